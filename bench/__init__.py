@@ -1,0 +1,3 @@
+"""The harness of simgap: compares tuners, and explains what tuning cannot fix."""
+
+__version__ = "0.1.0"

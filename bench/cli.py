@@ -1,0 +1,232 @@
+"""The command line: `simgap compare`, `plot`, `simulate`, `inspect`, `list`.
+
+Heavy packages are imported by the commands that need them, so that `simgap --help` is quick. A fault of the user's is
+one line on stderr and exit code 2; an internal error keeps its traceback.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bench import __version__
+
+if TYPE_CHECKING:
+    from bench.experiment import Experiment
+
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    from sims.base import InputError
+
+    try:
+        code: int = options.command(options)
+    except InputError as error:
+        print(f"simgap: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:  # `simgap list ... | head`
+        sys.stderr.close()
+        return 0
+    except KeyboardInterrupt:
+        print("simgap: interrupted before there was a result", file=sys.stderr)
+        return INTERRUPTED
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="simgap",
+        description="Compare methods that tune simulator parameters; find what tuning cannot fix.",
+    )
+    parser.add_argument("--version", action="version", version=f"simgap {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
+
+    compare = commands.add_parser("compare", help="run an experiment: tuners x targets x seeds; write table and figure")
+    compare.add_argument("experiment", metavar="EXPERIMENT", help="name (see `simgap list experiments`) or TOML file")
+    compare.add_argument("--tuners", metavar="A,B,...", help="only these tuners, by label or registered name")
+    compare.add_argument("--targets", type=_positive, metavar="N", help="targets in each range")
+    compare.add_argument("--seeds", type=_positive, metavar="N", help="seeds of each tuner that uses chance")
+    compare.add_argument("--budget", type=_positive, metavar="N", help="simulations on one target")
+    compare.add_argument("--jobs", type=_positive, metavar="N", default=2, help="worker processes (default: 2)")
+    compare.add_argument("--out", metavar="DIR", help="folder to write (default: a new one below results/)")
+    compare.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more tuners")
+    compare.set_defaults(command=_compare)
+
+    plot = commands.add_parser("plot", help="write table and figures of a comparison again")
+    plot.add_argument("run", metavar="RUN", type=Path, help="the comparison's folder")
+    plot.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more simulators")
+    plot.set_defaults(command=_plot)
+
+    _add_simulate(commands.add_parser("simulate", help="write a recording of a simulated system, its truth apart"))
+
+    inspect = commands.add_parser("inspect", help="summarise and draw a recording")
+    inspect.add_argument("recording", metavar="FILE.csv", type=Path, help="the table; its .toml stands beside it")
+    inspect.add_argument("--system", metavar="NAME", help="take it for this system, whatever the .toml says")
+    inspect.add_argument("--out", metavar="DIR", type=Path, help="folder for the figure (default: results/inspect)")
+    inspect.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more systems")
+    inspect.set_defaults(command=_inspect)
+
+    listing = commands.add_parser("list", help="list tuners, simulators, systems, effects or experiments")
+    listing.add_argument("what", choices=("tuners", "simulators", "systems", "effects", "experiments"))
+    listing.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more of them")
+    listing.set_defaults(command=_list)
+    return parser
+
+
+def _add_simulate(simulate: argparse.ArgumentParser) -> None:
+    simulate.add_argument("system", metavar="SYSTEM", help="see `simgap list systems`")
+    for name, metavar, text in (
+        ("theta", "NAME=VALUE", "parameters, or all values in order with commas between (default: nominal)"),
+        ("effect", "NAME=VALUE[,VALUE]", "effects that act, with their coefficients"),
+        ("constant", "NAME=VALUE", "constants other than the system's defaults"),
+        ("noise", "S", "sensor noise, 1 sigma: of every channel, or NAME=S (default: none)"),
+        ("input", "NAME=SIGNAL", "a number, sine:AMPLITUDE:HERTZ, square:A:HZ, steps:A:SECONDS, chirp:A:HZ:HZ"),
+        ("initial", "NAME=VALUE", "initial states, or NAME=LOW:HIGH to draw each run's"),
+    ):
+        simulate.add_argument(f"--{name}", action="extend", nargs="+", default=[], metavar=metavar, help=text)
+    simulate.add_argument("--observe", metavar="A,B,...", help="channels to record (default: the system's usual ones)")
+    simulate.add_argument("--runs", type=_positive, metavar="N", default=4, help="number of runs (default: 4)")
+    simulate.add_argument("--seconds", type=float, metavar="T", default=4.0, help="length of a run (default: 4)")
+    simulate.add_argument("--rate", type=float, metavar="HZ", default=100.0, help="samples a second (default: 100)")
+    simulate.add_argument("--engine", metavar="NAME", help="pybullet, mujoco or batch (default: batch)")
+    simulate.add_argument("--seed", type=int, metavar="K", default=0, help="of all that is drawn (default: 0)")
+    simulate.add_argument("--held-out", type=int, metavar="M", help="mark the last M runs (default: a third)")
+    simulate.add_argument("--out", type=Path, metavar="FILE.csv", required=True, help="file to write, a new one")
+    simulate.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more systems")
+    simulate.set_defaults(command=_simulate)
+
+
+def _positive(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, found '{text}'")
+    return value
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from bench.experiment import load
+    from bench.registry import load_plugins, tuners
+    from sims.base import unknown
+
+    load_plugins(options.plugin)
+    experiment = load(options.experiment).chosen(targets=options.targets, budget=options.budget)
+    if options.seeds:
+        experiment = experiment.with_seeds(options.seeds)
+    if options.tuners:
+        labels = [label.strip() for label in options.tuners.split(",") if label.strip()]
+        known = {*tuners.names(), *(entry.label for entry in experiment.tuners)}
+        for label in labels:
+            if label not in known:
+                raise unknown("tuner", label, sorted(known))
+        experiment = experiment.with_tuners(labels)
+    return _run(experiment, options)
+
+
+def _run(experiment: Experiment, options: argparse.Namespace) -> int:
+    from bench.report import finish
+    from bench.runner import prepare, run
+    from bench.store import new_folder, write_configuration, write_results
+
+    results = prepare(experiment)
+    folder = new_folder(experiment, options.out)
+    write_configuration(folder, experiment, options.plugin, options.jobs)
+    with _Bars() as bars:
+        run(results, options.plugin, options.jobs, bars.start)
+    write_results(folder, results)
+    finish(folder, results.problem, print)
+    if results.interrupted:
+        done = len(results.statuses)
+        print(f"simgap: interrupted; {done} of {results.planned} runs are finished and kept", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+class _Bars:
+    """Progress bars on stderr, one after another; tqdm estimates the time left."""
+
+    def __enter__(self) -> _Bars:
+        self._close: Callable[[], None] = lambda: None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+    def start(self, title: str, total: int) -> Callable[[], None]:
+        """Begin a bar of `total` steps; returns what advances it."""
+        from tqdm import tqdm
+
+        self._close()
+        pause = 0.5 if sys.stderr.isatty() else 30.0  # a log wants few lines
+        bar = tqdm(total=total, desc=title, unit="run", file=sys.stderr, dynamic_ncols=True, mininterval=pause)
+        self._close = bar.close
+
+        def step() -> None:
+            bar.update()
+
+        return step
+
+
+def _plot(options: argparse.Namespace) -> int:
+    from bench.problem import Problem
+    from bench.registry import load_plugins
+    from bench.report import finish
+    from bench.store import read
+
+    load_plugins(options.plugin)
+    finish(options.run, Problem(read(options.run).experiment), print)
+    return 0
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    from bench.registry import load_plugins
+    from bench.simulate import Wish, write
+
+    load_plugins(options.plugin)
+    wish = Wish(
+        options.system, options.theta, options.effect, options.constant, options.noise, options.input, options.initial,
+        [name.strip() for name in options.observe.split(",")] if options.observe else [], options.runs,
+        options.seconds, options.rate, options.engine, options.seed, options.held_out,
+    )  # fmt: skip
+    made = write(wish, options.out)
+    channels = ", ".join(made.recording.runs[0].channels)
+    runs = f"{options.runs} run{'s' * (options.runs > 1)}"
+    print(f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels {channels}")
+    print(f"{options.out.with_suffix('.truth.toml')}: what made it")
+    return 0
+
+
+def _inspect(options: argparse.Namespace) -> int:
+    from bench.inspection import load, summary
+    from bench.inspection_figure import draw
+    from bench.registry import load_plugins
+
+    load_plugins(options.plugin)
+    recording, kind = load(options.recording, options.system)
+    for line in summary(recording, kind):
+        print(line)
+    for path in draw(recording, kind, options.out or Path("results/inspect", options.recording.resolve().parent.name)):
+        print(path)
+    return 0
+
+
+def _list(options: argparse.Namespace) -> int:
+    from bench.catalogue import lines
+    from bench.registry import load_plugins
+
+    load_plugins(options.plugin)
+    for line in lines(options.what):
+        print(line)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

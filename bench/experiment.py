@@ -1,0 +1,270 @@
+"""An experiment as a data file: which tuners, on which simulator and targets, with what budget.
+
+The file's keys are the fields of `Experiment`; everything else is derived. `Experiment.document` gives the exact
+configuration back, defaults filled in and command-line changes applied, and is what a run stores.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from sims.base import InputError, unknown
+from sims.recording import read_toml
+
+RANGES = ("in", "wide", "real")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One tuner of a comparison: its registered name, options, and seeds or budget where they differ."""
+
+    label: str
+    tuner: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    seeds: int | None = None
+    budget: int | None = None
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Sample times of a simulated target: `samples` of them at `rate` Hz, from zero."""
+
+    rate: float = 100.0
+    samples: int = 400
+
+
+@dataclass(frozen=True)
+class Source:
+    """The recording that an experiment on real data tunes to; `path` is relative to the folder of recordings."""
+
+    path: str = ""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One comparison.
+
+    Attributes:
+        name: file name without its ending.
+        title: heading of figures.
+        says: a sentence on what it is.
+        simulator: registered name.
+        observe: channels the tuner sees; all where empty.
+        error_channel: the channel in which `obs_error` and `heldout_error` are reported; the first where empty.
+        ranges: in, wide (simulated targets), or real (a recording).
+        targets: number of targets in each range; for a recording, number of starting points.
+        seeds: runs of each stochastic tuner on each target, and trainings of each learned one.
+        budget: simulations on one target.
+        same_targets_as: another experiment whose targets are met; its own where empty.
+        training_budget: simulations that a learned tuner may train with.
+        timeout: seconds a run may take.
+        noise: standard deviation of the sensor noise added to simulated targets, by channel.
+        settings: the simulator's own settings, e.g. its time step.
+        world: settings of the simulator that makes the targets, where it is another: another engine, effects with
+            fixed coefficients. Empty: the same simulator. Its parameters are the first of the tuned ones.
+        constants: constants other than the simulator's defaults.
+        parameters: changes to parameters' nominal, bounds, training range.
+        initial: initial state: a number, or [low, high] for uniform between.
+        sampling: sample times of simulated targets.
+        recording: the measured data, for range real.
+        tuners: the entries.
+    """
+
+    name: str
+    title: str = ""
+    says: str = ""
+    simulator: str = ""
+    observe: tuple[str, ...] = ()
+    error_channel: str = ""
+    ranges: tuple[str, ...] = ("in", "wide")
+    targets: int = 20
+    seeds: int = 1
+    budget: int = 100
+    same_targets_as: str = ""
+    training_budget: int = 1600
+    timeout: float = 3600.0
+    noise: Mapping[str, float] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    world: Mapping[str, Any] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    initial: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
+    sampling: Sampling = field(default_factory=Sampling)
+    recording: Source | None = None
+    tuners: tuple[Entry, ...] = ()
+
+    def __post_init__(self) -> None:
+        for what in ("targets", "seeds", "budget"):
+            if getattr(self, what) < 1:
+                raise InputError(f"experiment {self.name}: {what} must be at least 1, found {getattr(self, what)}")
+        for name in self.ranges:
+            if name not in RANGES:
+                raise unknown("range", name, RANGES)
+        if ("real" in self.ranges) != (self.recording is not None) or (self.recording and len(self.ranges) != 1):
+            raise InputError(f"experiment {self.name}: range 'real' and a [recording] go together, and alone")
+
+    def document(self) -> dict[str, Any]:
+        """The whole configuration as TOML tables; `parse` of it gives an equal experiment."""
+        document = {k: v for k, v in asdict(self).items() if k not in ("name", "tuners") and v is not None}
+        document["tuners"] = {e.label: _without_none(e) for e in self.tuners}
+        return document
+
+    def chosen(self, **changes: Any) -> Experiment:
+        """This experiment with the given fields replaced where they are not None."""
+        return replace(self, **{k: v for k, v in changes.items() if v is not None})
+
+    def with_seeds(self, seeds: int) -> Experiment:
+        """The same number of seeds for every tuner whose entry does not ask for fewer."""
+        entries = tuple(replace(e, seeds=min(e.seeds, seeds) if e.seeds else None) for e in self.tuners)
+        return replace(self, seeds=seeds, tuners=entries)
+
+    def with_tuners(self, labels: Sequence[str]) -> Experiment:
+        """Only the tuners of these labels, in this order; a registered name that has no entry gets one."""
+        entries = {entry.label: entry for entry in self.tuners}
+        return replace(self, tuners=tuple(entries.get(label, Entry(label, label)) for label in labels))
+
+
+def _without_none(entry: Entry) -> dict[str, Any]:
+    return {k: v for k, v in asdict(entry).items() if v is not None and k != "label"}
+
+
+def names() -> list[str]:
+    """The experiments that come with the project."""
+    return sorted(f.name[:-5] for f in resources.files("bench.experiments").iterdir() if f.name.endswith(".toml"))
+
+
+def load(name_or_path: str) -> Experiment:
+    """An experiment of the project by name, or a user's by the path of its TOML file.
+
+    Raises:
+        InputError: no such experiment, or a fault in its file, in one line.
+    """
+    if name_or_path in names():
+        path = Path(str(resources.files("bench.experiments").joinpath(f"{name_or_path}.toml")))
+    elif name_or_path.endswith(".toml"):
+        path = Path(name_or_path)
+    else:
+        raise InputError(f"{unknown('experiment', name_or_path, names())} (or give the path of a .toml file)")
+    return parse(path.stem, read_toml(path), path)
+
+
+def parse(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
+    """Check the tables of an experiment file.
+
+    Raises:
+        InputError: an unknown key or a value of another type, naming file and key.
+    """
+    values = dict(document)
+    entries = _checked(path, "tuners", values.pop("tuners", {}), dict)
+    fields = {k: _field(path, k, v) for k, v in values.items()}
+    if not fields.get("simulator"):
+        raise InputError(f'{path}: expected simulator = "NAME", found none')
+    tuners = tuple(_entry(path, label, table) for label, table in entries.items())
+    try:
+        return Experiment(name=name, tuners=tuners, **fields)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+_TYPES: dict[str, type | tuple[type, ...]] = {
+    "title": str,
+    "says": str,
+    "simulator": str,
+    "observe": list,
+    "error_channel": str,
+    "ranges": list,
+    "targets": int,
+    "seeds": int,
+    "budget": int,
+    "same_targets_as": str,
+    "training_budget": int,
+    "timeout": (int, float),
+    "noise": dict,
+    "settings": dict,
+    "world": dict,
+    "constants": dict,
+    "parameters": dict,
+    "initial": dict,
+    "sampling": dict,
+    "recording": dict,
+}
+
+
+def _field(path: Path, key: str, value: Any) -> Any:
+    if key not in _TYPES:
+        raise unknown(f"entry of {path}", key, [*_TYPES, "tuners"])
+    _checked(path, key, value, _TYPES[key])
+    if key in ("observe", "ranges"):
+        return tuple(_checked(path, key, v, str) for v in value)
+    if key in ("noise", "constants"):
+        return {k: float(_checked(path, f"{key}.{k}", v, (int, float))) for k, v in value.items()}
+    if key == "parameters":
+        return {k: dict(_parameter(path, k, v)) for k, v in value.items()}
+    if key == "initial":
+        return {k: _initial(path, f"initial.{k}", v) for k, v in value.items()}
+    if key == "sampling":
+        return Sampling(**_table(path, key, value, {"rate": (int, float), "samples": int}))
+    if key == "recording":
+        return Source(**_table(path, key, value, {"path": str}))
+    return value
+
+
+def _parameter(path: Path, name: str, table: Any) -> dict[str, Any]:
+    changes = _table(path, f"parameters.{name}", table, {
+        "nominal": (int, float), "bounds": list, "training": list, "log": bool
+    })  # fmt: skip
+    for key in ("bounds", "training"):
+        if key in changes:
+            changes[key] = _pair(path, f"parameters.{name}.{key}", changes[key])
+    return changes
+
+
+def _initial(path: Path, where: str, value: Any) -> float | tuple[float, float]:
+    if isinstance(value, list):
+        return _pair(path, where, value)
+    return float(_checked(path, where, value, (int, float)))
+
+
+def _pair(path: Path, where: str, value: Any) -> tuple[float, float]:
+    if len(value) != 2:
+        raise InputError(f"{path}: {where}: expected [low, high], found {value!r}")
+    low, high = (float(_checked(path, where, v, (int, float))) for v in value)
+    if not low < high:
+        raise InputError(f"{path}: {where}: expected low < high, found {value!r}")
+    return low, high
+
+
+def _entry(path: Path, label: str, table: Any) -> Entry:
+    where = f"tuners.{label}"
+    fields = _table(path, where, table, {"tuner": str, "options": dict, "seeds": int, "budget": int})
+    for key in ("seeds", "budget"):
+        if fields.get(key, 1) < 1:
+            raise InputError(f"{path}: {where}.{key}: expected at least 1, found {fields[key]}")
+    return Entry(label, fields.pop("tuner", label), **fields)
+
+
+def _table(path: Path, where: str, value: Any, types: Mapping[str, type | tuple[type, ...]]) -> dict[str, Any]:
+    for key, found in _checked(path, where, value, dict).items():
+        if key not in types:
+            raise unknown(f"entry of [{where}] in {path}", key, list(types))
+        _checked(path, f"{where}.{key}", found, types[key])
+    return dict(value)
+
+
+def _checked(path: Path, where: str, value: Any, types: type | tuple[type, ...]) -> Any:
+    kinds = types if isinstance(types, tuple) else (types,)
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        wanted = {
+            str: "text",
+            int: "a whole number",
+            float: "a number",
+            dict: "a table",
+            list: "a list",
+            bool: "a bool",
+        }
+        raise InputError(f"{path}: {where}: expected {wanted[kinds[-1]]}, found {value!r}")
+    return value

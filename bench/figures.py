@@ -1,0 +1,250 @@
+"""The figures of a comparison: error against number of simulations, and against distance from the training range.
+
+Made for print: every tuner has its own marker and line style beside its colour, colours differ in lightness, bands are
+95 % bootstrap intervals of the median over targets. Each figure is written as PNG and PDF.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from bench.experiment import Experiment
+from bench.stats import checkpoints, interval, target_curves
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, safe for colour-blind readers, in an order that alternates dark and light.
+_COLOURS = (
+    "#000000",
+    "#E69F00",
+    "#0072B2",
+    "#56B4E9",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#7F7F7F",
+    "#5B3A8E",
+    "#A6761D",
+)
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
+_LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (6, 1, 1, 1, 1, 1)), (0, (8, 2)))
+_FLOOR = 1e-9
+"""Errors below this are drawn here: less than rounding in the observation."""
+_RESAMPLES = 500
+_CAPTION = (
+    "Line: median over targets of the recommendation's error (mean over seeds). Band or bar: 95 % bootstrap interval "
+    f"of the median. Errors below {_FLOOR:g} are drawn there."
+)
+
+_TITLES = {
+    "in": "Targets in the training range",
+    "wide": "Targets anywhere in the bounds",
+    "obs_error": "Runs tuned on",
+    "heldout_error": "Held-out runs, open loop",
+}
+
+
+def draw(folder: Path, experiment: Experiment, runs: pd.DataFrame, channel_unit: str, parameter: str) -> list[Path]:
+    """Draw every figure that the runs allow into `folder`/figures; returns the PNG files.
+
+    Args:
+        folder: the comparison's folder.
+        experiment: what was compared.
+        runs: rows of runs.parquet.
+        channel_unit: the error channel with its unit, for axes, e.g. ``q [rad]``.
+        parameter: the parameter with its unit where there is one, e.g. ``restitution``; empty for several.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    made = [_save(folder, "error-vs-simulations", _samples_figure(experiment, runs, channel_unit, parameter))]
+    if experiment.world:
+        made.append(_save(folder, "misfit-vs-simulations", _misfit_figure(experiment, runs, channel_unit)))
+    if "wide" in experiment.ranges and runs.loc[runs["range"] == "wide", "outside"].gt(0).any():
+        made.append(_save(folder, "error-vs-distance", _distance_figure(experiment, runs, parameter)))
+    return made
+
+
+def _samples_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: str, parameter: str) -> Figure:
+    """One panel a range (or, for a recording, held-out runs beside the runs tuned on)."""
+    if "real" in experiment.ranges:
+        metrics = [m for m in ("heldout_error", "obs_error") if runs[m].notna().any()]
+        panels = [(runs, m, _TITLES[m], f"RMSE of {channel_unit}") for m in metrics]
+    else:
+        metric = _parameter_metric(runs)
+        label = _parameter_label(parameter)
+        ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
+        panels = [(runs[runs["range"] == r], metric, _TITLES[r], label) for r in ranges]
+    figure, axes = _canvas(len(panels))
+    style = Styles(experiment, runs, panels[0][1])
+    for axis, (part, metric, title, label) in zip(axes, panels, strict=True):
+        _samples_panel(axis, part, metric, experiment.budget, style)
+        targets = part["target"].nunique()
+        what = "starts" if "real" in experiment.ranges else "targets"
+        axis.set_title(f"{title} ({targets} {what})", fontsize=10)
+        axis.set_ylabel(f"{label}, median")
+    _finish(figure, axes, style, experiment)
+    return figure
+
+
+def _misfit_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: str) -> Figure:
+    """What tuning leaves where the targets come from another simulator: the floor that no parameter removes."""
+    ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
+    figure, axes = _canvas(len(ranges))
+    style = Styles(experiment, runs, "obs_error")
+    for axis, kind in zip(axes, ranges, strict=True):
+        part = runs[runs["range"] == kind]
+        _samples_panel(axis, part, "obs_error", experiment.budget, style)
+        floor = float(part.groupby("target")["obs_error"].min().median())
+        axis.axhline(floor, color="#444444", linewidth=0.8, linestyle=(0, (2, 2)))
+        axis.annotate(
+            f"least that any tuner reached: {floor:.2g} (median)", (0, floor), xytext=(4, -10),
+            textcoords="offset points", fontsize=7.5,
+        )  # fmt: skip
+        axis.set_title(f"{_TITLES[kind]} ({part['target'].nunique()} targets)", fontsize=10)
+        axis.set_ylabel(f"RMSE of {channel_unit}, median")
+    _finish(figure, axes, style, experiment)
+    return figure
+
+
+def _samples_panel(axis: Axes, runs: pd.DataFrame, metric: str, budget: int, style: Styles) -> None:
+    points = sorted({*checkpoints(budget), *np.unique(np.geomspace(1, budget, 40).astype(int)).tolist()})
+    for tuner, group in runs.groupby("tuner", sort=False):
+        curves = np.maximum(target_curves(group, metric, points).to_numpy(dtype=np.float64), _FLOOR)
+        curves = curves[np.isfinite(curves).all(axis=1)]
+        if not len(curves):
+            continue
+        low, high = interval(curves, np.median, "figure", str(tuner), metric, resamples=_RESAMPLES)
+        look = style.of(str(tuner))
+        marks = [points.index(k) for k in checkpoints(budget)]
+        axis.plot(points, np.median(curves, axis=0), markevery=marks, markersize=4.5, **look)
+        axis.fill_between(points, low, high, color=look["color"], alpha=0.13, linewidth=0)
+    axis.set_xscale("symlog", linthresh=1, linscale=0.5)
+    axis.set_yscale("log")
+    ticks = checkpoints(budget)
+    axis.set_xticks(ticks, [str(k) for k in ticks])
+    axis.set_xlim(-0.08, budget * 1.1)
+    axis.minorticks_off()
+    axis.set_xlabel("simulations used on the target")
+
+
+def _distance_figure(experiment: Experiment, runs: pd.DataFrame, parameter: str) -> Figure:
+    """Median error after few, some and all simulations, by how far the target lies outside the training range."""
+    metric = _parameter_metric(runs)
+    wide = runs[runs["range"] == "wide"]
+    moments = [k for k in (3, 10) if k < experiment.budget] + [experiment.budget]
+    distances = wide.groupby("target")["outside"].first()
+    edges = np.linspace(0.0, float(distances.max()), 5)
+    places = np.where(distances > 0, np.searchsorted(edges[1:-1], distances, side="left"), -1)
+    bins = pd.Series(places, index=distances.index)
+    counts = [int((bins == b).sum()) for b in range(-1, 4)]
+    names = ["inside", *(f"{edges[b]:.2f}–{edges[b + 1]:.2f}" for b in range(4))]
+    figure, axes = _canvas(len(moments))
+    style = Styles(experiment, runs, metric)
+    for axis, k in zip(axes, moments, strict=True):
+        for tuner, group in wide.groupby("tuner", sort=False):
+            values = target_curves(group, metric, [k])[k].dropna().clip(lower=_FLOOR)
+            _distance_line(axis, values.to_numpy(), bins[values.index].to_numpy(), str(tuner), style)
+        axis.set_xticks(range(5), [f"{n}\nn={c}" for n, c in zip(names, counts, strict=True)], fontsize=7)
+        axis.set_yscale("log")
+        axis.set_title(f"After {k} simulations", fontsize=10)
+        axis.set_xlabel("distance of the target from the training range,\nin widths of that range; n targets")
+        axis.set_ylabel(f"{_parameter_label(parameter)}, median")
+    _finish(figure, axes, style, experiment)
+    return figure
+
+
+def _distance_line(axis: Axes, values: Any, bins: Any, tuner: str, style: Styles) -> None:
+    places, middle, low, high = [], [], [], []
+    for b in range(-1, 4):
+        part = values[bins == b]
+        if len(part):
+            below, above = interval(part[:, None], np.median, "distance", tuner, str(b), resamples=_RESAMPLES)
+            places.append(b + 1 + style.offset(tuner))
+            middle.append(np.median(part))
+            low.append(np.median(part) - below[0] if len(part) > 1 else 0.0)
+            high.append(above[0] - np.median(part) if len(part) > 1 else 0.0)
+    bars = np.maximum([low, high], 0.0)
+    axis.errorbar(places, middle, yerr=bars, markersize=4.5, elinewidth=0.8, capsize=1.5, **style.of(tuner))
+
+
+def _parameter_metric(runs: pd.DataFrame) -> str:
+    return "param_abs_error" if "param_abs_error" in runs else "param_error"
+
+
+def _parameter_label(parameter: str) -> str:
+    return f"absolute error of {parameter}" if parameter else "mean parameter error [training widths]"
+
+
+class Styles:
+    """Colour, marker and line of each tuner: fixed by its place in the experiment, listed by its final error."""
+
+    def __init__(self, experiment: Experiment, runs: pd.DataFrame, metric: str) -> None:
+        present = set(runs["tuner"].unique())
+        self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
+        last = runs.sort_values("k").groupby(["tuner", "run"])[metric].last().groupby(level="tuner").median()
+        self.order: Sequence[str] = sorted(self._places, key=lambda label: float(last.get(label, np.inf)))
+
+    def of(self, tuner: str) -> dict[str, Any]:
+        """Keyword arguments for plotting `tuner`."""
+        i = self._places[tuner]
+        return {
+            "color": _COLOURS[i % len(_COLOURS)],
+            "marker": _MARKERS[i % len(_MARKERS)],
+            "linestyle": _LINES[i % len(_LINES)],
+            "linewidth": 1.6,
+            "label": tuner,
+        }
+
+    def offset(self, tuner: str) -> float:
+        """A small shift along a category axis, so that error bars stand beside each other."""
+        return (self._places[tuner] - (len(self._places) - 1) / 2) * 0.6 / max(len(self._places), 1)
+
+
+def _canvas(panels: int) -> tuple[Figure, list[Axes]]:
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, panels, figsize=(1.2 + 4.3 * panels, 4.6), squeeze=False, sharey=True)
+    for axis in axes[0]:
+        axis.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
+        axis.spines[["top", "right"]].set_visible(False)
+    return figure, list(axes[0])
+
+
+def _finish(figure: Figure, axes: list[Axes], style: Styles, experiment: Experiment) -> None:
+    handles = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
+    labels = [label for label in style.order if label in handles]
+    figure.legend(
+        [handles[label] for label in labels],
+        labels,
+        loc="outside right upper",
+        title="best at the end first",
+        fontsize=9,
+        title_fontsize=8,
+        frameon=False,
+        handlelength=3.2,
+    )
+    for axis in axes[1:]:
+        if axis.get_ylabel() == axes[0].get_ylabel():
+            axis.set_ylabel("")
+    figure.suptitle(experiment.title or experiment.name, fontsize=11)
+    figure.supxlabel(_CAPTION, fontsize=7.5, color="#444444")
+
+
+def _save(folder: Path, name: str, figure: Figure) -> Path:
+    from matplotlib import pyplot as plt
+
+    target = folder / "figures"
+    target.mkdir(exist_ok=True)
+    figure.set_layout_engine("constrained")
+    figure.savefig(target / f"{name}.png", dpi=160)
+    figure.savefig(target / f"{name}.pdf", metadata={"CreationDate": None})
+    plt.close(figure)
+    return target / f"{name}.png"

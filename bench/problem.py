@@ -1,0 +1,161 @@
+"""An experiment's problem: its simulator, its targets with their truth sealed away, its practice ground.
+
+`Problem` is rebuilt from the experiment in every process. Targets are made in the parent process alone, which keeps
+their true parameters; workers get `SealedTarget`s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.experiment import Experiment
+from bench.measured import Side, measured
+from bench.registry import simulators
+from bench.seeds import rng_for
+from methods.base import Array, BudgetExceededError
+from sims.base import InputError, Scenario, Simulator, UnitCube, adjusted, unknown
+
+
+@dataclass(frozen=True)
+class SealedTarget:
+    """A target without its truth, as a worker process gets it.
+
+    Attributes:
+        name: e.g. ``wide-017``.
+        range: in, wide or real.
+        start: (dim,) where tuners start, unit cube.
+        fitting: what the tuner may see.
+        held_out: what only measures; without runs where nothing is held out.
+    """
+
+    name: str
+    range: str
+    start: Array
+    fitting: Side
+    held_out: Side
+
+
+@dataclass(frozen=True)
+class Target:
+    """A sealed target and, in the parent process only, its true parameters (dim,), physical; None where unknown."""
+
+    sealed: SealedTarget
+    truth: Array | None
+
+
+class Problem:
+    """What an experiment tunes: simulator, unit cube, observed channels and their scale."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self.experiment = experiment
+        kind = simulators.get(experiment.simulator)
+        observe = experiment.observe or tuple(c.name for c in kind.channels)
+        self.simulator = self._simulator(kind, observe, experiment.settings)
+        self._world = self._simulator(kind, observe, experiment.world) if experiment.world else self.simulator
+        self.cube = UnitCube(adjusted(self.simulator.parameters, experiment.parameters))
+        self.channels = self.simulator.channels
+        self.error_channel = self._channel(experiment.error_channel or self.channels[0].name)
+        noise = dict(experiment.noise)
+        for name in noise:
+            self._channel(name)
+        self._measured = None
+        if experiment.recording:
+            self._measured = measured(experiment.recording.path, self.simulator)
+            noise = {**self._measured.noise, **noise}
+        self.noise: Array = np.array([noise.get(c.name, 0.0) for c in self.channels])
+        self.scale: Array = np.where(self.noise > 0, self.noise, [c.scale for c in self.channels])
+
+    def _simulator(self, kind: type[Simulator], observe: Sequence[str], settings: Mapping[str, Any]) -> Simulator:
+        experiment = self.experiment
+        try:
+            return kind(constants=experiment.constants, observe=observe, **settings)
+        except TypeError as error:
+            raise InputError(f"experiment {experiment.name}: simulator {experiment.simulator}: {error}") from None
+
+    def close(self) -> None:
+        """Give back what the simulators hold."""
+        self.simulator.close()
+        self._world.close()
+
+    def _channel(self, name: str) -> int:
+        names = [c.name for c in self.channels]
+        if name not in names:
+            raise unknown("channel", name, names)
+        return names.index(name)
+
+    def simulate(self, points: Array, scenarios: tuple[Scenario, ...]) -> Array:
+        """Observations (n, T, C) of unit-cube points (n, dim), the scenarios' samples one after another."""
+        theta = self.cube.physical(points)
+        if len(scenarios) == 1:
+            return self.simulator.simulate(theta, scenarios[0])
+        return np.concatenate([self.simulator.simulate(theta, s) for s in scenarios], axis=1)
+
+    def scenarios(self, rng: np.random.Generator) -> tuple[Scenario, ...]:
+        """The recording's training runs, or one run with an initial state drawn as the experiment says."""
+        if self._measured:
+            return self._measured.fitting.scenarios
+        sampling = self.experiment.sampling
+        initial = {k: rng.uniform(*v) if isinstance(v, tuple) else v for k, v in self.experiment.initial.items()}
+        return (Scenario(np.arange(sampling.samples) / sampling.rate, initial),)
+
+    def target(self, kind: str, index: int) -> Target:
+        """Target `index` of range `kind`; it depends on the experiment's name, not on tuners, seeds or budgets."""
+        rng = rng_for(self.experiment.same_targets_as or self.experiment.name, "target", kind, index)
+        box = np.array([[0.0], [1.0]]) if kind == "wide" else self.cube.training
+        draw = rng.uniform(box[0], box[1], size=(2, self.cube.dim))
+        start, truth = draw[0], draw[1]
+        name = f"{kind}-{index:03d}"
+        if self._measured:
+            return Target(SealedTarget(name, kind, start, self._measured.fitting, self._measured.held_out), None)
+        scenarios = self.scenarios(rng)
+        theta = self.cube.physical(truth[None])[:, : len(self._world.parameters)]
+        observed = self._world.simulate(theta, scenarios[0])[0]
+        observed = observed + self.noise * rng.standard_normal(observed.shape)
+        held_out = Side((), np.empty((0, len(self.channels))))
+        return Target(SealedTarget(name, kind, start, Side(scenarios, observed), held_out), self.cube.physical(truth))
+
+    def targets(self) -> list[Target]:
+        """All targets of the experiment; the ranges take turns, so that a part of the work is a part of each."""
+        return [self.target(kind, i) for i in range(self.experiment.targets) for kind in self.experiment.ranges]
+
+    def outside(self, truth: Array) -> float:
+        """How far `truth` (dim,) lies outside the training range: the largest distance, in training-range widths."""
+        ranges = np.array([p.training_range for p in self.cube.parameters])
+        beyond = np.maximum(ranges[:, 0] - truth, truth - ranges[:, 1])
+        return float(max(0.0, (beyond / self.cube.training_widths()).max()))
+
+    def practice(self, budget: int) -> Practice:
+        """The simulator as a learned tuner may use it while training."""
+        return Practice(self, budget)
+
+
+class Practice:
+    """The practice ground of learned tuners; see `methods.base.Practice`."""
+
+    def __init__(self, problem: Problem, budget: int) -> None:
+        self._problem = problem
+        self.dim = problem.cube.dim
+        self.training = problem.cube.training
+        self.scale = problem.scale
+        self.used = 0
+        self.budget = budget
+        self.lengths = tuple(s.times.size for s in problem.scenarios(np.random.default_rng(0)))
+
+    def sample(self, rng: np.random.Generator, n: int) -> Array:
+        """(n, dim) parameters drawn uniformly from the training range, unit cube."""
+        return rng.uniform(self.training[0], self.training[1], size=(n, self.dim))
+
+    def simulate(self, rng: np.random.Generator, points: Array) -> Array:
+        """Observations (n, T, C) of `points` (n, dim), all in one scenario drawn by `rng`."""
+        points = np.asarray(points, dtype=np.float64)
+        slack = 1e-9
+        if not ((points >= self.training[0] - slack) & (points <= self.training[1] + slack)).all():
+            raise ValueError("a learned tuner may only simulate inside the training range while it trains")
+        if self.used + len(points) > self.budget:
+            raise BudgetExceededError(f"{self.used + len(points)} training simulations asked, {self.budget} allowed")
+        self.used += len(points)
+        return self._problem.simulate(points, self._problem.scenarios(rng))

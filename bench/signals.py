@@ -1,0 +1,72 @@
+"""Input signals by name, for recordings made by simulation: ``sine:2:0.5`` is 2 sin(2 pi 0.5 t)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from methods.base import Array
+from sims.base import InputError, unknown
+
+_TAU = 2 * np.pi
+
+
+def _constant(t: Array, rng: np.random.Generator, value: float) -> Array:  # noqa: ARG001
+    return np.full(t.size, value)
+
+
+def _sine(t: Array, rng: np.random.Generator, amplitude: float, frequency: float) -> Array:  # noqa: ARG001
+    signal: Array = amplitude * np.sin(_TAU * frequency * t)
+    return signal
+
+
+def _square(t: Array, rng: np.random.Generator, amplitude: float, frequency: float) -> Array:  # noqa: ARG001
+    return np.where(np.floor(2 * frequency * t) % 2 == 0, amplitude, -amplitude)
+
+
+def _steps(t: Array, rng: np.random.Generator, amplitude: float, seconds: float) -> Array:
+    place = np.floor(t / seconds + 1e-9).astype(int)  # a sample at the edge belongs to the new level
+    levels: Array = rng.uniform(-amplitude, amplitude, size=place[-1] + 1)
+    held: Array = levels[place]
+    return held
+
+
+def _chirp(t: Array, rng: np.random.Generator, amplitude: float, low: float, high: float) -> Array:  # noqa: ARG001
+    signal: Array = amplitude * np.sin(_TAU * (low * t + (high - low) * t * t / (2 * t[-1])))
+    return signal
+
+
+_FORMS: dict[str, tuple[Callable[..., Array], str]] = {
+    "constant": (_constant, "VALUE"),
+    "sine": (_sine, "AMPLITUDE:HERTZ"),
+    "square": (_square, "AMPLITUDE:HERTZ"),
+    "steps": (_steps, "AMPLITUDE:SECONDS"),
+    "chirp": (_chirp, "AMPLITUDE:HERTZ:HERTZ"),
+}
+HELP = ", ".join(f"{name}:{form}" for name, (_, form) in _FORMS.items())
+"""The forms there are, for a help text."""
+
+
+def signal(text: str, times: Array, rng: np.random.Generator) -> Array:
+    """The values (T,) at `times` (T,) of the signal that `text` describes; a plain number is constant.
+
+    `steps` holds levels drawn by `rng` evenly within the amplitude, `chirp` sweeps from one frequency to the other.
+
+    Raises:
+        InputError: no such form, or not its numbers.
+    """
+    name, *given = text.split(":")
+    if not given:
+        name, given = "constant", [text]
+    if name not in _FORMS:
+        raise unknown("signal", name, list(_FORMS))
+    make, form = _FORMS[name]
+    try:
+        numbers = [float(number) for number in given]
+    except ValueError:
+        numbers = []
+    # All behind the first are frequencies or durations.
+    if len(numbers) != len(form.split(":")) or not np.isfinite(numbers).all() or min([1.0, *numbers[1:]]) <= 0:
+        raise InputError(f"signal '{text}': expected {name}:{form} with numbers, all but the first > 0")
+    return make(times, rng, *numbers)

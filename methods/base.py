@@ -1,0 +1,227 @@
+"""The tuner's contract: a run is a generator that yields proposals and receives evaluations.
+
+A tuner works in the unit cube and never sees units, the simulator or the truth. The harness (`bench`) owns the loop:
+it simulates, counts, times and logs; the method reads like its paper.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Evaluation(NamedTuple):
+    """What the simulator showed for the proposals of one `yield`.
+
+    Attributes:
+        proposals: what was simulated (n, dim): the proposals, moved into the unit cube where they lay outside it.
+        observations: (n, T, C), SI units.
+        losses: (n,), each `Task.loss` of its observation; not finite where the simulation failed.
+    """
+
+    proposals: Array
+    observations: Array
+    losses: Array
+
+
+class Ask(NamedTuple):
+    """Proposals together with what the tuner would deliver now.
+
+    Yield a bare array to have the harness recommend the proposal of the lowest loss seen; yield an `Ask` to recommend
+    something else. The recommendation holds until the next `yield`.
+
+    Attributes:
+        points: (n, dim) or (dim,) proposals, unit cube.
+        recommend: (dim,), unit cube, made from the evaluations received so far; None for the lowest loss seen.
+    """
+
+    points: Array
+    recommend: Array | None = None
+
+
+Steps = Generator["Array | Ask", Evaluation, "str | None"]
+"""A tuner's run. Its return value, if any, is the reason for which it stopped by itself."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """Everything a tuner gets of one target; nothing here leads to its true parameters.
+
+    Attributes:
+        dim: number of parameters.
+        start: (dim,) where every tuner starts on this target, unit cube.
+        observed: (T, C) the target's observation, SI units; NaN where a sample is missing. The runs of a recording
+            with several runs follow one another along T.
+        scale: (C,) what a residual is divided by: the channel's noise where known, else its typical magnitude.
+        training: (2, dim) lower and upper corner of the training range, unit cube.
+        budget: number of simulations the tuner may use.
+        lengths: number of samples of each run; they add up to T.
+    """
+
+    dim: int
+    start: Array
+    observed: Array
+    scale: Array
+    training: Array
+    budget: int
+    lengths: tuple[int, ...]
+
+    def residuals(self, observations: Array) -> Array:
+        """Scaled differences simulated - observed, (n, T * C); zero where the target's sample is missing."""
+        difference = (observations - self.observed) / self.scale
+        return np.where(np.isnan(self.observed), 0.0, difference).reshape(len(observations), -1)
+
+
+class Practice(Protocol):
+    """The simulator as a learned tuner meets it in `fit`: counted, and fenced to the training range.
+
+    Attributes:
+        dim: number of parameters.
+        training: (2, dim) corners of the training range, unit cube.
+        scale: (C,) as in `Task`.
+        lengths: as in `Task`.
+        used: simulations made so far.
+        budget: simulations allowed.
+    """
+
+    dim: int
+    training: Array
+    scale: Array
+    lengths: tuple[int, ...]
+    used: int
+    budget: int
+
+    def sample(self, rng: np.random.Generator, n: int) -> Array:
+        """(n, dim) parameters drawn uniformly from the training range, unit cube."""
+        ...
+
+    def simulate(self, rng: np.random.Generator, points: Array) -> Array:
+        """Observations (n, T, C) of `points` (n, dim), all in one scenario drawn by `rng` as targets' are.
+
+        Raises:
+            ValueError: a point outside the training range.
+            BudgetExceededError: more simulations than the training budget.
+        """
+        ...
+
+
+class BudgetExceededError(RuntimeError):
+    """A learned tuner asked for more training simulations than it was given."""
+
+
+class Tuner:
+    """Base of all tuners. Subclasses implement `tune`; learned ones also `fit`, `state` and `restore`.
+
+    Options are keyword arguments with defaults (a dataclass does well). An instance is used for one run after another
+    and must not keep anything from one to the next, except what `fit` learned.
+
+    Attributes:
+        name: how the tuner is called in tables; derived from the class name where not given (RandomSearch ->
+            random_search).
+        requires: importable packages without which this tuner is listed as skipped.
+        stochastic: whether `tune` uses its generator; where not, one seed tells all.
+        learned: whether `fit` must have been called before `tune`.
+    """
+
+    name: ClassVar[str] = ""
+    requires: ClassVar[tuple[str, ...]] = ()
+    stochastic: ClassVar[bool] = True
+    learned: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "name" not in cls.__dict__:
+            cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+
+    def tune(self, task: Task, rng: np.random.Generator) -> Steps:
+        """Yield proposals (n, dim) in the unit cube, receive their `Evaluation`; return a reason to stop early."""
+        raise NotImplementedError(f"{type(self).__name__} does not implement tune")
+
+    def fit(self, simulator: Practice, rng: np.random.Generator, budget: int) -> None:
+        """Learn from at most `budget` simulations of the training range."""
+
+    def state(self) -> dict[str, Array]:
+        """What `fit` learned, as plain arrays by name."""
+        return {}
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Take back what `state` gave.
+
+        Raises:
+            ValueError: arrays of other names or shapes than this tuner's.
+        """
+
+
+class _Stopped(BaseException):
+    """Raised inside a callback optimiser's thread when the harness ends its run."""
+
+
+def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) -> Steps:
+    """Turn an optimiser that only takes an objective function into a tuner's generator.
+
+    The optimiser runs in a thread of its own and is never at work at the same time as the harness: each call of the
+    objective hands one point over and waits for its loss.
+
+    Args:
+        minimise: called with the objective (dim,) -> loss; returns the reason for which it stopped, or None. It must
+            let exceptions of the objective through.
+
+    Returns:
+        The generator; its return value is the reason.
+    """
+    to_harness: list[Array] = []
+    to_optimiser: list[float] = []
+    outcome: list[str | None] = []
+    failure: list[BaseException] = []
+    asked, answered = threading.Semaphore(0), threading.Semaphore(0)
+    closing = False
+
+    def objective(point: Array) -> float:
+        if closing:
+            raise _Stopped
+        to_harness.append(np.array(point, dtype=np.float64))
+        asked.release()
+        answered.acquire()
+        if closing:
+            raise _Stopped
+        return to_optimiser.pop()
+
+    def work() -> None:
+        try:
+            answered.acquire()
+            if not closing:
+                outcome.append(minimise(objective))
+        except _Stopped:
+            pass
+        except BaseException as error:  # handed to the harness, which files it
+            failure.append(error)
+        finally:
+            asked.release()
+
+    worker = threading.Thread(target=work, daemon=True, name="callback-optimiser")
+    worker.start()
+    try:
+        answered.release()
+        while True:
+            asked.acquire()
+            if failure:
+                raise failure[0]
+            if not to_harness:
+                return outcome[0] if outcome else None
+            seen = yield to_harness.pop()[None, :]
+            to_optimiser.append(float(seen.losses[0]))
+            answered.release()
+    finally:
+        closing = True
+        answered.release()
+        worker.join(timeout=5.0)
+        if worker.is_alive():
+            raise RuntimeError("the optimiser swallowed the exception that ends its run; its thread cannot be stopped")

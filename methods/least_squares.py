@@ -1,0 +1,210 @@
+"""Levenberg-Marquardt on the difference between simulated and observed samples: what a practitioner tries first.
+
+Sources: D. W. Marquardt, An algorithm for least-squares estimation of nonlinear parameters, SIAM J. Appl. Math. 11(2),
+1963, doi:10.1137/0111030. J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., 2006, chapter 10,
+doi:10.1007/978-0-387-40065-5. H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05, Technical
+University of Denmark. K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, 2nd ed.,
+IMM lecture note, 2004, section 3.5 (the secant version). C. G. Broyden, A class of methods for solving nonlinear
+simultaneous equations, Math. Comp. 19, 1965, doi:10.1090/S0025-5718-1965-0198670-6.
+
+Two things go beyond the textbook. A small change of a parameter grows along a simulation until impacts fall into other
+time steps, so the residual as a whole is jagged, with many local minima, while its first part is smooth: the fit starts
+on the first samples of each run and takes in more of them step by step. (This is continuation from an easy problem to
+the hard one; C. Bunks et al. do it with the frequencies of seismic data, Geophysics 60(5), 1995,
+doi:10.1190/1.1443880.) And what remains of the budget is spent on new starts, far from everything tried so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from methods.base import Array, Ask, Evaluation, Steps, Task, Tuner
+
+Result = TypeVar("Result")
+Simulates = Generator["Array | Ask", Evaluation, Result]
+"""A part of a run: it may simulate, and returns a Result."""
+Mask = NDArray[np.bool_]
+
+
+@dataclass(eq=False)
+class LeastSquares(Tuner):
+    """Levenberg-Marquardt with secant updates, a growing horizon and new starts; recommends the lowest loss seen.
+
+    `LeastSquares(horizons=(1.0,), secant=False, difference=1e-4, restart=False)` is the textbook's.
+
+    Attributes:
+        horizons: shares of each run's samples to fit, one after another; (1.0,) fits all of them at once.
+        secant: keep the Jacobian up to date with Broyden's formula, and take finite differences anew only where that
+            fails; otherwise take finite differences after every step that succeeds.
+        difference: longest step of the finite differences, a share of the cube; it shrinks with the fit's own steps.
+        smallest_difference: its lower limit.
+        damping: first damping, relative to the squared sensitivities.
+        patience: a fit is stuck after this many steps in succession without progress.
+        progress: share by which a step must lower the sum of squares to count as progress.
+        step_tolerance: a fit has converged when its step is shorter than this share of the cube.
+        restart: whether to start again elsewhere when the target has not been reproduced.
+        reproduced: the target is reproduced when the loss is below this share of the observation's root mean square.
+    """
+
+    horizons: tuple[float, ...] = (0.0625, 0.09, 0.125, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)
+    secant: bool = True
+    difference: float = 0.03
+    smallest_difference: float = 1e-6
+    damping: float = 1e-3
+    patience: int = 3
+    progress: float = 0.1
+    step_tolerance: float = 1e-10
+    restart: bool = True
+    reproduced: float = 1e-10
+
+    def tune(self, task: Task, rng: np.random.Generator) -> Steps:
+        """Fit from the start, then from other points until the target is reproduced."""
+        run = _Run(task, self.reproduced)
+        point = task.start
+        while True:
+            yield from self._fit(run, point)
+            if run.finished:
+                return "the simulation reproduces the target"
+            if not self.restart:
+                return "the fit reached a minimum"
+            point = run.untried(rng)
+
+    def _fit(self, run: _Run, point: Array) -> Simulates[None]:
+        """One fit from `point` over all horizons."""
+        (residual,) = yield from run.simulate(point[None])
+        if np.isnan(residual).any():
+            return
+        model = yield from self._differentiate(run, point, residual, self.difference)
+        for share in self.horizons:
+            chosen = run.samples(share)
+            if share >= 1.0 or model.sensitive(chosen):
+                model = yield from self._descend(run, model, chosen)
+            if run.finished:
+                return
+
+    def _differentiate(self, run: _Run, point: Array, residual: Array, longest: float) -> Simulates[_Model]:
+        """One-sided differences, inward at the upper border; to the other side where a simulation failed."""
+        h = min(max(longest, self.smallest_difference), self.difference)
+        steps = np.where(point + h > 1.0, -h, h)
+        moved = yield from run.simulate(point + np.diag(steps))
+        failed = np.isnan(moved).any(axis=1)
+        if failed.any():  # and where both sides fail, the column stays zero
+            steps[failed] *= -1.0
+            moved[failed] = yield from run.simulate(point + np.diag(steps)[failed])
+        return _Model(point, residual, np.nan_to_num((moved - residual) / steps[:, None]).T)
+
+    def _descend(self, run: _Run, model: _Model, chosen: Mask) -> Simulates[_Model]:
+        """Levenberg-Marquardt on the chosen samples until they are fitted, or it is stuck."""
+        worthwhile = 1e-8 if chosen.all() else 0.1  # of the sum of squares; early horizons need not be polished
+        damping, stalled, failed = _Damping(self.damping), 0, 0
+        while stalled < self.patience:
+            before = model.error(chosen)
+            step, promised = model.step(chosen, damping.mu)
+            if np.abs(step).max() < self.step_tolerance or promised <= worthwhile * before:
+                break
+            (residual,) = yield from run.simulate((model.point + step)[None])
+            after = float(residual[chosen] @ residual[chosen])  # NaN where the simulation failed
+            better = after < before
+            if np.isfinite(after):
+                model.update(step, residual)
+            if better:
+                model.point, model.residual = model.point + step, residual
+            damping.adapt((before - after) / promised)
+            failed = 0 if better else failed + 1
+            stalled = 0 if after < (1.0 - self.progress) * before else stalled + 1
+            if run.finished:
+                break
+            if (better and not self.secant) or (failed == 2 and len(step) > 1):
+                model = yield from self._differentiate(run, model.point, model.residual, float(np.abs(step).max()))
+        return model
+
+
+@dataclass
+class _Damping:
+    """Nielsen's rule: gentle where the model is good, ever stronger where it fails."""
+
+    mu: float
+    nu: float = 2.0
+
+    def adapt(self, gain: float) -> None:
+        """`gain`: decrease as a share of what the model promised; NaN for a failed simulation."""
+        if gain > 0.0:
+            self.mu, self.nu = self.mu * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 2.0
+        elif np.isnan(gain):
+            self.mu = 4.0 * self.mu + 3.0  # a quarter of the step, where the parameters do not interact
+        else:
+            self.mu, self.nu = self.mu * self.nu, self.nu * 2.0
+
+
+@dataclass
+class _Model:
+    """The residual near a point: r(θ + s) ≈ residual + jacobian s; arrays (dim,), (samples,), (samples, dim)."""
+
+    point: Array
+    residual: Array
+    jacobian: Array
+
+    def error(self, chosen: Mask) -> float:
+        """Sum of squares of the chosen samples."""
+        return float(self.residual[chosen] @ self.residual[chosen])
+
+    def sensitive(self, chosen: Mask) -> bool:
+        """Whether the chosen samples respond to any parameter, compared with all samples."""
+        return bool((self.jacobian[chosen] ** 2).mean() > 1e-6 * (self.jacobian**2).mean())
+
+    def step(self, chosen: Mask, mu: float) -> tuple[Array, float]:
+        """(JᵀJ + μ diag JᵀJ) s = -Jᵀr within the cube, and the decrease of the sum of squares that it promises."""
+        r, jacobian = self.residual[chosen], self.jacobian[chosen]
+        gradient = jacobian.T @ r
+        free = ~((self.point <= 0.0) & (gradient > 0.0) | (self.point >= 1.0) & (gradient < 0.0))
+        scale = np.sqrt((jacobian**2).sum(0))
+        scale = np.maximum(scale, 1e-6 * scale.max())
+        stacked = np.vstack([jacobian, np.diag(np.sqrt(mu) * scale)])[:, free]
+        step = np.zeros_like(self.point)
+        step[free] = np.linalg.lstsq(stacked, np.append(-r, np.zeros_like(step)), rcond=None)[0]
+        step = np.clip(self.point + step, 0.0, 1.0) - self.point
+        remaining = r + jacobian @ step
+        return step, float(r @ r - remaining @ remaining)
+
+    def update(self, step: Array, residual: Array) -> None:
+        """Broyden's update: the smallest change of the Jacobian that explains what the step did."""
+        missed = residual - self.residual - self.jacobian @ step
+        self.jacobian = self.jacobian + np.outer(missed, step / (step @ step))
+
+
+@dataclass
+class _Run:
+    """What one run has simulated."""
+
+    task: Task
+    reproduced: float
+    tried: list[Array] = field(default_factory=list)
+    finished: bool = False
+
+    def __post_init__(self) -> None:
+        observed = np.nan_to_num(self.task.observed) / self.task.scale
+        self.enough = self.reproduced * float(np.sqrt(np.mean(observed**2)))
+
+    def simulate(self, points: Array) -> Simulates[Array]:
+        """Residuals (n, samples) of the points; rows of NaN where the simulation failed."""
+        seen = yield np.clip(points, 0.0, 1.0)
+        self.tried.extend(seen.proposals)
+        self.finished = self.finished or bool((seen.losses <= self.enough).any())
+        return np.where(np.isfinite(seen.losses)[:, None], self.task.residuals(seen.observations), np.nan)
+
+    def samples(self, share: float) -> Mask:
+        """Which residuals belong to the first `share` of their run."""
+        first = np.concatenate([np.arange(n) < share * n for n in self.task.lengths])
+        return np.repeat(first, self.task.observed.shape[1])
+
+    def untried(self, rng: np.random.Generator) -> Array:
+        """The point farthest from all tried ones, among random candidates."""
+        candidates = rng.uniform(size=(64 * self.task.dim, self.task.dim))
+        squares = [((candidates - point) ** 2).sum(1) for point in self.tried]
+        farthest: Array = candidates[np.min(squares, axis=0).argmax()]
+        return farthest

@@ -1,0 +1,207 @@
+"""The network of TuneNet: one branch for each of two observations, concatenated, fully connected.
+
+Training uses torch (imported where it is needed); the forward pass used in tuning is plain numpy in double precision.
+Source: arXiv 1907.11200, section III and Eq. 1; layer sizes and training from the authors' released code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from methods.base import Array
+
+if TYPE_CHECKING:
+    import torch
+
+LAYERS = ("proposed", "target", "joined", "output")
+"""The fully connected layers; each has a `.weight` (inputs, outputs) and a `.bias` (outputs,)."""
+
+_LOG_2 = float(np.log(2.0))
+
+
+@dataclass(frozen=True)
+class Design:
+    """How a network is built and trained; the defaults are this project's, `PUBLISHED` the authors'.
+
+    Attributes:
+        width: units of each branch and of the joined layer.
+        smooth: softplus units (shifted through the origin) in place of rectified linear ones.
+        antisymmetric: h(a, b) = (n(a, b) - n(b, a)) / 2, hence h(o, o) = 0 exactly; else h = n.
+        bounded: tanh at the output.
+        relative: weigh each pair's squared error by 1 / (|difference|^2 + relative^2), unit cube; 0 weighs all alike.
+        adam: Adam and a rate falling along a cosine; else SGD without momentum and a rate x 0.99 an epoch.
+        rate: learning rate at the beginning.
+        weight_decay: lambda in Eq. 1, per mean squared error.
+        epochs: passes over the training data.
+        batch: scenarios, all of whose pairs are used (published: one pair each, the first member proposed).
+    """
+
+    width: int = 32
+    smooth: bool = True
+    antisymmetric: bool = True
+    bounded: bool = False
+    relative: float = 0.02
+    adam: bool = True
+    rate: float = 3e-3
+    weight_decay: float = 1e-5
+    epochs: int = 100
+    batch: int = 10
+
+
+PUBLISHED = Design(
+    smooth=False,
+    antisymmetric=False,
+    bounded=True,
+    relative=0.0,
+    adam=False,
+    rate=0.1,
+    weight_decay=0.5e-2,  # torch's weight_decay 1e-2 is the gradient of half of it times the squared norm
+    epochs=200,
+    batch=50,
+)
+
+
+def shapes(inputs: int, width: int, dim: int) -> dict[str, tuple[int, ...]]:
+    """Shape of every weight array by name, in the order of the network."""
+    sizes = ((inputs, width), (inputs, width), (2 * width, width), (width, dim))
+    named: dict[str, tuple[int, ...]] = {}
+    for layer, (fan_in, fan_out) in zip(LAYERS, sizes, strict=True):
+        named[f"{layer}.weight"], named[f"{layer}.bias"] = (fan_in, fan_out), (fan_out,)
+    return named
+
+
+def estimate(weights: dict[str, Array], design: Design, proposed: Array, target: Array) -> Array:
+    """h(proposed, target): the estimated parameter difference target - proposed.
+
+    Args:
+        weights: as in `shapes`.
+        design: how the network is built.
+        proposed: (n, D) input rows of the proposed simulations, or (D,).
+        target: (n, D) or (D,), likewise.
+
+    Returns:
+        (n, dim) or (dim,), unit cube.
+    """
+    w = weights
+
+    def unit(x: Array) -> Array:
+        return np.logaddexp(0.0, x) - _LOG_2 if design.smooth else np.maximum(x, 0.0)
+
+    def branch(x: Array, layer: str) -> Array:
+        return unit(x @ w[f"{layer}.weight"] + w[f"{layer}.bias"])
+
+    def joined(a: Array, b: Array) -> Array:
+        both = np.concatenate([branch(a, "proposed"), branch(b, "target")], axis=-1)
+        out: Array = unit(both @ w["joined.weight"] + w["joined.bias"]) @ w["output.weight"] + w["output.bias"]
+        return np.tanh(out) if design.bounded else out
+
+    if design.antisymmetric:
+        return (joined(proposed, target) - joined(target, proposed)) / 2.0
+    return joined(proposed, target)
+
+
+def train(
+    rows: Array, parameters: Array, design: Design, rng: np.random.Generator, alone: bool = False
+) -> dict[str, Array]:
+    """Fit the weights by Eq. 1; the same generator gives the same weights bit for bit.
+
+    Args:
+        rows: (scenarios, m, D) input rows.
+        parameters: (scenarios, m, dim), unit cube.
+        design: how the network is built and trained.
+        rng: seeds the initial weights and the order; no global random state is touched.
+        alone: learn parameters from the target alone, the proposed input being zero (the direct regressor).
+
+    Returns:
+        Weights as in `shapes`.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # sums in a fixed order, and the machine's other cores left to other runs
+    try:
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        weights = _initial(rows.shape[-1], parameters.shape[-1], design, generator)
+        loss = _loss(torch.as_tensor(rows, dtype=torch.float32), parameters, design, weights, alone)
+        with torch.enable_grad():
+            _descend(loss, list(weights.values()), len(rows), design, generator)
+        return {name: w.detach().numpy().astype(np.float64) for name, w in weights.items()}
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _initial(inputs: int, dim: int, design: Design, generator: torch.Generator) -> dict[str, Any]:
+    """Weights uniform in +- gain / sqrt(inputs); biases too (published), or zero."""
+    import torch
+
+    weights: dict[str, Any] = {}
+    fan_in = inputs
+    for name, shape in shapes(inputs, design.width, dim).items():
+        fan_in = shape[0] if name.endswith("weight") else fan_in
+        limit = (1.0 if not design.adam else 1.7 if name.endswith("weight") else 0.0) / fan_in**0.5
+        weights[name] = ((torch.rand(shape, generator=generator) * 2 - 1) * limit).requires_grad_()
+    return weights
+
+
+def _loss(rows: Any, parameters: Array, design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any], Any]:
+    """The objective of Eq. 1 over the scenarios of one batch."""
+    import torch
+    from torch.nn.functional import softplus
+
+    truth = torch.as_tensor(parameters, dtype=torch.float32)
+    each = rows.shape[1]
+    # antisymmetric: half of the ordered pairs will do, the other half are mirror images
+    one, other = torch.triu_indices(each, each, offset=1)
+
+    def unit(x: Any) -> Any:
+        return softplus(x) - _LOG_2 if design.smooth else torch.relu(x)
+
+    def branch(x: Any, layer: str) -> Any:
+        return unit(x @ w[f"{layer}.weight"] + w[f"{layer}.bias"])
+
+    def joined(a: Any, b: Any) -> Any:
+        both = torch.cat([a, b], dim=-1)
+        out = unit(both @ w["joined.weight"] + w["joined.bias"]) @ w["output.weight"] + w["output.bias"]
+        return torch.tanh(out) if design.bounded else out
+
+    def objective(batch: Any) -> Any:
+        x, y = rows[batch], truth[batch]
+        if alone:
+            b = branch(x, "target")
+            error = joined(unit(w["proposed.bias"]).expand_as(b), b) - y
+            data = (error**2).sum(dim=-1).mean()
+        else:
+            a, b = branch(x, "proposed"), branch(x, "target")
+            h = joined(a[:, one], b[:, other])
+            if design.antisymmetric:
+                h = (h - joined(a[:, other], b[:, one])) / 2.0
+            difference = y[:, other] - y[:, one]
+            squares = ((h - difference) ** 2).sum(dim=-1)
+            if design.relative:
+                squares = squares / ((difference**2).sum(dim=-1) + design.relative**2) / 30.0
+            data = squares.mean()
+        return data + design.weight_decay * sum((v**2).sum() for v in w.values())  # Eq. 1
+
+    return objective
+
+
+def _descend(
+    loss: Callable[[Any], Any], weights: list[Any], scenarios: int, design: Design, generator: torch.Generator
+) -> None:
+    import torch
+
+    kind = torch.optim.Adam if design.adam else torch.optim.SGD
+    optimiser: Any = kind(weights, lr=design.rate)
+    for epoch in range(design.epochs):
+        falling = 0.5 + 0.5 * np.cos(np.pi * epoch / design.epochs) if design.adam else 0.99**epoch
+        for group in optimiser.param_groups:
+            group["lr"] = design.rate * float(falling)
+        order = torch.randperm(scenarios, generator=generator)
+        for first in range(0, scenarios, design.batch):
+            optimiser.zero_grad()
+            loss(order[first : first + design.batch]).backward()
+            optimiser.step()

@@ -1,0 +1,22 @@
+"""The ball's world in MuJoCo: a sphere on three slides, which cannot spin, above a plane."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+
+def model(constants: Mapping[str, float]) -> str:
+    """The world as MJCF; the joints are x, y, z, zero at the origin; the ball states what its contact is like."""
+    return f"""
+    <mujoco>
+      <option gravity="0 0 {-constants["gravity"]!r}"/>
+      <worldbody>
+        <geom type="plane" size="0 0 1" condim="1"/>
+        <body>
+          <joint type="slide" axis="1 0 0"/>
+          <joint type="slide" axis="0 1 0"/>
+          <joint type="slide" axis="0 0 1"/>
+          <geom type="sphere" size="{constants["radius"]!r}" mass="{constants["mass"]!r}" condim="1" priority="1"/>
+        </body>
+      </worldbody>
+    </mujoco>"""

@@ -1,0 +1,75 @@
+"""The ball: a sphere that falls freely and bounces on level ground, declared once for every engine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from sims.base import Array, Channel, Constant, Parameter
+from sims.system import Kind, Moment, System
+
+
+class BallSystem(System):
+    """A sphere on which gravity alone acts; it leaves level ground with restitution times its impact speed.
+
+    States are the centre x, y, z [m], ground touched at z = radius, and its velocity vx, vy, vz [m/s]. It does not
+    spin, and the ground does not slow it along its plane unless an effect says so. Force is counted per unit mass.
+    """
+
+    name = "ball"
+    says = "a ball that falls and bounces on level ground"
+    kind: ClassVar[Kind] = "point"
+    parameters = (
+        Parameter(
+            "restitution", "1", 0.5, (0.0, 1.0), says="share of the impact speed with which the ball leaves the ground"
+        ),
+    )
+    constants = (
+        Constant("mass", "kg", 1.0, positive=True),
+        Constant("radius", "m", 0.5, positive=True),
+        Constant("gravity", "m/s^2", 9.81, "downward"),
+    )
+    channels = (
+        Channel("x", "m", says="centre, along the ground"),
+        Channel("y", "m", says="centre, along the ground, across x"),
+        Channel("z", "m", says="height of the centre above the ground"),
+        Channel("accel_z", "m/s^2", 10.0, "vertical proper acceleration: 0 in free fall, gravity at rest"),
+    )
+    coordinates = ("x", "y", "z")
+    rates = ("vx", "vy", "vz")
+    states: ClassVar[Mapping[str, float]] = MappingProxyType(
+        {"x": 0.0, "y": 0.0, "z": 4.5, "vx": 0.0, "vy": 0.0, "vz": 0.0}
+    )
+    sensed = ("z", "accel_z", "x", "y")
+    primary = 2
+    bounces = True
+    uniform = True
+
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:  # noqa: ARG002
+        """One: force is counted per unit mass."""
+        return np.ones((len(theta), 1))
+
+    def weight(self, moment: Moment) -> Array:
+        """Gravity, m/s^2."""
+        return np.concatenate([np.zeros((len(moment.x), 2)), -moment.gravity], axis=1)
+
+    def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
+        """A unit vector along the ground."""
+        unit = np.zeros_like(moment.x)
+        unit[:, "xy".index(axis)] = 1.0
+        return unit
+
+    def observe(self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]) -> dict[str, Array]:  # noqa: ARG002
+        """Position, and what an accelerometer on the ball shows along the vertical."""
+        return {"x": x[:, :, 0], "y": x[:, :, 1], "z": x[:, :, 2], "accel_z": a[:, :, 2] + constants["gravity"]}
+
+    def floor(self, constants: Mapping[str, Array]) -> Array:
+        """The ball's radius."""
+        return constants["radius"]
+
+    def restitution(self, theta: Array) -> Array:
+        """The parameter."""
+        return theta[:, :1]

@@ -1,0 +1,61 @@
+"""Dry friction: opposes motion, and holds still at rest what pulls less than its limit.
+
+Each law gives its limit; the engine adds the limits up and applies one force, so that sticking sticks. A negative
+coefficient is none.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.base import Array
+from sims.system import Coefficient, Friction, Moment
+
+_SURVEY = "B. Armstrong-Helouvry et al., Automatica 30(7), 1083 (1994), doi:10.1016/0005-1098(94)90209-7"
+_SMALLEST = 1e-9  # Stribeck speed that stands for zero, so that 0 / 0 never comes up
+
+
+class Coulomb(Friction):
+    """Friction that does not depend on speed: c sign(v)."""
+
+    name = "friction.coulomb"
+    says = "a constant friction opposes motion, and holds still what pulls less"
+    source = _SURVEY
+    needs = "guide"
+    coefficients = (Coefficient("coefficient", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),)
+
+    def limit(self, c: Array, moment: Moment) -> Array:  # noqa: ARG002
+        """The coefficient."""
+        return np.maximum(c[0], 0.0)
+
+
+class Stribeck(Friction):
+    """Friction that falls as motion picks up: coulomb + extra exp(-(v / speed)^2)."""
+
+    name = "friction.stribeck"
+    says = "friction is greatest at rest and falls as motion picks up"
+    source = _SURVEY
+    needs = "guide"
+    coefficients = (
+        Coefficient("coulomb", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),
+        Coefficient("extra", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),
+        Coefficient("speed", ("m/s", "m/s", "rad/s"), ((0.005, 0.5), (0.005, 0.5), (0.02, 2))),
+    )
+
+    def limit(self, c: Array, moment: Moment) -> Array:
+        """`coulomb` in fast motion, `coulomb` + `extra` at rest."""
+        return np.maximum(c[0] + c[1] * np.exp(-np.square(moment.speed / np.maximum(c[2], _SMALLEST))), 0.0)
+
+
+class Load(Friction):
+    """Friction of a loaded transmission: c times the drive from one side plus the load from the other."""
+
+    name = "friction.load"
+    says = "friction grows with the load that the drive carries"
+    source = "M. Duclusaud et al. (2024), arXiv:2410.08650, model M3"
+    needs = "input"
+    coefficients = (Coefficient("coefficient", (None, "1", "1"), ((0, 0), (0, 0.5), (0, 0.5))),)
+
+    def limit(self, c: Array, moment: Moment) -> Array:
+        """In proportion to the load."""
+        return np.maximum(c[0], 0.0) * moment.load

@@ -1,0 +1,116 @@
+"""The project's own engine: many lanes of a small system at once, in numpy.
+
+Each lane's motion is computed from that lane alone, so it does not depend, bit for bit, on what else is in the call,
+and an effect that is off in a lane changes nothing there. Lanes on which only a constant force acts fly in closed form
+(`parabola`); the others are stepped (`stepping`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sims.base import InputError
+from sims.engines.batch.field import Field, acts
+from sims.engines.batch.parabola import fly
+from sims.engines.batch.stepping import Stepping
+from sims.engines.ground import Ground, Indices, Mask
+from sims.system import Force, Friction, Lanes, Motion, System
+
+REQUIRES: tuple[str, ...] = ()
+TIME_STEP = 5e-3
+
+
+class Batch:
+    """Integrates lanes of any system.
+
+    Args:
+        time_step: longest step in seconds; steps are shorter where a lane's motion is too fast for it.
+
+    Raises:
+        InputError: a time step that is not a positive number.
+    """
+
+    name = "batch"
+    requires = REQUIRES
+
+    def __init__(self, time_step: float = TIME_STEP) -> None:
+        if not (np.isfinite(time_step) and time_step > 0):
+            raise InputError(f"engine batch: time_step must be a positive number of seconds, found {time_step}")
+        self.largest_step = float(time_step)
+
+    def integrate(self, lanes: Lanes) -> Motion:
+        """Integrate every lane over its steps; a lane whose numbers overflow is NaN throughout."""
+        with np.errstate(all="ignore"):
+            moved, order = _sorted(lanes)
+            if not moved.any():
+                motion = _moved(lanes)
+            else:
+                parts = [order[moved[order] == kind] for kind in (False, True)]
+                motion = _joined([(part, _moved(_take(lanes, part))) for part in parts if part.size], lanes)
+        lost = ~(np.isfinite(motion.x[:, -1]) & np.isfinite(motion.v[:, -1])).all(axis=1)
+        if lost.any():
+            for values in (motion.x, motion.v, motion.a):
+                values[lost] = np.nan
+        return motion
+
+    def refuses(self, system: type[System]) -> str:  # noqa: ARG002
+        """Nothing: it carries every system."""
+        return ""
+
+    def close(self) -> None:
+        """It holds nothing."""
+
+
+def engine(system: type[System], *, time_step: float = TIME_STEP) -> Batch:  # noqa: ARG001
+    """A new engine; see `Batch`."""
+    return Batch(time_step)
+
+
+def _sorted(lanes: Lanes) -> tuple[Mask, Indices]:
+    """(L,) whether more than a constant force acts in a lane; lanes in the order of what acts in them."""
+    forces = [acts(c) for effect, c in lanes.effects if isinstance(effect, (Force, Friction))]
+    steps = not lanes.system.uniform
+    if not forces:
+        return np.full(len(lanes.x), steps), np.arange(len(lanes.x))
+    moved: Mask = np.any(forces, axis=0) | steps
+    return moved, np.lexsort(forces)
+
+
+def _moved(lanes: Lanes) -> Motion:
+    """The motion of lanes that are all stepped or all in free flight."""
+    field = Field(lanes)
+    ground = Ground(lanes) if lanes.system.bounces else None
+    if field.free:
+        still = np.zeros((len(lanes.x), 1))
+        return fly(lanes, field.force(still, lanes.x, lanes.v) / field.mass, ground)
+    return Stepping(lanes, field, ground).run()
+
+
+def _take(lanes: Lanes, i: Indices) -> Lanes:
+    """Some lanes, i (n,)."""
+    if i.size == len(lanes.x) and (i[1:] > i[:-1]).all():
+        return lanes
+    shared = lanes.steps.strides[0] == 0
+    return replace(
+        lanes,
+        theta=lanes.theta[i],
+        constants={name: values[i] for name, values in lanes.constants.items()},
+        x=lanes.x[i],
+        v=lanes.v[i],
+        steps=np.broadcast_to(lanes.steps[0], (i.size, lanes.steps.shape[1])) if shared else lanes.steps[i],
+        inputs={name: values[i] for name, values in lanes.inputs.items()},
+        effects=tuple((effect, c[:, i]) for effect, c in lanes.effects),
+    )
+
+
+def _joined(parts: list[tuple[Indices, Motion]], lanes: Lanes) -> Motion:
+    """Motions of parts of the lanes put together in the lanes' own order."""
+    if len(parts) == 1 and (parts[0][0] == np.arange(len(lanes.x))).all():
+        return parts[0][1]
+    count, dim = lanes.x.shape
+    whole = np.empty((3, count, lanes.steps.shape[1] // lanes.every + 1, dim))
+    for i, motion in parts:
+        whole[:, i] = motion.x, motion.v, motion.a
+    return Motion(*whole)

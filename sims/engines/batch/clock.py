@@ -1,0 +1,94 @@
+"""Which step each lane is in, what it feels there, and which of its states are kept."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.base import Array
+from sims.engines.ground import Indices, Mask
+from sims.system import Lanes, Motion
+
+
+class Clock:
+    """A clock for every lane.
+
+    While all lanes are in the same step they are served by whole rows; from the first time that they differ, one by
+    one.
+
+    Attributes:
+        t: (L, 1) seconds since the start of the run.
+        left: (L, 1) seconds to the end of the lane's step.
+        over: whether every lane has made all its steps.
+    """
+
+    def __init__(self, lanes: Lanes) -> None:
+        count, self._end = lanes.steps.shape
+        steps = lanes.steps[:1] if lanes.steps.strides[0] == 0 else lanes.steps
+        none = np.zeros((1, len(steps)))  # rows must lie together: they are looked up by place
+        self._steps = np.ascontiguousarray(np.concatenate([steps.T, none]))
+        self._starts = np.ascontiguousarray(np.concatenate([none, np.cumsum(steps, axis=1).T]))
+        self._inputs = {name: np.ascontiguousarray(values.T) for name, values in lanes.inputs.items()}
+        self._every = lanes.every
+        self._kept = np.empty((self._end // lanes.every + 1, count, 3 * lanes.x.shape[1]))
+        self._lane = np.arange(count)
+        self._stride = self._steps.shape[1]
+        self._column = self._lane if self._stride > 1 else np.zeros_like(self._lane)
+        self._common: int | None = 0
+        self._step = np.zeros(count, dtype=np.intp)
+        self._begins = np.ones(count, dtype=bool)
+        self.over = self._end == 0
+        self.t, self.left = np.zeros((count, 1)), np.empty((count, 1))
+        self.left[:, 0] = self._steps[0]
+
+    def inputs(self) -> dict[str, Array]:
+        """(L, 1) by name; behind the last step, the last."""
+        if self._common is not None:
+            row = min(self._common, self._end - 1)
+            return {name: values[row][:, None] for name, values in self._inputs.items()}
+        rows = np.minimum(self._step, self._end - 1)
+        return {name: values[rows, self._lane][:, None] for name, values in self._inputs.items()}
+
+    def keep(self, state: Array) -> None:
+        """Keep the state (3 D, L) of lanes that begin a step behind a sample."""
+        if self._common is not None:
+            if self._common % self._every == 0:
+                self._kept[self._common // self._every] = state.T
+            return
+        lanes = np.flatnonzero(self._begins & (self._step % self._every == 0))
+        if lanes.size:
+            self._kept[self._step[lanes] // self._every, lanes] = state[:, lanes].T
+
+    def finish(self, ended: Mask | None = None) -> None:
+        """Lanes `ended` (L,), or all, go on to their next step."""
+        if ended is not None and self._common is not None and not ended.all():
+            self._step[:] = self._common
+            self._common = None
+        if self._common is not None:
+            self._common += 1
+            self.over = self._common == self._end
+            self.left[:, 0], self.t[:, 0] = self._steps[self._common], self._starts[self._common]
+            return
+        assert ended is not None
+        ended = ended & (self._step < self._end)
+        self._begins = ended
+        if ended.any():
+            self._step += ended.astype(np.intp)
+            place = self._step * self._stride + self._column
+            np.copyto(self.left[:, 0], self._steps.take(place), where=ended)
+            np.copyto(self.t[:, 0], self._starts.take(place), where=ended)
+            self.over = bool(self._step.min() == self._end)
+
+    def spend(self, h: Array) -> None:
+        """Let h (L, 1) seconds pass, at most what is left."""
+        self.t += h
+        self.left = np.maximum(self.left - h, 0.0)
+
+    def correct(self, lanes: Indices, h: Array) -> None:
+        """Move the clocks of some lanes (n,) by h (n, 1) seconds."""
+        self.t[lanes] += h
+        self.left[lanes] = np.maximum(self.left[lanes] - h, 0.0)
+
+    def motion(self) -> Motion:
+        """What was kept."""
+        x, v, a = np.split(self._kept.transpose(1, 0, 2), 3, axis=2)
+        return Motion(x, v, a)

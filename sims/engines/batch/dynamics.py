@@ -1,0 +1,104 @@
+"""Accelerations during a step: forces, dry friction, and the ground that bears what rests on it.
+
+Dry friction opposes motion with all of its limit. Its direction is held during a step, so that the step is smooth. A
+lane that is still sticks while what pulls is within the limit, else it slips where it is pulled.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.base import Array
+from sims.engines.batch.field import Field
+from sims.engines.ground import Indices
+
+
+class Dynamics:
+    """Accelerations of lanes during their steps.
+
+    Attributes:
+        rests: (L, 1) lanes that lie on the ground.
+        sticks: (L, 1) lanes that dry friction holds during the present step.
+        way: (L, D) direction of motion at the beginning of the present step; unit vectors.
+        rubs: (L, D) dry friction at each instant asked for since the present step began, had it acted against motion.
+        excess: (L, 1) by how much what pulled exceeded the limit, at the beginning of the step and in the last call.
+    """
+
+    def __init__(self, field: Field, shape: tuple[int, int]) -> None:
+        self.field = field
+        self.rests = np.zeros((shape[0], 1), dtype=bool)
+        self.sticks = np.zeros((shape[0], 1), dtype=bool)
+        self.way = np.zeros(shape)
+        self.rubs: list[Array] = []
+        self.excess = (np.zeros((shape[0], 1)),) * 2
+        self._any_rests = False
+
+    def begin(self, t: Array, x: Array, v: Array) -> Array:
+        """(L, D) acceleration at the beginning of a step; decides what sticks and which way the rest moves."""
+        pull = self._borne(t, x, v)
+        if not self.field.dry:
+            return pull / self.field.mass
+        limit, size, speed = self.field.limit(t, x, v), length(pull), length(v)
+        still = speed == 0
+        self.excess, self.rubs = (size - limit,) * 2, []
+        self.sticks = still & (size <= limit) & self.field.rubs
+        self.way = np.where(still, pull, v) / np.where(still, np.where(size > 0, size, 1.0), speed)
+        return self._rubbed(pull, limit, self.way)
+
+    def during(self, t: Array, x: Array, v: Array) -> Array:
+        """(L, D) acceleration within the step that was begun last."""
+        pull = self._borne(t, x, v)
+        if not self.field.dry:
+            return pull / self.field.mass
+        limit = self.field.limit(t, x, v)
+        self.excess = (self.excess[0], length(pull) - limit)
+        return self._rubbed(pull, limit, self._along(v))
+
+    def lay(self, lanes: Indices) -> None:
+        """These lanes (n,) rest on the ground from now on."""
+        self.rests[lanes] = True
+        self._any_rests = True
+
+    def lift(self, v: Array) -> None:
+        """Lanes that move up, v (L, D), rest no longer."""
+        if self._any_rests:
+            self.rests &= v[:, -1:] <= 0
+            self._any_rests = bool(self.rests.any())
+
+    def _borne(self, t: Array, x: Array, v: Array) -> Array:
+        """Forces but for dry friction, without what the ground takes."""
+        pull = self.field.force(t, x, v)
+        if self._any_rests:
+            pull = pull + 0.0
+            pull[:, -1:] = np.where(self.rests, np.maximum(pull[:, -1:], 0.0), pull[:, -1:])
+        return pull
+
+    def _along(self, v: Array) -> Array:
+        """Directions of v, turned to the side of the direction at the beginning."""
+        if v.shape[1] == 1:
+            return self.way
+        speed = length(v)
+        unit = np.where(speed > 0, v / np.where(speed > 0, speed, 1.0), self.way)
+        turned: Array = unit * np.where(dot(unit, self.way) < 0, -1.0, 1.0)
+        return turned
+
+    def _rubbed(self, pull: Array, limit: Array, way: Array) -> Array:
+        self.rubs.append(limit * way)
+        result: Array = np.where(self.sticks, 0.0, (pull - self.rubs[-1]) / self.field.mass)
+        return result
+
+
+def dot(a: Array, b: Array) -> Array:
+    """(L, 1) inner products."""
+    if a.shape[1] == 1:
+        return a * b
+    result: Array = (a * b).sum(axis=1, keepdims=True)
+    return result
+
+
+def length(v: Array) -> Array:
+    """(L, 1) magnitudes."""
+    if v.shape[1] == 1:
+        return np.abs(v)
+    result: Array = np.sqrt((v * v).sum(axis=1, keepdims=True))
+    return result

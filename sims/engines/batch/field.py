@@ -1,0 +1,151 @@
+"""Forces of the batch engine: what accelerates every lane at one instant.
+
+Lanes come sorted by the effects that act in them, so that each effect is asked for the span of lanes between the first
+and the last one it acts in. Whatever is computed for a lane is computed from that lane alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sims.base import Array
+from sims.engines.ground import Mask
+from sims.system import Effect, Force, Friction, Lanes, Moment
+
+
+@dataclass
+class Share:
+    """One effect, in the span of lanes where it acts.
+
+    Attributes:
+        effect: the effect.
+        c: (K, n, 1) its coefficients in the span.
+        span: the lanes.
+        on: (n, 1) the lanes of the span in which it acts; None if it acts in all of them.
+        moment: what it sees.
+        whole: whether the span is all lanes.
+    """
+
+    effect: Effect
+    c: Array
+    span: slice
+    on: Mask | None
+    moment: Moment
+    whole: bool
+
+    def look(self, t: Array, x: Array, v: Array) -> Moment:
+        """The span's part of an instant of all lanes."""
+        moment, span = self.moment, self.span
+        if self.whole:
+            moment.t, moment.x, moment.v = t, x, v
+        else:
+            moment.t, moment.x, moment.v = t[span], x[span], v[span]
+        return moment
+
+    def added(self, total: Array, values: Array) -> Array:
+        """`total` of all lanes plus the span's values (n, D)."""
+        if self.on is not None:
+            values = np.where(self.on, values, 0.0)
+        if self.whole:
+            return total + values
+        total = np.copy(total, order="K")
+        total[self.span] += values
+        return total
+
+
+class Field:
+    """Generalised forces of a system and the effects on it, over lanes.
+
+    Attributes:
+        mass: (L, 1) generalised inertia.
+        rubs: (L, 1) in which lanes dry friction acts.
+        pushed: (L, 1) in which lanes other forces of effects act.
+    """
+
+    def __init__(self, lanes: Lanes) -> None:
+        self._system = lanes.system
+        self._moment = Moment(lanes.system, lanes.theta, lanes.constants, np.zeros((1, 1)), lanes.x, lanes.v)
+        self.mass = lanes.system.mass(lanes.theta, lanes.constants)
+        self._none = np.zeros_like(self.mass)
+        shares = _shares(lanes)
+        self._forces = [(share, share.effect) for share in shares if isinstance(share.effect, Force)]
+        self._frictions = [(share, share.effect) for share in shares if isinstance(share.effect, Friction)]
+        self.pushed, self.rubs = (_where(found, len(lanes.x)) for found in (self._forces, self._frictions))
+        self.feel({name: values[:, :1] for name, values in lanes.inputs.items()})
+        start = self._at(self._moment.t, lanes.x, lanes.v)
+        self._constant = _by_coordinate(lanes.system.force(start)) if lanes.system.uniform else None
+
+    @property
+    def free(self) -> bool:
+        """Whether nothing acts but a force that is the same everywhere and always."""
+        return self._constant is not None and not self._forces and not self._frictions
+
+    @property
+    def dry(self) -> bool:
+        """Whether any dry friction acts."""
+        return bool(self._frictions)
+
+    def feel(self, inputs: Mapping[str, Array]) -> None:
+        """Set the inputs, (L, 1) by name."""
+        self._moment.inputs = inputs
+        for share, _ in (*self._forces, *self._frictions):
+            share.moment.inputs = {name: values[share.span] for name, values in inputs.items()}
+
+    def force(self, t: Array, x: Array, v: Array) -> Array:
+        """(L, D) generalised force but for dry friction."""
+        total = self._constant
+        if total is None:
+            total = _by_coordinate(self._system.force(self._at(t, x, v)))
+        for share, effect in self._forces:
+            total = share.added(total, effect.force(share.c, share.look(t, x, v)))
+        return total
+
+    def limit(self, t: Array, x: Array, v: Array) -> Array:
+        """(L, 1) largest dry friction."""
+        total = self._none
+        for share, effect in self._frictions:
+            total = share.added(total, effect.limit(share.c, share.look(t, x, v)))
+        return total
+
+    def _at(self, t: Array, x: Array, v: Array) -> Moment:
+        self._moment.t, self._moment.x, self._moment.v = t, x, v
+        return self._moment
+
+
+def acts(c: Array) -> Mask:
+    """(L,) in which lanes an effect with coefficients (K, L, 1) is not off."""
+    result: Mask = (c != 0).any(axis=(0, 2))
+    return result
+
+
+def _by_coordinate(values: Array) -> Array:
+    """The same values (L, D) stored as the state is, so that they combine without strides."""
+    return values if values.shape[1] == 1 else np.asfortranarray(values)
+
+
+def _where(shares: Sequence[tuple[Share, Effect]], count: int) -> Mask:
+    """(L, 1) the lanes in which any of the effects acts."""
+    result = np.zeros((count, 1), dtype=bool)
+    for share, _ in shares:
+        result[share.span] |= True if share.on is None else share.on
+    return result
+
+
+def _shares(lanes: Lanes) -> list[Share]:
+    result = []
+    for effect, c in lanes.effects:
+        on = acts(c)
+        if not isinstance(effect, (Force, Friction)) or not on.any():
+            continue
+        there = np.flatnonzero(on)
+        span = slice(int(there[0]), int(there[-1]) + 1)
+        constants = {name: values[span] for name, values in lanes.constants.items()}
+        start = np.zeros((1, 1))
+        moment = Moment(lanes.system, lanes.theta[span], constants, start, lanes.x[span], lanes.v[span])
+        everywhere = bool(on[span].all())
+        mask, whole = None if everywhere else on[span, None], there[0] == 0 and there[-1] == len(on) - 1
+        result.append(Share(effect, c[:, span], span, mask, moment, whole))
+    return result

@@ -1,0 +1,135 @@
+"""Motion under a constant force, with bounces, in closed form: no steps at all.
+
+From impact to impact every coordinate is a parabola, so the engine goes from impact to impact, and then reads all
+samples off the parabolas at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sims.base import Array
+from sims.engines.ground import Ground, Indices, Mask
+from sims.system import Lanes, Motion
+
+
+@dataclass
+class Arcs:
+    """Parabolas x + v s + a s^2 / 2, s seconds after t: lanes (n,), t (n, 1); x, v, a (n, D)."""
+
+    lanes: Indices
+    t: Array
+    x: Array
+    v: Array
+    a: Array
+
+    def take(self, chosen: Mask) -> Arcs:
+        """Some of them."""
+        return Arcs(self.lanes[chosen], self.t[chosen], self.x[chosen], self.v[chosen], self.a[chosen])
+
+    def joined(self, others: list[Arcs]) -> Arcs:
+        """These and others, sorted by lane."""
+        every = [self, *others]
+        lanes = np.concatenate([arcs.lanes for arcs in every])
+        order = np.argsort(lanes, kind="stable")
+        t, x, v, a = (np.concatenate([getattr(arcs, name) for arcs in every])[order] for name in ("t", "x", "v", "a"))
+        return Arcs(lanes[order], t, x, v, a)
+
+
+def fly(lanes: Lanes, a: Array, ground: Ground | None) -> Motion:
+    """The motion of lanes whose acceleration `a` (L, D) is constant, over `ground` if there is any."""
+    times = _kept_times(lanes)
+    first = Arcs(np.arange(len(a)), np.zeros((len(a), 1)), lanes.x, lanes.v, a)
+    if ground is None:
+        return _sampled(first, times)
+    first.x = first.x.copy()
+    first.x[:, -1:] = np.maximum(first.x[:, -1:], ground.floor)
+    arcs: list[Arcs] = []
+    first = _begun(first, ground)
+    now = first.take((first.a[:, -1] != 0) | (first.v[:, -1] != 0))
+    while now.lanes.size:
+        s = _fall(now, ground.floor)
+        goes = (now.t + s)[:, 0] <= times[now.lanes if len(times) > 1 else 0, -1]
+        now, flies = _bounced(now.take(goes), s[goes], ground, a)
+        arcs.append(now)
+        now = now.take(flies)
+    return _sampled(first.joined(arcs), times)
+
+
+def _kept_times(lanes: Lanes) -> Array:
+    """(L, R) instants of the states to be kept, or (1, R) if all lanes share them."""
+    steps = lanes.steps[:1] if lanes.steps.strides[0] == 0 else lanes.steps
+    times = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
+    return np.ascontiguousarray(times[:, :: lanes.every])
+
+
+def _begun(arcs: Arcs, ground: Ground) -> Arcs:
+    """The first arcs, with those that start on the ground thrown back or laid to rest."""
+    down = (arcs.x[:, -1] <= ground.floor[:, 0]) & (arcs.v[:, -1] <= 0)
+    if not down.any():
+        return arcs
+    struck = np.flatnonzero(down & (arcs.v[:, -1] < 0))
+    outcome = ground.strike(struck, arcs.v[struck], arcs.a[struck])
+    arcs.v = arcs.v.copy()
+    arcs.v[struck] = outcome.v
+    rests = down & (arcs.v[:, -1] == 0) & (arcs.a[:, -1] <= 0)
+    arcs.a = arcs.a.copy()
+    arcs.a[rests, -1] = 0.0
+    return arcs
+
+
+def _fall(arcs: Arcs, floor: Array) -> Array:
+    """(n, 1) seconds to the impact; infinite if there is none."""
+    high, up, down = arcs.x[:, -1:] - floor[arcs.lanes], arcs.v[:, -1:], -arcs.a[:, -1:]
+    root = np.sqrt(up * up + 2.0 * down * high)  # not a number if it turns back before
+    rising = np.where(down > 0, (up + root) / down, np.inf)
+    seconds = np.where(up < 0, 2.0 * high / (root - up), rising)
+    result: Array = np.where(np.isnan(seconds), np.inf, seconds)
+    return result
+
+
+def _bounced(arcs: Arcs, s: Array, ground: Ground, a: Array) -> tuple[Arcs, Mask]:
+    """The arcs after the impact s (n, 1) seconds on, and which of them fly again."""
+    x = arcs.x + s * (arcs.v + s * (0.5 * arcs.a))
+    outcome = ground.strike(arcs.lanes, arcs.v + s * arcs.a, arcs.a)
+    x[:, -1:] = ground.floor[arcs.lanes]
+    after = a[arcs.lanes]
+    after[outcome.rests, -1] = 0.0
+    return Arcs(arcs.lanes, arcs.t + s, x, outcome.v, after), ~outcome.rests
+
+
+def _sampled(arcs: Arcs, times: Array) -> Motion:
+    """States at the instants times (L or 1, R), of arcs that are sorted by lane."""
+    lanes, instants = int(arcs.lanes[-1]) + 1, times.shape[1]
+    begins = _places(times, arcs)
+    ends = np.append(np.where(arcs.lanes[1:] == arcs.lanes[:-1], begins[1:], instants), instants)
+    counts = ends - begins
+
+    def spread(values: Array) -> Array:
+        return np.repeat(values, counts).reshape(lanes, instants)
+
+    s = times - spread(arcs.t[:, 0])
+    result = np.empty((3, arcs.x.shape[1], lanes, instants))
+    for d in range(arcs.x.shape[1]):
+        x, v, a = result[:, d]
+        x[...], v[...], a[...] = (spread(column[:, d]) for column in (arcs.x, arcs.v, arcs.a))
+        x += s * (v + s * (0.5 * a))
+        v += s * a
+    x, v, a = np.moveaxis(result, 1, 3)
+    return Motion(x, v, a)
+
+
+def _places(times: Array, arcs: Arcs) -> Indices:
+    """(n,) for each arc the first instant of its lane that is not before it begins."""
+    begins = arcs.t[:, 0]
+    if len(times) == 1:
+        return np.searchsorted(times[0], begins)
+    size = times.shape[1]
+    low, high = np.zeros(begins.size, dtype=np.intp), np.full(begins.size, size, dtype=np.intp)
+    for _ in range(size.bit_length()):
+        middle = (low + high) // 2
+        before = (times[arcs.lanes, np.minimum(middle, size - 1)] < begins) & (low < high)
+        low, high = np.where(before, middle + 1, low), np.where(before, high, middle)
+    return low

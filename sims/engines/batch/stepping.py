@@ -1,0 +1,247 @@
+"""Fixed steps of fourth order, with what happens within them: impacts, standstill, breaking loose.
+
+The method is the classical one of Runge and Kutta, written for x'' = a(t, x, v) (Hairer, Norsett, Wanner, Solving
+Ordinary Differential Equations I, section II.1, doi:10.1007/978-3-540-78862-1). Steps are those of the plan, divided
+where a lane's motion is too fast for them. Every lane has its own clock: a step in which something happens is taken
+back and taken again up to that instant, estimated by interpolation and corrected to second order by what is then left;
+the state is changed there, and the rest of the step follows. No lane waits for another, nor knows of it.
+
+A lane with dry friction whose velocity would turn round is stopped where it is zero. Steps in which friction or the
+forces of effects bend sharply (Stribeck's peak, the ripples of a fast motor) are taken back and shortened.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.base import Array
+from sims.engines.batch.clock import Clock
+from sims.engines.batch.dynamics import Dynamics, dot, length
+from sims.engines.batch.field import Field
+from sims.engines.batch.pace import divisions
+from sims.engines.batch.roots import root
+from sims.engines.ground import Ground, Indices, Mask
+from sims.system import Lanes, Motion
+
+EVENTS = 256  # in one step of one lane; what else happens in that step is passed over
+FRICTION_BEND, FORCE_BEND = 0.05, 0.005  # by which they may bend within a step, of the limit and of the largest so far
+SHORTENED, FINEST = 0.25, 1.0 / 256.0  # a step that bends is shortened to this share, and to this of the full one
+PUNCTUAL = 1e-4  # share of a step by which breaking loose may be late
+NOTHING, IMPACT, STANDSTILL, LOOSE = range(4)
+
+
+class Stepping:
+    """Integrates lanes step by step, over `ground` if there is any."""
+
+    def __init__(self, lanes: Lanes, field: Field, ground: Ground | None) -> None:
+        count, dim = lanes.x.shape
+        self._field, self._ground = field, ground
+        # Stored coordinate by coordinate: what is per lane, (L, 1), multiplies whole rows.
+        self._state = np.empty((3, dim, count))
+        self._rows = self._state.reshape(3 * dim, count)
+        self._x, self._v, self._a = (part.T for part in self._state)
+        self._x[...], self._v[...] = lanes.x, lanes.v
+        spans = np.max(lanes.steps, axis=1, keepdims=True, initial=0.0)
+        parts = divisions(lanes, field, spans)
+        self._longest = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
+        self._bends = field.dry or bool(field.pushed.any())
+        self._eventful = ground is not None or self._bends or bool((parts > 1).any())
+        self._clock, self._dynamics = Clock(lanes), Dynamics(field, (count, dim))
+        self._limit = self._longest  # of steps, as forces bend
+        self._peak = np.zeros((count, 1))  # square of the largest acceleration so far
+        self._try = np.full((count, 1), np.inf)  # seconds to an event
+        self._goal = np.full(count, NOTHING, dtype=np.int8)
+        self._events = np.zeros(count, dtype=np.intp)
+        self._open = np.ones(count, dtype=bool)  # to events: under way to none, and not after too many
+        self._awaits = self._shortened = False
+        if ground is not None:
+            self._start_on(ground)
+
+    def run(self) -> Motion:
+        """All steps."""
+        clock, dynamics = self._clock, self._dynamics
+        while True:
+            self._field.feel(clock.inputs())
+            k1 = dynamics.begin(clock.t, self._x, self._v)
+            self._a[...] = k1
+            clock.keep(self._rows)
+            if clock.over:
+                return clock.motion()
+            if self._eventful:
+                h = np.minimum(clock.left, self._limit)
+                if self._awaits:
+                    h = np.minimum(h, self._try)
+                self._settle(h, k1)
+            else:
+                self._x[...], self._v[...], _ = self._stepped(clock.left, k1)[:3]
+                clock.finish()
+
+    def _stepped(self, h: Array, k1: Array) -> tuple[Array, Array, Array, Array]:
+        """Position, velocity and (to third order) acceleration a step of h (L, 1) later; how the acceleration bent."""
+        t, x, v, during = self._clock.t, self._x, self._v, self._dynamics.during
+        half = 0.5 * h
+        middle, sixth = t + half, h / 6.0
+        x2 = x + half * v
+        k2 = during(middle, x2, v + half * k1)
+        v3 = v + half * k2
+        k3 = during(middle, x2 + (half * half) * k1, v3)
+        k4 = during(t + h, x + h * v3, v + h * k3)
+        inner = k2 + k3
+        outer = k1 + k4
+        return x + h * (v + sixth * (k1 + inner)), v + sixth * (outer + 2.0 * inner), k4, outer - inner
+
+    def _settle(self, h: Array, k1: Array) -> None:
+        """Make steps of h (L, 1) where nothing happens in them; prepare to make the others again."""
+        x, v, k4, bend = self._stepped(h, k1)
+        refused = self._bent(h, k1, bend) if self._bends else None
+        found = self._found(h, (self._x, self._v, k1), (x, v, k4), refused)
+        if found is not None:
+            refused = found if refused is None else refused | found
+        if refused is None:
+            self._x[...], self._v[...] = x, v
+        else:
+            np.copyto(self._x, x, where=~refused[:, None])
+            np.copyto(self._v, v, where=~refused[:, None])
+            h = np.where(refused[:, None], 0.0, h)
+        self._clock.spend(h)
+        if self._awaits:
+            self._reach(refused, k4)
+        self._dynamics.lift(self._v)
+        ended = self._clock.left[:, 0] <= 0
+        self._clock.finish(ended if refused is None else ended & ~refused)
+        if self._events.any():
+            self._events[ended] = 0
+            self._open = (self._goal == NOTHING) & (self._events < EVENTS)
+
+    def _bent(self, h: Array, k1: Array, bend: Array) -> Mask | None:
+        """(L,) lanes whose step must be shorter, as forces bend too much in it; None if there are none."""
+        field = self._field
+        self._peak = np.maximum(self._peak, dot(k1, k1))
+        sharp = field.pushed & (dot(bend, bend) > (6.0 * FORCE_BEND) ** 2 * self._peak)
+        if field.dry:
+            first, second, third, fourth = self._dynamics.rubs
+            most = np.maximum(length(first), length(fourth))
+            bends = length(first - second - third + fourth) > 6.0 * FRICTION_BEND * most
+            sharp |= bends & field.rubs & ~self._dynamics.sticks
+        any_sharp = sharp.any()
+        if any_sharp:
+            sharp &= (h > FINEST * self._longest) & self._open[:, None]
+        if any_sharp or self._shortened:
+            grown = np.where(h >= self._limit, 2.0 * self._limit, self._limit)
+            self._limit = np.where(sharp, SHORTENED * h, np.minimum(grown, self._longest))
+            self._shortened = bool((self._limit < self._longest).any())
+        return sharp[:, 0] if any_sharp else None
+
+    def _found(
+        self, h: Array, now: tuple[Array, Array, Array], then: tuple[Array, Array, Array], refused: Mask | None
+    ) -> Mask | None:
+        """(L,) lanes to which something happens within the step, with the seconds to it set; None if there are none.
+
+        Args:
+            h: (L, 1) the step.
+            now: position, velocity and acceleration before it.
+            then: the same after it.
+            refused: (L,) lanes whose step is not made anyway.
+        """
+        watched = self._open if refused is None else self._open & ~refused
+        result = None
+        if self._ground is not None:
+            hit = (then[0][:, -1] < self._ground.floor[:, 0]) & watched
+            if hit.any():
+                self._await(hit, h, self._impacts(np.flatnonzero(hit), h, now, then), IMPACT)
+                result = hit
+        if self._field.dry:
+            dynamics = self._dynamics
+            moves = (watched[:, None] & self._field.rubs & ~dynamics.sticks)[:, 0]
+            turned = moves & (dot(then[1], dynamics.way) < 0)[:, 0]
+            if turned.any():
+                self._await(turned, h, self._standstills(np.flatnonzero(turned), h, now, then), STANDSTILL)
+                result = turned if result is None else result | turned
+            before, after = dynamics.excess
+            late = np.where(self._goal == LOOSE, PUNCTUAL, 0.0)[:, None] * (after - before)
+            under_way = watched | (self._goal == LOOSE)
+            loose = (dynamics.sticks & (after > late))[:, 0] & under_way
+            if loose.any():
+                self._await(loose, h, self._loosenings(np.flatnonzero(loose), h), LOOSE)
+                result = loose if result is None else result | loose
+        return result
+
+    def _impacts(self, i: Indices, h: Array, now: tuple[Array, ...], then: tuple[Array, ...]) -> Array:
+        """(n,) seconds to the impacts of lanes i (n,)."""
+        floor = self._ground.floor[i, 0] if self._ground is not None else np.zeros(i.size)
+        return root(now[0][i, -1] - floor, now[1][i, -1], then[0][i, -1] - floor, h[i, 0])
+
+    def _standstills(self, i: Indices, h: Array, now: tuple[Array, ...], then: tuple[Array, ...]) -> Array:
+        """(n,) seconds until lanes i (n,) have lost their speed along their way."""
+        way = self._dynamics.way[i]
+        speed, rate, later = (dot(part[i], way)[:, 0] for part in (now[1], now[2], then[1]))
+        return root(speed, rate, later, h[i, 0])
+
+    def _loosenings(self, i: Indices, h: Array) -> Array:
+        """(n,) seconds until what pulls lanes i (n,) exceeds friction, and hardly longer, so that it surely does."""
+        before, after = (excess[i, 0] for excess in self._dynamics.excess)
+        result: Array = h[i, 0] * (before / (before - after) + 0.1 * PUNCTUAL)
+        return result
+
+    def _await(self, found: Mask, h: Array, seconds: Array, goal: int) -> None:
+        """Note to what and when the next steps of lanes `found` (L,) lead; of two events the first counts."""
+        i = np.flatnonzero(found)
+        first = seconds < self._try[i, 0]
+        i, seconds = i[first], seconds[first]
+        self._try[i, 0] = np.clip(seconds, 0.0, h[i, 0])
+        self._goal[i] = goal
+        self._events[i] += 1
+        self._open[i] = False
+        self._awaits = True
+
+    def _reach(self, refused: Mask | None, k4: Array) -> None:
+        """Let happen to the lanes that have made a step what it led to."""
+        there = np.isfinite(self._try[:, 0])
+        if refused is not None:
+            there &= ~refused
+        if not there.any():
+            return
+        struck, stopped = (np.flatnonzero(there & (self._goal == goal)) for goal in (IMPACT, STANDSTILL))
+        if struck.size:
+            self._strike(struck, k4[struck])
+        if stopped.size:
+            self._stop(stopped, k4[stopped])
+        self._try[there], self._goal[there] = np.inf, NOTHING
+        self._awaits = bool(np.isfinite(self._try).any())
+
+    def _strike(self, i: Indices, a: Array) -> None:
+        """Impacts of lanes i (n,), to which their steps have led but for rounding; a (n, D) before."""
+        assert self._ground is not None
+        x, v, floor = self._x[i], self._v[i], self._ground.floor[i]
+        rate = v[:, -1:]
+        late = np.where(rate < 0, (floor - x[:, -1:]) / rate, 0.0)
+        late *= 1.0 - 0.5 * late * a[:, -1:] / np.where(rate < 0, rate, 1.0)
+        x, v = x + late * (v + 0.5 * late * a), v + late * a
+        self._clock.correct(i, late)
+        x[:, -1:], v[:, -1:] = floor, np.minimum(v[:, -1:], 0.0)
+        outcome = self._ground.strike(i, v, a)
+        self._x[i], self._v[i] = x, outcome.v
+        if outcome.rests.any():
+            self._dynamics.lay(i[outcome.rests])
+
+    def _stop(self, i: Indices, a: Array) -> None:
+        """Lanes i (n,) have lost their speed along their way but for rounding; a (n, D) before."""
+        v, way = self._v[i], self._dynamics.way[i]
+        slows = dot(a, way)
+        late = np.where(slows < 0, -dot(v, way) / slows, 0.0)
+        self._x[i] += late * v
+        self._clock.correct(i, late)
+        v = v + late * a
+        v = v - way * dot(v, way)
+        self._v[i] = np.where(length(v) <= 1e-9 * length(a) * self._longest[i], 0.0, v)
+
+    def _start_on(self, ground: Ground) -> None:
+        """Lift lanes that start in the ground onto it; throw back or lay to rest those that do not move up."""
+        self._x[:, -1:] = np.maximum(self._x[:, -1:], ground.floor)
+        down = (self._x[:, -1] <= ground.floor[:, 0]) & (self._v[:, -1] <= 0)
+        if down.any():
+            a = self._dynamics.begin(self._clock.t, self._x, self._v)
+            struck, lying = np.flatnonzero(down & (self._v[:, -1] < 0)), np.flatnonzero(down & (self._v[:, -1] == 0))
+            if struck.size:
+                self._strike(struck, a[struck])
+            self._dynamics.lay(lying)

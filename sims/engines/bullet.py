@@ -1,0 +1,276 @@
+"""Bullet as an engine: forces through its torque and force interfaces, impacts through its contact solver.
+
+The world that carries a system is built by the module ``bullet_world`` beside the system's own: `build` makes it and,
+for a system of one coordinate, `load` gives it its inertia.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from types import ModuleType
+from typing import Any
+
+from sims import bullet
+from sims.base import InputError
+from sims.engines import flight, joint, native
+from sims.engines.external import Lane, Path, checked_time_step, integrate, world_module
+from sims.engines.point import State, Vector
+from sims.system import Engine, Lanes, Motion, System
+
+REQUIRES = ("pybullet",)
+
+_PUBLISHED = {"linear_damping": 0.04, "lateral_friction": 0.2, "plane_restitution": 1.0}
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+_NOWHERE = (0.0, 0.0, 0.0)
+_IMPACT = 1e-4  # seconds: step of an impact
+_REACH = 0.02 * math.sqrt(3)  # Bullet's contact begins this many radii above the ground
+
+
+def engine(
+    system: type[System],
+    *,
+    time_step: float | None = None,
+    native_contact: bool = False,
+    linear_damping: float | None = None,
+    lateral_friction: float | None = None,
+    plane_restitution: float | None = None,
+) -> Engine:
+    """The engine for one simulator.
+
+    Args:
+        system: what it will integrate.
+        time_step: longest step in seconds; each sampling interval is divided into equal steps not longer than this.
+        native_contact: for a system that bounces: Bullet as it comes (`sims.ball.bullet_native`), stepped and read at
+            first order as the published experiments do, without `time_step` in one step a sample.
+        linear_damping: with `native_contact`: what Bullet takes for air, 1/s (0.04).
+        lateral_friction: with `native_contact`: friction of both ball and ground (0.2); the contact has the product.
+        plane_restitution: with `native_contact`: the ground's restitution (1.0); the contact has the product.
+
+    Raises:
+        InputError: an impossible setting.
+    """
+    own = {
+        "linear_damping": linear_damping,
+        "lateral_friction": lateral_friction,
+        "plane_restitution": plane_restitution,
+    }
+    given = {name: value for name, value in own.items() if value is not None}
+    if not native_contact:
+        if given:
+            raise InputError(f"setting {next(iter(given))} belongs to Bullet's own contact: set native_contact = true")
+        return BulletEngine(system, checked_time_step(time_step, system))
+    if not system.bounces:
+        raise InputError(f"system {system.name} does not bounce: leave native_contact out")
+    for name, value in given.items():
+        if not 0 <= value < math.inf:
+            raise InputError(f"{name} must be a number of at least 0, found {value}")
+    step = math.inf if time_step is None else checked_time_step(time_step, system)
+    return BulletEngine(system, step, {**_PUBLISHED, **given})
+
+
+class BulletEngine:
+    """Bullet, one lane after the other in one world."""
+
+    name: str = "pybullet"
+    requires: tuple[str, ...] = REQUIRES
+
+    def __init__(self, system: type[System], largest_step: float, own: Mapping[str, float] | None = None) -> None:
+        self.largest_step = largest_step
+        module = world_module(system, "bullet_world")
+        if module is None:
+            self._rollout: Callable[[Lane], Path] | None = None
+            return
+        build = module.build if own is None else partial(module.build_native, settings=own)
+        self._world = bullet.World(build)
+        if own is not None:
+            self._rollout = partial(native.rollout, NativeBall(self._world, own))
+        elif system.bounces:
+            self._rollout = partial(flight.rollout, Ball(self._world))
+        else:
+            self._rollout = partial(joint.rollout, Joint(self._world, module))
+
+    def integrate(self, lanes: Lanes) -> Motion:
+        """See `Engine`."""
+        assert self._rollout is not None, "a system that the engine refuses"
+        return integrate(lanes, self._rollout, self._world.discard)
+
+    def refuses(self, system: type[System]) -> str:
+        """See `Engine`."""
+        if self._rollout is None:
+            return f"no module bullet_world beside {system.__module__} builds it"
+        return ""
+
+    def close(self) -> None:
+        """Give back the Bullet world; the next integration opens a new one."""
+        if self._rollout is not None:
+            self._world.close()
+
+
+class Joint:
+    """A body on one hinge or guide; see `sims.engines.joint.Joint`."""
+
+    def __init__(self, world: bullet.World, module: ModuleType) -> None:
+        self._world = world
+        self._load, self._gravity = module.load, module.gravity
+        self.open_loop: bool = module.OPEN_LOOP
+
+    def start(self, constants: dict[str, float]) -> None:
+        """A world for these constants; all else that matters is set by `pace` and `place`."""
+        self._constants, self.gravity = constants, self._gravity(constants)
+        self._client, self._body = self._world.body(constants)
+
+    def pace(self, step: float, inertia: float, damping: float) -> bool:
+        """Step in seconds, generalised inertia, joint damping."""
+        p = bullet.engine()
+        if not self._load(self._client, self._body, inertia, self._constants):
+            return False
+        p.setTimeStep(step, self._client)
+        p.changeDynamics(self._body, 0, jointDamping=damping, physicsClientId=self._client)
+        return True
+
+    def place(self, x: float, w: float) -> None:
+        """The joint's position and velocity."""
+        bullet.engine().resetJointState(self._body, 0, x, w, self._client)
+
+    def advance(self, force: float) -> tuple[float, float]:
+        """One step."""
+        return self.glide(force, (1,))[0]
+
+    def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
+        """Steps with a force or torque at the joint."""
+        p, client, body, found = bullet.engine(), self._client, self._body, []
+        step, push, torque, read = p.stepSimulation, p.setJointMotorControl2, p.TORQUE_CONTROL, p.getJointState
+        for count in counts:
+            for _ in range(count):
+                if force:  # Bullet forgets applied torques after each step
+                    push(body, 0, torque, force=force, physicsClientId=client)
+                step(client)
+            found.append(read(body, 0, client)[:2])
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity", "open_loop")}
+
+
+class _Mover:
+    """A free ball; see `sims.engines.flight.Mover`."""
+
+    def __init__(self, world: bullet.World) -> None:
+        self._world = world
+        self._client = self._body = -1
+        self._mass = math.nan
+        self._contact = math.nan, math.nan
+        self._x: Vector = _NOWHERE
+
+    def start(self, constants: dict[str, float]) -> None:
+        """A world for these constants, without the contact points of the rollout before."""
+        p = bullet.engine()
+        self._mass, self._contact = constants["mass"], (math.nan, math.nan)
+        self._client, self._body = self._world.body(constants)
+        # Contact points outlive a reset and would be taken for old: they are dropped where the ball touches nothing.
+        far = 0.0, 0.0, 2.0 * constants["radius"] + 1.0
+        p.resetBasePositionAndOrientation(self._body, far, _UPRIGHT, self._client)
+        p.performCollisionDetection(self._client)
+
+    def pace(self, step: float) -> None:
+        """Step in seconds."""
+        bullet.engine().setTimeStep(step, self._client)
+
+    def place(self, x: Vector, w: Vector) -> None:
+        """Position and velocity; upright and without spin."""
+        bullet.engine().resetBasePositionAndOrientation(self._body, x, _UPRIGHT, self._client)
+        bullet.engine().resetBaseVelocity(self._body, w, _NOWHERE, self._client)
+        self._x = x
+
+    def advance(self, force: Vector) -> State:
+        """One step with a force at the centre, which is where it was last placed or read."""
+        p, mass = bullet.engine(), self._mass
+        newtons = mass * force[0], mass * force[1], mass * force[2]
+        p.applyExternalForce(self._body, -1, newtons, self._x, p.WORLD_FRAME, self._client)
+        return self.glide((1,))[0]
+
+    def glide(self, counts: Sequence[int]) -> list[State]:
+        """Steps under gravity."""
+        p, client, body = bullet.engine(), self._client, self._body
+        step, at, moving = p.stepSimulation, p.getBasePositionAndOrientation, p.getBaseVelocity
+        found: list[State] = []
+        for count in counts:
+            for _ in range(count):
+                step(client)
+            found.append((at(body, client)[0], moving(body, client)[0]))
+        self._x = found[-1][0]
+        return found
+
+    def touch(self, restitution: float, friction: float) -> None:
+        """The ball's restitution and friction."""
+        if (restitution, friction) != self._contact:
+            self._contact = restitution, friction
+            bullet.engine().changeDynamics(
+                self._body, -1, restitution=restitution, lateralFriction=friction, physicsClientId=self._client
+            )
+
+
+class Ball(_Mover):
+    """A ball that does not spin, on ground of restitution and friction 1; see `sims.engines.flight.Ball`."""
+
+    def start(self, constants: dict[str, float]) -> None:
+        """As every ball's, without contact."""
+        self._floor, self._gravity = constants["radius"], constants["gravity"]
+        super().start(constants)
+        self._meets(False)
+
+    def _meets(self, ground: bool) -> None:
+        """Let contact act or not."""
+        p = bullet.engine()
+        p.setCollisionFilterPair(p.getBodyUniqueId(0, self._client), self._body, -1, -1, ground, self._client)
+
+    def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
+        """Bullet's contact solver on one short step, gravity made up for."""
+        self.touch(restitution, friction)
+        self.pace(_IMPACT)
+        self.place((x[0], x[1], self._floor - flight.INSIDE), (v[0], v[1], v[2] + self._gravity * _IMPACT))
+        self._meets(True)
+        _, after = self.glide((1,))[0]
+        self._meets(False)
+        return after
+
+    def hold(self) -> None:
+        """Neither restitution nor friction."""
+        self.touch(0.0, 0.0)
+        self._meets(True)
+
+
+class NativeBall(_Mover):
+    """Bullet's own ball; see `sims.engines.native.Ball`."""
+
+    def __init__(self, world: bullet.World, settings: Mapping[str, float]) -> None:
+        super().__init__(world)
+        self.damping = settings["linear_damping"]
+        self._rough = settings["lateral_friction"]
+        self._reach = math.nan
+
+    def start(self, constants: dict[str, float]) -> None:
+        """As every ball's."""
+        super().start(constants)
+        self._reach = _REACH * constants["radius"]
+
+    def touch(self, restitution: float, friction: float) -> None:
+        """The ball's restitution; friction beside that of the settings, of which the contact has the product of two."""
+        if (restitution, friction) == self._contact:
+            return
+        own, ground = self._rough, self._rough
+        if friction:
+            own, ground = self._rough**2 + friction, 1.0
+        p = bullet.engine()
+        if friction or self._contact[1]:
+            floor = p.getBodyUniqueId(0, self._client)
+            p.changeDynamics(floor, -1, lateralFriction=ground, physicsClientId=self._client)
+            p.changeDynamics(self._body, -1, lateralFriction=own, physicsClientId=self._client)
+        p.changeDynamics(self._body, -1, restitution=restitution, physicsClientId=self._client)
+        self._contact = restitution, friction
+
+    def near(self, gap: float) -> bool:
+        """Within Bullet's reach."""
+        return gap <= self._reach

@@ -1,0 +1,261 @@
+"""What the engines share that step one body at a time: lane after lane, forces put in through the engine's interface.
+
+Bullet and MuJoCo (with its Euler integrator) step alike, by semi-implicit Euler: with step h,
+
+    w' = w + h (G(x) + F) / M,    x' = x + h w'
+
+where G is the gravity that the engine itself applies and F is what is put in from outside. That is of first order if w
+is read as the velocity at the time of x, and of second if it is read as the one half a step before (leapfrog; Hairer,
+Lubich, Wanner, Acta Numerica 12, 2003, doi:10.1017/S0962492902000144). `sims.engines.joint` and `sims.engines.flight`
+read it so: they choose F such that the engine's velocity ends where half a step's force takes the velocity at x.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.base import Array, InputError
+from sims.system import Acting, Contact, Force, Friction, Lanes, Moment, Motion, System
+
+# Sample times may miss the engine's steps by this share of an interval: recordings round their time stamps.
+TIME_TOLERANCE = 1e-6
+
+DEFAULT_STEPS = {"point": 1 / 120, "linear": 2.5e-3, "rotary": 2.5e-3}
+"""Longest step in seconds where the user sets none, by the system's kind."""
+
+Places = NDArray[np.intp]
+Path = tuple[Array, Array, Array]
+"""Positions, velocities, accelerations of one lane, (N, D)."""
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One lane's work. Effects whose coefficients are all zero are left out: off is off.
+
+    Attributes:
+        system: what to integrate.
+        theta: (1, p) the system's parameters.
+        constants: (1, 1) by name; `numbers` has them as numbers.
+        x: (D,) initial position.
+        v: (D,) initial velocity.
+        steps: (S,) seconds, all > 0: where a lane waits is left out.
+        inputs: (S,) by name, at least one value.
+        effects: those that act, with coefficients (K, 1, 1).
+        kept: (N,) increasing numbers of steps, from 0, after which the state is kept.
+    """
+
+    system: System
+    theta: Array
+    constants: Mapping[str, Array]
+    x: Array
+    v: Array
+    steps: Array
+    inputs: Mapping[str, Array]
+    effects: Acting
+    kept: Places
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The constants as plain numbers."""
+        return {name: float(value[0, 0]) for name, value in self.constants.items()}
+
+    @property
+    def contacts(self) -> list[tuple[Contact, Array]]:
+        """Effects on impacts."""
+        return [(effect, c) for effect, c in self.effects if isinstance(effect, Contact)]
+
+    def moment(self, t: Array, x: Array, v: Array, inputs: Mapping[str, Array]) -> Moment:
+        """Instants of this lane: t (n, 1), x and v (n, D), inputs (n, 1)."""
+        n = len(x)
+        known = {name: np.repeat(value, n, axis=0) for name, value in self.constants.items()}
+        return Moment(self.system, np.repeat(self.theta, n, axis=0), known, t, x, v, inputs)
+
+
+class Forces:
+    """The forces on one lane from outside the engine: the effects' and the system's own but for gravity.
+
+    Args:
+        lane: whose.
+        rows: how many velocities to ask for at once.
+    """
+
+    def __init__(self, lane: Lane, rows: int) -> None:
+        shape = (rows, lane.x.size)
+        inputs = {name: np.full((rows, 1), signal[0]) for name, signal in lane.inputs.items()}
+        self.moment = lane.moment(np.zeros((rows, 1)), np.zeros(shape), np.zeros(shape), inputs)
+        self._system, self._inputs = lane.system, inputs
+        self._more = type(lane.system).passive is not System.passive
+        self._driven = bool(inputs) or self._more
+        acting = [(effect, np.repeat(c, rows, axis=1)) for effect, c in lane.effects]
+        self._forces = [(effect, c) for effect, c in acting if isinstance(effect, Force)]
+        self._frictions = [(effect, c) for effect, c in acting if isinstance(effect, Friction)]
+        self._nothing = np.zeros(shape)
+        self.any = bool(self._forces or self._frictions or self._driven)
+
+    def feel(self, inputs: Mapping[str, float]) -> None:
+        """Set the inputs."""
+        for name, value in inputs.items():
+            self._inputs[name].fill(value)
+
+    def force(self) -> Array:
+        """(rows, D) generalised force at `moment`, friction apart."""
+        total = self._system.drive(self.moment) if self._driven else self._nothing
+        if self._more:
+            total = total - self._system.passive(self.moment) - self._system.weight(self.moment)
+        for effect, c in self._forces:
+            total = total + effect.force(c, self.moment)
+        return total
+
+    def limit(self) -> float:
+        """Largest friction at the first row of `moment`."""
+        return sum(float(effect.limit(c, self.moment)[0, 0]) for effect, c in self._frictions)
+
+
+def rate(velocity: float, force: float, limit: float) -> float:
+    """The force that is left of `force` when dry friction has taken what it can."""
+    if not limit:
+        return force
+    if velocity:
+        return force - math.copysign(limit, velocity)
+    return force - math.copysign(limit, force) if abs(force) > limit else 0.0
+
+
+def kick(velocity: float, force: float, limit: float, inverse: float, duration: float) -> float:
+    """The velocity after a constant force and dry friction have acted for `duration`.
+
+    Exact: friction opposes the motion until it stops, then holds it still if it can.
+
+    Args:
+        velocity: before.
+        force: without friction.
+        limit: largest friction.
+        inverse: one over the inertia.
+        duration: seconds.
+    """
+    if velocity and limit:
+        slope = rate(velocity, force, limit) * inverse
+        after = velocity + slope * duration
+        if after * velocity >= 0:
+            return after
+        duration += velocity / slope
+        velocity = 0.0
+    return velocity + rate(velocity, force, limit) * inverse * duration
+
+
+def integrate(lanes: Lanes, rollout: Callable[[Lane], Path], discard: Callable[[], None]) -> Motion:
+    """Lane after lane through `rollout`.
+
+    Args:
+        lanes: the work.
+        rollout: integrates one lane; its rows are those of `Lane.kept`.
+        discard: called after a rollout that failed; it may have left the engine's world in any state.
+
+    Returns:
+        The motion. A lane with a non-finite number or result is all NaN.
+    """
+    count = lanes.steps.shape[1] // lanes.every + 1
+    shape = (len(lanes.theta), count, lanes.x.shape[1])
+    motion = Motion(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan))
+    for i in range(len(lanes.theta)):
+        if i == 0 or not np.array_equal(lanes.steps[i], lanes.steps[i - 1]):
+            timing = _timing(lanes.steps[i], lanes.every)
+        lane = _lane(lanes, i, *timing[:3])
+        if not all(np.isfinite(values).all() for values in _given(lane)):
+            continue
+        try:
+            path = rollout(lane)
+        except BaseException:  # an interrupted rollout leaves forces behind
+            discard()
+            raise
+        if all(np.isfinite(values).all() for values in path):
+            for result, values in zip((motion.x, motion.v, motion.a), path, strict=True):
+                result[i] = values[timing[3]]
+        else:
+            discard()
+    return motion
+
+
+def _timing(steps: Array, every: int) -> tuple[Places, Array, Places, Places]:
+    """Which steps are taken, their lengths, how many precede the states to keep, and which of these each record is."""
+    moving = np.flatnonzero(steps > 0)
+    taken = np.concatenate([[0], np.cumsum(steps > 0)])[::every]
+    kept, rows = np.unique(taken, return_inverse=True)
+    return moving, evened(steps[moving], every), kept, rows
+
+
+def _lane(lanes: Lanes, i: int, moving: Places, steps: Array, kept: Places) -> Lane:
+    effects = tuple((effect, c[:, i : i + 1]) for effect, c in lanes.effects if c[:, i].any())
+    constants = {name: value[i : i + 1] for name, value in lanes.constants.items()}
+    inputs = {name: value[i, moving] if moving.size else value[i, :1] for name, value in lanes.inputs.items()}
+    return Lane(lanes.system, lanes.theta[i : i + 1], constants, lanes.x[i], lanes.v[i], steps, inputs, effects, kept)
+
+
+def _given(lane: Lane) -> list[Array]:
+    return [lane.theta, lane.x, lane.v, *lane.constants.values(), *lane.inputs.values(), *(c for _, c in lane.effects)]
+
+
+def evened(steps: Array, every: int) -> Array:
+    """`steps` (S,), made equal if they are but for rounding: each change of step costs an engine more than a step.
+
+    Args:
+        steps: seconds, > 0.
+        every: steps from one sample to the next.
+    """
+    if not steps.size:
+        return steps
+    even = math.fsum(steps) / steps.size
+    missed = np.abs(np.cumsum(steps) - even * np.arange(1, steps.size + 1)).max()
+    return np.full(steps.size, even) if missed <= TIME_TOLERANCE * even * every else steps
+
+
+def legs(lane: Lane, *signals: Array) -> list[tuple[int, list[int]]]:
+    """The steps as legs in which neither the step nor any of `signals` (S,) changes.
+
+    Returns:
+        The number of the first step of each leg, and how many steps it takes from one state to keep to the next, and at
+        last to its end.
+    """
+    size = lane.steps.size
+    new = np.zeros(size, dtype=bool)
+    new[:1] = True
+    for values in (lane.steps, *signals):
+        new[1:] |= values[1:size] != values[: size - 1]
+    stops = new.copy()
+    stops[lane.kept[lane.kept < size]] = True
+    begins = np.flatnonzero(stops)
+    counts = np.diff(begins, append=size).tolist()
+    result: list[tuple[int, list[int]]] = []
+    for begin, count, first in zip(begins.tolist(), counts, new[begins].tolist(), strict=True):
+        if first:
+            result.append((begin, []))
+        result[-1][1].append(count)
+    return result
+
+
+def checked_time_step(time_step: float | None, system: type[System]) -> float:
+    """Longest step in seconds: as given, or the default for systems of this kind.
+
+    Raises:
+        InputError: not finite or not positive.
+    """
+    if time_step is None:
+        return DEFAULT_STEPS[system.kind]
+    if isinstance(time_step, bool) or not isinstance(time_step, (int, float)) or not 0 < time_step < math.inf:
+        raise InputError(f"time_step must be a positive number of seconds, found {time_step}")
+    return float(time_step)
+
+
+def world_module(system: type[System], name: str) -> ModuleType | None:
+    """The module `name` beside the module that declares `system`; None where there is none."""
+    package = system.__module__.rpartition(".")[0]
+    if not package or find_spec(f"{package}.{name}") is None:
+        return None
+    return import_module(f"{package}.{name}")

@@ -1,0 +1,228 @@
+"""A ball stepped by an engine, read at second order in the step, its impacts solved by the engine where they happen.
+
+In flight the engine's velocity w is the one half a step before the position (see `sims.engines.external`): with
+acceleration a, a step of length h goes w = v + h a / 2, x' = x + h w, v' = w + h a' / 2. Under gravity alone that is
+the exact parabola. A step in which x + h v + h^2 a / 2 would pass the ground is cut where it meets it; there the engine
+solves the contact in a step of its own, of which only the change of velocity counts, and the rest of the step follows.
+The error of an impact is thus that of the flight, of second order in h, and none under gravity alone.
+
+When bouncing is over is agreed with the batch engine (`sims.engines.ground`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+from sims.engines.external import Lane, Path, legs
+from sims.engines.point import Impact, Pull, State, Vector, gravity, path_of
+
+_NO_TIME = 1e-12  # seconds that are not worth a step
+INSIDE = 1e-9  # metres inside the ground: where contact is beyond rounding
+
+
+class Mover(Protocol):
+    """A ball in an engine. Vectors are x, y, z; forces per unit mass."""
+
+    def start(self, constants: dict[str, float]) -> None:
+        """Make the world ready for a rollout, without a trace of the one before."""
+        ...
+
+    def pace(self, step: float) -> None:
+        """Set the step in seconds."""
+        ...
+
+    def place(self, x: Vector, w: Vector) -> None:
+        """Set the position and the engine's velocity."""
+        ...
+
+    def advance(self, force: Vector) -> State:
+        """Take one step with this force (m/s^2) beside gravity."""
+        ...
+
+    def glide(self, counts: Sequence[int]) -> list[State]:
+        """Take so many steps under gravity alone, and so many again, and so on; what is reached each time."""
+        ...
+
+
+class Ball(Mover, Protocol):
+    """A ball over level ground."""
+
+    def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
+        """The velocity after the engine's contact with the ground at x, all else standing still; `place` follows."""
+        ...
+
+    def hold(self) -> None:
+        """Let contact from now on do no more than hold the ball above the ground; `place` follows."""
+        ...
+
+
+def rollout(ball: Ball, lane: Lane) -> Path:
+    """Integrate one lane."""
+    ball.start(lane.numbers)
+    flight = _Flight(ball, lane)
+    kept, steps = set(lane.kept.tolist()), lane.steps.tolist()
+    rows = [flight.state]
+    for begin, counts in legs(lane):
+        found = flight.leg(steps[begin], counts)
+        rows.extend(found if begin + sum(counts) in kept else found[:-1])
+        if not math.isfinite(sum(flight.state)):
+            break
+    return path_of(lane, rows)
+
+
+class _Flight:
+    """One rollout."""
+
+    def __init__(self, ball: Ball, lane: Lane) -> None:
+        self._ball = ball
+        self._contact = Impact(lane)
+        self._pull = Pull(lane)
+        self._gravity = gravity(lane)
+        self._floor = float(lane.system.floor(lane.constants)[0, 0])
+        x, y, z = lane.x.tolist()
+        self._x: Vector = x, y, max(z, self._floor)  # what begins inside the ground begins on it
+        self._v: Vector = lane.v.tolist()
+        self._a = self._gravity
+        self._lift = self._gravity[2]  # vertical acceleration if there were no ground
+        self._w: Vector | None = None  # the engine's velocity; None when it must be placed anew
+        self._step = math.nan
+        self._rests = False
+        self._time = 0.0
+        self._look()
+        if self._time_to_ground() == 0.0 and self._v[2] == 0.0:
+            self._rest()
+            self._look()
+
+    @property
+    def state(self) -> tuple[float, ...]:
+        """Position, velocity, acceleration."""
+        return (*self._x, *self._v, *self._a)
+
+    def leg(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
+        """So many steps, and so many again, and so on; the state reached each time."""
+        if self._pull.any:
+            return [self._stepwise(step, count) for count in counts]
+        found: list[tuple[float, ...]] = []
+        left = list(counts)
+        while left:
+            room = math.inf if self._rests else self._time_to_ground() / step
+            whole = 0
+            for count in left:
+                if room < count:
+                    break
+                room -= count
+                whole += 1
+            if whole:
+                found.extend(self._glide(step, left[:whole]))
+                left = left[whole:]
+                continue
+            if room >= 1.0:
+                self._glide(step, (int(room),))
+            self._meet(step)
+            left[0] -= int(room) + 1
+            if not left[0]:
+                found.append(self.state)
+                left = left[1:]
+        return found
+
+    def _stepwise(self, step: float, count: int) -> tuple[float, ...]:
+        """Steps that ask for the forces; the state they reach."""
+        for _ in range(count):
+            if self._rests and self._lift > 0.0:
+                self._rests, self._w = False, None
+                self._look()
+            if self._rests or self._time_to_ground() >= step:
+                self._forced(step)
+            else:
+                self._meet(step)
+        return self.state
+
+    def _meet(self, left: float) -> None:
+        """A step with impacts."""
+        while left > _NO_TIME:
+            until = math.inf if self._rests else self._time_to_ground()
+            if until > _NO_TIME:
+                part = min(until, left)
+                if self._pull.any:
+                    self._forced(part)
+                else:
+                    self._glide(part, (1,))
+            if until >= left:
+                return
+            left -= until
+            self._strike()
+
+    def _ready(self, step: float) -> Vector:
+        """Make the engine step so, placed if it must be; its velocity."""
+        if step != self._step:
+            self._ball.pace(step)
+            self._step, self._w = step, None
+        if self._w is None:
+            (x, y, z), (ax, ay, az), half = self._v, self._a, 0.5 * step
+            self._w = x - half * ax, y - half * ay, z - half * az
+            self._ball.place(self._x, self._w)
+        return self._w
+
+    def _glide(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
+        """Steps under gravity alone, or at rest; the states they reach."""
+        self._ready(step)
+        ax, ay, az = self._a
+        x, y, z = 0.5 * step * ax, 0.5 * step * ay, 0.5 * step * az
+        found = self._ball.glide(counts)
+        self._x, self._w = found[-1]
+        states = [(*at, w[0] + x, w[1] + y, w[2] + z, ax, ay, az) for at, w in found]
+        self._v = states[-1][3:6]
+        return states
+
+    def _forced(self, step: float) -> None:
+        """One step, in flight or at rest, under all that acts."""
+        half = 0.5 * step
+        (wx, wy, wz), (x, y, z) = self._ready(step), self._v
+        (ax, ay, az), (gx, gy, gz) = self._a, self._gravity
+        lift = self._lift - gz if self._rests else (z + half * az - wz) / step - gz
+        force = (x + half * ax - wx) / step - gx, (y + half * ay - wy) / step - gy, lift
+        self._x, self._w = self._ball.advance(force)
+        self._time += step
+        wx, wy, wz = self._w
+        self._v = 2.0 * wx - x, 2.0 * wy - y, 0.0 if self._rests else 2.0 * wz - z
+        self._look()
+        ax, ay, az = self._a
+        self._v = wx + half * ax, wy + half * ay, 0.0 if self._rests else wz + half * az
+
+    def _look(self) -> None:
+        """Acceleration here and now; at rest the ground takes the vertical one."""
+        x, y, z = self._gravity
+        if self._pull.any:
+            felt = self._pull.at(self._time, self._x, self._v)
+            x, y, z = x + felt[0], y + felt[1], z + felt[2]
+        self._lift = z
+        self._a = x, y, 0.0 if self._rests else z
+
+    def _time_to_ground(self) -> float:
+        """Seconds until a flight with the present acceleration meets the ground; 0 on it, inf if never."""
+        gap, rate, lift = max(self._x[2] - self._floor, 0.0), self._v[2], self._a[2]
+        inside = rate * rate - 2.0 * lift * gap
+        if rate > 0.0 or (rate == 0.0 and lift < 0.0):
+            return (rate + math.sqrt(inside)) / -lift if lift < 0.0 else math.inf
+        if inside < 0.0 or (rate == 0.0 and lift >= 0.0):
+            return math.inf
+        return 2.0 * gap / (math.sqrt(inside) - rate)
+
+    def _strike(self) -> None:
+        speed = -self._v[2]
+        self._w = None
+        restitution, friction, over = self._contact.law(max(speed, 0.0), -self._a[2])
+        if speed > 0.0:
+            self._v = self._ball.strike(self._x, self._v, restitution, friction)
+            self._step = math.nan
+        if over:
+            self._rest()
+        self._look()
+
+    def _rest(self) -> None:
+        self._rests = True
+        self._x = self._x[0], self._x[1], min(self._x[2], self._floor - INSIDE)
+        self._v = self._v[0], self._v[1], 0.0
+        self._ball.hold()

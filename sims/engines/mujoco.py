@@ -1,0 +1,111 @@
+"""MuJoCo as an engine: forces through ``qfrc_applied``, impacts through its contact solver.
+
+The world that carries a system is written by the module ``mujoco_world`` beside the system's own: `model` gives it as
+MJCF and, for a system of one coordinate, `load` gives it its inertia.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+
+from sims.base import InputError
+from sims.engines import flight, joint, native
+from sims.engines.external import Lane, Path, checked_time_step, integrate, world_module
+from sims.engines.mujoco_bodies import Ball, Joint, SoftBall, World, library
+from sims.system import Engine, Lanes, Motion, System
+
+REQUIRES = ("mujoco",)
+
+_STIFFNESS = 1e5  # 1/s^2
+_OWN_STEP = 2e-3  # seconds: the step MuJoCo takes by default
+
+
+def engine(
+    system: type[System],
+    *,
+    time_step: float | None = None,
+    native_contact: bool = False,
+    stiffness: float | None = None,
+) -> Engine:
+    """The engine for one simulator.
+
+    Args:
+        system: what it will integrate.
+        time_step: longest step in seconds (2 ms with `native_contact`); each sampling interval is divided into equal
+            steps not longer than this.
+        native_contact: for a system that bounces: MuJoCo's contact as a spring and damper that give way, whose damping
+            is chosen for the restitution; stepped and read at first order (`sims.engines.native`).
+        stiffness: with `native_contact`: of the contact, 1/s^2 (1e5, that is contacts of 10 ms).
+
+    Raises:
+        InputError: an impossible setting.
+    """
+    if native_contact and time_step is None:
+        time_step = _OWN_STEP
+    step = checked_time_step(time_step, system)
+    if not native_contact:
+        if stiffness is not None:
+            raise InputError("setting stiffness belongs to MuJoCo's contact as it comes: set native_contact = true")
+        return MujocoEngine(system, step)
+    if not system.bounces:
+        raise InputError(f"system {system.name} does not bounce: leave native_contact out")
+    if stiffness is not None and not 0 < stiffness < math.inf:
+        raise InputError(f"stiffness must be a positive number, found {stiffness}")
+    return MujocoEngine(system, step, stiffness or _STIFFNESS)
+
+
+class MujocoEngine:
+    """MuJoCo, one lane after the other in one world."""
+
+    name: str = "mujoco"
+    requires: tuple[str, ...] = REQUIRES
+
+    def __init__(self, system: type[System], largest_step: float, stiffness: float | None = None) -> None:
+        self.largest_step = largest_step
+        module = world_module(system, "mujoco_world")
+        if module is None:
+            self._rollout: Callable[[Lane], Path] | None = None
+            return
+        self._world = World(module.model)
+        if stiffness is not None:
+            self._rollout = partial(native.rollout, SoftBall(self._world, stiffness))
+        elif system.bounces:
+            self._rollout = partial(flight.rollout, Ball(self._world))
+        else:
+            self._rollout = partial(joint.rollout, Joint(self._world, module))
+
+    def integrate(self, lanes: Lanes) -> Motion:
+        """See `Engine`."""
+        assert self._rollout is not None, "a system that the engine refuses"
+        with _quiet():
+            return integrate(lanes, self._rollout, self._world.close)
+
+    def refuses(self, system: type[System]) -> str:
+        """See `Engine`."""
+        if self._rollout is None:
+            return f"no module mujoco_world beside {system.__module__} builds it"
+        return ""
+
+    def close(self) -> None:
+        """Give back the MuJoCo world; the next integration makes a new one."""
+        if self._rollout is not None:
+            self._world.close()
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without MuJoCo's warnings of instability, which it would write to a file: such lanes become NaN."""
+    mujoco = library()
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_ignore)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _ignore(message: str) -> None:
+    """Nothing."""

@@ -1,0 +1,270 @@
+"""Bodies in MuJoCo: on a joint, and a ball over level ground.
+
+MuJoCo's contact asks for an acceleration a_ref = -b v - k r along the normal, of which it gives the share d: with what
+would happen without contact a_0, a = (1 - d) a_0 + d a_ref, never pulling ("Solver parameters",
+https://mujoco.readthedocs.io/en/stable/modeling.html#solver-parameters). Written as ``solref = (-stiffness, -damping)``
+with constant impedance d and no stiffness, a_ref = -(damping / d) v, so that with
+
+    damping = (1 + e) / h
+
+a single step of length h from the surface, other forces made up for (a_0 = 0), takes v to v - (1 + e) v = -e v: exactly
+the restitution e, for any h. A resting ball is held by damping 1 / h and stiffness 0.1 / h^2, which let it sink in by
+10 (1 - d) g h^2. MuJoCo's friction is a convex relaxation that turns slip into lift (Todorov, ICRA 2014,
+doi:10.1109/ICRA.2014.6907751), so contact is frictionless here and the tangential speed lost in an impact goes in as an
+impulse, through ``qfrc_applied`` in the step of the impact.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
+from typing import Any
+
+from sims.engines import flight
+from sims.engines.point import State, Vector
+
+_IMPACT = 1e-4  # seconds: step of an impact; MuJoCo takes accelerations above 1e10 for a failure
+_IMPEDANCE = 0.9999  # the largest MuJoCo allows
+_MOST_DAMPED = 2.0  # damping ratio
+
+
+@functools.cache
+def library() -> Any:
+    """The module ``mujoco``, imported on first use: it takes a while and most commands never simulate."""
+    import mujoco
+
+    return mujoco
+
+
+class World:
+    """One MuJoCo model and its state, compiled when first needed and again when the constants change.
+
+    Args:
+        model: called with the constants; returns MJCF.
+    """
+
+    def __init__(self, model: Callable[[Mapping[str, float]], str]) -> None:
+        self._compile = model
+        self._built_for: dict[str, float] | None = None
+        self._model: Any = None
+        self._data: Any = None
+
+    def __reduce__(self) -> tuple[type[World], tuple[Callable[[Mapping[str, float]], str]]]:
+        # A copy of a simulator, here or in another process, gets a world of its own.
+        return World, (self._compile,)
+
+    def fresh(self, constants: Mapping[str, float]) -> tuple[Any, Any]:
+        """Model and data as newly made, for these constants."""
+        if self._built_for != constants:
+            mujoco = library()
+            self._model = mujoco.MjModel.from_xml_string(self._compile(constants))
+            self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # joint damping is explicit
+            self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+            self._data = mujoco.MjData(self._model)
+            self._built_for = dict(constants)
+        else:
+            library().mj_resetData(self._model, self._data)
+        return self._model, self._data
+
+    def close(self) -> None:
+        """Give back model and data."""
+        self._model = self._data = self._built_for = None
+
+
+class Joint:
+    """A body on one hinge or guide; see `sims.engines.joint.Joint`."""
+
+    def __init__(self, world: World, module: ModuleType) -> None:
+        self._world = world
+        self._load, self._gravity = module.load, module.gravity
+        self.open_loop: bool = module.OPEN_LOOP
+
+    def start(self, constants: dict[str, float]) -> None:
+        """A world for these constants, as newly made."""
+        self._constants, self.gravity = constants, self._gravity(constants)
+        self._model, self._data = self._world.fresh(constants)
+        self._x, self._w, self._force = self._data.qpos, self._data.qvel, self._data.qfrc_applied
+        self._step = library().mj_step
+
+    def pace(self, step: float, inertia: float, damping: float) -> bool:
+        """Step in seconds, generalised inertia, joint damping."""
+        self._model.opt.timestep = step
+        self._model.dof_damping[0] = damping
+        loaded: bool = self._load(self._model, inertia, self._constants)
+        return loaded
+
+    def place(self, x: float, w: float) -> None:
+        """The joint's position and velocity."""
+        self._x[0], self._w[0] = x, w
+
+    def advance(self, force: float) -> tuple[float, float]:
+        """One step."""
+        self._force[0] = force
+        self._step(self._model, self._data)
+        return self._x.item(), self._w.item()
+
+    def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
+        """Steps with a force or torque at the joint."""
+        found = []
+        self._force[0] = force
+        for count in counts:
+            if count:
+                self._step(self._model, self._data, count)
+            found.append((self._x.item(), self._w.item()))
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity", "open_loop")}
+
+
+class _Mover:
+    """A ball on three slides; see `sims.engines.flight.Mover`."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def start(self, constants: dict[str, float]) -> None:
+        """A world for these constants, as newly made, without contact."""
+        mujoco = library()
+        self._mass, self._floor, self._gravity = constants["mass"], constants["radius"], constants["gravity"]
+        self._model, self._data = self._world.fresh(constants)
+        self._x, self._w, self._force = self._data.qpos, self._data.qvel, self._data.qfrc_applied
+        self._no_contact = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self._model.geom_solimp[:] = _IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0
+        self._step = mujoco.mj_step
+        self._hertz = math.nan
+        self._meets(False)
+
+    def _meets(self, ground: bool) -> None:
+        """Let contact act or not."""
+        flags = self._model.opt.disableflags
+        self._model.opt.disableflags = flags & ~self._no_contact if ground else flags | self._no_contact
+
+    def _contact(self, stiffness: float, damping: float) -> None:
+        """Stiffness (1/s^2) and damping (1/s) of the contact to come."""
+        self._model.geom_solref[:] = -stiffness, -damping
+
+    def pace(self, step: float) -> None:
+        """Step in seconds."""
+        self._model.opt.timestep = step
+        self._hertz = 1.0 / step
+
+    def place(self, x: Vector, w: Vector) -> None:
+        """Position and velocity."""
+        self._x[:], self._w[:] = x, w
+
+    def advance(self, force: Vector) -> State:
+        """One step with a force at the centre."""
+        mass = self._mass
+        self._force[:] = mass * force[0], mass * force[1], mass * force[2]
+        self._step(self._model, self._data)
+        self._force[:] = 0.0
+        return self._x.tolist(), self._w.tolist()
+
+    def glide(self, counts: Sequence[int]) -> list[State]:
+        """Steps under gravity."""
+        found: list[State] = []
+        for count in counts:
+            self._step(self._model, self._data, count)
+            found.append((self._x.tolist(), self._w.tolist()))
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in ("_world", "_stiffness") if name in self.__dict__}
+
+
+class Ball(_Mover):
+    """A ball that MuJoCo's contact sends back in one step; see `sims.engines.flight.Ball`."""
+
+    def start(self, constants: dict[str, float]) -> None:
+        """As every ball's."""
+        super().start(constants)
+        self._held = False
+
+    def pace(self, step: float) -> None:
+        """Step in seconds."""
+        super().pace(step)
+        if self._held:
+            self._contact(0.1 * self._hertz**2, self._hertz)
+
+    def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
+        """MuJoCo's contact solver on one short step, gravity made up for, friction put in as an impulse."""
+        self._held = False
+        self.pace(_IMPACT)
+        self.place((x[0], x[1], self._floor - flight.INSIDE), v)
+        self._contact(0.0, (1.0 + restitution) * self._hertz)
+        along = math.hypot(v[0], v[1])
+        lost = min(friction * (1.0 + restitution) * -v[2] / along, 1.0) * self._hertz if along else 0.0
+        self._meets(True)
+        _, after = self.advance((-lost * v[0], -lost * v[1], self._gravity))
+        self._meets(False)
+        return after
+
+    def hold(self) -> None:
+        """Contact that damps and, very little, springs."""
+        self._held = True
+        self._meets(True)
+        if not math.isnan(self._hertz):
+            self.pace(1.0 / self._hertz)
+
+
+class SoftBall(_Mover):
+    """A ball on MuJoCo's springy contact; see `sims.engines.native.Ball`.
+
+    Friction is put in as a force, a share of the normal force of the step before.
+    """
+
+    damping = 0.0
+
+    def __init__(self, world: World, stiffness: float) -> None:
+        super().__init__(world)
+        self._stiffness = stiffness
+
+    def start(self, constants: dict[str, float]) -> None:
+        """As every ball's, with contact."""
+        super().start(constants)
+        self._meets(True)
+        self._touched = math.nan, math.nan
+
+    def touch(self, restitution: float, friction: float) -> None:
+        """Damping that gives this restitution if the step is short; friction."""
+        if (restitution, friction) != self._touched:
+            self._touched = restitution, friction
+            self._contact(self._stiffness, 2.0 * damping_ratio(restitution) * math.sqrt(self._stiffness))
+
+    def near(self, gap: float) -> bool:
+        """Touching."""
+        return gap <= 0.0
+
+    def advance(self, force: Vector) -> State:
+        """One step with a force at the centre and what friction there is."""
+        friction = self._touched[1]
+        if friction and self._data.nefc:
+            vx, vy, _ = self._w.tolist()
+            slip = math.hypot(vx, vy)
+            share = min(friction * float(self._data.efc_force[0]) / self._mass / slip, self._hertz) if slip else 0.0
+            force = force[0] - share * vx, force[1] - share * vy, force[2]
+        return super().advance(force)
+
+
+def damping_ratio(restitution: float) -> float:
+    """The damping ratio of a spring and damper that push but do not pull, for a restitution; at most 2, for 0.06.
+
+    T. Schwager, T. Poeschel, Granular Matter 9, 465 (2007), doi:10.1007/s10035-007-0065-z, equation 20.
+    """
+    low, high = 0.0, _MOST_DAMPED
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _rebound(middle) > restitution else (low, middle)
+    return low
+
+
+def _rebound(ratio: float) -> float:
+    """Restitution of a spring and damper of this damping ratio."""
+    if ratio >= 1.0:
+        root = math.sqrt(ratio * ratio - 1.0)
+        return math.exp(-2.0 * ratio * math.acosh(ratio) / root) if root else math.exp(-2.0)
+    root = math.sqrt(1.0 - ratio * ratio)
+    return math.exp(-ratio / root * math.atan2(2.0 * ratio * root, 2.0 * ratio * ratio - 1.0))

@@ -1,0 +1,93 @@
+"""What acts on a ball beside its engine: effects, and the numbers of an impact."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from sims.engines.external import Forces, Lane, Path
+from sims.engines.ground import PATIENCE, SHORT, SHORTEST
+from sims.engines.scalar import resistance
+
+Vector = Sequence[float]
+"""x, y, z."""
+State = tuple[Vector, Vector]
+"""Position and the engine's velocity."""
+
+
+def gravity(lane: Lane) -> Vector:
+    """The acceleration of gravity, the same everywhere."""
+    nothing = np.zeros((1, 3))
+    weight: list[float] = lane.system.weight(lane.moment(np.zeros((1, 1)), nothing, nothing, {}))[0].tolist()
+    return weight
+
+
+def path_of(lane: Lane, rows: list[tuple[float, ...]]) -> Path:
+    """Rows of position, velocity, acceleration; NaN if some are missing."""
+    if len(rows) < lane.kept.size:
+        rows = [(math.nan,) * 9] * lane.kept.size
+    table = np.array(rows)
+    return table[:, :3], table[:, 3:6], table[:, 6:]
+
+
+class Pull:
+    """What effects add to gravity."""
+
+    def __init__(self, lane: Lane) -> None:
+        self._ask = Forces(lane, 1)
+        self._opposing = resistance(lane)
+        self.any = self._ask.any
+
+    def at(self, t: float, x: Vector, v: Vector) -> Vector:
+        """m/s^2, dry friction (which no effect of the library gives to a free ball) against the velocity."""
+        vx, vy, vz = v
+        speed = math.sqrt(vx * vx + vy * vy + vz * vz)
+        if self._opposing:
+            share, limit, fx, fy, fz = self._opposing.at(speed)[0], self._opposing.limit, 0.0, 0.0, 0.0
+        else:
+            moment = self._ask.moment
+            moment.t.fill(t)
+            moment.x[0], moment.v[0] = x, v
+            fx, fy, fz = self._ask.force()[0].tolist()
+            share, limit = 0.0, self._ask.limit()
+        if limit and speed:
+            share += limit / speed
+        return fx - share * vx, fy - share * vy, fz - share * vz
+
+
+class Impact:
+    """The numbers of an impact, from the system and the effects on contact."""
+
+    def __init__(self, lane: Lane) -> None:
+        self._restitution = lane.system.restitution(lane.theta)
+        self._effects = lane.contacts
+        self._shorts = 0
+
+    @property
+    def changes(self) -> bool:
+        """Whether any effect acts."""
+        return bool(self._effects)
+
+    def at(self, speed: float) -> tuple[float, float]:
+        """Restitution and friction of an impact at this speed."""
+        restitution, friction = self._restitution, 0.0
+        for effect, c in self._effects:
+            restitution = effect.restitution(c, restitution, np.array([[speed]]))
+            friction += float(effect.friction(c)[0, 0])
+        return float(restitution[0, 0]), friction
+
+    def law(self, speed: float, down: float) -> tuple[float, float, bool]:
+        """Restitution, friction, and whether bouncing is over, for a ball that falls with acceleration `down`.
+
+        The friction of the last impact includes that of all the bounces that are left out.
+        """
+        restitution, friction = self.at(speed)
+        up = restitution * speed
+        flight = 2.0 * up / down if down > 0.0 else math.inf
+        self._shorts = self._shorts + 1 if flight < SHORT else 0
+        if flight >= SHORTEST and self._shorts <= PATIENCE:
+            return restitution, friction, False
+        later = up / (1.0 - restitution) if restitution < 1.0 else 0.0
+        return 0.0, friction * (1.0 + restitution) * (1.0 + later / speed) if speed else 0.0, True

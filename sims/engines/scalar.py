@@ -1,0 +1,65 @@
+"""The commonest effects in plain numbers, for engines that go lane by lane and step by step.
+
+Asking an effect for its force takes NumPy some microseconds, as long as the engine's own step. For the laws below, and
+only as the library has them, it is worth writing them once more; tests compare both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from sims.engines.external import Lane
+from sims.system import Contact, Effect
+
+Law = Callable[[float, float], tuple[float, float]]
+"""Coefficient and speed -> resistance r in force = -r v, and by how much r times speed grows with speed."""
+
+_LAWS: Mapping[str, Law] = {
+    "drag.linear": lambda c, speed: (c, c),  # noqa: ARG005 - the same at every speed
+    "drag.quadratic": lambda c, speed: (c * speed, 2.0 * c * speed),
+}
+
+
+@dataclass(frozen=True)
+class Resistance:
+    """What opposes the motion and depends on nothing but speed.
+
+    Attributes:
+        laws: those that act, with their coefficients.
+        limit: of dry friction.
+    """
+
+    laws: tuple[tuple[Law, float], ...]
+    limit: float
+
+    def at(self, speed: float) -> tuple[float, float]:
+        """The sum of all laws at this speed; see `Law`."""
+        resistance = slope = 0.0
+        for law, c in self.laws:
+            more, steeper = law(c, speed)
+            resistance += more
+            slope += steeper
+        return resistance, slope
+
+
+def resistance(lane: Lane) -> Resistance | None:
+    """All effects of the lane but those on contact; None if some are not of this kind."""
+    laws: list[tuple[Law, float]] = []
+    limit = 0.0
+    for effect, c in lane.effects:
+        number = float(c[0, 0, 0])
+        if isinstance(effect, Contact):
+            continue
+        if is_library(effect, "friction.coulomb"):
+            limit += max(number, 0.0)
+        elif effect.name in _LAWS and is_library(effect, effect.name):
+            laws.append((_LAWS[effect.name], number))
+        else:
+            return None
+    return Resistance(tuple(laws), limit)
+
+
+def is_library(effect: Effect, name: str) -> bool:
+    """Whether this is the library's own effect of this name."""
+    return effect.name == name and type(effect).__module__.startswith("sims.effects.")

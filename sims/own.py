@@ -1,0 +1,199 @@
+"""A user's own model in PyBullet, MuJoCo or anything else that steps, as a simulator; see docs/own-simulator.md.
+
+Subclass `OwnSimulator`, declare what it is, and give `reset`, `step` and `observe`. Effects on inputs and sensors then
+act on it as on any other; effects that are forces and dry frictions do if it takes forces (`apply_force`, `inertia`).
+"""
+
+from __future__ import annotations
+
+import weakref
+from abc import abstractmethod
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sims.base import Array, Channel, InputError, Parameter
+from sims.bullet import engine
+from sims.own_engine import OwnEngine
+from sims.simulated import Simulated
+from sims.system import Contact, Effect, Engine, Force, Friction, Kind, Moment, System
+
+
+class OwnSystem(System):
+    """The declaration behind an own simulator, made from its class attributes."""
+
+    name, says = "own", "a user's own simulator"
+    kind: ClassVar[Kind] = "linear"
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    channels: ClassVar[tuple[Channel, ...]] = ()
+    coordinates: ClassVar[tuple[str, ...]] = ()
+    rates: ClassVar[tuple[str, ...]] = ()
+    states: ClassVar[Mapping[str, float]] = {}
+    sensed: ClassVar[tuple[str, ...]] = ()
+    simulator: ClassVar[type[OwnSimulator]]
+
+    @classmethod
+    def refuses(cls, effect: type[Effect]) -> str:
+        """A force needs the simulator's hook; dry friction its inertia besides; an impact is out of reach."""
+        if issubclass(effect, Contact):
+            return "an own simulator does not say when it strikes something"
+        if not issubclass(effect, Force | Friction):
+            return ""
+        if cls.simulator.apply_force is OwnSimulator.apply_force:
+            return "it takes no forces (it has no method apply_force)"
+        if issubclass(effect, Friction) and cls.simulator.inertia is OwnSimulator.inertia:
+            return "it does not say its inertia (it has no method inertia)"
+        try:
+            _ask(effect, cls)
+        except _UnsaidError as reason:
+            return str(reason)
+        return ""
+
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:  # noqa: ARG002
+        """Not known outside the simulator."""
+        raise _UnsaidError("it does not say its mass")
+
+    def weight(self, moment: Moment) -> Array:  # noqa: ARG002
+        """Not known outside the simulator."""
+        raise _UnsaidError("it does not say what gravity does to it")
+
+    def drive(self, moment: Moment) -> Array:  # noqa: ARG002
+        """Not known outside the simulator."""
+        raise _UnsaidError("it does not say what its inputs do to it")
+
+    def observe(self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]) -> dict[str, Array]:  # noqa: ARG002
+        """The motion of an own simulator is what it observes."""
+        return {c.name: x[:, :, i] for i, c in enumerate(self.channels)}
+
+
+class _UnsaidError(InputError):
+    """Something that an effect asks for and the simulator does not say."""
+
+
+def _ask(effect: type[Effect], system: type[OwnSystem]) -> None:
+    """Let the effect ask the system once for all it needs."""
+    one, d = np.ones((1, 1)), len(system.coordinates)
+    constants = {c.name: c.value * one for c in system.constants}
+    inputs = {c.name: 0.0 * one for c in system.inputs}
+    theta = np.array([[p.nominal for p in system.parameters]])
+    moment = Moment(system(), theta, constants, 0 * one, np.zeros((1, d)), np.zeros((1, d)), inputs)
+    c = np.zeros((len(effect.coefficients), 1, 1))
+    if issubclass(effect, Force):
+        effect().force(c, moment)
+    elif issubclass(effect, Friction):
+        effect().limit(c, moment)
+
+
+class OwnSimulator(Simulated):
+    """Base of a user's own simulator.
+
+    Declare the attributes of `Simulator` (name, says, parameters, channels, constants, inputs, states, requires), then
+    those below where they apply, and write `reset`, `step` and `observe`.
+
+    Attributes:
+        time_step: the longest step in seconds; `step` is called with this or less, so that every sample is hit.
+        kind: how its forces count: ``linear`` in N, ``rotary`` in N m, ``point`` per unit mass.
+        coordinates: states that are its generalised position, for effects that are forces.
+        rates: states that are their rates, in the same order.
+
+    Raises:
+        InputError: the declaration contradicts itself.
+    """
+
+    system = OwnSystem
+    time_step: ClassVar[float] = 1 / 240
+    kind: ClassVar[Kind] = "linear"
+    coordinates: ClassVar[tuple[str, ...]] = ()
+    rates: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        _check(cls)
+        forced = {*cls.coordinates, *cls.rates}
+        declared = {
+            **{
+                name: getattr(cls, name) for name in ("name", "parameters", "channels", "constants", "inputs", "states")
+            },
+            "says": cls.__dict__.get("says") or " ".join((cls.__doc__ or cls.says).split("\n\n")[0].split()),
+            "kind": cls.kind,
+            "coordinates": cls.coordinates,
+            "rates": (*cls.rates, *(name for name in cls.states if name not in forced)),  # whatever else has a start
+            "sensed": tuple(c.name for c in cls.channels),
+            "simulator": cls,
+        }
+        system: Any = type(f"{cls.__name__}System", (OwnSystem,), declared)
+        cls.system = system
+        super().__init_subclass__(**kwargs)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in _TAKEN and name in self.__dict__:
+            raise InputError(f"simulator {self.name}: the attribute '{name}' is the base class's; name yours otherwise")
+        super().__setattr__(name, value)
+
+    @abstractmethod
+    def reset(self, theta: Mapping[str, float], constants: Mapping[str, float], initial: Mapping[str, float]) -> None:
+        """Start a run: parameters, constants and initial state by name.
+
+        It must set all that a run may have changed, so that a run depends on nothing before it.
+        """
+
+    @abstractmethod
+    def step(self, inputs: Mapping[str, float], seconds: float) -> None:
+        """Go on by `seconds` with these inputs."""
+
+    @abstractmethod
+    def observe(self) -> Mapping[str, float]:
+        """What the sensors give now, at least every channel; for force effects the coordinates and rates as well."""
+
+    def apply_force(self, force: Array) -> None:
+        """Optional: add a generalised force (D,) along the coordinates, for the next step alone."""
+        raise NotImplementedError
+
+    def inertia(self) -> float:
+        """Optional: generalised inertia now (kg or kg m^2; 1 for ``point``), with which friction can hold still."""
+        raise NotImplementedError
+
+    def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
+        if name is not None:
+            raise InputError(f"simulator {self.name} steps itself; it has no engine '{name}'")
+        step = dict(settings).pop("time_step", self.time_step)
+        if extra := [key for key in settings if key != "time_step"]:
+            raise InputError(f"simulator {self.name} has no setting '{extra[0]}'; there is: time_step")
+        if isinstance(step, bool) or not isinstance(step, int | float) or not 0 < step < np.inf:
+            raise InputError(f"time_step must be a positive number of seconds, found {step}")
+        return OwnEngine(self, step)
+
+    def close(self) -> None:
+        """Give back what the simulator holds."""
+
+
+_TAKEN = ("channels", "columns", "constant_values", "effects", "engine", "fixed", "parameters")
+"""Attributes that are set once, by the base classes."""
+
+
+def _check(cls: type[OwnSimulator]) -> None:
+    if not isinstance(getattr(cls, "name", None), str) or cls.name == OwnSystem.name:
+        raise InputError(f'class {cls.__name__}: expected name = "..."')
+    if not cls.channels or not cls.parameters:
+        raise InputError(f"simulator {cls.name}: expected at least one parameter and one channel")
+    if len(cls.coordinates) != len(cls.rates):
+        raise InputError(f"simulator {cls.name}: expected a rate for each of {cls.coordinates}, found {cls.rates}")
+    for name in (*cls.coordinates, *cls.rates):
+        if name not in cls.states:
+            raise InputError(
+                f"simulator {cls.name}: {name} is not among its states {', '.join(cls.states) or '(none)'}"
+            )
+
+
+class BulletWorld:
+    """A world in PyBullet, whose functions are its methods; it prints nothing and ends with its last reference."""
+
+    def __init__(self) -> None:
+        self._engine = engine()
+        self._client: int = self._engine.connect(self._engine.DIRECT)
+        weakref.finalize(self, self._engine.disconnect, self._client)
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._engine, name)
+        return partial(found, physicsClientId=self._client) if callable(found) else found

@@ -1,0 +1,125 @@
+"""Steps a user's own simulator, and puts effects that are forces into it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sims.base import Array, InputError
+from sims.engines.external import evened
+from sims.system import Force, Friction, Lanes, Moment, Motion, System
+
+if TYPE_CHECKING:
+    from sims.own import OwnSimulator
+
+
+class OwnEngine:
+    """Steps an own simulator, lane after lane."""
+
+    name = "own"
+    requires: tuple[str, ...] = ()
+
+    def __init__(self, world: OwnSimulator, step: float) -> None:
+        self.world, self.largest_step = world, float(step)
+
+    def refuses(self, system: type[System]) -> str:  # noqa: ARG002
+        """Nothing."""
+        return ""
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+    def integrate(self, lanes: Lanes) -> Motion:
+        """Readings (L, R, C) in place of positions, a row after every `lanes.every` steps and one before the first."""
+        count, width = lanes.steps.shape[1] // lanes.every + 1, len(lanes.system.channels)
+        result = np.full((len(lanes.theta), count, width), np.nan)
+        for lane in range(len(lanes.theta)):
+            rows = self._run(lanes, lane)
+            if rows is not None and np.isfinite(rows).all():
+                result[lane] = rows
+        return Motion(result, result, result)
+
+    def _run(self, lanes: Lanes, lane: int) -> Array | None:
+        system, world = lanes.system, self.world
+        theta = dict(zip((p.name for p in system.parameters), lanes.theta[lane].tolist(), strict=True))
+        constants = {name: float(value[lane, 0]) for name, value in lanes.constants.items()}
+        initial = dict(zip((*system.coordinates, *system.rates), [*lanes.x[lane], *lanes.v[lane]], strict=True))
+        if not np.isfinite([*theta.values(), *constants.values(), *initial.values()]).all():
+            return None
+        world.reset(theta, constants, {name: float(value) for name, value in initial.items()})
+        forces, steps = _Forces(lanes, lane, world), lanes.steps[lane].copy()
+        steps[steps > 0] = evened(steps[steps > 0], lanes.every)
+        row, t, moved = self._row(system), 0.0, False
+        rows = [row]
+        for i, seconds in enumerate(steps.tolist()):
+            if seconds > 0:
+                inputs = {name: float(signal[lane, i]) for name, signal in lanes.inputs.items()}
+                if forces.any:
+                    world.apply_force(forces.at(t, inputs, seconds))
+                world.step(inputs, seconds)
+                t, moved = t + seconds, True
+            if (i + 1) % lanes.every == 0:
+                row, moved = self._row(system) if moved else row, False
+                rows.append(row)
+        return np.array(rows)
+
+    def _row(self, system: System) -> list[float]:
+        seen = self.world.observe()
+        return [_seen(self.world, seen, c.name) for c in system.channels]
+
+
+def _seen(world: OwnSimulator, seen: Mapping[str, float], name: str) -> float:
+    if name not in seen:
+        raise InputError(f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(seen)}")
+    return float(seen[name])
+
+
+class _Forces:
+    """The effects' forces on one lane."""
+
+    def __init__(self, lanes: Lanes, lane: int, world: OwnSimulator) -> None:
+        acting = [(effect, c[:, lane : lane + 1]) for effect, c in lanes.effects if c[:, lane].any()]
+        self.forces = [(effect, c) for effect, c in acting if isinstance(effect, Force)]
+        self.frictions = [(effect, c) for effect, c in acting if isinstance(effect, Friction)]
+        self.any = bool(acting)
+        self.world, self.system = world, lanes.system
+        self.theta = lanes.theta[lane : lane + 1]
+        self.constants = {name: value[lane : lane + 1] for name, value in lanes.constants.items()}
+        self._last: tuple[Array, Array, float] | None = None
+
+    def at(self, t: float, inputs: Mapping[str, float], seconds: float) -> Array:
+        """(D,) the sum over the coming step."""
+        seen = self.world.observe()
+        x, v = (self._state(seen, names) for names in (self.world.coordinates, self.world.rates))
+        felt = {name: np.array([[value]]) for name, value in inputs.items()}
+        moment = Moment(self.system, self.theta, self.constants, np.array([[t]]), x, v, felt)
+        force = np.zeros(x.shape[1])
+        for effect, c in self.forces:
+            force = force + effect.force(c, moment)[0]
+        if self.frictions:
+            force = force + self._friction(moment, force, seconds)
+        return force
+
+    def _friction(self, moment: Moment, force: Array, seconds: float) -> Array:
+        """What stops the motion within the step, as far as the limit allows.
+
+        What the simulator itself pulls with is taken from the last step.
+        """
+        inertia, v = self.world.inertia(), moment.v[0]
+        own = np.zeros_like(force)
+        if self._last is not None:
+            before, applied, took = self._last
+            own = inertia * (v - before) / took - applied
+        limit = sum(float(effect.limit(c, moment)[0, 0]) for effect, c in self.frictions)
+        stop = -(inertia * v / seconds + own + force)
+        size = float(np.linalg.norm(stop))
+        friction: Array = stop if size <= limit else stop * (limit / size)
+        self._last = v, force + friction, seconds
+        return friction
+
+    def _state(self, seen: Mapping[str, float], names: Sequence[str]) -> Array:
+        values = [[_seen(self.world, seen, name) for name in names]]
+        state: Array = np.array(values)
+        return state

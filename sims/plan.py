@@ -1,0 +1,249 @@
+"""When a simulation steps, and what its plant feels: sample instants, steps and inputs of many lanes at once.
+
+Effects that shift time (a sensor's delay, a skewed clock) move the instants at which the world is sampled; effects on
+the input change the signal before the integration starts, since it does not depend on the plant. So every engine has
+them. What a lane gets does not depend on the others, but for steps of no length in which it waits for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.base import Array, Scenario
+from sims.system import Acting, Effect, Input, Sensor, Signal
+
+Indices = NDArray[np.intp]
+Number = TypeVar("Number", np.float64, np.intp)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The steps of all lanes.
+
+    Attributes:
+        steps: (L, S) lengths, seconds; S is a multiple of `every`. Lanes may share memory.
+        ends: (L, S) seconds since the start of the run at the end of each step.
+        every: after this many steps the state is kept; the initial state is kept first.
+        rows: (L, T) which of the kept states each sample shows.
+    """
+
+    steps: Array
+    ends: Array
+    every: int
+    rows: Indices
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Scenarios of lanes, of which many may be the same.
+
+    Attributes:
+        distinct: scenarios that differ in their times or inputs.
+        of: (L,) which of them each lane has.
+    """
+
+    distinct: tuple[Scenario, ...]
+    of: Indices
+
+    def spread(self, rows: NDArray[Number]) -> NDArray[Number]:
+        """Rows (N, ...) of the distinct scenarios as rows of the lanes; one row is that of all, and shares memory."""
+        if len(rows) == 1:
+            return np.broadcast_to(rows, (self.of.size, *rows.shape[1:]))
+        return rows[self.of]
+
+
+def make_runs(scenarios: Sequence[Scenario]) -> Runs:
+    """Group scenarios (one a lane) with the same times and inputs."""
+    by_object: dict[int, int] = {}
+    by_content: dict[object, int] = {}
+    distinct: list[Scenario] = []
+    of = np.empty(len(scenarios), dtype=np.intp)
+    for lane, scenario in enumerate(scenarios):
+        group = by_object.get(id(scenario))
+        if group is None:
+            content = scenario.times.tobytes(), *((name, u.tobytes()) for name, u in sorted(scenario.inputs.items()))
+            group = by_content.setdefault(content, len(distinct))
+            if group == len(distinct):
+                distinct.append(scenario)
+            by_object[id(scenario)] = group
+        of[lane] = group
+    return Runs(tuple(distinct), of)
+
+
+Commands = Sequence[Mapping[str, Array]]
+"""Commanded inputs of each distinct scenario by name, each (T,)."""
+
+
+def make_plan(runs: Runs, commands: Commands, acting: Acting, largest_step: float) -> Plan:
+    """Steps through every instant at which a sample is taken or a changed command felt.
+
+    A sample that would be taken before the start shows the initial state. Shorter runs wait at their end.
+
+    Args:
+        runs: scenarios of the lanes.
+        commands: inputs of each distinct scenario.
+        acting: effects on input and sensors.
+        largest_step: no step is longer, in seconds.
+    """
+    samples = max(s.times.size for s in runs.distinct)
+    instants = np.stack([_padded(s.times - s.times[0], samples) for s in runs.distinct])
+    shifting = [(e, c) for e, c in acting if c.any() and _shifts(e)]
+    if not shifting:
+        if (instants == instants[:1]).all():
+            instants = instants[:1]
+        steps, ends, every, rows = _divided(instants, largest_step)
+        return Plan(runs.spread(steps), runs.spread(ends), every, runs.spread(rows))
+    instants = instants[runs.of]
+    for effect, c in shifting:
+        if isinstance(effect, Sensor):
+            instants = np.where(acts(c), effect.times(c, instants), instants)
+    instants = np.maximum.accumulate(np.maximum(instants, 0.0), axis=1)
+    marks = np.concatenate([instants, _changes(runs, commands, shifting)], axis=1)
+    marks = np.clip(marks, 0.0, instants[:, -1:])
+    order = np.argsort(marks, axis=1, kind="stable")
+    steps, ends, every, rows = _divided(np.take_along_axis(marks, order, axis=1), largest_step)
+    back = np.empty_like(rows)
+    np.put_along_axis(back, order, rows, axis=1)
+    return Plan(steps, ends, every, back[:, :samples])
+
+
+def _changes(runs: Runs, commands: Commands, shifting: Sequence[tuple[Effect, Array]]) -> Array:
+    """Instants (L, K) at which a changed command is felt; zero where a lane has fewer."""
+    columns = []
+    for place, name in enumerate(commands[0]):
+        rows = [(s.times - s.times[0])[1:][np.diff(u[name]) != 0] for s, u in zip(runs.distinct, commands, strict=True)]
+        size = max(row.size for row in rows)
+        given = np.stack([np.concatenate([row, np.zeros(size - row.size)]) for row in rows])[runs.of]
+        felt = given
+        for effect, c in shifting if place == 0 else ():
+            if isinstance(effect, Input):  # the inverse of a map of time that is a shift, or close to one
+                felt = np.where(acts(c), felt + (felt - effect.times(c, felt)), felt)
+        columns.append(felt)
+    return np.concatenate(columns, axis=1) if columns else np.zeros((runs.of.size, 0))
+
+
+def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, Indices]:
+    """Steps and their ends (N, S) through instants (N, T), after how many a state is kept, which one at each instant.
+
+    An interval is divided into equal steps; those of a lane depend on no other. They are laid into blocks of as many
+    steps as most intervals have, and steps of no length fill the last block of an interval.
+    """
+    lanes, samples = instants.shape
+    before = np.concatenate([np.zeros((lanes, 1)), instants[:, :-1]], axis=1)
+    intervals = instants - before
+    parts = np.ceil(intervals / largest_step - 1e-6).astype(np.intp)
+    parts = np.where(intervals > 0, np.maximum(parts, 1), 0)
+    every = int(np.bincount(parts[parts > 0]).argmax()) if parts.any() else 1
+    blocks = -(-parts // every)
+    rows = np.cumsum(blocks, axis=1)
+    size = max(int(rows[:, -1].max()), 1)
+    # From here on one entry a block: its interval, its number in the lane, the numbers of its steps in the interval.
+    interval = np.repeat(np.arange(lanes * samples), blocks.ravel())
+    lane = interval // samples
+    block = np.arange(interval.size) - (np.cumsum(rows[:, -1]) - rows[:, -1])[lane]
+    number = (block - (rows - blocks).ravel()[interval])[:, None] * every + np.arange(every)
+    count = parts.ravel()[interval, None]
+    length = intervals.ravel()[interval, None] / count
+    steps, ends = np.zeros((lanes, size, every)), np.repeat(instants[:, -1], size * every).reshape(lanes, size, every)
+    steps[lane, block] = np.where(number < count, length, 0.0)
+    inside = before.ravel()[interval, None] + (number + 1) * length
+    ends[lane, block] = np.where(number + 1 < count, inside, instants.ravel()[interval, None])
+    return steps.reshape(lanes, -1), ends.reshape(lanes, -1), every, rows
+
+
+def _padded(values: Array, size: int) -> Array:
+    return np.concatenate([values, np.full(size - values.size, values[-1])])
+
+
+def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> dict[str, Array]:
+    """What the plant feels over each step, (L, S) by name: each command's mean over the step, through the effects.
+
+    A command holds its value from one recorded sample to the next, and had its first value before the first. Effects
+    act on the first input.
+
+    Args:
+        plan: the steps.
+        runs: scenarios of the lanes.
+        commands: inputs of each distinct scenario.
+        acting: input effects in the order in which the signal passes them.
+    """
+    names = list(commands[0])
+    effects = tuple((effect, c, acts(c)) for effect, c in acting if c.any())
+    begin = _before(plan.ends)
+    felt = {name: _felt(runs, [u[name] for u in commands], begin, plan.ends) for name in names[1 if effects else 0 :]}
+    if not effects:
+        return felt
+    end = plan.ends
+    for effect, c, on in reversed(effects):
+        assert isinstance(effect, Input)
+        begin, end = np.where(on, effect.times(c, begin), begin), np.where(on, effect.times(c, end), end)
+    lasting = _lasting(plan.steps)
+    values = np.take_along_axis(_felt(runs, [u[names[0]] for u in commands], begin, end), lasting, axis=1)
+    start = np.array([u[names[0]][0] for u in commands])[runs.of, None]
+    for effect, c, on in effects:
+        assert isinstance(effect, Input)
+        begun = effect.feel(c, Signal(start, np.zeros_like(start), start, np.zeros_like(start)))
+        passed = effect.feel(c, Signal(values, plan.steps, start, plan.ends))
+        values, start = np.where(on, np.take_along_axis(passed, lasting, axis=1), values), np.where(on, begun, start)
+    return {names[0]: values, **felt}
+
+
+def _before(ends: Array) -> Array:
+    """(L, S) the beginnings of steps, from their ends; shares memory as they do."""
+    own = ends[:1] if ends.strides[0] == 0 else ends
+    begin = np.concatenate([np.zeros((len(own), 1)), own[:, :-1]], axis=1)
+    return np.broadcast_to(begin, ends.shape)
+
+
+def _lasting(steps: Array) -> Indices:
+    """(L, S) for each step itself if it has a length, else the last before it that has: waiting feels nothing new."""
+    own = np.arange(steps.shape[1])
+    last: Indices = np.maximum.accumulate(np.where(steps > 0, own, 0), axis=1)
+    return last
+
+
+def _felt(runs: Runs, signals: Sequence[Array], begin: Array, end: Array) -> Array:
+    """Means (L, S) of each lane's signal from `begin` to `end` (L, S)."""
+    alike = begin.strides[0] == 0 and end.strides[0] == 0  # all lanes make the same steps
+    result = np.empty((len(signals) if alike else len(begin), begin.shape[1]))
+    by_run = np.argsort(runs.of, kind="stable")
+    for lanes in np.split(by_run, np.flatnonzero(np.diff(runs.of[by_run])) + 1):
+        run = runs.of[lanes[0]]
+        times = runs.distinct[run].times
+        to, of = (slice(run, run + 1), slice(1)) if alike else (lanes, lanes)
+        result[to] = _means(times - times[0], signals[run], begin[of], end[of])
+    return runs.spread(result) if alike else result
+
+
+def _means(times: Array, values: Array, begin: Array, end: Array) -> Array:
+    """Means over [begin, end] of the signal that holds values[i] from times[i] on; its value where begin = end."""
+    place = np.clip(np.searchsorted(times, begin, side="right") - 1, 0, times.size - 1)
+    value: Array = values[place]
+    last = np.clip(np.searchsorted(times, end, side="left") - 1, 0, times.size - 1)
+    crossing = last > place
+    if crossing.any():
+        area = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(times))])
+        a, b = begin[crossing], end[crossing]
+        value[crossing] = (_area(times, values, area, b) - _area(times, values, area, a)) / (b - a)
+    return value
+
+
+def _area(times: Array, values: Array, area: Array, t: Array) -> Array:
+    place = np.clip(np.searchsorted(times, t, side="right") - 1, 0, times.size - 1)
+    result: Array = area[place] + values[place] * (t - times[place])
+    return result
+
+
+def _shifts(effect: Effect) -> bool:
+    return isinstance(effect, (Input, Sensor)) and type(effect).times not in (Input.times, Sensor.times)
+
+
+def acts(c: Array) -> NDArray[np.bool_]:
+    """(L, 1) in which lanes an effect with coefficients (K, L, 1) is not off."""
+    result: NDArray[np.bool_] = (c != 0).any(axis=0)
+    return result

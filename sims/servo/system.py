@@ -1,0 +1,76 @@
+"""The servo: a position-controlled motor that carries a pendulum."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from sims.base import Array, Channel, Constant, Parameter
+from sims.system import Kind, Moment, System
+
+_KT, _RESISTANCE, _ARMATURE = (slice(i, i + 1) for i in range(3))
+
+
+class ServoSystem(System):
+    """(armature + mass length^2) q'' = torque - mass gravity length sin q, with a proportional position controller.
+
+    duty = clip(kp error_gain (goal - q), -1, 1); torque = kt (duty voltage - kt q') / resistance while enabled, else 0.
+    States are the angle q [rad], 0 hanging, and its rate qd [rad/s].
+    """
+
+    name = "servo"
+    says = "a position-controlled servo motor that carries a pendulum"
+    kind: ClassVar[Kind] = "rotary"
+    parameters = (
+        Parameter("torque_constant", "N*m/A", 0.5, (0.05, 3.0), (0.2, 1.0), says="torque of the motor per ampere"),
+        Parameter("resistance", "ohm", 4.0, (0.5, 20.0), (2.0, 8.0), says="resistance of the motor's winding"),
+        Parameter("armature", "kg*m^2", 2e-3, (1e-4, 0.05), (5e-4, 8e-3), says="inertia of motor and gears"),
+    )
+    constants = (
+        Constant("mass", "kg", 0.49, "load", positive=True),
+        Constant("length", "m", 0.1, "from the joint to the load", positive=True),
+        Constant("gravity", "m/s^2", 9.81, "downward"),
+        Constant("voltage", "V", 7.4, "supply", positive=True),
+        Constant("error_gain", "1/rad", 0.00287738, "duty per radian of error and unit of kp"),
+        Constant("kp", "1", 200.0, "firmware gain"),
+    )
+    inputs = (
+        Channel("goal", "rad", says="commanded angle"),
+        Channel("torque_enable", "1", says="1 while the motor is driven, 0 while it is free"),
+    )
+    channels = (Channel("q", "rad", says="angle, 0 when hanging"),)
+    coordinates = ("q",)
+    rates = ("qd",)
+    states: ClassVar[Mapping[str, float]] = MappingProxyType({"q": 0.0, "qd": 0.0})
+    sensed = ("q",)
+
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+        """(L, 1) kg m^2 about the joint."""
+        return theta[:, _ARMATURE] + constants["mass"] * constants["length"] ** 2
+
+    def weight(self, moment: Moment) -> Array:
+        """Gravity's torque."""
+        k = moment.constants
+        torque: Array = -k["mass"] * k["gravity"] * k["length"] * np.sin(moment.x)
+        return torque
+
+    def drive(self, moment: Moment) -> Array:
+        """The motor's torque, with its own back electromotive force."""
+        k, kt = moment.constants, moment.theta[:, _KT]
+        duty = np.minimum(np.maximum(k["kp"] * k["error_gain"] * (moment.inputs["goal"] - moment.x), -1.0), 1.0)
+        torque = kt * (duty * k["voltage"] - kt * moment.v) / moment.theta[:, _RESISTANCE]
+        return np.where(moment.inputs["torque_enable"] > 0.5, torque, 0.0)
+
+    def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
+        """The pendulum swings in the plane of x and the vertical."""
+        if axis == "y":
+            return np.zeros_like(moment.x)
+        torque: Array = moment.constants["mass"] * moment.constants["length"] * np.cos(moment.x)
+        return torque
+
+    def observe(self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]) -> dict[str, Array]:  # noqa: ARG002
+        """The encoder's angle."""
+        return {"q": x[:, :, 0]}

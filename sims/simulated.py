@@ -1,0 +1,230 @@
+"""A simulator made of a system, an engine and effects: again a simulator, which any tuner tunes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims import effects as library
+from sims.base import Array, InputError, Parameter, Scenario, Simulator
+from sims.engines import engine_named
+from sims.plan import Plan, acts, felt_inputs, make_plan, make_runs
+from sims.system import Acting, Contact, Effect, Engine, Force, Friction, Input, Lanes, Motion, Sensor, Signal, System
+
+
+class Simulated(Simulator):
+    """Base of the simulators of declared systems; a subclass names its `system`.
+
+    Args:
+        constants: values for `constants` other than their defaults.
+        observe: channels to return, in order (default: all).
+        engine: pybullet, mujoco or batch.
+        effects: effects whose coefficients are parameters, behind the system's own, in the order in which a signal
+            passes them.
+        fixed: effects with known coefficients: a number, or a list where an effect has several.
+        settings: the engine's own, e.g. ``time_step``.
+
+    Raises:
+        InputError: an unknown name, an effect that the system cannot have, an engine that cannot carry it.
+    """
+
+    system: ClassVar[type[System]]
+    default_engine: ClassVar[str] = "batch"
+
+    def __init__(
+        self,
+        constants: Mapping[str, float] | None = None,
+        observe: Sequence[str] | None = None,
+        *,
+        engine: str | None = None,
+        effects: Sequence[str] = (),
+        fixed: Mapping[str, float | Sequence[float]] | None = None,
+        **settings: Any,
+    ) -> None:
+        super().__init__(constants, observe)
+        self._declared = self.system()
+        self.engine = self._engine(engine, settings)
+        self.effects = [self._effect(name) for name in effects]
+        self.fixed = [(self._effect(name), _row(name, value)) for name, value in (fixed or {}).items()]
+        doubled = [name for name in effects if name in (fixed or {})] or [
+            n for n in effects if list(effects).count(n) > 1
+        ]
+        if doubled:
+            raise InputError(f"effect {doubled[0]} is named twice")
+        for effect, values in self.fixed:
+            there = [c.name for c in effect.on(self.system)]
+            if not 1 <= len(values) <= len(there):
+                raise InputError(
+                    f"effect {effect.name}: expected up to {len(there)} values ({', '.join(there)}), found {values}"
+                )
+        observed = [c.name for c in self.channels]
+        extra = tuple(p for effect in self.effects for p in effect_parameters(effect, self.system, observed))
+        self.parameters = (*self.system.parameters, *extra)
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        system = cls.system
+        cls.name, cls.says = system.name, system.says
+        cls.parameters, cls.channels, cls.constants = system.parameters, system.channels, system.constants
+        cls.inputs, cls.states = system.inputs, system.states
+
+    def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
+        return engine_named(name or self.default_engine, self.system, settings)
+
+    def _effect(self, name: str) -> Effect:
+        effect = library.get(name)
+        if reason := effect.misses(self.system):
+            raise InputError(f"system {self.system.name} cannot have effect {name}: {reason}")
+        return effect()
+
+    def simulate(self, theta: Array, scenario: Scenario) -> Array:
+        """Simulate each row of `theta` (n, dim) in one scenario; returns (n, T, C). See `Simulator.simulate`."""
+        return self.simulate_lanes(theta, [scenario] * len(theta))
+
+    def simulate_lanes(
+        self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array] | None = None
+    ) -> Array:
+        """Simulate each row of `theta` (L, dim) in its own scenario, all in one call of the engine.
+
+        Cheapest where lanes share scenario objects.
+
+        Args:
+            theta: physical parameters, then coefficients of effects.
+            scenarios: one a lane.
+            initial: initial states (L,) by name, in place of the scenarios' own.
+
+        Returns:
+            Observations (L, T, C), T that of the longest scenario; behind the end of a shorter one stand NaN.
+
+        Raises:
+            InputError: a wrong shape, or a scenario that names a constant, input or state that the system lacks.
+        """
+        theta = np.asarray(theta, dtype=np.float64)
+        if theta.ndim != 2 or theta.shape != (len(scenarios), len(self.parameters)):
+            expected = (len(scenarios), len(self.parameters))
+            raise InputError(f"theta must have shape {expected}, found {theta.shape}")
+        if not len(theta):
+            return np.empty((0, 0, len(self.channels)))
+        acting, runs = self._acting(theta), make_runs(scenarios)
+        commands = [self.run_inputs(s) for s in runs.distinct]
+        with np.errstate(all="ignore"):  # a lane whose numbers overflow is NaN in the end
+            plan = make_plan(runs, commands, _of(acting, (Input, Sensor)), self.engine.largest_step)
+            inputs = felt_inputs(plan, runs, commands, _of(acting, Input)) if self.inputs else {}
+            sensors = tuple((effect, c) for effect, c in _of(acting, Sensor) if c.any())
+            every = 1 if any(isinstance(effect, Sensor) and effect.filters for effect, _ in sensors) else plan.every
+            own = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
+            constants, x, v = self._known(scenarios, initial or {})
+            forces = _of(acting, (Force, Friction, Contact))
+            lanes = Lanes(self._declared, own, constants, x, v, plan.steps, inputs, forces, every)
+            observations = self._read(self.engine.integrate(lanes), lanes, plan, sensors)
+        sizes = np.array([s.times.size for s in runs.distinct])
+        if sizes.min() < sizes.max():
+            observations[np.arange(sizes.max()) >= sizes[runs.of, None]] = np.nan
+        return observations
+
+    def close(self) -> None:
+        """Give back what the engine holds."""
+        self.engine.close()
+
+    def _acting(self, theta: Array) -> Acting:
+        """Effects with their coefficients (K, L, 1): the tuned ones from `theta`, then the fixed ones.
+
+        Those that the system does not have, or that were not given, are zero.
+        """
+        acting, place = [], len(self.system.parameters)
+        for effect in self.effects:
+            count = len(effect.on(self.system))
+            acting.append((effect, _coefficients(effect, theta[:, place : place + count].T)))
+            place += count
+        for effect, values in self.fixed:
+            acting.append((effect, _coefficients(effect, np.repeat(np.array(values)[:, None], len(theta), axis=1))))
+        return tuple(acting)
+
+    def _known(
+        self, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
+    ) -> tuple[dict[str, Array], Array, Array]:
+        """Constants (L, 1) by name, initial positions and velocities (L, D)."""
+        place: dict[int, int] = {}
+        distinct: list[Scenario] = []
+        for scenario in scenarios:
+            if place.setdefault(id(scenario), len(distinct)) == len(distinct):
+                distinct.append(scenario)
+        of = np.array([place[id(scenario)] for scenario in scenarios])
+        known, began = [self.run_constants(s) for s in distinct], [self.run_initial(s) for s in distinct]
+        constants = {name: np.array([row[name] for row in known])[of, None] for name in known[0]}
+        states = {name: np.array([row[name] for row in began])[of] for name in began[0]}
+        states = self._checked("initial state", states, initial)
+        x, v = (
+            np.stack([np.broadcast_to(states[name], of.shape) for name in names], axis=1)
+            if names
+            else np.empty((len(of), 0))
+            for names in (self.system.coordinates, self.system.rates)
+        )
+        return constants, x, v
+
+    def _read(self, motion: Motion, lanes: Lanes, plan: Plan, sensors: Acting) -> Array:
+        """What the sensors record: (L, T, C)."""
+        channels = self._declared.observe(motion.x, motion.v, motion.a, lanes.constants)
+        names = [c.name for c in self.channels]
+        valued = self.system.reading(names)
+        times = _kept(plan, lanes.every)
+        rows = plan.rows * (plan.every // lanes.every)
+        observations = np.empty((*rows.shape, len(names)))
+        for place, name in enumerate(names):
+            values, start = channels[name], channels[name][:, :1]
+            for effect, c in sensors:
+                assert isinstance(effect, Sensor)
+                if effect.filters or name == valued:
+                    begun = effect.read(c, Signal(start, np.zeros_like(start), start, np.zeros_like(start)))
+                    read = effect.read(c, Signal(values, np.diff(times, axis=1, prepend=0.0), start, times))
+                    values, start = np.where(acts(c), read, values), np.where(acts(c), begun, start)
+            observations[:, :, place] = _chosen(values, rows)
+        observations += 0.0  # no zero is negative: whatever made it, it is the same zero
+        return observations
+
+
+def _kept(plan: Plan, every: int) -> Array:
+    """(L, R) instants of the states that an engine keeps, in seconds since the start."""
+    return np.concatenate([np.zeros((len(plan.ends), 1)), plan.ends[:, every - 1 :: every]], axis=1)
+
+
+def _chosen(values: Array, rows: NDArray[np.intp]) -> Array:
+    """values[l, rows[l, t]], without a copy where all of the first values are chosen."""
+    if (rows[:1] == np.arange(rows.shape[1])).all() and (rows.strides[0] == 0 or (rows == rows[:1]).all()):
+        return values[:, : rows.shape[1]]
+    chosen: Array = np.take_along_axis(values, rows, axis=1)
+    return chosen
+
+
+def effect_parameters(
+    effect: Effect | type[Effect], system: type[System], observed: Sequence[str] = ()
+) -> tuple[Parameter, ...]:
+    """The coefficients of an effect as parameters, named for the effect and searched in their plausible range."""
+    result, there = [], effect.on(system)
+    for c in there:
+        name = effect.name if len(there) == 1 else f"{effect.name}.{c.name}"
+        low, high = c.range(system.kind)
+        unit = c.unit_on(system, observed) or ""
+        result.append(Parameter(name, unit, min(max(0.0, low), high), (low, high), says=effect.says))
+    return tuple(result)
+
+
+def _row(name: str, value: float | Sequence[float]) -> tuple[float, ...]:
+    values = tuple(float(v) for v in value) if isinstance(value, Sequence) else (float(value),)
+    if not np.isfinite(values).all():
+        raise InputError(f"effect {name}: expected finite coefficients, found {value}")
+    return values
+
+
+def _coefficients(effect: Effect, rows: Array) -> Array:
+    """`rows` (k, L) as (K, L, 1), the coefficients behind the first k zero."""
+    result = np.zeros((len(effect.coefficients), rows.shape[1], 1))
+    result[: len(rows), :, 0] = rows
+    return result
+
+
+def _of(acting: Acting, kind: Any) -> Acting:
+    return tuple((effect, c) for effect, c in acting if isinstance(effect, kind))

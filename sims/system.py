@@ -1,0 +1,404 @@
+"""What a system is, what an effect gives to it, what an engine integrates: the seam between the three.
+
+A *system* is declared once (`System`): names, units, and its generalised forces as array functions. An *engine*
+integrates it (`Engine`), many lanes at once. An *effect* (`Effect`) adds one contribution through one hook. None of
+them knows the others' insides: they meet in `Moment`, the instant at which forces are asked for, and in `Lanes`, the
+work for an engine.
+
+Shapes: L lanes (a parameter vector in a run), D coordinates, S steps, K coefficients. Per-lane numbers are (L, 1), so
+that they multiply generalised vectors (L, D) as they stand.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import takewhile
+from typing import ClassVar, Literal, Protocol
+
+import numpy as np
+
+from sims.base import Array, Channel, Constant, Parameter
+
+Kind = Literal["point", "linear", "rotary"]
+"""How a system counts force: `point` per unit mass (m/s^2), `linear` in N, `rotary` in N*m."""
+KINDS: tuple[Kind, ...] = ("point", "linear", "rotary")
+STANDARD_GRAVITY = 9.80665
+
+
+@dataclass
+class Moment:
+    """One instant of every lane, as effects see it.
+
+    Attributes:
+        system: whose moment it is.
+        theta: (L, p) the system's own parameters.
+        constants: known numbers of each lane, (L, 1) by name.
+        t: (L, 1) seconds since the start of the run.
+        x: (L, D) generalised position.
+        v: (L, D) generalised velocity.
+        inputs: inputs as the plant feels them, (L, 1) by name.
+    """
+
+    system: System
+    theta: Array
+    constants: Mapping[str, Array]
+    t: Array
+    x: Array
+    v: Array
+    inputs: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def speed(self) -> Array:
+        """(L, 1) magnitude of the velocity."""
+        if self.v.shape[1] == 1:
+            return np.abs(self.v)
+        speed: Array = np.sqrt((self.v * self.v).sum(axis=1, keepdims=True))
+        return speed
+
+    @property
+    def gravity(self) -> Array:
+        """(L, 1) m/s^2; the standard value where the system states none."""
+        return self.constants.get("gravity", np.full((len(self.x), 1), STANDARD_GRAVITY))
+
+    @property
+    def weight(self) -> Array:
+        """(L, D) generalised force of gravity."""
+        return self.system.weight(self)
+
+    def push(self, axis: Literal["x", "y"]) -> Array:
+        """(L, D) generalised force of one m/s^2 of horizontal acceleration of everything, along `axis`."""
+        return self.system.push(self, axis)
+
+    @property
+    def load(self) -> Array:
+        """(L, 1) what a transmission carries: the drive from one side plus what it works against from the other."""
+        load: Array = np.abs(self.system.drive(self) + self.system.passive(self)).sum(axis=1, keepdims=True)
+        return load
+
+    @property
+    def primary(self) -> Array:
+        """(L, 1) the coordinate that biases, springs and ripples act on."""
+        return self.x[:, self.system.primary, None]
+
+    def along_primary(self, force: Array) -> Array:
+        """(L, D) generalised force: `force` (L, 1) along the primary coordinate, zero along the others."""
+        result = np.zeros_like(self.x)
+        result[:, self.system.primary] = force[:, 0]
+        return result
+
+
+class System(ABC):
+    """A physical system, declared once for every engine.
+
+    Attributes:
+        kind: how it counts force.
+        parameters: what may be tuned.
+        constants: known numbers with their defaults.
+        inputs: signals it takes; effects on the input act on the first.
+        channels: what its sensors can give; effects on a sensor's value act on the first one observed of `sensed`.
+        coordinates: state names of the generalised position, in order.
+        rates: state names of the generalised velocity, in order.
+        states: defaults of both.
+        bounces: whether its last coordinate strikes ground at `floor`.
+        sensed: channels that sensor effects may act on, in order of preference.
+        primary: index of the coordinate that biases and springs act on.
+        uniform: whether its own force is the same everywhere and always, so that it moves along parabolas.
+    """
+
+    name: ClassVar[str]
+    says: ClassVar[str]
+    kind: ClassVar[Kind]
+    parameters: ClassVar[tuple[Parameter, ...]]
+    constants: ClassVar[tuple[Constant, ...]] = ()
+    inputs: ClassVar[tuple[Channel, ...]] = ()
+    channels: ClassVar[tuple[Channel, ...]]
+    coordinates: ClassVar[tuple[str, ...]]
+    rates: ClassVar[tuple[str, ...]]
+    states: ClassVar[Mapping[str, float]]
+    sensed: ClassVar[tuple[str, ...]]
+    primary: ClassVar[int] = 0
+    bounces: ClassVar[bool] = False
+    uniform: ClassVar[bool] = False
+
+    @classmethod
+    def reading(cls, observed: Sequence[str]) -> str:
+        """The channel among those `observed` whose value sensor effects act on."""
+        return next((name for name in cls.sensed if name in observed), observed[0])
+
+    @classmethod
+    def refuses(cls, effect: type[Effect]) -> str:  # noqa: ARG003
+        """Why it cannot have an effect although it has all that the effect `needs`; empty if it can."""
+        return ""
+
+    @abstractmethod
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+        """(L, 1) generalised inertia; 1 for a system that counts force per unit mass."""
+
+    @abstractmethod
+    def weight(self, moment: Moment) -> Array:
+        """(L, D) generalised force of gravity."""
+
+    def drive(self, moment: Moment) -> Array:
+        """(L, D) generalised force of the inputs, through the actuator."""
+        return np.zeros_like(moment.x)
+
+    def passive(self, moment: Moment) -> Array:
+        """(L, D) minus every generalised force of the system that is not the drive: what the drive works against."""
+        return -self.weight(moment)
+
+    def force(self, moment: Moment) -> Array:
+        """(L, D) generalised force of the system itself, without effects: what engines integrate."""
+        return self.drive(moment) - self.passive(moment)
+
+    def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
+        """(L, D) generalised force of one m/s^2 of horizontal acceleration along `axis`; zero where it has none."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def observe(self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]) -> dict[str, Array]:
+        """Channels (L, S) by name from positions, velocities, accelerations (L, S, D); constants are (L, 1)."""
+
+    def floor(self, constants: Mapping[str, Array]) -> Array:
+        """(L, 1) value of the last coordinate at which it strikes the ground."""
+        raise NotImplementedError
+
+    def restitution(self, theta: Array) -> Array:
+        """(L, 1) restitution at an impact."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """A number of an effect, zero where the effect is off.
+
+    Attributes:
+        name: ``coefficient`` where the effect has only one.
+        units: for a point (per unit mass), linear and rotary system; None where the effect does not exist there.
+        plausible: the range one would expect, in the same order.
+        of: whose unit it has where `units` are only the usual ones: ``input`` the first input's, ``reading`` that of
+            the channel it acts on, ``reading/s`` the same per second.
+    """
+
+    name: str
+    units: tuple[str | None, str | None, str | None]
+    plausible: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+    of: Literal["", "input", "reading", "reading/s"] = ""
+
+    def unit(self, kind: Kind) -> str | None:
+        """The unit on systems of this kind; None where the effect does not exist there."""
+        return self.units[KINDS.index(kind)]
+
+    def unit_on(self, system: System | type[System], observed: Sequence[str] = ()) -> str | None:
+        """The unit on this system, of whose channels those named `observed` are recorded (default: all)."""
+        if self.of == "input" and system.inputs:
+            return system.inputs[0].unit
+        if self.of.startswith("reading"):
+            units = {channel.name: channel.unit for channel in system.channels}
+            return self.of.replace("reading", units[system.reading(observed or tuple(units))])
+        return self.unit(system.kind)
+
+    def range(self, kind: Kind) -> tuple[float, float]:
+        """The plausible range on systems of this kind."""
+        return self.plausible[KINDS.index(kind)]
+
+
+class Effect(ABC):
+    """One physical cause that a simulator may lack. Subclass one of the hooks below, not this.
+
+    A coefficient vector `c` comes as (K, L, 1): ``c[0]`` is the first coefficient of every lane.
+
+    Attributes:
+        name: ``family.form``.
+        says: one sentence that a person understands, as the end of "the data say that ...".
+        source: where the law stands.
+        coefficients: its numbers; all zero is off, and must change nothing, bit for bit. Those that a kind of system
+            does not have come last and stay zero there; a kind that lacks the first lacks the effect.
+        needs: what the system must have: ``input``; ``ground`` to strike; ``guide``, which a body that flies freely
+            lacks; ``gravity``; ``push``, a say in what horizontal acceleration does to it; ``space`` of three
+            dimensions; or empty.
+        hook: which of the engine's hooks it uses; set by the hook classes.
+    """
+
+    name: ClassVar[str]
+    says: ClassVar[str]
+    source: ClassVar[str] = ""
+    coefficients: ClassVar[tuple[Coefficient, ...]]
+    needs: ClassVar[str] = ""
+    hook: ClassVar[str]
+
+    @classmethod
+    def fits(cls, system: System | type[System]) -> bool:
+        """Whether the system can have this effect."""
+        return not cls.misses(system)
+
+    @classmethod
+    def misses(cls, system: System | type[System]) -> str:
+        """What keeps the system from having this effect; empty if it can have it."""
+        declared = system if isinstance(system, type) else type(system)
+        lacks = {
+            "": "",
+            "input": "" if system.inputs else "it has no input",
+            "ground": "" if system.bounces else "it meets no ground",
+            "guide": "it flies freely" if system.bounces else "",
+            "gravity": "" if any(c.name == "gravity" for c in system.constants) else "it states no gravity",
+            "push": "it does not say what horizontal acceleration does" if declared.push is System.push else "",
+            "space": "" if len(system.coordinates) == 3 else "it does not move in three dimensions",
+        }[cls.needs]
+        undefined = "" if cls.on(system) else f"it is not defined for a {system.kind} system"
+        return lacks or undefined or system.refuses(cls)
+
+    @classmethod
+    def on(cls, system: System | type[System]) -> tuple[Coefficient, ...]:
+        """The coefficients that the effect has on this system."""
+        return tuple(takewhile(lambda c: c.unit(system.kind) is not None, cls.coefficients))
+
+
+class Force(Effect):
+    """A generalised force, added to the others."""
+
+    hook = "force"
+
+    @abstractmethod
+    def force(self, c: Array, moment: Moment) -> Array:
+        """(L, D) generalised force."""
+
+
+class Friction(Effect):
+    """Dry friction: opposes motion with at most `limit`, and holds still at rest what pulls less than that.
+
+    Engines add up the limits of all frictions and apply one force against the motion.
+    """
+
+    hook = "force"
+
+    @abstractmethod
+    def limit(self, c: Array, moment: Moment) -> Array:
+        """(L, 1) largest force, >= 0."""
+
+
+class Contact(Effect):
+    """A change to what happens at an impact with the ground."""
+
+    hook = "contact"
+
+    def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:  # noqa: ARG002
+        """(L, 1) restitution from what it would be, and the impact speed (L, 1) >= 0 in m/s."""
+        return restitution
+
+    def friction(self, c: Array) -> Array:
+        """(L, 1) friction coefficient: tangential speed lost is this times (1 + e) |vn|, never more than there is."""
+        return np.zeros_like(c[0])
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A signal on the steps of an integration.
+
+    Attributes:
+        values: (L, S); for an input the constant value over each step, for a reading the value at its end.
+        steps: (L, S) lengths of the steps, seconds; zero where a lane waits.
+        start: (L, 1) value before the first step.
+        times: (L, S) seconds since the start of the run, at the end of each step.
+    """
+
+    values: Array
+    steps: Array
+    start: Array
+    times: Array
+
+
+class Input(Effect):
+    """The first input as the plant feels it. Several are applied in the order of `bench` and the command line."""
+
+    hook = "input"
+    needs = "input"
+
+    def times(self, c: Array, t: Array) -> Array:  # noqa: ARG002
+        """The instants (L, S) of the commanded signal that are felt at instants t (L, S)."""
+        return t
+
+    def feel(self, c: Array, signal: Signal) -> Array:  # noqa: ARG002
+        """(L, S) felt values over the steps."""
+        return signal.values
+
+
+class Sensor(Effect):
+    """The observation as recorded."""
+
+    hook = "sensor"
+    filters: ClassVar[bool] = False
+    """Whether `read` must see every step of the integration rather than the samples alone."""
+
+    def times(self, c: Array, t: Array) -> Array:  # noqa: ARG002
+        """The instants (L, T) at which the world is really sampled, for recorded time stamps t since the start."""
+        return t
+
+    def read(self, c: Array, signal: Signal) -> Array:  # noqa: ARG002
+        """(L, S) recorded values."""
+        return signal.values
+
+
+Acting = tuple[tuple[Effect, Array], ...]
+"""Effects with their coefficients (K, L, 1)."""
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """Work for an engine.
+
+    Attributes:
+        system: what to integrate.
+        theta: (L, p) the system's parameters.
+        constants: (L, 1) by name.
+        x: (L, D) initial position.
+        v: (L, D) initial velocity.
+        steps: (L, S) step lengths in seconds; zero where a lane has nothing more to do.
+        inputs: felt inputs (L, S) by name, constant over each step.
+        effects: forces, frictions and contacts; inputs and sensors are dealt with outside the engine.
+        every: keep the state after every this many steps (and the initial one).
+    """
+
+    system: System
+    theta: Array
+    constants: Mapping[str, Array]
+    x: Array
+    v: Array
+    steps: Array
+    inputs: Mapping[str, Array]
+    effects: Acting
+    every: int = 1
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What an engine gives back: positions, velocities, accelerations (L, S // every + 1, D).
+
+    The acceleration is that of the smooth motion (an impact's shock is not in it). A lane that failed is NaN.
+    """
+
+    x: Array
+    v: Array
+    a: Array
+
+
+class Engine(Protocol):
+    """Integrates lanes."""
+
+    name: str
+    requires: tuple[str, ...]
+    largest_step: float
+    """Seconds; the plan divides sampling intervals into steps not longer than this."""
+
+    def integrate(self, lanes: Lanes) -> Motion:
+        """Integrate every lane over its steps."""
+        ...
+
+    def refuses(self, system: type[System]) -> str:
+        """Why this engine cannot carry the system; empty if it can."""
+        ...
+
+    def close(self) -> None:
+        """Give back worlds."""
+        ...

@@ -1,0 +1,303 @@
+"""Every check has a subject that breaks exactly what it checks, and a sound one that passes them all."""
+
+import random
+
+import numpy as np
+import pytest
+
+from bench.checks import EFFECT_CHECKS, SIMULATOR_CHECKS, TUNER_CHECKS, CheckError, simulators, tuners
+from methods.base import Ask, Tuner
+from sims.base import Channel, Constant, Parameter, Simulator
+from sims.system import Coefficient, Force
+from tests.conftest import PLUGINS
+
+
+class Sound(Tuner):
+    """Shrinks a cloud around the best point."""
+
+    def tune(self, task, rng):
+        best, best_loss, width = task.start, np.inf, 0.3
+        while True:
+            seen = yield np.clip(best + width * rng.normal(size=(3, task.dim)), 0, 1)
+            if seen.losses.min() < best_loss:
+                best, best_loss = seen.proposals[seen.losses.argmin()], seen.losses.min()
+            width *= 0.9
+
+
+class OneDimensional(Sound):
+    def tune(self, task, rng):
+        while True:
+            yield np.array([float(np.asarray(task.start).item())])
+
+
+class ChokesOnSmallBudgets(Sound):
+    def tune(self, task, rng):
+        if task.budget < 5:
+            raise ValueError("needs five")
+        yield from super().tune(task, rng)
+
+
+class LeavesTheCube(Sound):
+    def tune(self, task, rng):
+        yield Ask(task.start, recommend=task.start + 2.0)
+        yield from super().tune(task, rng)
+
+
+class DrawsGlobally(Sound):
+    def tune(self, task, rng):
+        while True:
+            yield np.random.uniform(size=(1, task.dim))  # noqa: NPY002
+
+
+class Remembers(Sound):
+    def __init__(self):
+        self.best = None
+
+    def tune(self, task, rng):
+        self.best = task.start * 0.5 if self.best is not None else task.start
+        while True:
+            yield self.best
+
+
+class SeedsGlobally(Sound):
+    def tune(self, task, rng):
+        random.seed(0)
+        yield from super().tune(task, rng)
+
+
+class CallsItselfDeterministic(Sound):
+    stochastic = False
+
+
+class ChokesOnFailures(Sound):
+    def tune(self, task, rng):
+        seen = yield task.start
+        while True:
+            seen = yield np.clip(task.start + rng.normal(size=task.dim) * (1 + seen.losses.min() * 0), 0, 1)
+
+
+class NeverBetter(Sound):
+    def tune(self, task, rng):
+        while True:
+            yield Ask(rng.uniform(size=(1, task.dim)), recommend=task.start)
+
+
+class ForgetsWhatItLearned(Sound):
+    learned = True
+
+    def fit(self, simulator, rng, budget):
+        self.weights = {"shift": np.full(simulator.dim, 0.1)}
+
+    def state(self):
+        return {"shift": np.zeros(2)}
+
+    def restore(self, state):
+        self.weights = state
+
+    def tune(self, task, rng):
+        while True:
+            yield np.clip(task.start + self.weights["shift"], 0, 1)
+
+
+class HoldsAFunction(Sound):
+    def __init__(self):
+        self.helper = lambda x: x
+
+
+BROKEN_TUNERS = {
+    "check_runs_in_one_and_in_ten_dimensions": OneDimensional,
+    "check_budget_is_exact": ChokesOnSmallBudgets,
+    "check_proposals_stay_in_the_unit_cube": LeavesTheCube,
+    "check_same_seed_gives_the_same_run": DrawsGlobally,
+    "check_runs_do_not_touch_each_other": Remembers,
+    "check_global_random_state_is_left_alone": SeedsGlobally,
+    "check_stochastic_is_declared": CallsItselfDeterministic,
+    "check_failed_simulations_are_survived": ChokesOnFailures,
+    "check_easy_problem_is_improved": NeverBetter,
+    "check_what_was_learned_can_be_stored": ForgetsWhatItLearned,
+    "check_instances_can_be_sent_to_workers": HoldsAFunction,
+}
+
+
+@pytest.mark.parametrize("check", TUNER_CHECKS, ids=lambda check: check.__name__)
+def test_tuner_check_rejects_its_broken_subject_and_no_sound_one(check):
+    check(Sound)
+    with pytest.raises(CheckError, match=r"(?s)expected .*; found .*; see "):
+        check(BROKEN_TUNERS[check.__name__])
+
+
+def test_training_outside_the_training_range_or_beyond_the_budget_is_rejected():
+    class Greedy(Sound):
+        learned = True
+
+        def fit(self, simulator, rng, budget):
+            simulator.simulate(rng, np.full((1, simulator.dim), 0.9))
+
+    with pytest.raises(CheckError, match="training range"):
+        tuners.check_budget_is_exact(Greedy)
+
+
+class Wave(Simulator):
+    """A sound simulator."""
+
+    name, says = "wave", "a wave"
+    parameters = (Parameter("rate", "rad/s", 3.0, (1.0, 5.0)), Parameter("height", "m", 1.0, (0.5, 2.0)))
+    channels = (Channel("x", "m"), Channel("v", "m/s"))
+    constants = (Constant("shift", "m", 0.0),)
+
+    def simulate(self, theta, scenario):
+        self.run_inputs(scenario), self.run_initial(scenario)
+        shift, t = self.run_constants(scenario)["shift"], scenario.times
+        wave = np.stack([np.sin(theta[:, :1] * t), np.cos(theta[:, :1] * t)], axis=2)
+        return (shift + theta[:, 1:, None] * wave)[:, :, self.columns]
+
+
+class NoUnit(Wave):
+    channels = (Channel("x", ""), Channel("v", "m/s"))
+
+
+class WrongShape(Wave):
+    def simulate(self, theta, scenario):
+        return super().simulate(theta, scenario)[:, :, 0]
+
+
+class WarmStarted(Wave):
+    calls = 0
+
+    def simulate(self, theta, scenario):
+        self.calls += 1
+        return super().simulate(theta, scenario) * (1.0 + 1e-15 * (self.calls > 1))
+
+
+class Clobbers(Wave):
+    def simulate(self, theta, scenario):
+        result = super().simulate(theta, scenario)
+        theta[:] = 0.0
+        return result
+
+
+class SpoilsNeighbours(Wave):
+    def simulate(self, theta, scenario):
+        return super().simulate(theta, scenario) + 0.0 * theta.sum()
+
+
+class IgnoresHeight(Wave):
+    def simulate(self, theta, scenario):
+        return super().simulate(np.column_stack([theta[:, 0], np.where(np.isnan(theta[:, 1]), np.nan, 1.0)]), scenario)
+
+
+class TakesAnything(Wave):
+    def run_inputs(self, scenario):
+        return {}
+
+
+class WrongColumns(Wave):
+    def simulate(self, theta, scenario):
+        return np.sort(super().simulate(theta, scenario), axis=2)
+
+
+BROKEN_SIMULATORS = {
+    "check_declaration_is_complete": NoUnit,
+    "check_observations_have_the_declared_shape": WrongShape,
+    "check_same_proposal_gives_the_same_bits": WarmStarted,
+    "check_arguments_are_not_changed": Clobbers,
+    "check_parameters_that_are_not_numbers_spoil_only_their_lane": SpoilsNeighbours,
+    "check_every_parameter_shows": IgnoresHeight,
+    "check_unknown_names_are_refused": TakesAnything,
+    "check_chosen_channels_are_the_same_columns": WrongColumns,
+}
+
+
+@pytest.mark.parametrize("check", SIMULATOR_CHECKS, ids=lambda check: check.__name__)
+def test_simulator_check_rejects_its_broken_subject_and_no_sound_one(check):
+    check(Wave)
+    with pytest.raises(CheckError, match=r"(?s)expected .*; found .*; see "):
+        check(BROKEN_SIMULATORS[check.__name__])
+
+
+def test_the_test_simulator_conforms(spring):
+    for check in SIMULATOR_CHECKS:
+        if check is not simulators.check_unknown_names_are_refused:  # it takes neither inputs nor constants
+            check(spring)
+
+
+def test_awkward_tuners_do_not_conform():
+    from bench.registry import load_plugins
+    from bench.registry import tuners as registered
+
+    load_plugins([PLUGINS / "awkward.py"])
+    with pytest.raises(CheckError, match="boom"):
+        tuners.check_runs_in_one_and_in_ten_dimensions(registered.get("crashing"))
+    with pytest.raises(CheckError, match="not finite"):
+        tuners.check_runs_in_one_and_in_ten_dimensions(registered.get("nan_proposing"))
+
+
+class Breeze(Force):
+    """A sound effect."""
+
+    name, says, source = "breeze.sound", "a breeze pushes along the track", "any textbook"
+    coefficients = (Coefficient("coefficient", ("m/s^2", "N", "N*m"), ((-1, 2), (-1, 2), (-0.1, 0.2))),)
+
+    def force(self, c, moment):
+        return c[0] + 0.0 * moment.x
+
+
+class Nameless(Breeze):
+    name, says = "breeze.nameless", ""
+
+
+class NeverOff(Breeze):
+    name = "breeze.never_off"
+
+    def force(self, c, moment):
+        return c[0] + 1e-9 + 0.0 * moment.x
+
+
+class NeverOn(Breeze):
+    name = "breeze.never_on"
+
+    def force(self, c, moment):
+        return 0.0 * c[0] * moment.x
+
+
+class Mixes(Breeze):
+    name = "breeze.mixes"
+
+    def force(self, c, moment):
+        return c[0].mean() * (c[0] != 0) + 0.0 * moment.x
+
+
+class Elsewhere(Breeze):
+    name = "breeze.elsewhere"
+    needs = "input"
+
+    @classmethod
+    def misses(cls, system):
+        return "says no, and yes" if cls.asked else ""
+
+    asked = False
+
+
+BROKEN_EFFECTS = {
+    "check_declaration_is_complete": Nameless,
+    "check_contribution_is_nothing_at_zero": NeverOff,
+    "check_it_shows_and_stays_finite": NeverOn,
+    "check_lanes_are_independent": Mixes,
+    "check_impossible_hosts_are_refused": Elsewhere,
+}
+
+
+@pytest.mark.parametrize("check", EFFECT_CHECKS, ids=lambda check: check.__name__)
+def test_effect_check_rejects_its_broken_subject_and_no_sound_one(check, monkeypatch):
+    from sims import effects
+
+    monkeypatch.setattr(effects, "_from_files", {})
+    check(Breeze)
+    broken = BROKEN_EFFECTS[check.__name__]
+    if broken is Elsewhere:
+        from sims.simulated import Simulated
+
+        broken.asked = True
+        monkeypatch.setattr(Simulated, "_effect", lambda self, name: effects.get(name)())
+    with pytest.raises(CheckError, match=r"(?s)expected .*; found .*; see "):
+        check(broken)

@@ -1,0 +1,32 @@
+"""The conformance suites over everything registered: to register is to be tested."""
+
+import pytest
+
+from bench.checks import EFFECT_CHECKS, SIMULATOR_CHECKS, TUNER_CHECKS
+from bench.registry import SkippedError, simulators, tuners
+from sims import effects
+
+
+def subject(registry, name):
+    try:
+        return registry.get(name)
+    except SkippedError as reason:
+        pytest.skip(f"{name}: {reason}")
+
+
+@pytest.mark.parametrize("check", TUNER_CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("name", tuners.names())
+def test_tuner(name, check):
+    check(subject(tuners, name))
+
+
+@pytest.mark.parametrize("check", SIMULATOR_CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("name", simulators.names())
+def test_simulator(name, check):
+    check(subject(simulators, name))
+
+
+@pytest.mark.parametrize("check", EFFECT_CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("name", effects.names())
+def test_effect(name, check):
+    check(effects.get(name))

@@ -1,0 +1,21 @@
+"""A small experiment on the test simulator."""
+
+from bench.experiment import parse
+
+SPRING = {
+    "simulator": "spring",
+    "observe": ["x"],
+    "targets": 4,
+    "seeds": 2,
+    "budget": 12,
+    "timeout": 60,
+    "sampling": {"rate": 20.0, "samples": 60},
+    "initial": {"x": [0.8, 1.2]},
+    "tuners": {"random": {}},
+}
+
+
+def spring_experiment(path="spring-test.toml", **changes):
+    from pathlib import Path
+
+    return parse("spring-test", {**SPRING, **changes}, Path(path))

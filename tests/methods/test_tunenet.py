@@ -1,0 +1,317 @@
+import sys
+
+import numpy as np
+import pytest
+
+from bench.drive import drive
+from methods.base import Array, BudgetExceededError, Task
+from methods.pair_inputs import resample, roughness, weighed_inputs
+from methods.pair_network import PUBLISHED, Design, estimate, train
+from methods.tunenet import TuneNet, _Search
+
+TRAINING = {1: np.array([[0.3], [0.7]]), 2: np.array([[0.3, 0.2], [0.7, 0.6]])}
+
+
+def swing(points: Array, amplitude: float, samples: int = 60) -> Array:
+    """A damped oscillation and its rate, two channels: damping and, with two parameters, frequency."""
+    t = np.linspace(0.0, 6.0, samples)
+    damping = 0.1 + 0.9 * points[:, :1]
+    frequency = 2.0 + (points[:, 1:2] if points.shape[1] > 1 else 0.0)
+    q = amplitude * np.exp(-damping * t) * np.cos(frequency * t)
+    return np.stack([q, np.gradient(q, t, axis=1)], axis=2)
+
+
+class Toy:
+    """A `Practice` that holds its users to the fence and the budget."""
+
+    def __init__(self, dim: int = 1, budget: int = 10_000, runs: int = 1) -> None:
+        self.dim, self.budget, self.used, self.runs = dim, budget, 0, runs
+        self.training, self.scale, self.lengths = TRAINING[dim], np.ones(2), (60,) * runs
+        self.calls: list[int] = []
+
+    def sample(self, rng, n):
+        return rng.uniform(*self.training, size=(n, self.dim))
+
+    def scenario(self, rng):
+        return rng.uniform(1.0, 2.0, size=self.runs)
+
+    def observe(self, points, scenario):
+        return np.concatenate([swing(points, amplitude) for amplitude in scenario], axis=1)
+
+    def simulate(self, rng, points):
+        assert (points >= self.training[0]).all()
+        assert (points <= self.training[1]).all()
+        self.calls.append(len(points))
+        self.used += len(points)
+        if self.used > self.budget:
+            raise BudgetExceededError
+        return self.observe(points, self.scenario(rng))
+
+
+def run(tuner, toy, seed, wide=False, budget=10, spoil=None):
+    """Trace of one target and its truth."""
+    rng = np.random.default_rng(seed)
+    low, high = (np.zeros(toy.dim), np.ones(toy.dim)) if wide else toy.training
+    start, truth, scenario = rng.uniform(low, high), rng.uniform(low, high), toy.scenario(rng)
+    observed = toy.observe(truth[None], scenario)[0]
+    if spoil is not None:
+        spoil(observed)
+    task = Task(toy.dim, start, observed, toy.scale, toy.training, budget, toy.lengths)
+
+    def evaluate(points):
+        seen = toy.observe(points, scenario)
+        return seen, np.sqrt(np.nanmean((seen - observed) ** 2, axis=(1, 2)))
+
+    trace = drive(tuner, task, evaluate, rng)
+    assert trace.status in ("done", "converged"), trace.reason
+    return trace, truth
+
+
+def errors(tuner, toy, seeds=range(20), **kwargs):
+    """Mean absolute error after each simulation, (budget + 1,)."""
+    rows = []
+    for seed in seeds:
+        trace, truth = run(tuner, toy, seed, **kwargs)
+        row = np.abs(trace.recommendations - truth).mean(axis=1)
+        rows.append(np.append(row, np.full(11 - len(row), row[-1])))
+    return np.mean(rows, axis=0)
+
+
+def trained(toy, seed=0, **options):
+    tuner = TuneNet(**{"scenarios": 40, "points": 60, "epochs": 100, **options})
+    tuner.fit(toy, np.random.default_rng(seed), toy.budget)
+    return tuner
+
+
+@pytest.fixture(scope="module")
+def one():
+    return trained(Toy())
+
+
+@pytest.fixture(scope="module")
+def two():
+    return trained(Toy(2, runs=3), scenarios=80)
+
+
+def test_error_falls_in_range(one):
+    error = errors(one, Toy())
+    assert error[0] > 0.1
+    assert error[1] < 5e-3
+    assert error[3] < 1e-6
+    assert error[10] < 1e-9
+
+
+def test_error_falls_outside_the_training_range(one):
+    error = errors(one, Toy(), wide=True)
+    assert error[1] < 0.1
+    assert error[10] < 1e-6
+
+
+def test_two_parameters_three_runs_two_channels(two):
+    error = errors(two, Toy(2, runs=3))
+    assert error[1] < 0.02
+    assert error[3] < 2e-3
+    assert error[10] < 1e-7
+
+
+def test_missing_samples_leave_the_truth_where_it_was(two):
+    def spoil(observed):
+        observed[10:20] = np.nan
+        observed[60:120, 1] = np.nan  # one channel of one run is not there at all
+
+    assert errors(two, Toy(2, runs=3), seeds=range(10), spoil=spoil)[10] < 1e-6
+
+
+def test_a_noisy_target_is_left_to_the_network_that_knows_noise(one):
+    noise = np.random.default_rng(3)
+
+    def spoil(observed):
+        observed += 0.01 * noise.standard_normal(observed.shape)
+
+    assert errors(one, Toy(), spoil=spoil)[10] < 0.01
+    task = Task(1, np.zeros(1), swing(np.full((1, 1), 0.9), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,))
+    assert one._fitted.suited(task) is one._fitted.clean
+    spoil(task.observed)
+    assert one._fitted.suited(task) is one._fitted.noisy
+
+
+def test_roughness_is_the_noise_and_sees_no_motion():
+    t = np.linspace(0.0, 6.0, 2000)
+    smooth = np.stack([np.sin(t), t**2], axis=1)[None]
+    assert roughness(smooth, (1000, 1000)).max() < 1e-7
+    rough = smooth + np.array([0.01, 0.3]) * np.random.default_rng(0).standard_normal(smooth.shape)
+    rough[0, 5:50] = np.nan
+    share = roughness(rough, (1000, 1000))[0] / [0.01, 0.3]  # the calmest of eight parts is a little calmer
+    assert ((share > 0.75) & (share < 1.0)).all()
+    assert (roughness(np.full((1, 9, 1), np.nan), (3, 6)) == 0.0).all()
+
+
+def test_same_observation_means_no_difference(one):
+    fitted = one._fitted.clean
+    seen = fitted.rows(Toy().simulate(np.random.default_rng(0), np.full((3, 1), 0.5)), (60,))
+    assert (fitted.difference(seen, seen) == 0.0).all()
+    assert (fitted.difference(seen[0], seen[0] + 1.0) == -fitted.difference(seen[0] + 1.0, seen[0])).all()
+
+
+def test_recommends_its_newest_guess(one):
+    trace, _ = run(one, Toy(), 1, budget=3)
+    assert (trace.recommendations[:3] == trace.proposals).all()
+    assert len(trace.recommendations) == 4
+
+
+def test_published_network_has_the_published_size():
+    tuner = TuneNet(published=True)
+    toy = Toy(runs=1)
+    toy.observe = lambda points, scenario: swing(points, scenario[0], samples=400)[:, :, :1]
+    toy.lengths = (400,)
+    tuner.fit(toy, np.random.default_rng(0), 40)
+    weights = tuner._fitted.clean.weights
+    assert {name: w.shape for name, w in weights.items() if name.endswith("weight")} == {
+        "proposed.weight": (400, 32),
+        "target.weight": (400, 32),
+        "joined.weight": (64, 32),
+        "output.weight": (32, 1),
+    }
+    assert sum(w.size for w in weights.values()) == 27_777
+    assert toy.calls == [2] * 20
+    assert tuner._fitted.clean.rows(toy.observe(np.ones((1, 1)), [1.0]), (400,))[0, 0] == 1.0  # raw metres
+
+
+def test_published_is_clamped_at_zero_only_and_does_not_settle():
+    tuner = TuneNet(published=True, points=60)
+    tuner.fit(Toy(), np.random.default_rng(0), 400)
+    seen = tuner._fitted.clean.rows(Toy().observe(np.array([[0.5]]), [1.5]), (60,))[0]
+    assert np.abs(tuner._fitted.clean.difference(seen, seen)).max() > 1e-6
+    steps = tuner.tune(Task(1, np.zeros(1), swing(np.ones((1, 1)), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)), None)
+    next(steps)
+    tuner._fitted.clean.weights["output.bias"] = np.full(1, 9.0)
+    assert steps.send(evaluation(0.9))[0] > 1.5
+    tuner._fitted.clean.weights["output.bias"] = np.full(1, -9.0)
+    assert steps.send(evaluation(0.5))[0] == 0.0
+
+
+def evaluation(at):
+    from methods.base import Evaluation
+
+    point = np.full((1, 1), at)
+    return Evaluation(point, swing(point, 1.5), np.zeros(1))
+
+
+def test_budget_is_met_exactly_and_never_passed():
+    toy = Toy(budget=50)
+    trained(toy)
+    assert toy.used == 48  # six scenarios of eight
+    with pytest.raises(ValueError, match="two scenarios"):
+        trained(Toy(budget=15))
+    toy = Toy(budget=320)
+    trained(toy)
+    assert toy.used == 320
+
+
+def test_same_seed_gives_the_same_weights_and_touches_no_global_state():
+    import torch
+
+    torch_state, numpy_state, threads = torch.get_rng_state(), np.random.get_state()[1].copy(), torch.get_num_threads()  # noqa: NPY002
+    first, second = (trained(Toy(budget=64), epochs=3).state() for _ in range(2))
+    other = trained(Toy(budget=64), seed=1, epochs=3).state()
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+    assert not np.array_equal(first["clean.joined.weight"], other["clean.joined.weight"])
+    assert torch.equal(torch_state, torch.get_rng_state())
+    assert np.array_equal(numpy_state, np.random.get_state()[1])  # noqa: NPY002
+    assert threads == torch.get_num_threads()
+
+
+def test_state_survives_a_round_trip_and_is_checked(one, tmp_path):
+    np.savez(tmp_path / "state.npz", **one.state())
+    with np.load(tmp_path / "state.npz", allow_pickle=False) as stored:
+        state = dict(stored)
+    copy = TuneNet(scenarios=40, points=60)
+    copy.restore(state)
+    assert np.array_equal(run(copy, Toy(), 4)[0].proposals, run(one, Toy(), 4)[0].proposals)
+    for broken in (
+        {k: v for k, v in state.items() if k != "clean.joined.bias"},
+        {**state, "extra": np.zeros(1)},
+        {**state, "noisy.joined.weight": state["noisy.joined.weight"].T},
+        {k: v for k, v in state.items() if not k.startswith("noisy")},
+        {k: v for k, v in state.items() if k != "limit"},
+        {**state, "clean.output.bias": np.array([np.nan])},
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            copy.restore(broken)
+    with pytest.raises(ValueError, match="train on"):
+        one._fitted.clean.rows(np.zeros((1, 60, 1)), (60,))
+    with pytest.raises(RuntimeError, match="not been trained"):
+        next(TuneNet().tune(Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 1, (1,)), None))
+
+
+def test_weight_decay_is_that_of_equation_1():
+    """A step of gradient descent on data alike: w <- w - rate * 2 * lambda * w where the data have no say."""
+    rows, parameters = np.zeros((4, 2, 5)), np.full((4, 2, 1), 0.5)
+    design = {"smooth": False, "antisymmetric": False, "adam": False, "rate": 0.1, "epochs": 1, "batch": 4}
+    free, decayed = (
+        train(rows, parameters, Design(**design, weight_decay=decay), np.random.default_rng(0)) for decay in (0.0, 0.5)
+    )
+    assert np.allclose(decayed["proposed.weight"], free["proposed.weight"] * (1 - 0.1 * 2 * 0.5), rtol=1e-5)
+    assert PUBLISHED.weight_decay * 2 == 1e-2  # torch's weight_decay is the factor in the gradient
+
+
+def test_estimate_by_hand():
+    one = np.ones((1, 1))
+    weights = {f"{layer}.weight": one * v for layer, v in (("proposed", 2.0), ("target", 3.0), ("output", 0.5))}
+    weights |= {f"{layer}.bias": np.zeros(1) for layer in ("proposed", "target", "joined", "output")}
+    weights["joined.weight"] = np.array([[-1.0], [1.0]])
+    value = estimate(weights, PUBLISHED, np.array([1.0]), np.array([2.0]))
+    assert value == pytest.approx(np.tanh(0.5 * (3.0 * 2.0 - 2.0 * 1.0)))
+
+
+def test_resampling_is_linear_run_by_run_and_bridges_gaps():
+    observed = np.array([0.0, 1.0, 2.0, 10.0, np.nan, 30.0, 40.0, 50.0])[None, :, None]
+    assert resample(observed, (3, 5), 5)[0].tolist() == [[0.0, 0.5, 1.0, 1.5, 2.0], [10.0, 20.0, 30.0, 40.0, 50.0]]
+    with pytest.raises(ValueError, match="add up"):
+        resample(observed, (3, 4), 5)
+
+
+def test_inputs_prefer_what_follows_the_parameters():
+    rng = np.random.default_rng(0)
+    parameters = rng.uniform(size=(20, 8, 1))
+    jumping = np.where(parameters > 0.5, 3.0, 0.0)
+    circumstance = np.broadcast_to(rng.uniform(size=(20, 1, 1)), (20, 8, 1))
+    observations = np.stack([parameters, jumping, circumstance], axis=-1)  # one channel each, a single sample
+    observations = np.repeat(observations, 2, axis=2)
+    inputs = weighed_inputs(parameters, observations, (2,), 2, most=3 * 6, strictness=1000.0)
+    gain = {int(number): gain for number, gain in zip(inputs.chosen, inputs.gain, strict=True)}
+    assert gain[0] * np.std(parameters) > 1e3 * gain[6] * np.std(jumping)
+    assert gain[12] * np.std(circumstance) > 1e3 * gain[6] * np.std(jumping)
+
+
+def test_search_solves_a_linear_system_in_as_many_steps_as_it_must():
+    matrix, root = np.array([[-0.6, 0.2], [0.1, -1.5]]), np.array([0.4, 0.7])
+    task = Task(2, np.array([0.1, 0.9]), np.zeros((1, 1)), np.ones(1), TRAINING[2], 9, (1,))
+    search, guess = _Search(task), task.start
+    distances = []
+    for _ in range(6):
+        guess = search.after(guess, matrix @ (guess - root))
+        distances.append(np.abs(guess - root).max())
+    assert distances[0] > 0.05
+    assert distances[5] < 1e-9
+
+
+def test_search_survives_a_failed_simulation():
+    search = _Search(Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 9, (1,)))
+    assert search.after(np.zeros(1), np.array([np.nan])).tolist() == [0.25]
+    assert search.after(np.full(1, 0.2), np.array([0.4])).tolist() == pytest.approx([0.6])
+    assert search.after(np.full(1, 0.6), np.array([np.nan])).tolist() == pytest.approx([0.4])
+
+
+def test_failed_simulation_is_no_evidence(one):
+    steps = one.tune(Task(1, np.zeros(1), swing(np.ones((1, 1)), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)), None)
+    next(steps)
+    failed = evaluation(0.0)._replace(observations=np.full((1, 60, 2), np.nan))
+    assert steps.send(failed).recommend.tolist() == [0.25]  # half the way to the middle of the training range
+
+
+def test_torch_stays_out_until_it_trains(one):
+    import subprocess
+
+    code = "import methods.tunenet, methods.regressor, sys; print('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

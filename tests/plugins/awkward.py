@@ -1,0 +1,83 @@
+"""Tuners that misbehave, each in its own way."""
+
+import gc
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from methods.base import Tuner
+
+
+class Crashing(Tuner):
+    def tune(self, task, rng):
+        yield task.start
+        raise RuntimeError("boom")
+
+
+class NanProposing(Tuner):
+    def tune(self, task, rng):
+        yield task.start
+        yield np.full(task.dim, np.nan)
+
+
+class OverAsking(Tuner):
+    def tune(self, task, rng):
+        while True:
+            yield rng.uniform(size=(7, task.dim))
+
+
+class Dying(Tuner):
+    def tune(self, task, rng):
+        yield task.start
+        os._exit(3)
+
+
+class Hanging(Tuner):
+    def tune(self, task, rng):
+        yield task.start
+        time.sleep(3600)
+
+
+class Stopping(Tuner):
+    def tune(self, task, rng):
+        yield task.start
+        return "found nothing better"
+
+
+class Snooping(Tuner):
+    """Writes down every number that it can reach: from its task, the frames that call it, everything alive."""
+
+    def tune(self, task, rng):
+        seen = yield task.start
+        numbers, frame = set(), sys._getframe()
+        walk(task, numbers, set(), 6)
+        walk(seen, numbers, set(), 6)
+        while frame is not None:
+            walk(dict(frame.f_locals), numbers, set(), 6)
+            frame = frame.f_back
+        for thing in gc.get_objects():
+            if type(thing) in (list, tuple, dict, np.ndarray) or hasattr(thing, "__dataclass_fields__"):
+                walk(thing, numbers, set(), 2)
+        Path(os.environ["SNOOPED"]).write_text(json.dumps(sorted(numbers)))
+
+
+def walk(thing, numbers, visited, depth):
+    if id(thing) in visited or depth < 0:
+        return
+    visited.add(id(thing))
+    if isinstance(thing, float):
+        numbers.add(float(thing))
+    elif isinstance(thing, np.ndarray) and thing.dtype == np.float64:
+        numbers.update(thing.ravel()[:100_000].tolist())
+    elif isinstance(thing, dict):
+        for value in list(thing.values()):
+            walk(value, numbers, visited, depth - 1)
+    elif isinstance(thing, list | tuple):
+        for value in thing[:1000]:
+            walk(value, numbers, visited, depth - 1)
+    elif hasattr(thing, "__dict__"):
+        walk(dict(vars(thing)), numbers, visited, depth - 1)

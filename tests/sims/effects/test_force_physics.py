@@ -1,0 +1,246 @@
+"""Forces through the batch engine, against closed forms and conservation laws."""
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import ellipk
+
+from tests.sims.effects.worlds import run
+
+G = 9.81
+FREE = {"gravity": 0.0}
+WEIGHT = 0.15 * 9.81 * 0.15  # N*m, of the default pendulum at the horizontal
+
+
+def slide(times, fixed, mass=1.0, u=0.0, **initial):
+    """x and v, each (T,)."""
+    return run("slider", times, fixed, [mass], {"u": np.broadcast_to(u, times.shape)}, **initial).T
+
+
+def swing(times, fixed, inertia=3.3e-3, u=0.0, **initial):
+    """q and qd, each (T,)."""
+    return run("pendulum", times, fixed, [inertia], {"u": np.broadcast_to(u, times.shape)}, **initial).T
+
+
+def fly(times, fixed, constants=None, **initial):
+    """x, y, z, accel_z, each (T,)."""
+    return run("ball", times, fixed, constants=constants, **initial).T
+
+
+def period(times, x):
+    """Mean period from the upward zero crossings, located by linear interpolation."""
+    i = np.flatnonzero((x[:-1] < 0) & (x[1:] >= 0))
+    crossings = times[i] - x[i] * (times[i + 1] - times[i]) / (x[i + 1] - x[i])
+    return (crossings[-1] - crossings[0]) / (len(crossings) - 1)
+
+
+@pytest.mark.parametrize(("c", "mass"), [(0.8, 2.0), (5.0, 0.5)])
+def test_linear_drag_decays_at_its_rate(c, mass):
+    times = np.arange(100) * 0.01
+    x, v = slide(times, {"drag.linear": c}, mass, v=3.0)
+    rate = -np.polyfit(times, np.log(v), 1)[0]
+    assert rate == pytest.approx(c / mass, rel=1e-6)
+    assert x == pytest.approx(3.0 * mass / c * -np.expm1(-c / mass * times), abs=1e-6)
+
+
+def test_quadratic_drag_ends_at_the_terminal_speed():
+    times, k = np.arange(0, 12, 0.05), 0.05
+    terminal = (G / k) ** 0.5
+    x, y, z, accel = fly(times, {"drag.quadratic": k}, z=500.0)
+    assert z == pytest.approx(500 - terminal**2 / G * np.log(np.cosh(G * times / terminal)), abs=1e-5)
+    assert (z[-2] - z[-1]) / 0.05 == pytest.approx(terminal, rel=1e-4)
+    assert accel[-1] == pytest.approx(G, rel=1e-4)
+    assert not x.any()
+    assert not y.any()
+
+
+def test_wind_carries_a_weightless_ball_with_the_air():
+    times, k, w = np.arange(0, 5, 0.05), 0.1, np.array([6.0, -8.0])
+    x, y, _, _ = fly(times, {"wind": [k, *w]}, FREE, z=50.0)
+    carried = times - np.log1p(k * 10 * times) / (k * 10)  # u' = -k |u| u for the velocity relative to the air
+    assert x == pytest.approx(6 * carried, abs=1e-6)
+    assert y == pytest.approx(-8 * carried, abs=1e-6)
+
+
+def test_terminal_velocity_in_wind_is_the_wind_and_the_fall():
+    times, k = np.arange(0, 20, 0.1), 0.05
+    x, _, z, _ = fly(times, {"wind": [k, 5.0]}, z=900.0)
+    assert np.diff(x)[-1] / 0.1 == pytest.approx(5.0, abs=1e-3)
+    assert np.diff(z)[-1] / 0.1 == pytest.approx(-((G / k) ** 0.5), abs=1e-3)
+
+
+def test_wind_on_a_slider_counts_its_mass():
+    times, k, mass = np.arange(0, 5, 0.05), 0.4, 2.0
+    x, _ = slide(times, {"wind": [k, 3.0]}, mass)
+    assert x == pytest.approx(3 * times - mass / k * np.log1p(3 * k / mass * times), abs=1e-6)
+
+
+@pytest.mark.parametrize(("c", "mass"), [(1.5, 0.5), (0.3, 2.0)])
+def test_coulomb_friction_stops_where_and_when_it_should_and_holds(c, mass):
+    slowing = c / mass
+    stop = 2.0 / slowing
+    times = np.linspace(0, 1.5 * stop, 151)
+    x, v = slide(times, {"friction.coulomb": c}, mass, v=2.0)
+    moving = times < stop
+    assert v[moving] == pytest.approx(2 - slowing * times[moving], abs=1e-9)
+    assert x[-1] == pytest.approx(2.0 / slowing, rel=1e-6)  # v0^2 / 2 a
+    assert not v[times > stop * 1.01].any()
+    assert len(set(x[times > stop * 1.01])) == 1
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_coulomb_friction_holds_what_pulls_less_and_lets_go_of_more(sign):
+    times = np.arange(0, 1, 0.01)
+    for pull, acceleration in ((0.99, 0.0), (1.5, 0.25)):
+        x, v = slide(times, {"friction.coulomb": 1.0}, 2.0, sign * pull)
+        assert x == pytest.approx(sign * acceleration * times**2 / 2, abs=1e-9)
+        assert np.array_equal(v, np.zeros_like(v)) == (pull < 1)
+
+
+def test_coulomb_friction_takes_the_same_from_every_swing():
+    times, c = np.arange(0, 4, 0.005), 2e-3
+    q, _ = swing(times, {"friction.coulomb": c, "gravity.scale": 0.0}, q=0.1)
+    turns = np.flatnonzero(np.diff(np.sign(np.diff(q)))) + 1
+    heights = np.abs(q[turns])[:3]
+    assert np.diff(np.concatenate([[0.1], heights])) == pytest.approx(-2 * c / WEIGHT, rel=0.01)
+    assert q[-1] == q[-100]
+    assert abs(WEIGHT * np.sin(q[-1])) < c
+
+
+def test_stribeck_friction_stops_after_the_time_of_its_quadrature():
+    coulomb, extra, speed, mass = 0.5, 1.0, 0.3, 1.5
+    times = np.arange(0, 4, 0.005)
+    _, v = slide(times, {"friction.stribeck": [coulomb, extra, speed]}, mass, v=1.0)
+
+    def slowing(s):
+        return mass / (coulomb + extra * np.exp(-((s / speed) ** 2)))
+
+    stop = quad(slowing, 0, 1.0)[0]
+    halfway = quad(slowing, 0.5, 1.0)[0]
+    assert np.interp(halfway, times, v) == pytest.approx(0.5, abs=1e-4)
+    assert v[times < stop - 0.005].min() > 0
+    assert not v[times > stop + 0.005].any()
+
+
+def test_stribeck_friction_holds_up_to_its_greatest_level():
+    times, c = np.arange(0, 2, 0.01), {"friction.stribeck": [1.0, 0.5, 0.05]}
+    assert not slide(times, c, 1.0, 1.49)[0].any()
+    _, v = slide(times, c, 1.0, 1.51)
+    assert v[-1] > 0.3
+    assert np.diff(v)[-10:] / 0.01 == pytest.approx(0.51, abs=1e-3)  # only the Coulomb level is left
+
+
+def test_load_friction_takes_a_share_of_the_drive():
+    times = np.arange(0, 1, 0.01)
+    x, _ = slide(times, {"friction.load": 0.2}, 2.0, 3.0)
+    assert x == pytest.approx(0.8 * 3.0 / 2.0 * times**2 / 2, abs=1e-9)
+
+
+@pytest.mark.parametrize(("factor", "holds"), [(0.995, True), (1.005, False)])
+def test_load_friction_holds_in_the_band_of_equilibrium(factor, holds):
+    """|u - w| <= c (u + w): u may be w (1 + c) / (1 - c) at most and w (1 - c) / (1 + c) at least."""
+    times, c, w = np.arange(0, 1, 0.01), 0.2, WEIGHT * np.sin(0.5)
+    for u in (w * (1 + c) / (1 - c) * factor, w * (1 - c) / (1 + c) / factor):
+        q, _ = swing(times, {"friction.load": c}, u=u, q=0.5)
+        assert np.array_equal(q, np.full_like(q, 0.5)) == holds
+
+
+def test_gravity_scale_shows_in_the_period():
+    times, c = np.arange(0, 8, 0.002), 0.15
+    q, _ = swing(times, {"gravity.scale": c}, q=1e-3)
+    assert period(times, q) == pytest.approx(2 * np.pi * (3.3e-3 / (WEIGHT * (1 + c))) ** 0.5, rel=1e-6)
+
+
+def test_gravity_scale_shows_in_the_fall():
+    times = np.arange(0, 0.8, 0.02)
+    _, _, z, accel = fly(times, {"gravity.scale": -0.1}, z=5.0)
+    assert z == pytest.approx(5 - 0.9 * G * times**2 / 2, abs=1e-9)
+    assert accel == pytest.approx(0.1 * G, abs=1e-9)
+
+
+def test_tilt_moves_the_equilibrium_of_a_pendulum():
+    times, c = np.arange(0, 3, 0.005), 0.1
+    q, _ = swing(times, {"gravity.tilt": c}, q=np.arctan(c))
+    assert q == pytest.approx(np.arctan(c), abs=1e-9)
+    q, _ = swing(times, {"gravity.tilt": c}, q=np.arctan(c) + 1e-3)
+    expected = 2 * np.pi * (3.3e-3 / (WEIGHT * (1 + c * c) ** 0.5)) ** 0.5
+    assert period(times, q - np.arctan(c)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_tilt_pulls_ball_and_slider_sideways():
+    times = np.arange(0, 0.8, 0.02)
+    x, y, z, _ = fly(times, {"gravity.tilt": [0.1, -0.2]}, z=5.0)
+    half = times**2 / 2
+    assert np.stack([x, y, z - 5]) == pytest.approx(G * np.stack([0.1 * half, -0.2 * half, -half]), abs=1e-9)
+    assert slide(times, {"gravity.tilt": 0.1}, 3.0)[0] == pytest.approx(0.1 * 9.80665 * half, abs=1e-9)
+
+
+def test_magnus_flight_is_a_circle_of_radius_speed_over_coefficient():
+    times, c, v = np.arange(0, 12, 0.05), 0.5, 3.0
+    x, y, z, _ = fly(times, {"lift.magnus": c}, FREE, z=50.0, vx=v)
+    assert x == pytest.approx(v / c * np.sin(c * times), abs=1e-6)
+    assert z - 50 == pytest.approx(v / c * (1 - np.cos(c * times)), abs=1e-6)
+    assert np.hypot(x, z - 50 - v / c) == pytest.approx(v / c, rel=1e-6)
+    assert not y.any()
+    x, y, z, _ = fly(times, {"lift.magnus": [0.0, c]}, FREE, z=50.0, vx=v)
+    assert np.hypot(x, y - v / c) == pytest.approx(v / c, rel=1e-6)
+    assert z == pytest.approx(50.0, abs=1e-12)
+
+
+def test_springs_keep_energy():
+    times, k, cubic = np.arange(0, 10, 0.01), 20.0, 40.0
+    x, v = slide(times, {"spring.linear": k, "spring.cubic": cubic}, 0.8, x=0.4, v=1.0)
+    energy = 0.8 * v**2 / 2 + k * x**2 / 2 + cubic * x**4 / 4
+    assert energy == pytest.approx(energy[0], rel=1e-5)
+    assert np.ptp(x) > 0.5
+
+
+def test_linear_spring_oscillates_at_its_frequency():
+    times = np.arange(0, 8, 0.002)
+    x, _ = slide(times, {"spring.linear": 30.0}, 1.5, x=0.2)
+    assert x == pytest.approx(0.2 * np.cos((30.0 / 1.5) ** 0.5 * times), abs=1e-5)
+
+
+def test_springs_act_on_an_angle_as_on_a_length():
+    times, inertia = np.arange(0, 4, 0.002), 3.3e-3
+    q, _ = swing(times, {"spring.linear": 0.3}, inertia, q=1e-3)
+    assert period(times, q) == pytest.approx(2 * np.pi * (inertia / (WEIGHT + 0.3)) ** 0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize("amplitude", [0.1, 0.5])
+def test_purely_cubic_spring_has_the_elliptic_period(amplitude):
+    times, c, mass = np.arange(0, 40, 0.01), 30.0, 1.2
+    x, _ = slide(times, {"spring.cubic": c}, mass, x=amplitude)
+    assert period(times, x) == pytest.approx(4 * ellipk(0.5) / (amplitude * (c / mass) ** 0.5), rel=1e-5)
+
+
+def test_softening_spring_slows_down_by_the_expansion():
+    """omega = omega0 (1 + 3 c A^2 / (8 k)) to second order in the amplitude A."""
+    times, k, c, amplitude = np.arange(0, 12, 0.005), 20.0, -10.0, 0.1
+    x, _ = slide(times, {"spring.linear": k, "spring.cubic": c}, x=amplitude)
+    shift = 2 * np.pi / period(times, x) / k**0.5 - 1
+    assert shift == pytest.approx(3 * c * amplitude**2 / (8 * k), rel=0.01)
+
+
+def test_bias_accelerates():
+    times = np.arange(0, 0.8, 0.02)
+    assert slide(times, {"force.bias": 1.5}, 3.0)[0] == pytest.approx(0.5 * times**2 / 2, abs=1e-9)
+    assert fly(times, {"force.bias": 1.5}, z=5.0)[2] == pytest.approx(5 - (G - 1.5) * times**2 / 2, abs=1e-9)
+
+
+def test_ripple_keeps_energy_and_slows_by_its_amplitude():
+    times, a, b, length, mass = np.arange(0, 2, 0.002), 0.8, -0.5, 0.2, 0.7
+    x, v = slide(times, {"force.ripple": [a, b, length]}, mass, v=1.0)
+    wave = 2 * np.pi / length
+    potential = (a * np.cos(wave * x) - b * np.sin(wave * x)) / wave
+    energy = mass * v**2 / 2 + potential
+    assert energy == pytest.approx(energy[0], rel=1e-6)
+    assert np.ptp(mass * v**2 / 2) == pytest.approx(2 * np.hypot(a, b) / wave, rel=1e-3)
+
+
+def test_periodic_force_shakes_with_its_amplitude():
+    times, a, b, f, mass = np.arange(0, 3, 0.01), 1.2, -0.7, 2.0, 0.5
+    _, v = slide(times, {"force.periodic": [a, b, f]}, mass)
+    omega = 2 * np.pi * f
+    expected = (a * (1 - np.cos(omega * times)) + b * np.sin(omega * times)) / (mass * omega)
+    assert v == pytest.approx(expected, abs=1e-5)

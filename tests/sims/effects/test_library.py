@@ -1,0 +1,188 @@
+"""The library as a whole: complete, small, declared for what it fits, off at zero, and its page is current."""
+
+import inspect
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import numpy as np
+import pint
+import pytest
+
+from sims import effects
+from sims.base import InputError
+from sims.effects.table import table
+from sims.simulated import effect_parameters
+from sims.system import KINDS, Contact, Force, Friction, Input, Sensor, Signal
+from tests.sims.effects.worlds import NAMES, PAIRS, SIMULATORS, SYSTEMS, lanes, moment, run
+
+HOOKS = {"force": (Force, Friction), "contact": (Contact,), "input": (Input,), "sensor": (Sensor,)}
+UNITS = pint.UnitRegistry()
+
+
+def test_the_designed_vocabulary_is_registered_and_importable():
+    registered = {entry.name for entry in entry_points(group="simgap.effects")}
+    assert set(NAMES) <= registered
+    assert [effects.get(name).name for name in NAMES] == NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_effect_is_at_most_fifteen_lines_of_body_with_a_sentence_and_a_source(name):
+    effect = effects.get(name)
+    assert len(inspect.getsource(effect).splitlines()) - 1 <= 15
+    assert effect.says
+    assert effect.says[0].islower()
+    assert not effect.says.endswith(".")
+    assert effect.source
+    assert issubclass(effect, HOOKS[effect.hook])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_units_parse_and_ranges_hold_zero_or_begin_above_it(name):
+    effect = effects.get(name)
+    for c in effect.coefficients:
+        for kind in KINDS:
+            low, high = c.range(kind)
+            if c.unit(kind) is None:
+                assert (low, high) == (0, 0)
+                continue
+            UNITS.parse_units("dimensionless" if c.unit(kind) == "1" else c.unit(kind))
+            assert low < high
+            assert high > 0
+    assert any(effect.coefficients[0].unit(kind) is not None for kind in KINDS)
+    assert len({c.name for c in effect.coefficients}) == len(effect.coefficients)
+    first = effect.coefficients[0]
+    assert all(first.range(kind)[0] <= 0 for kind in KINDS), "the first coefficient must be able to switch it off"
+
+
+@pytest.mark.parametrize(("name", "system"), PAIRS)
+def test_coefficients_become_parameters_with_units(name, system):
+    effect = effects.get(name)
+    parameters = effect_parameters(effect, SYSTEMS[system])
+    assert len(parameters) == len(effect.on(SYSTEMS[system])) >= 1
+    assert all(p.unit for p in parameters)
+    assert all(p.name.startswith(name) for p in parameters)
+
+
+def test_units_of_input_and_reading_are_those_of_the_system():
+    def unit(name, system, observed=()):
+        return effect_parameters(effects.get(name), SYSTEMS[system], observed)[0].unit
+
+    assert (unit("input.bias", "servo"), unit("input.bias", "pendulum"), unit("backlash", "slider")) == (
+        "rad",
+        "N*m",
+        "N",
+    )
+    assert (unit("sensor.bias", "ball"), unit("sensor.bias", "ball", ["accel_z"])) == ("m", "m/s^2")
+    assert unit("sensor.drift", "pendulum", ["qd"]) == "rad/s/s"
+    assert unit("drag.quadratic", "ball") == "1/m"
+
+
+def test_what_fits_what():
+    there = {system: {name for name in NAMES if (name, system) in PAIRS} for system in SYSTEMS}
+    impact, flight = {"restitution.speed", "contact.friction"}, {"lift.magnus"}
+    guided = {"friction.coulomb", "friction.stribeck", "spring.linear", "spring.cubic", "force.ripple"}
+    inputs = {name for name in NAMES if name.startswith("input.")} | {"backlash", "friction.load"}
+    assert there["ball"] == set(NAMES) - guided - inputs
+    assert there["slider"] == set(NAMES) - impact - flight - {"gravity.scale"}
+    assert there["pendulum"] == there["servo"] == set(NAMES) - impact - flight - {"wind"}
+
+
+@pytest.mark.parametrize(
+    ("name", "system", "reason"),
+    [
+        ("lift.magnus", "slider", "three dimensions"),
+        ("input.delay", "ball", "no input"),
+        ("contact.friction", "pendulum", "no ground"),
+        ("gravity.scale", "slider", "no gravity"),
+        ("friction.coulomb", "ball", "flies freely"),
+        ("wind", "pendulum", "not defined for a rotary system"),
+    ],
+)
+def test_what_does_not_fit_says_why(name, system, reason):
+    with pytest.raises(InputError, match=f"{system} cannot have effect {name}: .*{reason}"):
+        SIMULATORS[system](engine="batch", effects=[name])
+
+
+@pytest.mark.parametrize("count", [1, 5])
+@pytest.mark.parametrize(("name", "system"), PAIRS)
+def test_zero_gives_nothing_and_shapes_are_those_of_the_lanes(name, system, count):
+    effect = effects.get(name)()
+    rng = np.random.default_rng(7)
+    size = len(SYSTEMS[system].coordinates)
+    now = moment(system, rng.normal(size=(count, size)), rng.normal(size=(count, size)), inputs=[0.7], t=0.3)
+    off = lanes(*[0.0] * len(effect.coefficients), count=count)
+    on = lanes(*[0.1] * len(effect.coefficients), count=count)
+    signal = Signal(rng.normal(size=(count, 6)), np.full((count, 6), 0.01), np.zeros((count, 1)), np.ones((count, 6)))
+    if isinstance(effect, Force):
+        assert not effect.force(off, now).any()
+        assert effect.force(on, now).shape == (count, size)
+    elif isinstance(effect, Friction):
+        assert not effect.limit(off, now).any()
+        assert effect.limit(on, now).shape == (count, 1)
+    elif isinstance(effect, Contact):
+        assert not effect.friction(off).any()
+        e, speed = np.full((count, 1), 0.7), np.full((count, 1), 3.0)
+        assert np.array_equal(effect.restitution(off, e, speed), e)
+        assert effect.restitution(on, e, speed).shape == effect.friction(on).shape == (count, 1)
+    else:
+        change = effect.feel if isinstance(effect, Input) else effect.read
+        assert np.array_equal(change(off, signal), signal.values)
+        assert np.array_equal(effect.times(off, signal.times), signal.times)
+        assert change(on, signal).shape == effect.times(on, signal.times).shape == (count, 6)
+
+
+@pytest.mark.parametrize(("name", "system"), PAIRS)
+def test_friction_and_forces_are_safe_at_rest(name, system):
+    effect, size = effects.get(name)(), len(SYSTEMS[system].coordinates)
+    rest = moment(system, np.zeros((1, size)), np.zeros((1, size)))
+    for value in (0.0, 0.1):
+        c = lanes(*[value] * len(effect.coefficients))
+        if isinstance(effect, (Force, Friction)):
+            given = effect.force(c, rest) if isinstance(effect, Force) else effect.limit(c, rest)
+            assert np.isfinite(given).all()
+
+
+INITIAL = {"ball": {"z": 1.5, "vx": 1.0}, "pendulum": {"qd": 1.0}, "servo": {"q": 0.3}, "slider": {"v": 0.5}}
+
+
+@pytest.mark.parametrize(("name", "system"), PAIRS)
+def test_zero_changes_no_bit_of_a_run(name, system):
+    times = np.arange(60) * 0.02
+    inputs = {c.name: np.where(times > 0.4, 0.5, 0.1) for c in SYSTEMS[system].inputs}
+    base = run(system, times, inputs=inputs, **INITIAL[system])
+    assert np.array_equal(run(system, times, {name: 0.0}, inputs=inputs, **INITIAL[system]), base)
+
+
+def test_the_table_in_the_readme_is_current():
+    page = (Path(effects.__file__).parent / "README.md").read_text()
+    assert table() in page, "paste the output of: python -m sims.effects.table"
+
+
+def test_the_example_in_the_readme_works_and_is_short():
+    page = (Path(effects.__file__).parent / "README.md").read_text()
+    code = page.split("```python\n")[1].split("```")[0]
+    scope = {}
+    exec(code, scope)
+    magnet = scope["Magnet"]
+    body = code[code.index("class Magnet") :].strip().splitlines()
+    assert len(body) <= 15
+    assert magnet.fits(SYSTEMS["slider"])
+    assert not magnet.fits(SYSTEMS["ball"])
+    now = moment("slider", [[0.1]], [[0.0]])
+    assert magnet().force(lanes(20.0, 0.1), now) == pytest.approx(-2 * np.exp(-1))
+    assert not magnet().force(lanes(0.0, 0.0), now).any()
+
+
+def test_a_third_party_effect_registers_once_and_is_usable_by_name():
+    class Mine(effects.get("drag.linear")):
+        name = "drag.mine"
+
+    effects.register(Mine)
+    try:
+        assert effects.get("drag.mine") is Mine
+        assert "drag.mine" in effects.library(SYSTEMS["ball"])
+        assert [p.name for p in SIMULATORS["ball"](engine="batch", effects=["drag.mine"]).parameters][-1] == "drag.mine"
+        with pytest.raises(InputError, match=r"effect 'drag\.mine' exists already"):
+            effects.register(Mine)
+    finally:
+        del effects._from_files["drag.mine"]

@@ -1,0 +1,120 @@
+"""Array functions of input and sensor effects against numbers worked out by hand and closed forms."""
+
+import numpy as np
+import pytest
+
+from sims import effects
+from sims.system import Signal
+from tests.sims.effects.worlds import lanes
+
+
+def signal(values, step=0.1, start=None):
+    values = np.atleast_2d(np.array(values, dtype=float))
+    steps = np.broadcast_to(step, values.shape).astype(float)
+    first = np.zeros((len(values), 1)) if start is None else np.full((len(values), 1), start)
+    return Signal(values, steps, first, np.cumsum(steps, axis=1))
+
+
+def through(name, c, *args, **kwargs):
+    effect, given = effects.get(name)(), signal(*args, **kwargs)
+    change = effect.feel if effect.hook == "input" else effect.read
+    return change(lanes(c, count=len(given.values)), given)[0]
+
+
+RAMP = np.array([-2.0, -1.0, 0.0, 0.5, 1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "c", "expected"),
+    [
+        ("input.gain", 0.5, [-3, -1.5, 0, 0.75, 1.5, 3]),
+        ("sensor.gain", -0.5, [-1, -0.5, 0, 0.25, 0.5, 1]),
+        ("input.bias", 0.5, [-1.5, -0.5, 0.5, 1, 1.5, 2.5]),
+        ("sensor.bias", -0.5, [-2.5, -1.5, -0.5, 0, 0.5, 1.5]),
+        ("sensor.drift", 2.0, [-1.8, -0.6, 0.6, 1.3, 2.0, 3.2]),
+        ("input.deadband", 0.75, [-1.25, -0.25, 0, 0, 0.25, 1.25]),
+        ("input.saturation", 0.75, [-0.75, -0.75, 0, 0.5, 0.75, 0.75]),
+        ("input.saturation", -0.75, RAMP),
+        ("input.deadband", -0.75, RAMP),
+        ("backlash", -0.75, RAMP),
+        ("input.lag", -0.1, RAMP),
+        ("sensor.lag", -0.1, RAMP),
+    ],
+)
+def test_values_by_hand(name, c, expected):
+    assert through(name, c, RAMP) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["input.delay", "sensor.delay"])
+def test_delays_look_back_and_a_negative_one_ahead(name):
+    t = np.array([[0.0, 0.5, 1.0]])
+    assert effects.get(name)().times(lanes(0.25), t).tolist() == [[-0.25, 0.25, 0.75]]
+    assert effects.get(name)().times(lanes(-0.25), t).tolist() == [[0.25, 0.75, 1.25]]
+
+
+def test_a_slow_clock_lets_more_time_pass_between_its_stamps():
+    assert effects.get("clock.skew")().times(lanes(0.25), np.array([[0.0, 1.0, 4.0]])).tolist() == [[0.0, 1.25, 5.0]]
+
+
+def test_backlash_plays_its_width():
+    there_and_back = np.concatenate([np.linspace(0, 2, 21), np.linspace(1.9, -2, 40)])
+    felt = through("backlash", 0.6, there_and_back)
+    assert felt[:21] == pytest.approx(np.maximum(np.linspace(0, 2, 21) - 0.3, 0))  # starts in the middle
+    still = there_and_back[21:] > 2 - 0.6 - 1e-9
+    assert felt[21:][still] == pytest.approx(1.7)  # a reversal costs the whole width
+    assert felt[21:][~still] == pytest.approx(there_and_back[21:][~still] + 0.3)
+
+
+def test_backlash_starts_centred_on_the_first_value():
+    assert through("backlash", 0.6, [5.2, 5.4, 5.0], start=5.0) == pytest.approx([5.0, 5.1, 5.1])
+
+
+@pytest.mark.parametrize("step", [0.001, 0.1, 3.0])
+@pytest.mark.parametrize("lag", [1e-15, 1e-3, 0.2, 50.0])
+def test_input_lag_is_the_exact_mean_of_a_step_response(step, lag):
+    ends = step * np.arange(1, 9)
+    begins = ends - step
+    integral = [t - lag * -np.expm1(-t / lag) for t in (begins, ends)]  # of 1 - exp(-t / lag)
+    assert through("input.lag", lag, np.ones(8), step) == pytest.approx((integral[1] - integral[0]) / step, abs=1e-9)
+
+
+def test_input_lag_does_not_depend_on_how_the_time_is_divided():
+    rng = np.random.default_rng(3)
+    values, steps = rng.normal(size=6), rng.uniform(0.01, 0.3, size=6)
+    coarse = through("input.lag", 0.1, values, steps)
+    fine = through("input.lag", 0.1, np.repeat(values, 5), np.repeat(steps / 5, 5))
+    assert fine.reshape(6, 5).mean(axis=1) == pytest.approx(coarse, abs=1e-12)
+
+
+@pytest.mark.parametrize("step", [0.001, 0.1, 3.0])
+@pytest.mark.parametrize("lag", [1e-15, 1e-3, 0.2, 50.0])
+def test_sensor_lag_is_exact_on_a_ramp(step, lag):
+    t = step * np.arange(1, 9)
+    expected = 2 * (t - lag * -np.expm1(-t / lag))
+    assert through("sensor.lag", lag, 2 * t, step) == pytest.approx(expected, abs=1e-9)
+
+
+def test_sensor_lag_of_a_jump_within_a_step_settles_as_an_exponential():
+    read = through("sensor.lag", 0.2, np.ones(50), 0.01, start=1.0)
+    assert read == pytest.approx(np.ones(50))
+    jump = through("sensor.lag", 0.2, np.concatenate([[0.0], np.ones(49)]), 0.01)
+    assert np.diff(np.log(1 - jump[1:])) == pytest.approx(-0.05 * np.ones(48))
+
+
+@pytest.mark.parametrize("name", ["input.lag", "sensor.lag"])
+def test_lags_stand_still_while_a_lane_waits(name):
+    steps = np.array([0.1, 0.1, 0.0, 0.0])
+    felt = through(name, 0.05, [1.0, 1.0, 1.0, 1.0], steps)
+    assert np.isfinite(felt).all()
+    assert felt[2] == felt[3]
+    assert felt[1] < felt[2] < 1 if name == "input.lag" else felt[1] == felt[2] < 1
+
+
+@pytest.mark.parametrize("name", ["input.lag", "sensor.lag", "input.deadband", "backlash", "input.saturation"])
+def test_lanes_that_are_off_keep_every_bit_beside_lanes_that_are_on(name):
+    effect = effects.get(name)()
+    given = signal(np.random.default_rng(5).normal(size=(3, 40)))
+    change = effect.feel if effect.hook == "input" else effect.read
+    felt = change(np.array([[[0.0], [0.3], [0.0]]]), given)
+    assert np.array_equal(felt[::2], given.values[::2])
+    assert np.abs(felt[1] - given.values[1]).max() > 0.1

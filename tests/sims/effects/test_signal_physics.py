@@ -1,0 +1,99 @@
+"""Effects on inputs and sensors through the batch engine, against closed forms."""
+
+import numpy as np
+import pytest
+
+from tests.sims.effects.worlds import run
+
+TIMES = np.arange(0, 3, 0.02)
+STEP = np.where(TIMES >= 0.5 - 1e-9, 2.0, 0.0)  # N, from half a second on
+
+
+def slide(fixed, u=0.0, times=TIMES, mass=2.0, **initial):
+    """x and v, each (T,)."""
+    return run("slider", times, fixed, [mass], {"u": np.broadcast_to(u, times.shape)}, **initial).T
+
+
+def felt(fixed, u, times=TIMES):
+    """The input as a slider of 2 kg felt it between samples, from the velocity's differences."""
+    return 2.0 * np.diff(slide(fixed, u, times)[1]) / np.diff(times)
+
+
+@pytest.mark.parametrize(("delay", "within"), [(0.1, 1e-9), (0.1234, 0.02**2 / 8), (0.003, 0.02**2 / 8)])
+def test_input_delay_is_an_exact_shift(delay, within):
+    """Exact in the impulse; the position is off by how the step in which the jump arrives shares out its mean."""
+    x, v = slide({"input.delay": delay}, STEP)
+    since = np.maximum(TIMES - 0.5 - delay, 0.0)
+    assert v == pytest.approx(since, abs=1e-9)  # 2 N on 2 kg
+    assert x == pytest.approx(since**2 / 2, abs=within)
+
+
+@pytest.mark.parametrize("lag", [0.01, 0.2])
+def test_input_lag_is_the_step_response(lag):
+    _, v = slide({"input.lag": lag}, STEP)
+    since = np.maximum(TIMES - 0.5, 0.0)
+    assert v == pytest.approx(since - lag * -np.expm1(-since / lag), abs=1e-9)
+
+
+def test_input_gain_and_bias():
+    assert felt({"input.gain": -0.25}, STEP) == pytest.approx(0.75 * STEP[:-1], abs=1e-9)
+    assert felt({"input.bias": -0.25}, STEP) == pytest.approx(STEP[:-1] - 0.25, abs=1e-9)
+
+
+def test_a_chain_starts_settled():
+    """A lag behind a gain and a bias begins at what they make of the first value, not at the command's."""
+    fixed = {"input.gain": 0.5, "input.bias": 0.2, "input.lag": 0.3}
+    assert felt(fixed, 2.0) == pytest.approx(3.2, abs=1e-9)
+    readings, _ = slide({"sensor.gain": 0.5, "sensor.bias": 0.2, "sensor.lag": 0.3}, x=2.0)
+    assert readings == pytest.approx(3.2, abs=1e-12)
+
+
+def test_deadband_and_saturation():
+    wave = 2 * np.sin(4 * TIMES)
+    expected = np.sign(wave) * np.maximum(np.abs(wave) - 0.5, 0)
+    assert felt({"input.deadband": 0.5}, wave) == pytest.approx(expected[:-1], abs=1e-9)
+    assert felt({"input.saturation": 0.5}, wave) == pytest.approx(np.clip(wave, -0.5, 0.5)[:-1], abs=1e-9)
+
+
+def test_the_width_of_backlash_shows_at_a_reversal():
+    width = 0.6
+    triangle = 2 * np.abs((TIMES + 0.5) % 2 - 1)  # falls from 1 to 0 at 0.5 s, rises to 2 at 1.5 s, falls again
+    given, got = triangle[:-1], felt({"backlash": width}, triangle)
+    top = int(np.argmax(given))
+    rising = given[:top] > width
+    assert got[:top][rising & (TIMES[:top] > 0.5)] == pytest.approx(
+        given[:top][rising & (TIMES[:top] > 0.5)] - width / 2, abs=1e-9
+    )
+    falling = slice(top, top + 40)
+    assert got[falling] == pytest.approx(np.minimum(got[top], given[falling] + width / 2), abs=1e-9)
+    assert np.ptp(got[TIMES[:-1] > 0.5]) == pytest.approx(np.ptp(given[TIMES[:-1] > 0.5]) - width, abs=0.05)
+
+
+@pytest.mark.parametrize("delay", [0.1, 0.1234])
+def test_sensor_delay_is_an_exact_shift(delay):
+    times = np.arange(0, 2, 0.02)
+    late = run("pendulum", times, {"sensor.delay": delay}, q=0.8, qd=1.0)
+    shifted = times[times >= delay] - delay
+    prompt = run("pendulum", np.concatenate([[0.0], shifted[shifted > 0]]), q=0.8, qd=1.0)
+    assert late[times < delay] == pytest.approx(np.tile(prompt[0], (int((times < delay).sum()), 1)), abs=0)
+    assert late[times > delay] == pytest.approx(prompt[1:], abs=1e-7)
+
+
+@pytest.mark.parametrize("lag", [0.005, 0.2])
+def test_sensor_lag_follows_a_ramp_by_its_lag(lag):
+    x, v = slide({"sensor.lag": lag}, x=1.0, v=3.0)
+    assert x == pytest.approx(1 + 3 * (TIMES - lag * -np.expm1(-TIMES / lag)), abs=1e-9)
+    assert v == pytest.approx(3.0, abs=1e-9)  # every channel, settled at its first value
+
+
+def test_sensor_gain_bias_and_drift_change_one_channel():
+    x, v = slide({"sensor.gain": 0.1, "sensor.bias": 0.2, "sensor.drift": 0.05}, x=1.0, v=3.0)
+    assert x == pytest.approx(1.1 * (1 + 3 * TIMES) + 0.2 + 0.05 * TIMES, abs=1e-9)
+    assert v == pytest.approx(3.0, abs=1e-9)
+
+
+def test_a_skewed_clock_stretches_the_record():
+    skewed = run("pendulum", TIMES, {"clock.skew": 0.04}, q=0.8)
+    stretched = run("pendulum", TIMES * 1.04, q=0.8)
+    assert skewed == pytest.approx(stretched, abs=1e-7)
+    assert np.abs(skewed - run("pendulum", TIMES, q=0.8)).max() > 0.1

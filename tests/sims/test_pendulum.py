@@ -1,0 +1,231 @@
+"""The pendulum in Bullet and MuJoCo against closed forms, an accurate integrator, and its own used world."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.special import ellipk
+
+from sims.base import InputError, Scenario
+from sims.pendulum.simulator import Pendulum
+
+MASS, LENGTH, GRAVITY = 0.15, 0.15, 9.81
+WEIGHT = MASS * LENGTH * GRAVITY  # N*m at the horizontal
+INERTIA, DAMPING = 3.3e-3, 2e-4
+OMEGA = (WEIGHT / INERTIA) ** 0.5
+
+
+@pytest.fixture(params=["pybullet", "mujoco"], autouse=True)
+def engine(request, monkeypatch):
+    monkeypatch.setattr(Pendulum, "default_engine", request.param)
+    return request.param
+
+
+def swing(scenario, inertia=INERTIA, damping=0.0, constants=None, fixed=None, **settings):
+    """q and qd, each (T,)."""
+    fixed = {**(fixed or {}), **({"drag.linear": damping} if damping else {})}
+    return Pendulum(constants, fixed=fixed, **settings).simulate(np.array([[inertia]]), scenario)[0].T
+
+
+def exact(times, q, qd, inertia=INERTIA, damping=DAMPING, torque=lambda _: 0.0, quadratic=0.0):
+    def law(t, state):
+        resistance = damping + quadratic * abs(state[1])
+        return [state[1], (torque(t) - WEIGHT * np.sin(state[0]) - resistance * state[1]) / inertia]
+
+    options = {"rtol": 1e-9, "atol": 1e-11, "max_step": 0.02}
+    return solve_ivp(law, (times[0], times[-1]), [q, qd], t_eval=times, **options).y
+
+
+def period(times, q):
+    """Mean period from the upward zero crossings, located by linear interpolation."""
+    i = np.flatnonzero((q[:-1] < 0) & (q[1:] >= 0))
+    crossings = times[i] - q[i] * (times[i + 1] - times[i]) / (q[i + 1] - q[i])
+    return (crossings[-1] - crossings[0]) / (len(crossings) - 1)
+
+
+def order(steps, errors):
+    return np.polyfit(np.log(steps), np.log(errors), 1)[0]
+
+
+@pytest.mark.parametrize(("amplitude", "length"), [(1e-3, 1.0), (0.5, 1.0), (1.6, 1.0), (3.0, 2.0)])
+def test_period_follows_the_elliptic_integral(amplitude, length):
+    times = np.arange(2000) * 2e-3
+    q, _ = swing(Scenario(times, {"q": amplitude}), time_step=5e-4)
+    expected = 4 / OMEGA * ellipk(np.sin(amplitude / 2) ** 2)
+    assert period(times, q) == pytest.approx(expected, rel=2e-5)
+    if amplitude == 1e-3:
+        assert expected == pytest.approx(2 * np.pi / OMEGA, rel=1e-6)
+
+
+@pytest.mark.parametrize("inertia", [1e-3, 2e-3, 3.3e-3, 1e-2])
+def test_inertia_below_mass_length_squared_works_too(inertia):
+    times = np.arange(2000) * 2e-3
+    q, _ = swing(Scenario(times, {"q": 1e-3}), inertia=inertia, time_step=5e-4)
+    assert period(times, q) == pytest.approx(2 * np.pi * (inertia / WEIGHT) ** 0.5, rel=2e-5)
+
+
+def test_damping_without_gravity_decays_at_the_closed_rate():
+    times = np.arange(200) * 0.01
+    q, qd = swing(Scenario(times, {"q": 0.0, "qd": 20.0}), damping=2e-3, constants={"gravity": 0.0})
+    rate = 2e-3 / INERTIA
+    np.testing.assert_allclose(qd, 20 * np.exp(-rate * times), rtol=1e-6)
+    np.testing.assert_allclose(q, 20 / rate * (1 - np.exp(-rate * times)), atol=1e-5)
+
+
+def test_damped_small_swing_decays_at_the_closed_rate():
+    times, damping = np.arange(2000) * 5e-3, 1e-3
+    q, _ = swing(Scenario(times, {"q": 1e-3, "qd": 0.0}), damping=damping, time_step=1e-3)
+    rate = damping / (2 * INERTIA)
+    omega = (OMEGA**2 - rate**2) ** 0.5
+    expected = 1e-3 * np.exp(-rate * times) * (np.cos(omega * times) + rate / omega * np.sin(omega * times))
+    np.testing.assert_allclose(q, expected, atol=3e-7)
+
+
+def test_torque_step_without_gravity_is_a_parabola():
+    times = np.arange(100) * 0.01
+    scenario = Scenario(times, {"q": 0.0}, {"u": np.where(times >= 0.295, 0.05, 0.0)})
+    q, qd = swing(scenario, constants={"gravity": 0.0})
+    since = np.maximum(times - 0.3, 0.0)
+    np.testing.assert_allclose(qd, 0.05 / INERTIA * since, atol=1e-11)
+    np.testing.assert_allclose(q, 0.05 / INERTIA * since**2 / 2, atol=1e-11)
+
+
+def test_constant_torque_holds_where_it_balances_gravity():
+    balance = WEIGHT * np.sin(0.7)
+    q, qd = swing(Scenario(np.arange(500) * 0.01, {"q": 0.7}, {"u": np.full(500, balance)}), damping=DAMPING)
+    np.testing.assert_allclose(q, 0.7, atol=1e-12)
+    np.testing.assert_allclose(qd, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("q", "qd", "tolerance"), [(0.5, 0.0, 5e-4), (-1.6, 1.8, 1e-3), (2.5, 3.0, 3e-3), (0.0, 25.0, 8e-3)]
+)
+def test_default_step_stays_near_an_accurate_integrator(q, qd, tolerance):
+    times = np.arange(1000) / 200
+    found = swing(Scenario(times, {"q": q, "qd": qd}), damping=DAMPING)
+    reference = exact(times, q, qd)
+    assert np.abs(found[0] - reference[0]).max() < tolerance
+    assert np.abs(found[1] - reference[1]).max() < 10 * tolerance
+
+
+def test_changing_torque_matches_an_accurate_integrator():
+    times = np.arange(300) / 100
+    torque = 0.1 * np.sign(np.sin(7 * times))
+    found = swing(Scenario(times, {"q": 0.3}, {"u": torque}), damping=1e-3, time_step=5e-4)
+    pieces, state = [np.array([0.3, 0.0])], (0.3, 0.0)
+    for start, end, u in zip(times[:-1], times[1:], torque[:-1], strict=True):
+        state = exact(np.array([start, end]), *state, damping=1e-3, torque=lambda _, u=u: u)[:, -1]
+        pieces.append(state)
+    np.testing.assert_allclose(found, np.array(pieces).T, atol=3e-4)
+
+
+@pytest.mark.parametrize("damping", [0.0, 2e-3])
+@pytest.mark.parametrize("torque", [0.0, 0.1])
+def test_second_order_in_the_step_with_damping_and_torque(damping, torque):
+    times = np.array([0.0, 0.13, 0.5, 1.0])  # uneven: the step differs from interval to interval
+    scenario = Scenario(times, {"q": 1.5, "qd": -2.0}, {"u": np.full(4, torque)})
+    reference = exact(times, 1.5, -2.0, damping=damping, torque=lambda _: torque)
+    steps = np.array([8e-3, 4e-3, 2e-3, 1e-3])
+    errors = np.array([np.abs(swing(scenario, damping=damping, time_step=h) - reference).max(axis=1) for h in steps])
+    for channel in (0, 1):
+        assert order(steps, errors[:, channel]) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize("fixed", [{"drag.quadratic": 1e-3}, {"drag.linear": 1e-3, "drag.quadratic": 1e-3}])
+def test_second_order_with_forces_from_outside(fixed):
+    times = np.array([0.0, 0.13, 0.5, 1.0])
+    scenario = Scenario(times, {"q": 1.5, "qd": -2.0}, {"u": np.full(4, 0.05)})
+    known = {"damping": fixed.get("drag.linear", 0.0), "quadratic": fixed["drag.quadratic"]}
+    reference = exact(times, 1.5, -2.0, torque=lambda _: 0.05, **known)
+    steps = np.array([8e-3, 4e-3, 2e-3, 1e-3])
+    errors = np.array([np.abs(swing(scenario, fixed=fixed, time_step=h) - reference).max(axis=1) for h in steps])
+    for channel in (0, 1):
+        assert order(steps, errors[:, channel]) == pytest.approx(2.0, abs=0.1)
+
+
+def test_damping_carried_by_the_joint_is_damping_put_in_from_outside():
+    # A second effect makes the engine ask for forces; one that is next to nothing changes nothing else.
+    scenario = Scenario(np.arange(200) / 100, {"q": 1.5}, {"u": 0.05 * np.sign(np.sin(3.0 * np.arange(200) / 100))})
+    carried = swing(scenario, damping=1e-3)
+    known = swing(scenario, damping=1e-3, fixed={"drag.quadratic": 1e-300})
+    asked = swing(scenario, damping=1e-3, fixed={"spring.linear": 1e-300})
+    np.testing.assert_allclose(known, carried, atol=1e-10)
+    np.testing.assert_allclose(asked, carried, atol=1e-9)
+
+
+def test_strong_damping_is_stable():
+    # 2.5 ms steps against a time constant of 0.33 ms: explicit damping would blow up.
+    times = np.arange(200) / 100
+    q, qd = swing(Scenario(times, {"q": 1.0}), damping=10.0, fixed={"drag.quadratic": 1e-300})
+    np.testing.assert_allclose(q, 2.0 * np.arctan(np.tan(0.5) * np.exp(-WEIGHT / 10.0 * times)), atol=1e-4)
+    assert np.abs(qd).max() < 0.05
+
+
+def test_energy_does_not_drift():
+    times = np.arange(4000) / 200
+    q, qd = swing(Scenario(times, {"q": 2.0}))
+    energy = INERTIA * qd**2 / 2 + WEIGHT * (1 - np.cos(q))
+    assert np.abs(energy / energy[0] - 1).max() < 5e-4
+    assert abs(energy[-400:].mean() / energy[:400].mean() - 1) < 2e-6
+
+
+def test_damping_only_takes_energy():
+    times = np.arange(2000) / 200
+    q, qd = swing(Scenario(times, {"q": 2.0}), damping=DAMPING, time_step=5e-4)
+    energy = INERTIA * qd**2 / 2 + WEIGHT * (1 - np.cos(q))
+    lost = DAMPING * np.sum((qd[1:] ** 2 + qd[:-1] ** 2) / 2) / 200
+    assert energy[0] - energy[-1] == pytest.approx(lost, rel=1e-3)
+
+
+def test_whirling_is_not_limited():
+    q, qd = swing(Scenario(np.arange(100) * 0.01, {"q": 0.0, "qd": 300.0}), constants={"gravity": 0.0})
+    np.testing.assert_allclose(qd, 300.0, rtol=1e-12)
+    assert q[-1] == pytest.approx(297.0, rel=1e-12)
+
+
+def test_first_sample_is_the_initial_state_and_observe_orders():
+    scenario = Scenario(np.array([5.0, 5.1]), {"q": 0.3, "qd": -1.0})
+    theta = np.array([[INERTIA]])
+    both = Pendulum().simulate(theta, scenario)
+    np.testing.assert_array_equal(both[0, 0], [0.3, -1.0])
+    np.testing.assert_array_equal(Pendulum(observe=["qd"]).simulate(theta, scenario), both[..., 1:])
+
+
+@pytest.mark.parametrize("inertia", [0.0, -1e-3, MASS * LENGTH**2 / 1000])
+def test_impossible_inertia_gives_nan(inertia):
+    theta = np.array([[inertia], [INERTIA]])
+    result = Pendulum().simulate(theta, Scenario(np.arange(10) / 100))
+    assert np.isnan(result[0]).all()
+    assert np.isfinite(result[1]).all()
+
+
+@pytest.mark.parametrize("effects", [["drag.linear"], ["drag.linear", "friction.coulomb", "spring.linear"]])
+def test_a_used_world_gives_the_same_bits_as_a_new_one(engine, effects):
+    rng = np.random.default_rng(4)
+    used, new = Pendulum(effects=effects), Pendulum(effects=effects)
+    for i in range(60):
+        count = int(rng.integers(2, 100))
+        times = np.cumsum(rng.choice([5e-3, 1e-2, 1.7e-2], size=count))
+        signal = rng.normal(size=count) * 0.1 * rng.integers(2)
+        scenario = Scenario(times, {"q": rng.normal(), "qd": 5 * rng.normal()}, {"u": signal})
+        theta = np.array([[rng.uniform(1e-3, 1e-2), *rng.choice([0.0, 1e-3], size=len(effects))]])
+        if i % 20 and engine == "pybullet":
+            new.engine._world.discard()  # rebuilt, which is quicker than connecting anew
+        else:
+            new.close()
+        np.testing.assert_array_equal(used.simulate(theta, scenario), new.simulate(theta, scenario))
+
+
+@pytest.mark.parametrize(
+    ("refused", "says"),
+    [
+        (lambda: Pendulum({"colour": 1.0}), "unknown constant .* there are: gravity, length, mass"),
+        (lambda: Pendulum({"length": -0.1}), "'length' .* must be > 0"),
+        (lambda: Pendulum(observe=["angle"]), "unknown channel .* there are: q, qd"),
+        (lambda: Pendulum().simulate([[1e-3]], Scenario([0.0], {"x": 1.0})), "unknown initial .* there are: q, qd"),
+        (lambda: Pendulum().simulate([[1e-3]], Scenario([0.0], inputs={"w": [1.0]})), "unknown input .* are: u"),
+        (lambda: Pendulum().simulate([[1e-3]], Scenario([0.0], inputs={"u": [np.nan]})), "'u' .* must be finite"),
+    ],
+)
+def test_errors_list_the_names(refused, says):
+    with pytest.raises(InputError, match=says):
+        refused()

@@ -1,0 +1,158 @@
+"""When lanes step, what they are sampled at, and what their plants feel: against numbers worked out by hand."""
+
+import numpy as np
+import pytest
+
+from sims.base import InputError, Scenario
+from sims.effects.actuation import Backlash, Delay
+from sims.effects.sensing import Delay as Late
+from sims.effects.sensing import Skew
+from sims.plan import Plan, felt_inputs, make_plan, make_runs
+from sims.slider.simulator import Slider
+from sims.system import Input
+
+
+def coefficients(*values):
+    """One coefficient (1, L, 1) for each lane."""
+    return np.array(values, dtype=float)[None, :, None]
+
+
+def planned(*times, largest=0.01, acting=(), commands=None):
+    runs = make_runs([Scenario(np.array(t)) for t in times])
+    return make_plan(runs, commands or [{} for _ in runs.distinct], acting, largest)
+
+
+def test_intervals_are_divided_into_equal_steps_and_samples_show_their_ends():
+    plan = planned([5.0, 5.02, 5.04], largest=0.008)
+    assert plan.every == 3
+    np.testing.assert_allclose(plan.steps, [[0.02 / 3] * 6], rtol=1e-12)
+    np.testing.assert_allclose(plan.ends[0, [2, 5]], [0.02, 0.04], rtol=1e-12)
+    assert plan.rows.tolist() == [[0, 1, 2]]
+
+
+def test_an_interval_that_is_an_exact_multiple_is_not_divided_once_more():
+    assert planned(np.arange(50) / 100.0, largest=0.005).steps.shape == (1, 98)
+
+
+def test_a_gap_costs_only_its_own_steps():
+    plan = planned([0.0, 0.02, 0.04, 0.09, 0.11])
+    assert plan.every == 2
+    steps = [0.01] * 4 + [0.01] * 5 + [0.0] + [0.01] * 2  # the last block of the gap is filled up
+    np.testing.assert_allclose(plan.steps, [steps], atol=1e-15)
+    assert plan.rows.tolist() == [[0, 1, 2, 5, 6]]
+    np.testing.assert_allclose(plan.ends[0, 8:10], [0.09, 0.09], rtol=1e-15)
+
+
+def test_lanes_of_unequal_rate_and_length_do_not_share_steps():
+    plan = planned([0.0, 0.01, 0.02], [0.0, 0.03])
+    assert plan.every == 1
+    np.testing.assert_allclose(plan.steps, [[0.01, 0.01, 0.0], [0.01, 0.01, 0.01]], atol=1e-15)
+    assert plan.rows.tolist() == [[0, 1, 2], [0, 3, 3]]
+    np.testing.assert_allclose(plan.ends, [[0.01, 0.02, 0.02], [0.01, 0.02, 0.03]], rtol=1e-12)
+
+
+def test_effects_on_time_move_the_instants_of_their_lanes_only():
+    times = [0.0, 0.01, 0.02, 0.03]
+    plan = planned(times, times, times, acting=((Late(), coefficients(0.015, 0.0, -0.005)),))
+    kept = np.concatenate([np.zeros((3, 1)), plan.ends[:, plan.every - 1 :: plan.every]], axis=1)
+    sampled = np.take_along_axis(kept, plan.rows, axis=1)
+    np.testing.assert_allclose(
+        sampled, [[0, 0, 0.005, 0.015], [0, 0.01, 0.02, 0.03], [0.005, 0.015, 0.025, 0.035]], atol=1e-15
+    )
+    skewed = planned(times, acting=((Skew(), coefficients(0.5)),))
+    np.testing.assert_allclose(skewed.ends[0, -1], 0.045, rtol=1e-12)
+    assert skewed.steps.max() <= 0.01
+
+
+def test_a_delayed_command_changes_between_steps():
+    runs = make_runs([Scenario(np.array([0.0, 0.01, 0.02, 0.03]), {}, {"u": [1.0, 3.0, 3.0, 3.0]})] * 2)
+    commands, delay = [dict(runs.distinct[0].inputs)], ((Delay(), coefficients(0.004, 0.0)),)
+    plan = make_plan(runs, commands, delay, 0.01)
+    np.testing.assert_allclose(plan.steps, [[0.01, 0.004, 0.006, 0.01], [0.01, 0.01, 0.01, 0.0]], atol=1e-15)
+    assert plan.rows.tolist() == [[0, 1, 3, 4], [0, 1, 2, 3]]
+    felt = felt_inputs(plan, runs, commands, delay)["u"]
+    np.testing.assert_allclose(felt, [[1, 1, 3, 3], [1, 3, 3, 3]], rtol=1e-12)
+
+
+def test_felt_input_is_the_mean_of_the_command_over_the_step():
+    runs = make_runs([Scenario(np.array([0.0, 0.01, 0.02]), {}, {"u": [1.0, 5.0, 2.0]})])
+    steps = np.array([[0.015, 0.01, 0.0, 0.02]])
+    plan = Plan(steps, np.cumsum(steps, axis=1), 1, np.array([[0, 1, 2]]))
+    felt = felt_inputs(plan, runs, [dict(runs.distinct[0].inputs)], ())["u"]
+    first, second = (1.0 * 0.01 + 5.0 * 0.005) / 0.015, (5.0 * 0.005 + 2.0 * 0.005) / 0.01
+    np.testing.assert_allclose(felt, [[first, second, 2.0, 2.0]], rtol=1e-12)
+
+
+def test_input_effects_act_in_order_on_the_first_input_and_where_they_are_on():
+    class Doubled(Input):
+        name, says, coefficients = "doubled", "", ()
+
+        def feel(self, c, signal):
+            return 2.0 * signal.values
+
+    class Raised(Input):
+        name, says, coefficients = "raised", "", ()
+
+        def feel(self, c, signal):
+            return signal.values + c[0]
+
+    run = Scenario(np.array([0.0, 0.01]), {}, {"u": [1.0, 1.0], "w": [7.0, 7.0]})
+    runs = make_runs([run, run, run])
+    commands = [dict(run.inputs)]
+    acting = ((Raised(), coefficients(1.0, 1.0, 0.0)), (Doubled(), coefficients(1.0, 0.0, 1.0)))
+    felt = felt_inputs(make_plan(runs, commands, acting, 0.01), runs, commands, acting)
+    assert felt["u"].tolist() == [[4.0], [2.0], [2.0]]
+    assert felt["w"].tolist() == [[7.0], [7.0], [7.0]]
+
+
+def test_waiting_feels_nothing_new():
+    runs = make_runs([Scenario(np.array([0.0, 0.01, 0.02]), {}, {"u": [0.0, 1.0, 0.0]})])
+    commands, play = [dict(runs.distinct[0].inputs)], ((Backlash(), coefficients(0.2)),)
+    steps = np.array([[0.01, 0.0, 0.01, 0.0]])  # at the second step the command is 1 already, at the fourth 0 again
+    plan = Plan(steps, np.cumsum(steps, axis=1), 1, np.array([[0, 2, 4]]))
+    felt = felt_inputs(plan, runs, commands, play)["u"]
+    np.testing.assert_allclose(felt, [[0.0, 0.0, 0.9, 0.9]], atol=1e-15)
+
+
+def test_scenarios_with_the_same_content_are_one_run():
+    t = np.arange(5) / 10
+    runs = make_runs(
+        [Scenario(t, {}, {"u": t}), Scenario(t, {"x": 1.0}, {"u": t.copy()}), Scenario(t, {}, {"u": 2 * t})]
+    )
+    assert len(runs.distinct) == 2
+    assert runs.of.tolist() == [0, 0, 1]
+
+
+def test_lanes_of_unequal_length_end_in_nan():
+    slider = Slider(engine="batch")
+    runs = [Scenario(np.arange(n) / 10, {"v": 1.0}) for n in (3, 5)]
+    seen = slider.simulate_lanes(np.ones((3, 1)), [runs[0], runs[1], runs[0]])
+    np.testing.assert_allclose(seen[0, :3, 0], [0.0, 0.1, 0.2], rtol=1e-12)
+    np.testing.assert_allclose(seen[1, :, 0], [0.0, 0.1, 0.2, 0.3, 0.4], rtol=1e-12)
+    assert np.isnan(seen[[0, 2], 3:]).all()
+
+
+def test_initial_states_may_be_given_lane_by_lane():
+    slider, scenario = Slider(engine="batch"), Scenario(np.array([0.0, 0.5]), {"x": 9.0, "v": 2.0})
+    seen = slider.simulate_lanes(np.ones((2, 1)), [scenario] * 2, {"x": np.array([1.0, 3.0])})
+    np.testing.assert_allclose(seen[:, :, 0], [[1.0, 2.0], [3.0, 4.0]], rtol=1e-13)
+    with pytest.raises(InputError, match="unknown initial state of simulator slider 'z'"):
+        slider.simulate_lanes(np.ones((1, 1)), [scenario], {"z": np.zeros(1)})
+
+
+def test_a_wrong_shape_is_refused():
+    slider, scenario = Slider(engine="batch", effects=["drag.linear"]), Scenario(np.array([0.0, 0.5]))
+    with pytest.raises(InputError, match=r"theta must have shape \(2, 2\), found \(2, 1\)"):
+        slider.simulate_lanes(np.ones((2, 1)), [scenario] * 2)
+
+
+def test_sensor_effects_act_on_samples_and_filters_on_every_step():
+    t = np.arange(6) / 10
+    seen = Slider(engine="batch", fixed={"sensor.delay": 0.25, "sensor.gain": 0.5}).simulate(
+        np.ones((1, 1)), Scenario(t, {"x": 2.0, "v": 1.0})
+    )[0]
+    np.testing.assert_allclose(seen[:, 0], 1.5 * (2.0 + np.maximum(t - 0.25, 0.0)), rtol=1e-12)
+    assert seen[:, 1].tolist() == [1.0] * 6
+    lag = 0.05
+    seen = Slider(engine="batch", fixed={"sensor.lag": lag}).simulate(np.ones((1, 1)), Scenario(t, {"v": 1.0}))[0]
+    np.testing.assert_allclose(seen[:, 0], t - lag * (1.0 - np.exp(-t / lag)), atol=1e-13)
