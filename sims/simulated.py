@@ -23,7 +23,7 @@ class Simulated(Simulator):
         observe: channels to return, in order (default: all).
         engine: pybullet, mujoco or batch.
         effects: effects whose coefficients are parameters, behind the system's own, in the order in which a signal
-            passes them.
+            passes them: registered names, or classes that need no registering.
         fixed: effects with known coefficients: a number, or a list where an effect has several.
         settings: the engine's own, e.g. ``time_step``.
 
@@ -40,18 +40,17 @@ class Simulated(Simulator):
         observe: Sequence[str] | None = None,
         *,
         engine: str | None = None,
-        effects: Sequence[str] = (),
+        effects: Sequence[str | type[Effect]] = (),
         fixed: Mapping[str, float | Sequence[float]] | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(constants, observe)
         self._declared = self.system()
         self.engine = self._engine(engine, settings)
-        self.effects = [self._effect(name) for name in effects]
+        self.effects = [self._effect(effect) for effect in effects]
         self.fixed = [(self._effect(name), _row(name, value)) for name, value in (fixed or {}).items()]
-        doubled = [name for name in effects if name in (fixed or {})] or [
-            n for n in effects if list(effects).count(n) > 1
-        ]
+        named = [effect.name for effect in self.effects]
+        doubled = [name for name in named if name in (fixed or {}) or named.count(name) > 1]
         if doubled:
             raise InputError(f"effect {doubled[0]} is named twice")
         for effect, values in self.fixed:
@@ -74,10 +73,10 @@ class Simulated(Simulator):
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
         return engine_named(name or self.default_engine, self.system, settings)
 
-    def _effect(self, name: str) -> Effect:
-        effect = library.get(name)
+    def _effect(self, named: str | type[Effect]) -> Effect:
+        effect = library.get(named) if isinstance(named, str) else named
         if reason := effect.misses(self.system):
-            raise InputError(f"system {self.system.name} cannot have effect {name}: {reason}")
+            raise InputError(f"system {self.system.name} cannot have effect {effect.name}: {reason}")
         return effect()
 
     def simulate(self, theta: Array, scenario: Scenario) -> Array:

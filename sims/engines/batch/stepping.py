@@ -24,7 +24,8 @@ from sims.engines.ground import Ground, Indices, Mask
 from sims.system import Lanes, Motion
 
 EVENTS = 256  # in one step of one lane; what else happens in that step is passed over
-FRICTION_BEND, FORCE_BEND = 0.05, 0.005  # by which they may bend within a step, of the limit and of the largest so far
+FRICTION_BEND, FORCE_BEND = 0.05, 0.005  # by which they may bend within a step, each of its largest so far
+FAINT = 1e-5  # share of all acceleration below which friction may bend as it likes
 SHORTENED, FINEST = 0.25, 1.0 / 256.0  # a step that bends is shortened to this share, and to this of the full one
 PUNCTUAL = 1e-4  # share of a step by which breaking loose may be late
 NOTHING, IMPACT, STANDSTILL, LOOSE = range(4)
@@ -49,6 +50,7 @@ class Stepping:
         self._clock, self._dynamics = Clock(lanes), Dynamics(field, (count, dim))
         self._limit = self._longest  # of steps, as forces bend
         self._peak = np.zeros((count, 1))  # square of the largest acceleration so far
+        self._rubbed = np.zeros((count, 1))  # largest friction so far
         self._try = np.full((count, 1), np.inf)  # seconds to an event
         self._goal = np.full(count, NOTHING, dtype=np.int8)
         self._events = np.zeros(count, dtype=np.intp)
@@ -120,7 +122,9 @@ class Stepping:
         sharp = field.pushed & (dot(bend, bend) > (6.0 * FORCE_BEND) ** 2 * self._peak)
         if field.dry:
             first, second, third, fourth = self._dynamics.rubs
-            most = np.maximum(length(first), length(fourth))
+            # Against the largest so far: a Stribeck peak's tail, all but nothing at speed, bends sharply in proportion.
+            self._rubbed = np.maximum(self._rubbed, np.maximum(length(first), length(fourth)))
+            most = np.maximum(self._rubbed, FAINT * np.sqrt(self._peak) * field.mass)
             bends = length(first - second - third + fourth) > 6.0 * FRICTION_BEND * most
             sharp |= bends & field.rubs & ~self._dynamics.sticks
         any_sharp = sharp.any()
