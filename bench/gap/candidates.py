@@ -1,0 +1,146 @@
+"""What to try of each effect: directions in which it would change the trajectories, and where a fit of it may begin.
+
+An effect's coefficients scale it (a drag), shape it (a period), or modify it (the speed of a wind without which there
+is drag in still air). Those that scale give a direction each; those that shape or modify are laid on a grid, since a
+trajectory says nothing of them while the effect is off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from bench.gap.fit import Fit
+from bench.gap.world import World
+from methods.base import Array
+from sims.base import Parameter
+from sims.simulated import effect_parameters
+
+SMALL = 1e-4
+"""Share of a plausible range at which a direction is first taken."""
+LEVELS = (0.15, 0.35, 0.6, 0.85)
+"""Shares of the largest input at which limits, dead bands and plays are tried besides."""
+SHAPES, FREQUENCIES = 12, 48
+MODIFIED = (-0.7, -0.25, 0.0, 0.25, 0.7)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One direction.
+
+    Attributes:
+        effect: its name.
+        group: number of the grid point; directions of one group act together.
+        place: which coefficient scales it.
+        c: (k,) the coefficients simulated.
+        signed: whether the coefficient may be negative.
+        fixed: whether the direction holds at this size alone.
+    """
+
+    effect: str
+    group: int
+    place: int
+    c: Array
+    signed: bool
+    fixed: bool = False
+
+
+@dataclass(frozen=True)
+class Directions:
+    """Probes and what they change: (R, T, C, K), in units of the coefficient that scales, or of the whole change."""
+
+    probes: tuple[Probe, ...]
+    values: Array
+
+
+def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
+    """What each of these effects would change about a fitted model.
+
+    Args:
+        world: the runs.
+        at: the model.
+        names: effects, none of which the model has.
+    """
+    probes = [probe for name in names for probe in _first(world, name)]
+    values = _responses(world, at, probes)
+    again = list(_modified(world, probes, values))
+    kept = [i for i, response in enumerate(np.abs(values).max(axis=(0, 1, 2), initial=0.0)) if response > 0]
+    probes, values = [probes[i] for i in kept], values[..., kept]
+    if again:
+        more = _responses(world, at, again)
+        probes, values = [*probes, *again], np.concatenate([values, more], axis=3)
+    return Directions(tuple(probes), values)
+
+
+def _first(world: World, name: str) -> Iterator[Probe]:
+    parameters = effect_parameters(world.effects[name], world.simulator.system, world.channels)
+    shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
+    grids = [_grid(world, parameters[i]) for i in shaping]
+    group = 0
+    for point in product(*grids):
+        for place, p in enumerate(parameters):
+            if place in shaping:
+                continue
+            c = np.zeros(len(parameters))
+            c[shaping] = point
+            c[place] = SMALL * p.bounds[1]
+            yield Probe(name, group, place, c, p.bounds[0] < 0)
+        group += 1
+    if world.effects[name].coefficients[0].of == "input" and parameters[0].bounds[0] == 0:
+        largest = max(float(np.abs(next(iter(t.scenario.inputs.values()), np.zeros(1))).max()) for t in world.tracks)
+        for level in LEVELS:
+            if largest > 0:
+                yield Probe(name, group, 0, np.array([level * largest]), False, True)
+                group += 1
+
+
+def _grid(world: World, parameter: Parameter) -> Array:
+    low, high = parameter.bounds
+    if parameter.unit == "Hz":
+        seconds = max(float(t.scenario.times[-1] - t.scenario.times[0]) for t in world.tracks)
+        count = int(np.clip(2.0 * (high - low) * seconds, 4, FREQUENCIES))
+        return low + (high - low) * np.linspace(0.0, 1.0, count) ** 1.3
+    return np.geomspace(low, high, SHAPES)
+
+
+def _modified(world: World, probes: Sequence[Probe], values: Array) -> Iterator[Probe]:
+    """Grid points of coefficients that change nothing by themselves but belong to an effect that acts."""
+    moves = np.abs(values).max(axis=(0, 1, 2), initial=0.0) > 0
+    acting = {p.effect for p, m in zip(probes, moves, strict=True) if m}
+    idle: dict[str, list[Probe]] = {}
+    for p, m in zip(probes, moves, strict=True):
+        if not m and p.effect in acting and not p.fixed and p.group == 0:
+            idle.setdefault(p.effect, []).append(p)
+    for name, modifiers in idle.items():
+        first = next(p for p, m in zip(probes, moves, strict=True) if m and p.effect == name)
+        parameters = effect_parameters(world.effects[name], world.simulator.system, world.channels)
+        for group, point in enumerate(product(MODIFIED, repeat=len(modifiers)), start=1):
+            if any(point):
+                c = first.c.copy()
+                for modifier, share in zip(modifiers, point, strict=True):
+                    c[modifier.place] = share * parameters[modifier.place].bounds[1]
+                yield Probe(name, group, first.place, c, first.signed)
+
+
+def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
+    """(R, T, C, K): the change that each probe makes, per unit of its coefficient, or as it is where that is fixed."""
+    changed = simulate_with(world, at, [(p.effect, p.c) for p in probes])
+    values = np.nan_to_num(np.moveaxis(changed - at.simulated, 0, -1))
+    sizes = np.array([1.0 if p.fixed else p.c[p.place] for p in probes])
+    result: Array = values / sizes
+    return result
+
+
+def simulate_with(world: World, at: Fit, added: Sequence[tuple[str, Array]]) -> Array:
+    """(K, R, T, C): the fitted model's runs with one more effect, for each of K effects with their coefficients."""
+    runs = len(world.tracks)
+    theta = np.tile(at.theta, (len(added), 1))
+    for row, (name, c) in zip(theta, added, strict=True):
+        row[world.slots[name]] = c
+    seen = world.simulate(
+        np.repeat(theta, runs, axis=0), np.tile(np.arange(runs), len(added)), np.tile(at.states, (len(added), 1))
+    )
+    return seen.reshape(len(added), runs, *seen.shape[1:])

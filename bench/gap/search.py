@@ -1,0 +1,250 @@
+"""Finds the effects that explain a recording: linear scores nominate, simulation decides, moves correct.
+
+Forward selection alone is not enough: where two effects act, the first pick is often a third one that mimics both. So
+several models are carried along (a beam search), and each larger model is compared with those that lack or replace one
+of its effects (A. Miller, Subset Selection in Regression, 2nd ed., 2002, doi:10.1201/9781420035933, chapter 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bench.gap.candidates import Directions, directions
+from bench.gap.colour import Likelihood, Noise, likelihood, surrogates
+from bench.gap.fit import Fit, Fitter, Start
+from bench.gap.score import Scores, score, tail
+from bench.gap.world import Mask, World, coefficient_bounds
+from methods.base import Array
+
+Names = tuple[str, ...]
+
+SURROGATES = 120
+ALPHA = 0.003
+"""Chance at which an effect would be taken for real although nothing is missing."""
+UNLIKELY, DOUBTFUL = 0.2, 0.05
+"""Chance of the linear scores above which no effect, or no further one, is tried by simulation."""
+LOUD = 1.3
+"""What is left that exceeds the noise floor by more is looked into by simulation whatever the scores say."""
+MOST_EFFECTS = 3
+NOMINATED = 7
+PROMISING = 0.25
+"""Candidates are refitted that promise at least this share of the best one's score."""
+BEAM = 3
+RIVAL = 0.5
+"""A model goes on in the beam if it has at least this share of the best one's gain."""
+SWITCH = 7.0
+"""Twice the log likelihood by which two models must differ to be told apart: odds of 33 to 1."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A fitted model and its merit.
+
+    Attributes:
+        fit: the fit.
+        likelihood: of its residual.
+        merit: twice the log likelihood less the log of the number of samples for each coefficient (G. Schwarz,
+            Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136).
+    """
+
+    fit: Fit
+    likelihood: Likelihood
+    merit: float
+
+    @property
+    def names(self) -> Names:
+        """Its effects."""
+        return self.fit.effects
+
+
+@dataclass
+class Search:
+    """The models of one recording that have been fitted, and what has been scored about them."""
+
+    world: World
+    noise: Noise
+    frozen: frozenset[int]
+    rng: np.random.Generator
+    models: dict[frozenset[str], Model] = field(default_factory=dict)
+    scanned: dict[frozenset[str], tuple[Directions, Scores]] = field(default_factory=dict)
+    tests: dict[frozenset[str], float] = field(default_factory=dict)
+
+    @property
+    def seen(self) -> Mask:
+        """(R, T, C) samples that there are."""
+        return np.isfinite(self.world.observed)
+
+    def residual(self, fit: Fit) -> Array:
+        """(R, T, C) observed less simulated, zero where nothing was seen."""
+        residual: Array = np.where(self.seen, self.world.observed - fit.simulated, 0.0)
+        return residual
+
+    def enter(self, fit: Fit) -> Model:
+        """Take a fit into account; the better of two fits of the same effects is kept."""
+        own = fit.jacobian.shape[3] * 1.0 + fit.states.size - fit.states.shape[1]
+        found = likelihood(self.residual(fit), self.seen, own) if np.isfinite(fit.cost) else _LOST
+        coefficients = sum(s.stop - s.start for s in (self.world.slots[name] for name in fit.effects))
+        merit = found.value - coefficients * float(np.log(max(int(self.seen.sum()), 2)))
+        model, key = Model(fit, found, merit), frozenset(fit.effects)
+        if key not in self.models or merit > self.models[key].merit:
+            self.models[key] = model
+            self.scanned.pop(key, None)
+        return self.models[key]
+
+    def refit(self, starts: Sequence[Start], noise: Noise | None = None, iterations: int = 12) -> None:
+        """Fit models from their starts and enter them."""
+        fitter = Fitter(self.world, noise or self.noise, self.frozen)
+        for fit in fitter.fit(starts, iterations, race=True):
+            self.enter(fit)
+
+    def scan(self, model: Model, against: Array | None = None) -> Scores:
+        """Score every effect that the model lacks.
+
+        Args:
+            model: about which.
+            against: (R, T, C) a residual for surrogates; the model's own if None.
+        """
+        key = frozenset(model.names)
+        lacking = [name for name in self.world.slots if name not in key]
+        if key not in self.scanned:
+            self.scanned[key] = (directions(self.world, model.fit, lacking), _NOTHING)
+        found = self.scanned[key][0]
+        residual = self.residual(model.fit)
+        like = surrogates(residual if against is None else against, self.seen, SURROGATES, self.rng)
+        scores = score(model.fit, residual, found, self.seen, self._weights(model), like)
+        self.scanned[key] = (found, scores)
+        self.tests[key] = scores.p_value
+        return scores
+
+    def _weights(self, model: Model) -> Noise:
+        """Channels weigh by what the model leaves of them where that is more than their noise."""
+        left = np.where(np.isfinite(model.likelihood.sigma), model.likelihood.sigma, 0.0)
+        return Noise(np.maximum(self.noise.sigma, left), self.noise.phi)
+
+    def starts(self, model: Model, scores: Scores, most: int) -> list[Start]:
+        """Where to begin with the most promising candidates, at what their scores say and at less."""
+        found = self.scanned[frozenset(model.names)][0]
+        promise = scores.score - scores.chance
+        order = np.argsort(-promise, kind="stable")
+        chosen = [i for i in order if promise[i] >= PROMISING * promise[order[0]]][:most]
+        result = []
+        for i in chosen:
+            name, group = scores.effects[i], scores.group[i]
+            bounds = coefficient_bounds(self.world, name)
+            for share in (1.0, 0.25):
+                c = found.probes[group.columns[0]].c.copy()
+                for column, size in zip(group.columns, scores.c[i], strict=True):
+                    probe = found.probes[column]
+                    if not probe.fixed:
+                        c[probe.place] = share * float(np.clip(size, *bounds[probe.place]))
+                theta = model.fit.theta.copy()
+                theta[self.world.slots[name]] = c
+                result.append(Start((*model.names, name), theta, model.fit.states))
+                if found.probes[group.columns[0]].fixed:
+                    break
+        return self._nearest(result)
+
+    def _nearest(self, starts: Sequence[Start]) -> list[Start]:
+        """Of the starts with the same effects the one whose simulation comes nearest."""
+        if not starts:
+            return []
+        world, runs = self.world, len(self.world.tracks)
+        theta = np.repeat([s.theta for s in starts], runs, axis=0)
+        states = np.concatenate([s.states for s in starts])
+        seen = world.simulate(theta, np.tile(np.arange(runs), len(starts)), states)
+        seen = seen.reshape(len(starts), runs, *seen.shape[1:])
+        best: dict[Names, tuple[float, Start]] = {}
+        for start, part in zip(starts, seen, strict=True):
+            left = np.where(self.seen, world.observed - part, 0.0) / self.noise.sigma
+            cost = float(np.square(left).sum())
+            if cost < best.get(start.effects, (np.inf,))[0]:
+                best[start.effects] = cost, start
+        return [start for _, start in best.values()]
+
+    def extend(self, beam: Iterable[Model], most: int) -> None:
+        """Refit the most promising extensions of some models."""
+        starts = []
+        for model in beam:
+            key = frozenset(model.names)
+            scores = self.scanned[key][1] if key in self.scanned else self.scan(model)
+            starts += [s for s in self.starts(model, scores, most) if frozenset(s.effects) not in self.models]
+        if starts:
+            self.refit(starts)
+
+    def best(self, size: int) -> Model | None:
+        """The best model with so many effects."""
+        there = [m for m in self.models.values() if len(m.names) == size]
+        return max(there, key=lambda m: m.merit) if there else None
+
+    def missing(self, model: Model, larger: Model) -> float:
+        """Probability that a model which lacks nothing would seem to gain as much as it does by becoming the larger one.
+
+        The surrogates have the colour of what the larger model leaves, which is closer to the noise alone.
+        """
+        scores = self.scan(model, self.residual(larger.fit))
+        gain = larger.likelihood.value - model.likelihood.value
+        chance = {name: float(c) for name, c in zip(scores.effects, scores.chance, strict=True)}
+        added = max((chance.get(name, 0.0) for name in larger.names), default=0.0)
+        return min(scores.p_value, tail(scores.by_chance, np.array([gain - added])))
+
+    def plain(self, model: Model, doubt: float) -> bool:
+        """Whether nothing suggests that the model lacks something: neither a score nor the size of what it leaves."""
+        left = np.nanmax(model.likelihood.sigma / self.noise.sigma)
+        return self.scan(model).p_value > doubt and float(left) < LOUD
+
+    def drop(self, model: Model) -> Model:
+        """The model without effects that it does not need."""
+        for name in model.names:
+            rest = tuple(n for n in model.names if n != name)
+            if frozenset(rest) not in self.models:
+                theta = model.fit.theta.copy()
+                theta[self.world.slots[name]] = 0.0
+                self.refit([Start(rest, theta, model.fit.states)])
+            smaller = self.models[frozenset(rest)]
+            if smaller.merit >= model.merit:
+                return self.drop(smaller)
+        return model
+
+    def swap(self, model: Model) -> Model:
+        """The best model that has one effect replaced, as long as that gains."""
+        while True:
+            for name in model.names:
+                rest = self.models[frozenset(n for n in model.names if n != name)]
+                self.extend([rest], NOMINATED)
+            better = self.best(len(model.names))
+            if better is None or better.merit <= model.merit + 1e-6:
+                return model
+            model = self.drop(better)
+
+    def run(self) -> Model:
+        """The model of all effects that the data show."""
+        best = self.models[frozenset()]
+        for size in range(1, MOST_EFFECTS + 1):
+            if self.plain(best, UNLIKELY if size == 1 else DOUBTFUL):
+                break
+            self.extend([best], NOMINATED)
+            larger = self.best(size)
+            if larger is None or larger.merit <= best.merit or self.missing(best, larger) > ALPHA:
+                break
+            self.extend(self._beam(size - 1), NOMINATED)
+            larger = self.best(size)
+            assert larger is not None
+            if size > 1:
+                larger = self.drop(self.swap(self.drop(larger)))
+            best = larger
+            if len(best.names) < size:
+                break
+        return best
+
+    def _beam(self, size: int) -> list[Model]:
+        """The best models of so many effects that explain enough to be in the running."""
+        base = self.models[frozenset()].merit
+        there = sorted((m for m in self.models.values() if len(m.names) == size), key=lambda m: -m.merit)
+        return [m for m in there if m.merit - base >= RIVAL * (there[0].merit - base)][:BEAM] if size else []
+
+
+_LOST = Likelihood(-np.inf, np.zeros(0), np.zeros(0))
+_NOTHING = Scores((), np.zeros(0), np.zeros(0), (), (), 1.0, 0.0, np.zeros((0, 0)))

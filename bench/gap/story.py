@@ -1,0 +1,124 @@
+"""What an explanation tells: plain data that the account, the figures and the report are made from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from methods.base import Array
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One recorded channel: name, unit, noise (1 sigma), whether the recording states it, its quantisation (0: none)."""
+
+    name: str
+    unit: str
+    sigma: float
+    stated: bool
+    step: float
+
+
+@dataclass(frozen=True)
+class Side:
+    """Runs with what was measured and simulated.
+
+    Attributes:
+        names: of the runs.
+        times: (T_r,) seconds of each run.
+        observed: (R, T, C), NaN where missing and behind the end of shorter runs.
+        before: (R, T, C) the tuned base model.
+        after: (R, T, C) the extended model; the base model again where nothing was found.
+    """
+
+    names: tuple[str, ...]
+    times: tuple[Array, ...]
+    observed: Array
+    before: Array
+    after: Array
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the gap is: RMS of the residual in units of the noise, before and after, in one part of the data.
+
+    Attributes:
+        kind: ``run``, ``channel`` or ``phase``.
+        label: which one.
+        samples: how many.
+        before: RMS, 1 is the noise floor.
+        after: RMS.
+    """
+
+    kind: str
+    label: str
+    samples: int
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The residual of one channel against a variable, averaged in bins.
+
+    Attributes:
+        channel: whose residual.
+        variable: ``time``, ``position``, ``speed`` or an input's name.
+        unit: of the variable.
+        centres: (B,) of the bins.
+        before: (B,) mean residual, units of the channel; NaN in empty bins.
+        after: (B,).
+        error: (B,) standard error of a mean, from the noise.
+    """
+
+    channel: str
+    variable: str
+    unit: str
+    centres: Array
+    before: Array
+    after: Array
+    error: Array
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """A parameter before and after the extension, each with its 95 % interval (NaN where the data give none)."""
+
+    name: str
+    unit: str
+    before: tuple[float, float, float]
+    after: tuple[float, float, float]
+    touched: bool
+
+
+@dataclass(frozen=True)
+class Story:
+    """Everything that is told.
+
+    Attributes:
+        title: of the recording.
+        path: of the recording.
+        verdict: verdict.json, see DESIGN; its ``says`` and names are texts from files or plugins: escape them.
+        channels: the recorded ones.
+        fitting: runs for fitting.
+        held_out: runs for measuring; None where there are none.
+        places: where the gap is, held-out runs included.
+        profiles: the residual against time, position, speed and inputs.
+        parameters: before and after.
+        remains: what the extended model leaves unexplained and what to bear in mind, a sentence each; may be empty.
+        why: sentences that say why the verdict is what it is, the most important first.
+    """
+
+    title: str
+    path: Path
+    verdict: Mapping[str, Any]
+    channels: tuple[Shown, ...]
+    fitting: Side
+    held_out: Side | None
+    places: tuple[Place, ...]
+    profiles: tuple[Profile, ...]
+    parameters: tuple[Tuned, ...]
+    remains: tuple[str, ...]
+    why: tuple[str, ...]

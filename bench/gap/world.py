@@ -1,0 +1,244 @@
+"""The recorded runs as the simulator meets them: any parameters, effects and initial states, many lanes in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from methods.base import Array
+from sims import effects as library
+from sims.base import InputError, Parameter, Scenario, unknown
+from sims.recording import Recording, Run
+from sims.simulated import Simulated, effect_parameters
+from sims.system import Effect, Input, Sensor
+
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+LANE_SAMPLES = 400_000
+"""Samples simulated in one call of the engine: beyond it more lanes cost memory and gain nothing."""
+TIME_STEP = 0.01
+"""Longest step of the batch engine, seconds; it shortens its steps itself where motion or forces ask for it."""
+FREED = 5.0
+"""A constant that is set free is searched from a fifth of its value to five times it."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """One recorded run.
+
+    Attributes:
+        name: the run's name.
+        scenario: what the simulator is given; its initial states are guesses where they are not stated.
+        observed: (T, C) SI units, NaN where missing.
+        guess: (s,) initial states, stated or guessed from the first samples.
+        known: (s,) which of them the recording states.
+    """
+
+    name: str
+    scenario: Scenario
+    observed: Array
+    guess: Array
+    known: Mask
+
+
+class World:
+    """Some runs of a recording, and one simulator that has every effect at hand, off unless its coefficients say so.
+
+    A vector theta (P,) holds the system's own parameters, constants set free, then all coefficients.
+
+    Args:
+        kind: the simulator's class.
+        recording: what was recorded.
+        runs: which of its runs; all have the same length of padding afterwards.
+        engine: the engine's name.
+        extra: effects beside the registered library.
+        free: constants to treat as parameters.
+
+    Raises:
+        InputError: the simulator is no system that takes effects, a constant does not exist, or no channel is its own.
+    """
+
+    def __init__(
+        self,
+        kind: type[Simulated],
+        recording: Recording,
+        runs: Sequence[Run],
+        engine: str | None = "batch",
+        extra: Sequence[type[Effect]] = (),
+        free: Sequence[str] = (),
+        candidates: Sequence[str] | None = None,
+    ) -> None:
+        self.kind, self.recording, self.engine = kind, recording, engine
+        usable = library.library(kind.system)
+        names = list(usable) if candidates is None else list(candidates)
+        chosen: list[str | type[Effect]] = [*names, *extra]
+        observe = [c.name for c in kind.channels if c.name in runs[0].channels]
+        settings = {"time_step": TIME_STEP} if engine == "batch" else {}
+        self.simulator = kind(recording.constants, observe, engine=engine, effects=chosen, **settings)
+        own = list(self.simulator.system.parameters)
+        self.freed = [self._freed(name) for name in free]
+        self.parameters: tuple[Parameter, ...] = (*own, *self.freed, *self.simulator.parameters[len(own) :])
+        self.base: Indices = np.arange(len(own) + len(self.freed))
+        self.slots = self._slots()
+        self.states = [*self.simulator.system.coordinates, *self.simulator.system.rates] or list(kind.states)
+        self.tracks = tuple(self._track(run) for run in runs)
+        self.lengths: Indices = np.array([len(t.observed) for t in self.tracks])
+        self.observed = np.full((len(runs), self.lengths.max(), len(observe)), np.nan)
+        for row, track in zip(self.observed, self.tracks, strict=True):
+            row[: len(track.observed)] = track.observed
+        self.known: Mask = np.array([t.known for t in self.tracks])
+        self.guess: Array = np.array([t.guess for t in self.tracks])
+        self.simulations = 0
+        self._shifting, self._filtering = self._delaying()
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the recorded channels, in the order of observations."""
+        return [c.name for c in self.simulator.channels]
+
+    @property
+    def effects(self) -> dict[str, Effect]:
+        """Every effect at hand, by name."""
+        return {effect.name: effect for effect in self.simulator.effects}
+
+    def nominal(self) -> Array:
+        """(P,) parameters at their nominal values, every effect off."""
+        values = np.array([p.nominal for p in self.parameters])
+        values[self.base.size :] = 0.0
+        return values
+
+    def simulate(self, theta: Array, runs: Indices, states: Array) -> Array:
+        """Observations (L, T, C) of lanes with parameters (L, P), in runs (L,), from initial states (L, s)."""
+        self.simulations += len(theta)
+        result = np.empty((len(theta), self.observed.shape[1], self.observed.shape[2]))
+        active = theta != 0
+        kinds = active[:, self._shifting].any(axis=1) + 2 * active[:, self._filtering].any(axis=1)
+        for kind in np.unique(kinds):
+            lanes = np.flatnonzero(kinds == kind)
+            size = max(1, LANE_SAMPLES // result.shape[1])
+            for begin in range(0, lanes.size, size):
+                part = lanes[begin : begin + size]
+                seen = self._simulated(theta[part], runs[part], states[part])
+                result[part, : seen.shape[1]] = seen
+                result[part, seen.shape[1] :] = np.nan
+        return result
+
+    def _simulated(self, theta: Array, runs: Indices, states: Array) -> Array:
+        own = len(self.simulator.system.parameters)
+        scenarios = [self.tracks[run].scenario for run in runs]
+        if self.freed:
+            names = [p.name for p in self.freed]
+            values = theta[:, own : own + len(names)].tolist()
+            scenarios = [
+                replace(s, constants={**s.constants, **dict(zip(names, row, strict=True))})
+                for s, row in zip(scenarios, values, strict=True)
+            ]
+        lanes = np.delete(theta, np.arange(own, self.base.size), axis=1)
+        return self.simulator.simulate_lanes(lanes, scenarios, dict(zip(self.states, states.T, strict=True)))
+
+    def close(self) -> None:
+        """Give back what the engine holds."""
+        self.simulator.close()
+
+    def _freed(self, name: str) -> Parameter:
+        constants = {c.name: c for c in self.kind.constants}
+        if name not in constants:
+            raise unknown(f"constant of system {self.kind.name}", name, list(constants) or ["none"])
+        value = self.simulator.constant_values[name]
+        if value == 0 or any(name in run.constants for run in self.recording.runs):
+            raise InputError(f"--free {name}: expected a constant that is not zero and the same in every run")
+        low, high = sorted((value / FREED, value * FREED))
+        return Parameter(name, constants[name].unit, value, (low, high), says=constants[name].says)
+
+    def _slots(self) -> dict[str, slice]:
+        slots, place = {}, self.base.size
+        for effect in self.simulator.effects:
+            count = len(effect.on(self.simulator.system))
+            slots[effect.name] = slice(place, place + count)
+            place += count
+        return slots
+
+    def _delaying(self) -> tuple[Indices, Indices]:
+        """Where coefficients stand that move instants, and that need every step: lanes with them are simulated apart."""
+        found: tuple[list[int], list[int]] = ([], [])
+        for effect in self.simulator.effects:
+            places = range(*self.slots[effect.name].indices(len(self.parameters)))
+            if (isinstance(effect, Input) and type(effect).times is not Input.times) or (
+                isinstance(effect, Sensor) and type(effect).times is not Sensor.times
+            ):
+                found[0].extend(places)
+            if isinstance(effect, Sensor) and effect.filters:
+                found[1].extend(places)
+        return np.array(found[0], dtype=np.intp), np.array(found[1], dtype=np.intp)
+
+    def _track(self, run: Run) -> Track:
+        observed = np.stack([run.channels[name] for name in self.channels], axis=1)
+        guess, known = self._start(run)
+        constants = {**self.recording.constants, **run.constants}
+        scenario = Scenario(run.times, {}, run.inputs, constants)
+        return Track(run.name, scenario, observed, guess, known)
+
+    def _start(self, run: Run) -> tuple[Array, Mask]:
+        """Initial states (s,), and which of them are stated: from the first samples where they are not."""
+        system, defaults = self.simulator.system, self.kind.states
+        values = dict(defaults)
+        for coordinate, rate in zip(system.coordinates, system.rates, strict=True):
+            if coordinate in run.channels:
+                place, slope = beginning(run.times, run.channels[coordinate])
+                values[coordinate], values[rate] = place, slope
+            if rate in run.channels:
+                values[rate] = beginning(run.times, run.channels[rate])[0]
+        self._lift(values, run)
+        values.update(run.initial)
+        return np.array([values[name] for name in self.states]), np.array([n in run.initial for n in self.states])
+
+    def _lift(self, values: dict[str, float], run: Run) -> None:
+        """Where the height above the ground is not recorded, no impact can be told: begin too high for one."""
+        system = self.simulator.system
+        if not system.bounces or system.coordinates[-1] in run.channels:
+            return
+        gravity = float(run.constants.get("gravity", self.simulator.constant_values.get("gravity", 9.81)))
+        seconds = float(run.times[-1] - run.times[0])
+        values[system.coordinates[-1]] = 10.0 + 100.0 * seconds + gravity * seconds**2
+
+
+def beginning(times: Array, values: Array) -> tuple[float, float]:
+    """Value and slope at the first instant, from a parabola through the first samples that are there."""
+    seen = np.isfinite(values)
+    t, y = times[seen][:_FIRST] - times[0], values[seen][:_FIRST]
+    if t.size == 0:
+        return 0.0, 0.0
+    if t.size < 3:
+        return float(y[0]), 0.0
+    scale = float(t[-1]) or 1.0
+    slope, value = np.polynomial.polynomial.polyfit(t / scale, y, 1 if t.size < 5 else 2)[1::-1]
+    return float(value), float(slope / scale)
+
+
+_FIRST = 8
+
+
+def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
+    """The range in which a fit may move each coefficient of an effect.
+
+    A plausible range orders causes; it does not overrule the data: what may have either sign may be twenty times
+    larger. What is zero or positive by its meaning stays so, and what shapes an effect stays in its range.
+    """
+    bounds = []
+    for parameter in effect_parameters(world.effects[name], world.simulator.system, world.channels):
+        low, high = parameter.bounds
+        bounds.append((low, high) if low > 0 else (0.0 if low == 0 else _BEYOND * low, _BEYOND * high))
+    return bounds
+
+
+_BEYOND = 20.0
+
+
+def plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values without the entries that are None."""
+    return {key: value for key, value in values.items() if value is not None}

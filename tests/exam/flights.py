@@ -1,0 +1,130 @@
+"""The ball with anything acting on it, for scipy: flights from impact to impact."""
+
+from __future__ import annotations
+
+from math import cos, hypot, pi, sin, sqrt, tanh
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from tests.exam.joints import TOLERANCES, inside
+
+AT_REST = 1e-5  # m/s: slower rebounds are none
+FOREIGN = ("updraft", "gust", "wear", "layer")
+STATES = ("x", "y", "z", "vx", "vy", "vz")
+
+
+class Air:
+    """Everything that accelerates a ball in flight."""
+
+    def __init__(self, world, number):
+        self.g, self.acting = world.constants["gravity"], {**world.effects, **world.foreign}
+        self.laws = [(LAWS[name], c) for name, c in self.acting.items() if name in LAWS]
+        self.gust = None
+        if "gust" in self.acting:
+            along, up, lasting, *begins = self.acting["gust"]
+            self.gust = along, up, begins[number], begins[number] + lasting
+        self.breaks = list(self.gust[2:]) if self.gust else []
+
+    def at(self, t, y, middle):
+        """Acceleration in state y; `middle` is an instant within the stretch between two breaks that is integrated."""
+        ax, ay, az = 0.0, 0.0, -self.g
+        for law, c in self.laws:
+            bx, by, bz = law(c, self.g, t, *y)
+            ax, ay, az = ax + bx, ay + by, az + bz
+        if self.gust and self.gust[2] <= middle < self.gust[3]:
+            ax, az = ax + self.gust[0], az + self.gust[1]
+        return ax, ay, az
+
+
+def _drag(c, u, v, w, speed=1.0):
+    return -c * speed * u, -c * speed * v, -c * speed * w
+
+
+def _wind(c, g, t, x, y, z, u, v, w):
+    u, v = u - c[1], v - c[2]
+    return _drag(c[0], u, v, w, sqrt(u * u + v * v + w * w))
+
+
+def _periodic(c, g, t, *state):
+    return 0.0, 0.0, c[0] * sin(2 * pi * c[2] * t) + c[1] * cos(2 * pi * c[2] * t)
+
+
+def _layer(c, g, t, x, y, z, u, v, w):
+    share = 0.5 * (1 + tanh((z - c[1]) / 0.02))
+    return _drag(c[0] * share, u, v, w, sqrt(u * u + v * v + w * w))
+
+
+LAWS = {
+    "drag.linear": lambda c, g, t, x, y, z, u, v, w: _drag(c[0], u, v, w),
+    "drag.quadratic": lambda c, g, t, x, y, z, u, v, w: _drag(c[0], u, v, w, sqrt(u * u + v * v + w * w)),
+    "wind": _wind,
+    "gravity.scale": lambda c, g, *s: (0.0, 0.0, -c[0] * g),
+    "gravity.tilt": lambda c, g, *s: (c[0] * g, c[1] * g, 0.0),
+    "force.bias": lambda c, g, *s: (0.0, 0.0, c[0]),
+    "force.periodic": _periodic,
+    "lift.magnus": lambda c, g, t, x, y, z, u, v, w: (-c[0] * w - c[1] * v, c[1] * u, c[0] * u),
+    "updraft": lambda c, g, t, x, *s: (0.0, 0.0, c[0] * inside(x, c[1], c[2])),  # foreign: air that rises over a place
+    "layer": _layer,  # foreign: drag above a height only
+}
+
+
+def move(world, scenario, number, instants):
+    """Positions and velocities (T, 6) of run `number` at increasing instants (T,) >= 0."""
+    air, until = Air(world, number), float(instants[-1])
+    state = np.array([scenario.initial[name] for name in STATES])
+    out = np.empty((instants.size, 6))
+    out[instants <= 0] = state
+    now, rising, resting = 0.0, 0.0, False
+    while now < until:
+        end = min([until, *(b for b in air.breaks if b > now)], default=until)
+        looks = not (rising or resting)
+        if rising:  # the rise after a bounce is integrated without looking for the ground, where it begins
+            end = min(end, now + rising)
+        solved = _fly(air, now, end, state, world.constants["radius"] if looks else None, resting)
+        reached, state = float(solved.t[-1]), solved.y[:, -1].copy()
+        first, last = np.searchsorted(instants, [now, reached], side="right")
+        if last > first:
+            out[first:last] = solved.sol(instants[first:last]).T
+        now, rising = reached, 0.0
+        if looks and solved.t_events[0].size:
+            state, resting = _bounce(world, now, state)
+            state[2] = world.constants["radius"]
+            rising = 0.0 if resting else 0.4 * state[5] / max(-air.at(now, state, now)[2], 1e-3)
+    return out
+
+
+def _fly(air, now, end, state, floor, resting):
+    middle = 0.5 * (now + end)
+
+    def rate(t, y):
+        ax, ay, az = air.at(t, y.tolist(), middle)
+        return (y[3], y[4], y[5], ax, ay, max(az, 0.0) if resting else az)
+
+    def meets(t, y):
+        return y[2] - floor
+
+    meets.terminal, meets.direction = True, -1
+    events = None if floor is None else meets
+    step = min(0.02, end - now)
+    solved = solve_ivp(rate, (now, end), state, events=events, dense_output=True, first_step=step, **TOLERANCES)
+    if not solved.success:
+        raise RuntimeError(solved.message)
+    return solved
+
+
+def _bounce(world, t, state):
+    """The state after an impact, and whether the ball stays down."""
+    speed, e = -state[5], world.parameters["restitution"]
+    if "restitution.speed" in world.effects:
+        e = min(e * speed ** world.effects["restitution.speed"][0], 1.0)
+    if "wear" in world.foreign:  # foreign: restitution that fades with time
+        e = min(max(e * (1.0 - world.foreign["wear"][0] * t), 0.0), 1.0)
+    along = hypot(state[3], state[4])
+    lost = world.effects.get("contact.friction", [0.0])[0] * (1 + e) * speed
+    after = state.copy()
+    after[3:5] *= max(1.0 - lost / along, 0.0) if along > 0 else 1.0
+    after[5] = e * speed if e * speed > AT_REST else 0.0
+    return after, after[5] == 0.0
+
+

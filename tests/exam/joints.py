@@ -1,0 +1,225 @@
+"""Pendulum and slider with anything acting on them, for scipy: one coordinate, events where dry friction stops it.
+
+Every law is written out here once more, in plain numbers; nothing is shared with the library that the exam is about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import copysign, cos, exp, inf, pi, sin, tanh
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+TOLERANCES = {"method": "DOP853", "rtol": 1e-8, "atol": 1e-10}
+EDGE = 0.05  # a region's borders are soft over this share of its half width, so that the solver keeps its order
+
+Law = Callable[[float, float, float], float]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A stretch of time in which the felt input approaches `target` from `start`, at once where `lag` is zero."""
+
+    begin: float
+    end: float
+    start: float
+    target: float
+    lag: float
+
+    def at(self, t):
+        return self.target + ((self.start - self.target) * exp((self.begin - t) / self.lag) if self.lag > 0 else 0.0)
+
+    def cut(self, begin, end):
+        return Piece(begin, end, self.at(begin), self.target, self.lag)
+
+
+def felt(scenario, effects, until) -> list[Piece]:
+    """The first input as the plant feels it, from 0 to `until`; a lag comes behind whatever is not linear."""
+    if "u" not in scenario.inputs:
+        return [Piece(0.0, until, 0.0, effects.get("input.bias", [0.0])[0], 0.0)]
+    levels, edges, lag = np.array(scenario.inputs["u"]), scenario.times - scenario.times[0], 0.0
+    for name, c in effects.items():
+        if name in ("input.deadband", "input.saturation", "backlash") and lag:
+            raise NotImplementedError(f"{name} behind input.lag")
+        if name == "input.delay":
+            edges = edges + c[0]
+        elif name == "input.lag":
+            lag = c[0]
+        elif name in STEPWISE:
+            levels = STEPWISE[name](levels, c[0])
+    changes = np.flatnonzero(np.diff(levels)) + 1
+    begins, targets = [0.0, *edges[changes]], [levels[0], *levels[changes]]
+    pieces, state = [], levels[0]
+    for begin, end, target in zip(begins, [*begins[1:], inf], targets, strict=True):
+        if begin < until:
+            pieces.append(Piece(float(begin), float(min(end, until)), float(state), float(target), lag))
+            state = pieces[-1].at(pieces[-1].end)
+    return pieces
+
+
+def _play(levels, width):
+    result, state = [], levels[0]
+    for level in levels:
+        if abs(level - state) > width / 2:
+            state = level - copysign(width / 2, level - state)
+        result.append(state)
+    return np.array(result)
+
+
+STEPWISE = {
+    "input.gain": lambda u, c: u * (1 + c),
+    "input.bias": lambda u, c: u + c,
+    "input.deadband": lambda u, c: np.sign(u) * np.maximum(np.abs(u) - c, 0.0),
+    "input.saturation": lambda u, c: np.minimum(np.maximum(u, -c), c),
+    "backlash": _play,
+}
+
+
+class Joint:
+    """One coordinate: generalised `inertia`, `weight` (its own force of position), laws that push, laws that rub."""
+
+    def __init__(self, world, number):
+        k, p = world.constants, world.parameters
+        self.piece = None
+        if world.system == "pendulum":
+            arm = k["mass"] * k["length"]
+            self.inertia, gravity = p["inertia"], k["gravity"]
+            self.weight, self.sideways = (lambda x: -arm * gravity * sin(x)), (lambda x: arm * cos(x))
+        else:
+            self.inertia, gravity = p["mass"], 9.80665
+            self.weight, self.sideways = (lambda x: 0.0), (lambda x: self.inertia)
+        self.gravity = gravity
+        acting = {**world.effects, **world.foreign}
+        self.forces = [FORCES[name](self, list(c)) for name, c in acting.items() if name in FORCES]
+        self.limits = [LIMITS[name](self, list(c)) for name, c in acting.items() if name in LIMITS]
+        self.breaks = []
+        if "gust" in acting:
+            push, lasting, *begins = acting["gust"]
+            begin = begins[number]
+            self.breaks = [begin, begin + lasting]
+            self.forces.append(lambda t, x, v: push if begin <= self.middle < begin + lasting else 0.0)
+        self.restless = "force.periodic" in acting or "input.lag" in acting
+
+    def enter(self, piece):
+        self.piece, self.middle = piece, 0.5 * (piece.begin + piece.end)
+
+    def pull(self, t, x, v):
+        """All but dry friction."""
+        total = self.piece.at(t) + self.weight(x)
+        for force in self.forces:
+            total += force(t, x, v)
+        return total
+
+    def limit(self, t, x, v):
+        """The largest dry friction."""
+        return sum(limit(t, x, v) for limit in self.limits)
+
+
+def _wave(c, cycles):
+    return c[0] * sin(2 * pi * cycles) + c[1] * cos(2 * pi * cycles)
+
+
+FORCES: dict[str, Callable[[Joint, list[float]], Law]] = {
+    "drag.linear": lambda j, c: lambda t, x, v: -c[0] * v,
+    "drag.quadratic": lambda j, c: lambda t, x, v: -c[0] * abs(v) * v,
+    "wind": lambda j, c: lambda t, x, v: -c[0] * abs(v - c[1]) * (v - c[1]),
+    "gravity.scale": lambda j, c: lambda t, x, v: c[0] * j.weight(x),
+    "gravity.tilt": lambda j, c: lambda t, x, v: c[0] * j.gravity * j.sideways(x),
+    "spring.linear": lambda j, c: lambda t, x, v: -c[0] * x,
+    "spring.cubic": lambda j, c: lambda t, x, v: -c[0] * x**3,
+    "force.bias": lambda j, c: lambda t, x, v: c[0],
+    "force.ripple": lambda j, c: lambda t, x, v: _wave(c, x / c[2]),
+    "force.periodic": lambda j, c: lambda t, x, v: _wave(c, t * c[2]),
+    "ageing": lambda j, c: lambda t, x, v: -c[0] * t * v,  # foreign: damping that grows with time
+    "stop": lambda j, c: lambda t, x, v: -c[0] * max(x - c[1], 0.0),  # foreign: a soft stop on one side
+}
+LIMITS: dict[str, Callable[[Joint, list[float]], Law]] = {
+    "friction.coulomb": lambda j, c: lambda t, x, v: c[0],
+    "friction.stribeck": lambda j, c: lambda t, x, v: c[0] + c[1] * exp(-((v / c[2]) ** 2)),
+    "friction.load": lambda j, c: lambda t, x, v: c[0] * abs(j.piece.at(t) - j.weight(x)),
+    "patch": lambda j, c: lambda t, x, v: c[0] * inside(x, c[1], c[2]),  # foreign: rough from c1 - c2 to c1 + c2
+}
+FOREIGN = ("patch", "gust", "ageing", "stop")
+
+
+def inside(x, centre, half):
+    """1 inside a region, 0 outside, its borders soft; the integral over x is the region's width."""
+    return 0.5 * (tanh((x - centre + half) / (EDGE * half)) - tanh((x - centre - half) / (EDGE * half)))
+
+
+def move(world, scenario, number, instants):
+    """Positions and velocities (T, 2) of run `number` at increasing instants (T,) >= 0."""
+    joint, until = Joint(world, number), float(instants[-1])
+    names = ("q", "qd") if world.system == "pendulum" else ("x", "v")
+    state = np.array([scenario.initial[name] for name in names])
+    out = np.empty((instants.size, 2))
+    out[instants <= 0] = state
+    for piece in felt(scenario, world.effects, until):
+        marks = [piece.begin, *(b for b in sorted(joint.breaks) if piece.begin < b < piece.end), piece.end]
+        for begin, end in zip(marks[:-1], marks[1:], strict=True):
+            joint.enter(piece.cut(begin, end))
+            state = _through(joint, state, instants, out)
+    return out
+
+
+def _through(joint, state, instants, out):
+    """To the end of the joint's piece of input, standstill by standstill."""
+    now, end = joint.piece.begin, joint.piece.end
+    for _ in range(10_000):
+        if now >= end:
+            return state
+        reached, after, solution = _glide(joint, now, state)
+        first, last = np.searchsorted(instants, [now, reached], side="right")
+        if last > first:
+            out[first:last] = solution(instants[first:last]).T if solution else state
+        now, state = reached, after
+    raise RuntimeError("it never gets through: too many standstills")
+
+
+def _glide(joint, now, state: np.ndarray) -> tuple[float, np.ndarray, Callable | None]:
+    """Until the next standstill, breaking loose or the piece's end: when, the state there, the motion (None: none)."""
+    (x, v), end = state, joint.piece.end
+    way = copysign(1.0, v) if v else 0.0
+    if joint.limits and v == 0.0:
+        pull = joint.pull(now, x, 0.0)
+        if abs(pull) <= joint.limit(now, x, 0.0):
+            return _loose(joint, now, x), state, None
+        way = copysign(1.0, pull)
+
+    def rate(t, y):
+        rubbing = way * joint.limit(t, *y) if joint.limits else 0.0
+        return y[1], (joint.pull(t, *y) - rubbing) / joint.inertia
+
+    def turns(t, y):
+        return way * y[1]
+
+    turns.terminal, turns.direction = True, -1
+    events, first = (turns, min(0.01, end - now)) if joint.limits else (None, min(0.02, end - now))
+    solved = solve_ivp(
+        rate, (now, end), state, events=events, dense_output=True, max_step=0.05, first_step=first, **TOLERANCES
+    )
+    if not solved.success:
+        raise RuntimeError(solved.message)
+    after = solved.y[:, -1].copy()
+    if joint.limits and solved.t_events[0].size:
+        after[1] = 0.0
+    return float(solved.t[-1]), after, solved.sol
+
+
+def _loose(joint, now, x):
+    """When what pulls exceeds friction, else the piece's end; within a piece only some forces change by themselves."""
+    end = joint.piece.end
+    if not joint.restless:
+        return end
+
+    def excess(t):
+        return abs(joint.pull(t, x, 0.0)) - joint.limit(t, x, 0.0)
+
+    grid: Sequence[float] = np.linspace(now, end, max(3, int(500 * (end - now)))).tolist()
+    for before, after in zip(grid[:-1], grid[1:], strict=True):
+        if excess(after) > 0:
+            return min(brentq(excess, before, after, xtol=1e-13) + 1e-12 if excess(before) < 0 else after, end)
+    return end

@@ -1,0 +1,179 @@
+"""Coefficients of hidden causes: their shape is drawn, their strength s is left open, 1 being the far end of plausible.
+
+`shape(name, setting, rng)` gives a function from strength to coefficients. Bounds are of the library's tables.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims import effects as library
+from tests.exam.worlds import SIMULATORS, solved
+
+SIGNED = ("force.bias", "gravity.scale", "input.gain", "input.bias", "sensor.gain", "sensor.bias", "sensor.drift")
+SIGNED += ("clock.skew", "spring.cubic", "restitution.speed")
+LARGEST = 2.0  # beyond twice the plausible range nothing is asked
+
+
+def shape(name, setting, rng):
+    """The coefficients of an effect of the library by its strength."""
+    kind = SIMULATORS[setting.system].system.kind
+    far = max(abs(bound) for bound in library.get(name).coefficients[0].range(kind))
+    if name in SHAPES:
+        return SHAPES[name](far, setting, rng)
+    sign = float(rng.choice([-1, 1])) if name in SIGNED else 1.0
+    return lambda s: (sign * far * s,)
+
+
+def largest(name):
+    """The largest strength that is asked."""
+    return 0.97 if name == "input.saturation" else LARGEST
+
+
+def _direction(far, setting, rng, *behind):
+    angle = rng.uniform(0, 2 * np.pi)
+    along, across = far * float(np.cos(angle)), far * float(np.sin(angle))
+    return lambda s: (along * s, across * s, *behind)
+
+
+def _level(far, setting, rng):
+    """Along x, and along y where there is one."""
+    if setting.system == "ball":
+        return _direction(far, setting, rng)
+    sign = float(rng.choice([-1, 1]))
+    return lambda s: (sign * far * s,)
+
+
+def _ripple(far, setting, rng):
+    """A period that the motion passes several times."""
+    travel = np.median(_ranges(setting))
+    period = min(travel / rng.uniform(2.0, 8.0), 1.0 if setting.system == "slider" else 6.28)
+    return _direction(far, setting, rng, float(period))
+
+
+def _periodic(far, setting, rng):
+    """A few periods in a run at least."""
+    low, high = 1.5 / setting.seconds, 4.0
+    return _direction(far, setting, rng, float(np.exp(rng.uniform(np.log(low), np.log(high)))))
+
+
+def _wind(far, setting, rng):
+    if setting.system == "slider":
+        speed = float(rng.choice([-1, 1]) * rng.uniform(0.5, 3.0))
+        return lambda s: (far * s, speed)
+    speed, angle = rng.uniform(2.0, 8.0), rng.uniform(0, 2 * np.pi)
+    return lambda s: (far * s, float(speed * np.cos(angle)), float(speed * np.sin(angle)))
+
+
+def _stribeck(far, setting, rng):
+    """An extra as large as the rest, at speeds that the motion has for a good while."""
+    extra, typical = rng.uniform(1.0, 4.0), np.median(np.abs(_speeds(setting)))
+    speed = float(np.clip(typical * rng.uniform(0.15, 0.6), 0.02, 2.0))
+    return lambda s: (far * s, extra * far * s, speed)
+
+
+def _saturation(far, setting, rng):
+    """A limit below the input's peak: at strength 0 at the peak, at 1 at nothing."""
+    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    return lambda s: (float(peak * (1 - s)),)
+
+
+SHAPES = {
+    "gravity.tilt": _level,
+    "lift.magnus": _direction,
+    "force.ripple": _ripple,
+    "force.periodic": _periodic,
+    "wind": _wind,
+    "friction.stribeck": _stribeck,
+    "input.saturation": _saturation,
+}
+
+
+def _bare(setting):
+    """Noiseless motion of every run with nothing hidden, (T,) of the first channel."""
+    channel = setting.channels[:1]
+    return [solved(setting.world(), s, channel, i)[:, 0] for i, s in enumerate(setting.scenarios)]
+
+
+def _ranges(setting):
+    return [np.ptp(path) for path in _bare(setting)]
+
+
+def _speeds(setting):
+    return np.concatenate([np.diff(path) for path in _bare(setting)]) * setting.rate
+
+
+def foreign(name, setting, rng):
+    """The numbers of a foreign cause by its strength; see `tests.exam.worlds`."""
+    return FOREIGN[(setting.system == "ball", name)](setting, rng)
+
+
+def _begins(setting, lasting, rng):
+    """A beginning within each run, not the same in any two."""
+    return [float(rng.uniform(0.1, 0.9) * (setting.seconds - lasting)) for _ in setting.scenarios]
+
+
+def _patch(setting, rng):
+    """Somewhere well within where it moves; about as wide as a fifth of that."""
+    low, high = np.quantile(np.concatenate(_bare(setting)), [0.1, 0.9])
+    half = float((high - low) * rng.uniform(0.07, 0.15))
+    centre = float(rng.uniform(low + half, high - half))
+    return lambda s: (_force(setting) * s, centre, half)
+
+
+def _force(setting):
+    return 0.5 if setting.system == "pendulum" else 5.0
+
+
+def _gust(setting, rng):
+    lasting, sign = float(rng.uniform(0.1, 0.3)), float(rng.choice([-1, 1]))
+    begins = _begins(setting, lasting, rng)
+    return lambda s: (sign * _force(setting) * s, lasting, *begins)
+
+
+def _ageing(setting, rng):
+    far = (0.1 if setting.system == "pendulum" else 5.0) / setting.seconds
+    return lambda s: (far * s,)
+
+
+def _stop(setting, rng):
+    """Met by the motion in most runs, for a small part of the time."""
+    place = float(np.quantile(np.concatenate(_bare(setting)), rng.uniform(0.7, 0.85)))
+    far = 10.0 if setting.system == "pendulum" else 2000.0
+    return lambda s: (far * s, place)
+
+
+def _updraft(setting, rng):
+    where = np.concatenate(_bare(setting))
+    half = float(rng.uniform(0.3, 0.8))
+    centre = float(rng.uniform(*np.quantile(where, [0.1, 0.9])))
+    return lambda s: (10.0 * s, centre, half)
+
+
+def _ball_gust(setting, rng):
+    lasting, angle = float(rng.uniform(0.1, 0.4)), rng.uniform(0, 2 * np.pi)
+    begins = _begins(setting, lasting, rng)
+    return lambda s: (20.0 * s * float(np.cos(angle)), 20.0 * s * float(np.sin(angle)), lasting, *begins)
+
+
+def _wear(setting, rng):
+    sign = float(rng.choice([-1, 1]))
+    return lambda s: (sign * s / setting.seconds,)
+
+
+def _layer(setting, rng):
+    """Above most of the bounces, below most of the drops."""
+    height = float(min(s.initial["z"] for s in setting.scenarios) * rng.uniform(0.55, 0.8))
+    return lambda s: (2.0 * s, height)
+
+
+FOREIGN = {
+    (False, "patch"): _patch,
+    (False, "gust"): _gust,
+    (False, "ageing"): _ageing,
+    (False, "stop"): _stop,
+    (True, "updraft"): _updraft,
+    (True, "gust"): _ball_gust,
+    (True, "wear"): _wear,
+    (True, "layer"): _layer,
+}
