@@ -95,9 +95,10 @@ def _costs(world: World, noise: Noise, starts: Sequence[Start]) -> Array:
     runs = len(world.tracks)
     theta = np.repeat([s.theta for s in starts], runs, axis=0)
     states = np.concatenate([s.states for s in starts])
-    seen = world.simulate(theta, np.tile(np.arange(runs), len(starts)), states)
+    share = HORIZONS[0][0]
+    seen = world.simulate(theta, np.tile(np.arange(runs), len(starts)), states, share)
     seen = seen.reshape(len(starts), runs, *seen.shape[1:])
-    counted = Fitter(world, noise, share=HORIZONS[0][0]).counted()
+    counted = world.counted(share)
     residual = np.where(counted, np.nan_to_num(world.observed - seen, nan=1e3), 0.0) / noise.sigma
     costs: Array = np.square(residual).sum(axis=(1, 2, 3))
     return costs

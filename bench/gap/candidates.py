@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 
 from bench.gap.fit import Fit
-from bench.gap.world import World
+from bench.gap.world import Mask, World
 from methods.base import Array
 from sims.base import Parameter
 from sims.simulated import effect_parameters
@@ -23,6 +23,8 @@ SMALL = 1e-4
 """Share of a plausible range at which a direction is first taken."""
 LEVELS = (0.15, 0.35, 0.6, 0.85)
 """Shares of the largest input at which limits, dead bands and plays are tried besides."""
+NOTHING = 1e-11
+"""Share of the largest observation below which a change is rounding."""
 SHAPES, FREQUENCIES = 12, 48
 MODIFIED = (-0.7, -0.25, 0.0, 0.25, 0.7)
 
@@ -66,8 +68,9 @@ def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
     """
     probes = [probe for name in names for probe in _first(world, name)]
     values = _responses(world, at, probes)
-    again = list(_modified(world, probes, values))
-    kept = [i for i, response in enumerate(np.abs(values).max(axis=(0, 1, 2), initial=0.0)) if response > 0]
+    moves = _moving(world, probes, values)
+    again = list(_modified(world, probes, moves))
+    kept = np.flatnonzero(moves)
     probes, values = [probes[i] for i in kept], values[..., kept]
     if again:
         more = _responses(world, at, again)
@@ -106,9 +109,16 @@ def _grid(world: World, parameter: Parameter) -> Array:
     return np.geomspace(low, high, SHAPES)
 
 
-def _modified(world: World, probes: Sequence[Probe], values: Array) -> Iterator[Probe]:
+def _moving(world: World, probes: Sequence[Probe], values: Array) -> Mask:
+    """(K,) which probes change more than rounding does."""
+    sizes = np.array([1.0 if p.fixed else p.c[p.place] for p in probes])
+    changes = np.abs(values).max(axis=(0, 1), initial=0.0) * np.abs(sizes)
+    moving: Mask = (changes > NOTHING * np.nanmax(np.abs(world.observed), axis=(0, 1))[:, None]).any(axis=0)
+    return moving
+
+
+def _modified(world: World, probes: Sequence[Probe], moves: Mask) -> Iterator[Probe]:
     """Grid points of coefficients that change nothing by themselves but belong to an effect that acts."""
-    moves = np.abs(values).max(axis=(0, 1, 2), initial=0.0) > 0
     acting = {p.effect for p, m in zip(probes, moves, strict=True) if m}
     idle: dict[str, list[Probe]] = {}
     for p, m in zip(probes, moves, strict=True):

@@ -1,7 +1,7 @@
 """Least squares on trajectories: parameters that all runs share, initial states that each run has for itself.
 
 Levenberg-Marquardt for many models at once, so that one call of the engine serves all of them. Initial states are
-eliminated run by run (the Schur complement of the arrow-shaped normal equations; B. Triggs et al., Bundle adjustment,
+eliminated run by run (damping by Nielsen's rule, IMM-REP-1999-05; the Schur complement of the arrow-shaped normal equations; B. Triggs et al., Bundle adjustment,
 2000, doi:10.1007/3-540-44480-7_21, section 6), so the cost grows linearly with the number of runs. Noise that
 remembers is whitened first (`colour`), which makes the fit one of generalised least squares.
 """
@@ -21,11 +21,12 @@ RESPONSE = 0.1
 """Finite differences move a parameter until the observation changes by this share of its noise, RMS."""
 UNMEASURED, MEASURED = 3.0, 100.0
 """1 sigma of what is known beforehand of an initial state, SI units: without, and with samples that show it."""
-BEATEN, RACED = 100.0, 4
+BEATEN, RACED, HOPE = 100.0, 4, 10.0
 """After so many steps a model is given up whose sum of squares, less several times what the next step promises, is so
 much above the best one's."""
-ENOUGH = 0.01
-"""A fit has converged when the next step promises less than this of the sum of squares, in units of the noise."""
+ENOUGH, SHARE = 0.02, 1e-4
+"""A fit has converged when a step lowers the sum of squares, in units of the noise, by less than this and less than
+this share of it."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,8 @@ class _Problem:
     simulated: Array = field(default_factory=lambda: np.empty(0))
     jacobian: Array = field(default_factory=lambda: np.empty(0))
     cost: float = np.inf
-    damping: float = 1e-2
+    damping: float = 1e-3
+    growth: float = 2.0
     promised: float = np.inf
     done: bool = False
 
@@ -105,22 +107,16 @@ class Fitter:
     share: float = 1.0
     parameters: bool = True
 
-    def counted(self) -> Mask:
-        """(R, T, C) the samples that count."""
-        world = self.world
-        first = np.arange(world.observed.shape[1]) < np.ceil(self.share * world.lengths)[:, None]
-        return np.isfinite(world.observed) & first[:, :, None]
-
     def fit(self, starts: Sequence[Start], iterations: int = 12, race: bool = False) -> list[Fit]:
         """Fit each model from its start; in a race, those that fall far behind are left unfinished."""
         problems = [self._problem(start) for start in starts]
-        seen = self.counted()
+        seen = self.world.counted(self.share)
         for problem, (simulated, jacobian) in zip(problems, self._derivatives(problems), strict=True):
             self._take(problem, problem.theta, problem.states, simulated, jacobian, seen)
         for taken in range(iterations):
             best = min(p.cost for p in problems)
             for p in problems if race and taken >= RACED else ():
-                p.done |= p.cost - 3.0 * p.promised > best + BEATEN
+                p.done |= p.cost - HOPE * p.promised > best + BEATEN
             active = [p for p in problems if not p.done]
             trials = [(p, *self._step(p, seen)) for p in active]
             trials = [(p, t, s) for p, t, s in trials if not p.done]
@@ -164,7 +160,7 @@ class Fitter:
         thetas = np.concatenate([np.repeat(theta, runs, axis=0) for theta, _, _ in blocks])
         begins = np.concatenate([begin.reshape(-1, states) for _, begin, _ in blocks])
         lanes = np.tile(np.arange(runs), len(thetas) // runs)
-        seen = self.world.simulate(thetas, lanes, begins)
+        seen = self.world.simulate(thetas, lanes, begins, self.share)
         result, place = [], 0
         for theta, _, steps in blocks:
             part = seen[place : place + len(theta) * runs].reshape(len(theta), runs, *seen.shape[1:])
@@ -194,16 +190,8 @@ class Fitter:
         if not np.isfinite(residual).all():
             return np.inf
         w = whitened(residual, seen, self.noise)
-        drift = (states - self.world.guess) / self._prior()
+        drift = (states - self.world.guess) / prior_of(self.world)
         return float((w * w).sum() + (drift * drift).sum())
-
-    def _prior(self) -> Array:
-        """(s,) what is known of initial states beforehand, 1 sigma."""
-        system = self.world.simulator.system
-        shown = set(self.world.channels)
-        pairs = dict(zip(system.rates, system.coordinates, strict=True))
-        measured = [name in shown or pairs.get(name) in shown for name in self.world.states]
-        return np.where(measured, MEASURED, UNMEASURED)
 
     def _step(self, p: _Problem, seen: Mask) -> tuple[Array, Array]:
         """The next parameters and initial states to try; marks the problem done if they promise nothing."""
@@ -214,13 +202,13 @@ class Fitter:
         residual = whitened(np.where(seen, self.world.observed - p.simulated, 0.0), seen, self.noise)
         jacobian = whitened(np.where(seen[..., None], p.jacobian, 0.0), seen, self.noise)
         solved = arrow_step(
-            residual, jacobian, q, (p.states - self.world.guess) / self._prior(), self._prior(), self.world.known,
+            residual, jacobian, q, (p.states - self.world.guess) / prior_of(self.world), prior_of(self.world), self.world.known,
             p.damping, _stuck(p, residual, jacobian),
         )  # fmt: skip
         theta = p.theta.copy()
         theta[p.free] = np.clip(theta[p.free] + solved.shared, p.low, p.high)
         p.promised = solved.promised
-        if solved.promised < ENOUGH or p.damping > 1e8:
+        if solved.promised < ENOUGH + SHARE * p.cost or p.damping > 1e8:
             p.done = True
         return theta, p.states + solved.own
 
@@ -228,16 +216,25 @@ class Fitter:
         cost = self._cost(simulated, states, seen)
         if cost < p.cost:
             gained = p.cost - cost
+            ratio = gained / max(p.promised, 1e-300)
             self._take(p, theta, states, simulated, jacobian, seen)
-            p.damping = max(p.damping / 8.0, 1e-10)
-            p.done = gained < ENOUGH
+            p.damping, p.growth = max(p.damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3), 1e-10), 2.0
+            p.done = gained < ENOUGH + SHARE * cost
         else:
-            p.damping *= 10.0
+            p.damping, p.growth = p.damping * 2.0 * p.growth, 2.0 * p.growth
 
 
 def replace_at(p: _Problem, theta: Array, states: Array) -> _Problem:
     """The same problem elsewhere."""
     return replace(p, theta=theta, states=states)
+
+
+def prior_of(world: World) -> Array:
+    """(s,) what is known of initial states beforehand, 1 sigma."""
+    system, shown = world.simulator.system, set(world.channels)
+    pairs = dict(zip(system.rates, system.coordinates, strict=True))
+    measured = [name in shown or pairs.get(name) in shown for name in world.states]
+    return np.where(measured, MEASURED, UNMEASURED)
 
 
 @dataclass(frozen=True)

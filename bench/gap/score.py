@@ -20,6 +20,8 @@ from bench.gap.colour import GRID, Mask, Noise, log_determinant, whitened
 from bench.gap.fit import Fit
 from methods.base import Array
 
+SMALL = 4
+"""Groups of more columns are taken as they are, without a choice of columns."""
 RANK = 1e-7
 """Directions below this share of the largest singular value are none."""
 
@@ -67,12 +69,12 @@ class Projected:
         d = whitened(np.where(seen[..., None], directions, 0.0), seen, noise)
         r = whitened(np.where(seen[..., None], residuals, 0.0), seen, noise)
         runs = len(seen)
-        shared, d, r = (part.reshape(runs, -1, part.shape[3]) for part in (own[..., :q], d, r))
-        inner = own[..., q:].reshape(runs, shared.shape[1], -1)
+        count = seen.shape[1] * seen.shape[2]
+        shared, d, r, inner = (part.reshape(runs, count, part.shape[3]) for part in (own[..., :q], d, r, own[..., q:]))
         for i in range(runs):
             basis = span(inner[i])
             shared[i], d[i], r[i] = (part[i] - basis @ (basis.T @ part[i]) for part in (shared, d, r))
-        flat_shared, flat_d, flat_r = (part.reshape(-1, part.shape[2]) for part in (shared, d, r))
+        flat_shared, flat_d, flat_r = (part.reshape(runs * count, part.shape[2]) for part in (shared, d, r))
         basis = span(flat_shared)
         flat_d = flat_d - basis @ (basis.T @ flat_d)
         flat_r = flat_r - basis @ (basis.T @ flat_r)
@@ -108,6 +110,8 @@ def explained(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
     Coefficients that must not be negative are held at zero where they would be.
     """
     count = len(group.columns)
+    if count > SMALL:
+        return _jointly(gram, cross, group)
     best, coefficients = np.zeros(cross.shape[1]), np.zeros((count, cross.shape[1]))
     scale = np.sqrt(np.maximum(np.diagonal(gram), 0.0))
     for size in range(1, count + 1):
@@ -131,6 +135,17 @@ def explained(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
             whole[list(chosen)] = solved / scale[columns, None]
             coefficients = np.where(better, whole, coefficients)
     return best, coefficients
+
+
+def _jointly(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
+    """The same for a group of many columns, none of them held."""
+    columns = list(group.columns)
+    scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 1e-300))
+    values, vectors = np.linalg.eigh(gram[np.ix_(columns, columns)] / np.outer(scale, scale))
+    kept = values > RANK * values[-1]
+    right = vectors[:, kept].T @ (cross[columns] / scale[:, None])
+    gain: Array = np.einsum("ks,ks->s", right, right / values[kept, None])
+    return gain, (vectors[:, kept] @ (right / values[kept, None])) / scale[:, None]
 
 
 def score(

@@ -7,16 +7,17 @@ of its effects (A. Miller, Subset Selection in Regression, 2nd ed., 2002, doi:10
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from bench.gap.base import HORIZONS
 from bench.gap.candidates import Directions, directions
 from bench.gap.colour import Likelihood, Noise, likelihood, surrogates
-from bench.gap.fit import Fit, Fitter, Start
-from bench.gap.score import Scores, score, tail
-from bench.gap.world import Mask, World, coefficient_bounds
+from bench.gap.fit import Fit, Fitter, Start, prior_of
+from bench.gap.score import Group, Scores, score, tail
+from bench.gap.world import BEYOND, Mask, World, coefficient_bounds
 from methods.base import Array
 
 Names = tuple[str, ...]
@@ -24,7 +25,9 @@ Names = tuple[str, ...]
 SURROGATES = 120
 ALPHA = 0.003
 """Chance at which an effect would be taken for real although nothing is missing."""
-UNLIKELY, DOUBTFUL = 0.2, 0.05
+CERTAIN = 1e-6
+"""A chance below which surrogates of another colour are not asked."""
+UNLIKELY, DOUBTFUL = 0.1, 0.015
 """Chance of the linear scores above which no effect, or no further one, is tried by simulation."""
 LOUD = 1.3
 """What is left that exceeds the noise floor by more is looked into by simulation whatever the scores say."""
@@ -32,6 +35,9 @@ MOST_EFFECTS = 3
 NOMINATED = 7
 PROMISING = 0.25
 """Candidates are refitted that promise at least this share of the best one's score."""
+SIFTED = (12, 8)
+"""Of models that are fitted with patience so many go on from each horizon to the next."""
+MOVES = 2
 BEAM = 3
 RIVAL = 0.5
 """A model goes on in the beam if it has at least this share of the best one's gain."""
@@ -46,8 +52,8 @@ class Model:
     Attributes:
         fit: the fit.
         likelihood: of its residual.
-        merit: twice the log likelihood less the log of the number of samples for each coefficient (G. Schwarz,
-            Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136).
+        merit: twice the log likelihood less the log of the number of samples for each parameter and initial state that
+            the data fix (G. Schwarz, Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136).
     """
 
     fit: Fit
@@ -84,20 +90,28 @@ class Search:
 
     def enter(self, fit: Fit) -> Model:
         """Take a fit into account; the better of two fits of the same effects is kept."""
-        own = fit.jacobian.shape[3] * 1.0 + fit.states.size - fit.states.shape[1]
-        found = likelihood(self.residual(fit), self.seen, own) if np.isfinite(fit.cost) else _LOST
-        coefficients = sum(s.stop - s.start for s in (self.world.slots[name] for name in fit.effects))
-        merit = found.value - coefficients * float(np.log(max(int(self.seen.sum()), 2)))
+        free = fit.free.size + freedom(self.world, fit, self.noise)
+        found = likelihood(self.residual(fit), self.seen, free) if np.isfinite(fit.cost) else _LOST
+        merit = found.value - free * float(np.log(max(int(self.seen.sum()), 2)))
         model, key = Model(fit, found, merit), frozenset(fit.effects)
         if key not in self.models or merit > self.models[key].merit:
             self.models[key] = model
             self.scanned.pop(key, None)
         return self.models[key]
 
-    def refit(self, starts: Sequence[Start], noise: Noise | None = None, iterations: int = 12) -> None:
-        """Fit models from their starts and enter them."""
-        fitter = Fitter(self.world, noise or self.noise, self.frozen)
-        for fit in fitter.fit(starts, iterations, race=True):
+    def refit(self, starts: Sequence[Start], noise: Noise | None = None, patient: bool = False) -> None:
+        """Fit models from their starts and enter them.
+
+        Args:
+            starts: where to begin.
+            noise: weighs the samples; the search's own if None.
+            patient: fit the beginnings of the runs first, as the base model's fit does, and go on with the best.
+        """
+        noise = noise or self.noise
+        for (share, iterations), kept in zip(HORIZONS[:-1], SIFTED, strict=True) if patient else ():
+            fits = Fitter(self.world, noise, self.frozen, share).fit(starts, iterations)
+            starts = [fit.start() for fit in sorted(fits, key=lambda fit: fit.cost)[:kept]]
+        for fit in Fitter(self.world, noise, self.frozen).fit(starts, 24, race=True):
             self.enter(fit)
 
     def scan(self, model: Model, against: Array | None = None) -> Scores:
@@ -108,71 +122,85 @@ class Search:
             against: (R, T, C) a residual for surrogates; the model's own if None.
         """
         key = frozenset(model.names)
-        lacking = [name for name in self.world.slots if name not in key]
+        lacking = [name for name in self.world.library if name not in key]
         if key not in self.scanned:
             self.scanned[key] = (directions(self.world, model.fit, lacking), _NOTHING)
         found = self.scanned[key][0]
         residual = self.residual(model.fit)
         like = surrogates(residual if against is None else against, self.seen, SURROGATES, self.rng)
-        scores = score(model.fit, residual, found, self.seen, self._weights(model), like)
+        scores = score(model.fit, residual, found, self.seen, self.weights(model), like)
         self.scanned[key] = (found, scores)
         self.tests[key] = scores.p_value
         return scores
 
-    def _weights(self, model: Model) -> Noise:
+    def weights(self, model: Model) -> Noise:
         """Channels weigh by what the model leaves of them where that is more than their noise."""
         left = np.where(np.isfinite(model.likelihood.sigma), model.likelihood.sigma, 0.0)
         return Noise(np.maximum(self.noise.sigma, left), self.noise.phi)
 
-    def starts(self, model: Model, scores: Scores, most: int) -> list[Start]:
-        """Where to begin with the most promising candidates, at what their scores say and at less."""
+    def starts(self, model: Model, scores: Scores, most: int, patient: bool) -> list[Start]:
+        """Where to begin with the most promising candidates, at what their scores say and at less; all with patience."""
         found = self.scanned[frozenset(model.names)][0]
         promise = scores.score - scores.chance
         order = np.argsort(-promise, kind="stable")
-        chosen = [i for i in order if promise[i] >= PROMISING * promise[order[0]]][:most]
+        chosen = [i for i in order if patient or promise[i] >= PROMISING * promise[order[0]]]
+        chosen = chosen if patient else chosen[:most]
         result = []
         for i in chosen:
-            name, group = scores.effects[i], scores.group[i]
-            bounds = coefficient_bounds(self.world, name)
-            for share in (1.0, 0.25):
-                c = found.probes[group.columns[0]].c.copy()
-                for column, size in zip(group.columns, scores.c[i], strict=True):
-                    probe = found.probes[column]
-                    if not probe.fixed:
-                        c[probe.place] = share * float(np.clip(size, *bounds[probe.place]))
+            for c in self._sizes(found, scores.group[i], scores.c[i], scores.effects[i]):
                 theta = model.fit.theta.copy()
-                theta[self.world.slots[name]] = c
-                result.append(Start((*model.names, name), theta, model.fit.states))
-                if found.probes[group.columns[0]].fixed:
-                    break
-        return self._nearest(result)
+                theta[self.world.slots[scores.effects[i]]] = c
+                result.append(Start((*model.names, scores.effects[i]), theta, model.fit.states))
+        return self._nearest(result, HORIZONS[0][0] if patient else 1.0)
 
-    def _nearest(self, starts: Sequence[Start]) -> list[Start]:
-        """Of the starts with the same effects the one whose simulation comes nearest."""
+    def _sizes(self, found: Directions, group: Group, scored: Array, name: str) -> Iterator[Array]:
+        """Coefficients to begin with: as scored, less, and at shares of the plausible range where one scales it."""
+        bounds = coefficient_bounds(self.world, name)
+        first = found.probes[group.columns[0]]
+        if first.fixed:
+            yield first.c
+            return
+        for share in (1.0, 0.25):
+            c = first.c.copy()
+            for column, size in zip(group.columns, scored, strict=True):
+                place = found.probes[column].place
+                c[place] = share * float(np.clip(size, *bounds[place]))
+            yield c
+        if len(group.columns) == 1:
+            reach = bounds[first.place][1] / BEYOND
+            for share in (0.2, 0.7, 1.5, *((-0.2, -0.7, -1.5) if first.signed else ())):
+                c = first.c.copy()
+                c[first.place] = share * reach
+                yield c
+
+    def _nearest(self, starts: Sequence[Start], share: float) -> list[Start]:
+        """Of the starts with the same effects the one whose simulation comes nearest over the first share of the runs."""
         if not starts:
             return []
         world, runs = self.world, len(self.world.tracks)
         theta = np.repeat([s.theta for s in starts], runs, axis=0)
         states = np.concatenate([s.states for s in starts])
-        seen = world.simulate(theta, np.tile(np.arange(runs), len(starts)), states)
+        seen = world.simulate(theta, np.tile(np.arange(runs), len(starts)), states, share)
         seen = seen.reshape(len(starts), runs, *seen.shape[1:])
+        counted = world.counted(share)
         best: dict[Names, tuple[float, Start]] = {}
         for start, part in zip(starts, seen, strict=True):
-            left = np.where(self.seen, world.observed - part, 0.0) / self.noise.sigma
+            left = np.where(counted, world.observed - part, 0.0) / self.noise.sigma
             cost = float(np.square(left).sum())
             if cost < best.get(start.effects, (np.inf,))[0]:
                 best[start.effects] = cost, start
         return [start for _, start in best.values()]
 
-    def extend(self, beam: Iterable[Model], most: int) -> None:
-        """Refit the most promising extensions of some models."""
+    def extend(self, beam: Iterable[Model], most: int, patient: bool = False) -> None:
+        """Refit the most promising extensions of some models; those that are known already only with patience."""
         starts = []
         for model in beam:
             key = frozenset(model.names)
             scores = self.scanned[key][1] if key in self.scanned else self.scan(model)
-            starts += [s for s in self.starts(model, scores, most) if frozenset(s.effects) not in self.models]
+            found = self.starts(model, scores, most, patient)
+            starts += [s for s in found if patient or frozenset(s.effects) not in self.models]
         if starts:
-            self.refit(starts)
+            self.refit(starts, patient=patient)
 
     def best(self, size: int) -> Model | None:
         """The best model with so many effects."""
@@ -184,40 +212,49 @@ class Search:
 
         The surrogates have the colour of what the larger model leaves, which is closer to the noise alone.
         """
-        scores = self.scan(model, self.residual(larger.fit))
         gain = larger.likelihood.value - model.likelihood.value
-        chance = {name: float(c) for name, c in zip(scores.effects, scores.chance, strict=True)}
-        added = max((chance.get(name, 0.0) for name in larger.names), default=0.0)
-        return min(scores.p_value, tail(scores.by_chance, np.array([gain - added])))
+        scores = self.scanned[frozenset(model.names)][1]
+        if (first := self._gained(scores, larger, gain)) < CERTAIN:
+            return first
+        scores = self.scan(model, self.residual(larger.fit))
+        return min(scores.p_value, self._gained(scores, larger, gain))
+
+    def _gained(self, scores: Scores, larger: Model, gain: float) -> float:
+        """Chance of a gain in twice the log likelihood, less what chance gives the larger model's effects."""
+        chance = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
+        return tail(scores.by_chance, np.array([gain - max((chance.get(n, 0.0) for n in larger.names), default=0.0)]))
 
     def plain(self, model: Model, doubt: float) -> bool:
         """Whether nothing suggests that the model lacks something: neither a score nor the size of what it leaves."""
         left = np.nanmax(model.likelihood.sigma / self.noise.sigma)
         return self.scan(model).p_value > doubt and float(left) < LOUD
 
+    def without(self, model: Model, name: str) -> Model:
+        """The model with one of its effects taken away."""
+        rest = tuple(n for n in model.names if n != name)
+        if frozenset(rest) not in self.models:
+            theta = model.fit.theta.copy()
+            theta[self.world.slots[name]] = 0.0
+            self.refit([Start(rest, theta, model.fit.states)])
+        return self.models[frozenset(rest)]
+
     def drop(self, model: Model) -> Model:
         """The model without effects that it does not need."""
         for name in model.names:
-            rest = tuple(n for n in model.names if n != name)
-            if frozenset(rest) not in self.models:
-                theta = model.fit.theta.copy()
-                theta[self.world.slots[name]] = 0.0
-                self.refit([Start(rest, theta, model.fit.states)])
-            smaller = self.models[frozenset(rest)]
+            smaller = self.without(model, name)
             if smaller.merit >= model.merit:
                 return self.drop(smaller)
         return model
 
     def swap(self, model: Model) -> Model:
-        """The best model that has one effect replaced, as long as that gains."""
-        while True:
-            for name in model.names:
-                rest = self.models[frozenset(n for n in model.names if n != name)]
-                self.extend([rest], NOMINATED)
+        """The best model that has one effect replaced."""
+        for _ in range(MOVES):
+            self.extend([self.without(model, name) for name in model.names], NOMINATED)
             better = self.best(len(model.names))
             if better is None or better.merit <= model.merit + 1e-6:
-                return model
+                break
             model = self.drop(better)
+        return model
 
     def run(self) -> Model:
         """The model of all effects that the data show."""
@@ -227,13 +264,14 @@ class Search:
                 break
             self.extend([best], NOMINATED)
             larger = self.best(size)
+            if size == 1 and not (larger and self.plain(larger, ALPHA)):
+                self.extend([best], NOMINATED, patient=True)
+                larger = self.best(size)
             if larger is None or larger.merit <= best.merit or self.missing(best, larger) > ALPHA:
                 break
-            self.extend(self._beam(size - 1), NOMINATED)
-            larger = self.best(size)
-            assert larger is not None
             if size > 1:
-                larger = self.drop(self.swap(self.drop(larger)))
+                self.extend(self._beam(size - 1), NOMINATED)
+                larger = self.drop(self.swap(self.drop(self.best(size) or larger)))
             best = larger
             if len(best.names) < size:
                 break
@@ -244,6 +282,16 @@ class Search:
         base = self.models[frozenset()].merit
         there = sorted((m for m in self.models.values() if len(m.names) == size), key=lambda m: -m.merit)
         return [m for m in there if m.merit - base >= RIVAL * (there[0].merit - base)][:BEAM] if size else []
+
+
+def freedom(world: World, fit: Fit, noise: Noise) -> float:
+    """How many initial states the data fix, all runs together: one that a model does not use gives it no freedom."""
+    seen = np.isfinite(world.observed)
+    states = np.where(seen[..., None], fit.jacobian[..., fit.free.size :], 0.0) / noise.sigma[:, None]
+    columns = states.reshape(len(states), seen.shape[1] * seen.shape[2], states.shape[3]) * prior_of(world)
+    columns = np.where(world.known[:, None, :], 0.0, columns)
+    powers = np.linalg.eigvalsh(np.matmul(columns.transpose(0, 2, 1), columns))
+    return float((powers / (1.0 + np.maximum(powers, 0.0))).clip(0.0, 1.0).sum())
 
 
 _LOST = Likelihood(-np.inf, np.zeros(0), np.zeros(0))

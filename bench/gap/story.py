@@ -12,7 +12,7 @@ from methods.base import Array
 
 @dataclass(frozen=True)
 class Shown:
-    """One recorded channel: name, unit, noise (1 sigma), whether the recording states it, its quantisation (0: none)."""
+    """One recorded channel: name, unit, noise (1 sigma), whether that is stated, its quantisation (0: none)."""
 
     name: str
     unit: str
@@ -109,6 +109,7 @@ class Story:
         parameters: before and after.
         remains: what the extended model leaves unexplained and what to bear in mind, a sentence each; may be empty.
         why: sentences that say why the verdict is what it is, the most important first.
+        vague: names of base parameters that the data do not fix.
     """
 
     title: str
@@ -122,3 +123,4 @@ class Story:
     parameters: tuple[Tuned, ...]
     remains: tuple[str, ...]
     why: tuple[str, ...]
+    vague: tuple[str, ...] = ()

@@ -36,7 +36,7 @@ class Track:
         scenario: what the simulator is given; its initial states are guesses where they are not stated.
         observed: (T, C) SI units, NaN where missing.
         guess: (s,) initial states, stated or guessed from the first samples.
-        known: (s,) which of them the recording states.
+        known: (s,) which of them are not to be estimated: stated, or of a coordinate that is not recorded.
     """
 
     name: str
@@ -76,11 +76,13 @@ class World:
         self.kind, self.recording, self.engine = kind, recording, engine
         usable = library.library(kind.system)
         names = list(usable) if candidates is None else list(candidates)
-        chosen: list[str | type[Effect]] = [*names, *extra]
+        self.library = names
+        chosen: list[str | type[Effect]] = [*names, *(e for e in extra if e.fits(kind.system))]
         observe = [c.name for c in kind.channels if c.name in runs[0].channels]
         settings = {"time_step": TIME_STEP} if engine == "batch" else {}
         self.simulator = kind(recording.constants, observe, engine=engine, effects=chosen, **settings)
         own = list(self.simulator.system.parameters)
+        self.own = len(own)
         self.freed = [self._freed(name) for name in free]
         self.parameters: tuple[Parameter, ...] = (*own, *self.freed, *self.simulator.parameters[len(own) :])
         self.base: Indices = np.arange(len(own) + len(self.freed))
@@ -94,6 +96,7 @@ class World:
         self.known: Mask = np.array([t.known for t in self.tracks])
         self.guess: Array = np.array([t.guess for t in self.tracks])
         self.simulations = 0
+        self._parts: dict[float, list[Scenario]] = {}
         self._shifting, self._filtering = self._delaying()
 
     @property
@@ -112,10 +115,13 @@ class World:
         values[self.base.size :] = 0.0
         return values
 
-    def simulate(self, theta: Array, runs: Indices, states: Array) -> Array:
-        """Observations (L, T, C) of lanes with parameters (L, P), in runs (L,), from initial states (L, s)."""
+    def simulate(self, theta: Array, runs: Indices, states: Array, share: float = 1.0) -> Array:
+        """Observations (L, T, C) of lanes with parameters (L, P), in runs (L,), from initial states (L, s).
+
+        Only the first share of each run is simulated; what is behind it, or behind the end of a shorter run, is NaN.
+        """
         self.simulations += len(theta)
-        result = np.empty((len(theta), self.observed.shape[1], self.observed.shape[2]))
+        result = np.full((len(theta), self.observed.shape[1], self.observed.shape[2]), np.nan)
         active = theta != 0
         kinds = active[:, self._shifting].any(axis=1) + 2 * active[:, self._filtering].any(axis=1)
         for kind in np.unique(kinds):
@@ -123,22 +129,32 @@ class World:
             size = max(1, LANE_SAMPLES // result.shape[1])
             for begin in range(0, lanes.size, size):
                 part = lanes[begin : begin + size]
-                seen = self._simulated(theta[part], runs[part], states[part])
+                seen = self._simulated(theta[part], runs[part], states[part], share)
                 result[part, : seen.shape[1]] = seen
-                result[part, seen.shape[1] :] = np.nan
         return result
 
-    def _simulated(self, theta: Array, runs: Indices, states: Array) -> Array:
-        own = len(self.simulator.system.parameters)
-        scenarios = [self.tracks[run].scenario for run in runs]
+    def counted(self, share: float) -> Mask:
+        """(R, T, C) the samples that are there in the first share of each run."""
+        first = np.arange(self.observed.shape[1]) < np.ceil(share * self.lengths)[:, None]
+        return np.isfinite(self.observed) & first[:, :, None]
+
+    def _scenarios(self, share: float) -> list[Scenario]:
+        """The first share of every run, made once."""
+        if share not in self._parts:
+            self._parts[share] = [first_of(t.scenario, int(np.ceil(share * len(t.observed)))) for t in self.tracks]
+        return self._parts[share]
+
+    def _simulated(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
+        whole = self._scenarios(share)
+        scenarios = [whole[run] for run in runs]
         if self.freed:
             names = [p.name for p in self.freed]
-            values = theta[:, own : own + len(names)].tolist()
+            values = theta[:, self.own : self.own + len(names)].tolist()
             scenarios = [
                 replace(s, constants={**s.constants, **dict(zip(names, row, strict=True))})
                 for s, row in zip(scenarios, values, strict=True)
             ]
-        lanes = np.delete(theta, np.arange(own, self.base.size), axis=1)
+        lanes = np.delete(theta, np.arange(self.own, self.base.size), axis=1)
         return self.simulator.simulate_lanes(lanes, scenarios, dict(zip(self.states, states.T, strict=True)))
 
     def close(self) -> None:
@@ -195,7 +211,18 @@ class World:
                 values[rate] = beginning(run.times, run.channels[rate])[0]
         self._lift(values, run)
         values.update(run.initial)
-        return np.array([values[name] for name in self.states]), np.array([n in run.initial for n in self.states])
+        known = [name in run.initial or name in self._hidden() for name in self.states]
+        return np.array([values[name] for name in self.states]), np.array(known)
+
+    def _hidden(self) -> set[str]:
+        """States of coordinates that nothing recorded has to do with: taken to be at their defaults."""
+        system, shown = self.simulator.system, self.channels
+        hidden = set()
+        for axis, (coordinate, rate) in enumerate(zip(system.coordinates, system.rates, strict=True)):
+            about = (coordinate, rate, f"accel_{coordinate}")
+            if axis != system.primary and not any(name in shown for name in about):
+                hidden |= {coordinate, rate}
+        return hidden
 
     def _lift(self, values: dict[str, float], run: Run) -> None:
         """Where the height above the ground is not recorded, no impact can be told: begin too high for one."""
@@ -205,6 +232,14 @@ class World:
         gravity = float(run.constants.get("gravity", self.simulator.constant_values.get("gravity", 9.81)))
         seconds = float(run.times[-1] - run.times[0])
         values[system.coordinates[-1]] = 10.0 + 100.0 * seconds + gravity * seconds**2
+
+
+def first_of(scenario: Scenario, samples: int) -> Scenario:
+    """The first samples of a scenario."""
+    if samples >= scenario.times.size:
+        return scenario
+    inputs = {name: signal[:samples] for name, signal in scenario.inputs.items()}
+    return replace(scenario, times=scenario.times[:samples], inputs=inputs)
 
 
 def beginning(times: Array, values: Array) -> tuple[float, float]:
@@ -232,11 +267,11 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
     bounds = []
     for parameter in effect_parameters(world.effects[name], world.simulator.system, world.channels):
         low, high = parameter.bounds
-        bounds.append((low, high) if low > 0 else (0.0 if low == 0 else _BEYOND * low, _BEYOND * high))
+        bounds.append((low, high) if low > 0 else (0.0 if low == 0 else BEYOND * low, BEYOND * high))
     return bounds
 
 
-_BEYOND = 20.0
+BEYOND = 20.0
 
 
 def plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from sims.base import InputError
 from sims.engines.batch.field import Field, acts
+from sims.engines.batch.pace import divisions
 from sims.engines.batch.parabola import fly
 from sims.engines.batch.stepping import Stepping
 from sims.engines.ground import Ground, Indices, Mask
@@ -20,6 +21,8 @@ from sims.system import Force, Friction, Lanes, Motion, System
 
 REQUIRES: tuple[str, ...] = ()
 TIME_STEP = 5e-3
+FEW = 3
+"""Lanes whose steps are divided into more parts are stepped apart from the others."""
 
 
 class Batch:
@@ -85,7 +88,12 @@ def _moved(lanes: Lanes) -> Motion:
     if field.free:
         still = np.zeros((len(lanes.x), 1))
         return fly(lanes, field.force(still, lanes.x, lanes.v) / field.mass, ground)
-    return Stepping(lanes, field, ground).run()
+    spans = np.max(lanes.steps, axis=1, keepdims=True, initial=0.0)
+    parts = divisions(lanes, field, spans)
+    slow = (parts > FEW)[:, 0]
+    if slow.any() and not slow.all():  # few lanes in many short steps would keep the others waiting in every one
+        return _joined([(part, _moved(_take(lanes, part))) for part in map(np.flatnonzero, (~slow, slow))], lanes)
+    return Stepping(lanes, field, ground, spans, parts).run()
 
 
 def _take(lanes: Lanes, i: Indices) -> Lanes:

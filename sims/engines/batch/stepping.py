@@ -18,7 +18,6 @@ from sims.base import Array
 from sims.engines.batch.clock import Clock
 from sims.engines.batch.dynamics import Dynamics, dot, length
 from sims.engines.batch.field import Field
-from sims.engines.batch.pace import divisions
 from sims.engines.batch.roots import root
 from sims.engines.ground import Ground, Indices, Mask
 from sims.system import Lanes, Motion
@@ -32,9 +31,17 @@ NOTHING, IMPACT, STANDSTILL, LOOSE = range(4)
 
 
 class Stepping:
-    """Integrates lanes step by step, over `ground` if there is any."""
+    """Integrates lanes step by step, over `ground` if there is any.
 
-    def __init__(self, lanes: Lanes, field: Field, ground: Ground | None) -> None:
+    Args:
+        lanes: what to integrate.
+        field: its forces.
+        ground: what it may strike.
+        spans: (L, 1) longest step of each lane, seconds.
+        parts: (L, 1) into how many parts it is to be divided.
+    """
+
+    def __init__(self, lanes: Lanes, field: Field, ground: Ground | None, spans: Array, parts: Array) -> None:
         count, dim = lanes.x.shape
         self._field, self._ground = field, ground
         # Stored coordinate by coordinate: what is per lane, (L, 1), multiplies whole rows.
@@ -42,8 +49,6 @@ class Stepping:
         self._rows = self._state.reshape(3 * dim, count)
         self._x, self._v, self._a = (part.T for part in self._state)
         self._x[...], self._v[...] = lanes.x, lanes.v
-        spans = np.max(lanes.steps, axis=1, keepdims=True, initial=0.0)
-        parts = divisions(lanes, field, spans)
         self._longest = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
         self._bends = field.dry or bool(field.pushed.any())
         self._eventful = ground is not None or self._bends or bool((parts > 1).any())

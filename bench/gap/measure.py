@@ -1,0 +1,149 @@
+"""Measures what an extension gains: on held-out runs against the noise floor, and how well its numbers are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.gap.base import HORIZONS
+from bench.gap.colour import Noise, likelihood, whitened
+from bench.gap.fit import Fit, Fitter, Start, prior_of
+from bench.gap.search import Model, Search, freedom
+from bench.gap.world import Mask, World
+from methods.base import Array
+
+Z95 = 1.959964
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Runs simulated with parameters that others gave: (R, T, C), and their merit, which counts initial states."""
+
+    simulated: Array
+    merit: float
+
+
+class HeldOut:
+    """Runs on which nothing is fitted but their initial states.
+
+    Args:
+        world: the runs, with the effects of the fitted model in the same places.
+        noise: weighs the channels.
+    """
+
+    def __init__(self, world: World, noise: Noise) -> None:
+        self.world, self.noise = world, noise
+        self.seen: Mask = np.isfinite(world.observed)
+
+    def measure(self, thetas: Sequence[Array]) -> list[Measured]:
+        """Simulate with each parameter vector (P,), initial states estimated run by run."""
+        starts = [Start((), theta, self.world.guess) for theta in thetas]
+        fits: list[Fit] = []
+        for share, iterations in HORIZONS[1:]:
+            fits = Fitter(self.world, self.noise, share=share, parameters=False).fit(starts, iterations)
+            starts = [fit.start() for fit in fits]
+        return [self._measured(fit) for fit in fits]
+
+    def _measured(self, fit: Fit) -> Measured:
+        if not np.isfinite(fit.cost):
+            return Measured(np.full_like(self.world.observed, np.nan), -np.inf)
+        residual = np.where(self.seen, self.world.observed - fit.simulated, 0.0)
+        free = freedom(self.world, fit, self.noise)
+        value = likelihood(residual, self.seen, free).value - free * float(np.log(max(int(self.seen.sum()), 2)))
+        return Measured(fit.simulated, value)
+
+
+def covariance(search: Search, model: Model) -> Array:
+    """(q, q) of the fitted parameters, from the curvature, with the noise's own correlation.
+
+    Generalised least squares (W. H. Greene, Econometric Analysis, chapter 9): initial states are eliminated run by run.
+    """
+    world, fit, q = search.world, model.fit, model.fit.free.size
+    noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), model.likelihood.phi)
+    jacobian = whitened(np.where(search.seen[..., None], fit.jacobian, 0.0), search.seen, noise)
+    j = jacobian.reshape(len(jacobian), -1, jacobian.shape[3])
+    normal = np.matmul(j.transpose(0, 2, 1), j)
+    inner = normal[:, q:, q:] + np.diag(1.0 / prior_of(world) ** 2)
+    cross = np.where(world.known[:, None, :], 0.0, normal[:, :q, q:])
+    schur = normal[:, :q, :q].sum(axis=0) - np.matmul(cross, np.linalg.solve(inner, cross.transpose(0, 2, 1))).sum(0)
+    scale = np.sqrt(np.maximum(np.diagonal(normal[:, :q, :q].sum(axis=0)), 1e-300))
+    inverse = np.linalg.pinv(schur / np.outer(scale, scale), rcond=1e-13, hermitian=True)
+    values, vectors = np.linalg.eigh(schur / np.outer(scale, scale))
+    lost = values < 1e-12
+    if lost.any():  # a direction that the data do not fix at all has no pseudo-inverse that says so
+        inverse = inverse + (vectors[:, lost] * 1e12) @ vectors[:, lost].T
+    result: Array = inverse / np.outer(scale, scale)
+    return result
+
+
+def intervals(search: Search, model: Model) -> dict[int, tuple[float, float, float]]:
+    """Value, low and high (95 %) of each fitted parameter by its place; NaN where the data do not bound it."""
+    spread = np.sqrt(np.maximum(np.diagonal(covariance(search, model)), 0.0))
+    result = {}
+    for place, sd in zip(model.fit.free.tolist(), spread.tolist(), strict=True):
+        value = float(model.fit.theta[place])
+        low, high = search.world.parameters[place].bounds
+        known = np.isfinite(sd) and 2.0 * Z95 * sd < 4.0 * max(high - low, abs(value))
+        result[place] = (value, value - Z95 * sd, value + Z95 * sd) if known else (value, np.nan, np.nan)
+    return result
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Held-out error in the unit of the channels counted, and the share of the gap closed with its 95 % interval."""
+
+    base: float
+    extended: float
+    floor: float
+    closed: float
+    low: float
+    high: float
+
+
+def gain(world: World, before: Array, after: Array, channels: Sequence[int], floor: float, rng: np.random.Generator) -> Gain:
+    """Share of the gap closed, (before - after) / (before - floor) in RMSE, with a bootstrap interval over runs.
+
+    With a single run the resampling is over stretches of it (circular blocks; D. N. Politis, J. P. Romano 1992).
+
+    Args:
+        world: the runs.
+        before: (R, T, C) simulated by the base model.
+        after: (R, T, C) simulated by the extended one.
+        channels: those that count; they share a unit.
+        floor: RMS of the noise over them.
+        rng: of the resampling.
+    """
+    pieces = _pieces(world, before, after, channels)
+    whole = pieces.sum(axis=0)
+    rows = rng.integers(len(pieces), size=(RESAMPLES, len(pieces)))
+    shares = _closed(pieces[rows].sum(axis=1), floor)
+    low, high = (float(v) for v in np.quantile(shares, [0.025, 0.975])) if len(pieces) > 1 else (np.nan, np.nan)
+    base, extended = float(np.sqrt(whole[0] / whole[2])), float(np.sqrt(whole[1] / whole[2]))
+    return Gain(base, extended, floor, float(_closed(whole[None], floor)[0]), low, high)
+
+
+def _pieces(world: World, before: Array, after: Array, channels: Sequence[int]) -> Array:
+    """(n, 3): sums of squares before and after, and samples, of each run, or of ten stretches of a single one."""
+    parts: list[tuple[int, slice]] = [(r, slice(None)) for r in range(len(world.tracks))]
+    if len(parts) == 1:
+        edges = np.linspace(0, world.lengths[0], 11).astype(int)
+        parts = [(0, slice(int(a), int(b))) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+    rows = []
+    for run, part in parts:
+        seen = np.isfinite(world.observed[run, part][:, channels])
+        if seen.any():
+            errors = [(world.observed - s)[run, part][:, channels][seen] for s in (before, after)]
+            rows.append([*(float(e @ e) for e in errors), float(seen.sum())])
+    return np.array(rows)
+
+
+def _closed(sums: Array, floor: float) -> Array:
+    """Shares of the gap closed of rows (n, 3); 0 where there is no gap above the floor."""
+    base, extended = np.sqrt(sums[:, 0] / sums[:, 2]), np.sqrt(sums[:, 1] / sums[:, 2])
+    gap = base - floor
+    with np.errstate(all="ignore"):
+        share: Array = np.where(gap > 1e-3 * floor, (base - np.maximum(extended, floor)) / gap, 0.0)
+    return np.clip(share, -9.0, 1.0)

@@ -1,0 +1,202 @@
+"""Names the cause: which effects the search found, what else would do as well, and which of six verdicts that makes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.gap.colour import Noise
+from bench.gap.measure import HeldOut, Measured, covariance
+from bench.gap.remains import Remains, remains
+from bench.gap.score import tail
+from bench.gap.search import ALPHA, SWITCH, Model, Names, Search
+from methods.base import Array
+from sims.simulated import effect_parameters
+
+EXPLAINED = 0.7
+"""Share of the gap that the effects must close to be taken for its explanation."""
+VAGUE = 0.5
+"""A base parameter is not fixed by the data if its 1 sigma is more than this share of its bounds."""
+NEAR = 30.0
+"""Rivals this near in twice the log likelihood are fitted once more before they are judged."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One effect that was found.
+
+    Attributes:
+        effect: its name.
+        alternatives: effects that would explain the same as well, the most plausible first.
+        p_value: chance of a gain like its own if it were not there.
+        gain: twice the log likelihood lost without it.
+        preferred: which of the set should stand for it: the likeliest, held-out runs included, of those whose
+            coefficients are plausible.
+    """
+
+    effect: str
+    alternatives: tuple[str, ...]
+    p_value: float
+    gain: float
+    preferred: str = ""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found.
+
+    Attributes:
+        verdict: one of DESIGN's six words.
+        model: the extended model; the base model where nothing was found.
+        base: the base model.
+        causes: strongest first.
+        remains: what the extended model leaves.
+        vague: base parameters that the data do not fix.
+        measured: models on held-out runs, by their effects; None where there are none.
+    """
+
+    verdict: str
+    model: Model
+    base: Model
+    causes: tuple[Cause, ...]
+    remains: Remains
+    vague: tuple[str, ...] = ()
+    measured: Mapping[Names, Measured] | None = None
+
+
+def name(search: Search, stated: Array, held_out: HeldOut | None) -> Finding:
+    """Search, check on held-out runs, collect alternatives, and judge.
+
+    Args:
+        search: with the base model entered.
+        stated: (C,) whether the recording states the noise of each channel.
+        held_out: the runs for measuring; None if there are none.
+    """
+    base = search.models[frozenset()]
+    vague = unfixed(search, base)
+    if vague:
+        return Finding("unidentifiable", base, base, (), remains(search, base, stated), vague)
+    model = polished(search, search.run())
+    measured = _measured(search, model, held_out)
+    merits = None if measured is None else {names: part.merit for names, part in measured.items()}
+    model = _kept(search, model, merits)
+    left = remains(search, model, stated)
+    causes = _causes(search, model, merits)
+    preferred = search.models.get(frozenset(cause.preferred for cause in causes), model)
+    if preferred is not model:
+        model, causes = preferred, _causes(search, preferred, merits)
+    return Finding(_verdict(search, model, causes, left), model, base, causes, left, (), measured)
+
+
+def unfixed(search: Search, base: Model) -> tuple[str, ...]:
+    """Base parameters that shape the data and are not fixed by them."""
+    spread = np.sqrt(np.maximum(np.diagonal(covariance(search, base)), 0.0))
+    parameters = search.world.parameters
+    found = []
+    for place, sd in zip(base.fit.free.tolist(), spread.tolist(), strict=True):
+        low, high = parameters[place].bounds
+        if not sd < VAGUE * (high - low):
+            found.append(parameters[place].name)
+    return tuple(found)
+
+
+def polished(search: Search, model: Model) -> Model:
+    """The best model after it and its rivals of the same size were fitted again by generalised least squares."""
+    size, names = len(model.names), set(model.names)
+    near = [m for m in search.models.values() if len(m.names) == size and model.merit - m.merit < NEAR]
+    near += [m for m in search.models.values() if len(m.names) == size - 1 and set(m.names) < names]
+    noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), np.maximum(model.likelihood.phi, 0.0))
+    search.refit([m.fit.start() for m in near], noise)
+    return search.best(size) or model
+
+
+def _measured(search: Search, model: Model, held_out: HeldOut | None) -> dict[Names, Measured] | None:
+    """On held-out runs: the base model, the best ones with one effect, and all that are near the one found."""
+    if held_out is None:
+        return None
+    base = search.models[frozenset()]
+    near = [m for m in search.models.values() if len(m.names) == len(model.names) and model.merit - m.merit < NEAR]
+    parts = [m for m in search.models.values() if set(m.names) < set(model.names)]
+    singles = sorted((m for m in search.models.values() if len(m.names) == 1), key=lambda m: -m.merit)[:SHOWN]
+    chosen = {m.names: m for m in [base, model, *near, *parts, *singles]}
+    return dict(zip(chosen, held_out.measure([m.fit.theta for m in chosen.values()]), strict=True))
+
+
+SHOWN = 6
+
+
+def _kept(search: Search, model: Model, merits: dict[Names, float] | None) -> Model:
+    """The model without effects that make held-out runs worse."""
+    if merits is None:
+        return model
+    while model.names:
+        smaller = [m for m in search.models.values() if len(m.names) == len(model.names) - 1]
+        smaller = [m for m in smaller if set(m.names) < set(model.names) and m.names in merits]
+        better = [m for m in smaller if merits[m.names] > merits.get(model.names, -np.inf)]
+        if not better:
+            return model
+        model = max(better, key=lambda m: merits[m.names])
+    return model
+
+
+def _causes(search: Search, model: Model, merits: dict[Names, float] | None) -> tuple[Cause, ...]:
+    """The model's effects, strongest first."""
+    return tuple(sorted((_cause(search, model, n, merits) for n in model.names), key=lambda cause: -cause.gain))
+
+
+def _cause(search: Search, model: Model, effect: str, merits: dict[Names, float] | None) -> Cause:
+    rest = search.without(model, effect)
+    gain = model.likelihood.value - rest.likelihood.value
+    scores = search.scanned[frozenset(rest.names)][1] if frozenset(rest.names) in search.scanned else search.scan(rest)
+    chance = dict(zip(scores.effects, scores.chance.tolist(), strict=True)).get(effect, 0.0)
+    p_value = min(search.tests.get(frozenset(rest.names), 1.0), tail(scores.by_chance, np.array([gain - chance])))
+    rivals = [(0.0, effect)]
+    for other in search.models.values():
+        added = set(other.names) - set(rest.names)
+        if len(other.names) == len(model.names) and set(rest.names) < set(other.names) and effect not in added:
+            behind = model.merit - other.merit
+            if merits is not None and other.names in merits and model.names in merits:
+                behind += merits[model.names] - merits[other.names]
+            if behind < SWITCH:
+                rivals.append((behind, added.pop()))
+    ordered = [n for _, n in sorted(rivals, key=lambda rival: (not _in_range(search, rival[1]), rival))]
+    alternatives = tuple(n for n in ordered if n != effect)
+    return Cause(effect, alternatives, float(np.clip(p_value, 0.0, 1.0)), float(gain), ordered[0])
+
+
+def _in_range(search: Search, effect: str) -> bool:
+    """Whether the coefficients with which an effect explains the gap are what one would expect."""
+    world = search.world
+    with_it = [m for m in search.models.values() if effect in m.names]
+    if not with_it:
+        return False
+    best = max(with_it, key=lambda m: m.merit)
+    parameters = effect_parameters(world.effects[effect], world.simulator.system, world.channels)
+    values = best.fit.theta[world.slots[effect]]
+    return all(p.bounds[0] <= v <= p.bounds[1] for p, v in zip(parameters, values, strict=True))
+
+
+def closed(search: Search, base: Model, model: Model, floor: Array) -> float:
+    """Share of the gap on the fitted runs that a model closes, all channels in units of their noise."""
+    before, after = (_loud(search, m, floor) for m in (base, model))
+    return (before - max(after, 1.0)) / (before - 1.0) if before > 1.0 + 1e-9 else 0.0
+
+
+def _loud(search: Search, model: Model, floor: Array) -> float:
+    left = search.residual(model.fit) / floor
+    return float(np.sqrt(np.square(left[search.seen]).mean()))
+
+
+def _verdict(search: Search, model: Model, causes: Sequence[Cause], left: Remains) -> str:
+    base = search.models[frozenset()]
+    floor = np.where(np.isfinite(model.likelihood.sigma) & ~left.structure, model.likelihood.sigma, search.noise.sigma)
+    unexplained = left.structure or search.tests.get(frozenset(model.names), 1.0) < ALPHA
+    if not causes:
+        return "unknown" if unexplained else "adequate"
+    if closed(search, base, model, np.maximum(floor, search.noise.sigma)) < EXPLAINED:
+        return "unknown"
+    if unexplained:
+        return "partial"
+    return "ambiguous" if any(cause.alternatives for cause in causes) else "named"

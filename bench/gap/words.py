@@ -1,0 +1,145 @@
+"""Numbers, units and names as a person reads them; shared by the account, the figures and the page."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from math import floor, isfinite, log10
+
+_NOUNS: Mapping[str, str] = {
+    "backlash": "backlash",
+    "clock.skew": "a clock skew",
+    "contact.friction": "friction at impacts",
+    "drag.linear": "linear drag",
+    "drag.quadratic": "quadratic drag",
+    "force.bias": "a constant force",
+    "force.periodic": "a force periodic in time",
+    "force.ripple": "a force periodic in position",
+    "friction.coulomb": "Coulomb friction",
+    "friction.load": "load-dependent friction",
+    "friction.stribeck": "Stribeck friction",
+    "gravity.scale": "a correction of gravity",
+    "gravity.tilt": "a tilt of gravity",
+    "input.bias": "an input bias",
+    "input.deadband": "an input dead band",
+    "input.delay": "an input delay",
+    "input.gain": "an input gain",
+    "input.lag": "an input lag",
+    "input.saturation": "input saturation",
+    "lift.magnus": "Magnus lift",
+    "restitution.speed": "speed-dependent restitution",
+    "sensor.bias": "a sensor bias",
+    "sensor.delay": "a sensor delay",
+    "sensor.drift": "a sensor drift",
+    "sensor.gain": "a sensor gain",
+    "sensor.lag": "a sensor lag",
+    "spring.cubic": "a cubic spring",
+    "spring.linear": "a linear spring",
+    "wind": "wind",
+}
+_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+_SMALL, _LARGE = 1e-3, 1e5
+"""Magnitudes beyond which numbers are written with a power of ten."""
+_FEW = log10(3.55)
+"""Mantissa of an interval below which it is written with two digits (Particle Data Group's rule)."""
+_LEAST = 1e-12
+"""Probabilities below this are all the same."""
+
+
+def clean(text: object, most: int = 400) -> str:
+    """Text from a file or plugin on one line: what a terminal would obey is spelled out, what is too long cut."""
+    plain = "".join(c if c.isprintable() else " " if c.isspace() else ascii(c)[1:-1] for c in str(text)).strip()
+    return plain if len(plain) <= most else plain[: most - 1] + "…"
+
+
+def noun(effect: str) -> str:
+    """An effect as a noun, e.g. ``linear drag``; effects joined by + as ``a and b``; unknown ones keep their name."""
+    return joined([_NOUNS.get(part.strip(), clean(part, 60)) for part in effect.split("+")])
+
+
+def name_of(effect: str) -> str:
+    """An effect's noun without its article, for lists."""
+    return re.sub(r"^an? ", "", noun(effect))
+
+
+def joined(parts: Sequence[str], last: str = "and") -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return f" {last} ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+
+
+def sentence(text: object) -> str:
+    """With a capital at its beginning and a stop at its end."""
+    plain = clean(text)
+    if not plain:
+        return plain
+    begin = plain[0].upper() if plain.split()[0].rstrip(",:;.").isalpha() else plain[0]  # a name stays as it is
+    return begin + plain[1:] + ("" if plain[-1] in ".!?…" else ".")
+
+
+def pretty(unit: str) -> str:
+    """A unit as printed, ``kg·m²``; empty for a pure number."""
+    raised = re.sub(r"(?:\^|\*\*)(-?\d+)", lambda power: power[1].translate(_RAISED), clean(unit, 60))
+    return "" if raised == "1" else raised.replace("*", "·")
+
+
+def labelled(name: str, unit: str, most: int = 30) -> str:
+    """``q [rad]``, ``q`` for a pure number."""
+    return f"{clean(name, most)} [{pretty(unit)}]" if pretty(unit) else clean(name, most)
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A number and its unit."""
+    return f"{text} {pretty(unit)}" if pretty(unit) else text
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """With so many significant digits; a dash where there is none."""
+    if value is None or not isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    rounded = float(f"{value:.{digits - 1}e}")
+    exponent = _exponent(abs(rounded))
+    decimals = max(0, digits - 1 - floor(log10(abs(rounded))) + exponent)
+    text = f"{rounded / 10.0**exponent:.{decimals}f}"
+    return _signed(text.rstrip("0").rstrip(".") if "." in text else text) + _power(exponent)
+
+
+def estimate(value: float, low: float | None, high: float | None) -> str:
+    """``0.00333 (0.00330 to 0.00336)``: one digit of the interval's half width, two where it begins with 1 to 3."""
+    if low is None or high is None or not (isfinite(low) and isfinite(high)) or high <= low:
+        return f"{number(value)} (no interval)"
+    exponent = _exponent(max(abs(value), abs(low), abs(high)))
+    half = log10((high - low) / 2) - exponent
+    decimals = min(max(0, (half % 1 < _FEW) - floor(half)), 9)
+    texts = [_signed(f"{x / 10.0**exponent:.{decimals}f}") + _power(exponent) for x in (value, low, high)]
+    return f"{texts[0]} ({texts[1]} to {texts[2]})"
+
+
+def percent(share: float | None) -> str:
+    """A share as ``90 %``; below 10 % and close to 100 % with one decimal."""
+    if share is None or not isfinite(share):
+        return "–"
+    size = abs(100 * share)
+    decimals = 1 if 0 < size < 9.95 or 99 < size < 99.95 else 0
+    return _signed(f"{100 * share:.{decimals}f}") + " %"
+
+
+def probability(p: float | None) -> str:
+    """``p = 0.03``."""
+    if p is None or not isfinite(p):
+        return "p unknown"
+    return f"p < {number(_LEAST, 1)}" if p < _LEAST else f"p = {number(p, 2)}"
+
+
+def _exponent(size: float) -> int:
+    return 0 if size == 0 or _SMALL <= size < _LARGE else floor(log10(size))
+
+
+def _power(exponent: int) -> str:
+    return f"×10{str(exponent).translate(_RAISED)}" if exponent else ""
+
+
+def _signed(text: str) -> str:
+    zero = not text.strip("-0.")
+    return text.lstrip("-") if zero else text.replace("-", "−")
