@@ -32,3 +32,8 @@ check: $(STAMP)
 benchmark: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.harness
 	$(BIN)/python -m tests.benchmarks.engines
+
+# the exam of `explain`, on recordings of independent simulators: long, goes on where it was; `make exam QUICK=--quick`
+.PHONY: exam
+exam: $(STAMP)
+	$(BIN)/python -m tests.exam $(QUICK)

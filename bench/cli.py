@@ -1,4 +1,4 @@
-"""The command line: `simgap compare`, `plot`, `simulate`, `inspect`, `list`.
+"""The command line: `simgap compare`, `plot`, `simulate`, `inspect`, `explain`, `score`, `list`.
 
 Heavy packages are imported by the commands that need them, so that `simgap --help` is quick. A fault of the user's is
 one line on stderr and exit code 2; an internal error keeps its traceback.
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench import __version__
+from bench.gap.commands import add_explain, add_score
 
 if TYPE_CHECKING:
     from bench.experiment import Experiment
@@ -71,6 +72,9 @@ def _parser() -> argparse.ArgumentParser:
     inspect.add_argument("--out", metavar="DIR", type=Path, help="folder for the figure (default: results/inspect)")
     inspect.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more systems")
     inspect.set_defaults(command=_inspect)
+
+    add_explain(commands.add_parser("explain", help="show what a simulation gets wrong on a recording, and why"))
+    add_score(commands.add_parser("score", help="error of an extended simulator on another recording"))
 
     listing = commands.add_parser("list", help="list tuners, simulators, systems, effects or experiments")
     listing.add_argument("what", choices=("tuners", "simulators", "systems", "effects", "experiments"))

@@ -74,12 +74,13 @@ class Recording:
         return tuple(run for run in self.runs if run.held_out)
 
 
-def read_recording(path: str | Path, declared: Declared) -> Recording:
+def read_recording(path: str | Path, declared: Declared, whole: bool = False) -> Recording:
     """Read `NAME.csv` and `NAME.toml` and check them against a system's channels, inputs, constants and states.
 
     Args:
         path: the table.
         declared: the system, or a simulator of it; `system_of` says which system the recording states.
+        whole: hold nothing out but the runs that are marked, and do not divide a single run.
 
     Raises:
         InputError: anything malformed, in one line.
@@ -90,7 +91,8 @@ def read_recording(path: str | Path, declared: Declared) -> Recording:
     parts = read_table(table, list(about.channels), list(about.inputs))
     check_names(description, about.runs, [part.name for part in parts])
     runs = [_run(table, part, about) for part in parts]
-    return Recording(table, about.system, about.title, about.constants, about.noise, _split(description, runs))
+    kept = tuple(runs) if whole else _split(description, runs)
+    return Recording(table, about.system, about.title, about.constants, about.noise, kept)
 
 
 _UNMARKED = RunMarks({}, {}, None)

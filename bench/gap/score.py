@@ -16,14 +16,14 @@ from itertools import combinations
 import numpy as np
 
 from bench.gap.candidates import Directions
-from bench.gap.colour import GRID, Mask, Noise, log_determinant, whitened
+from bench.gap.colour import GRID, Mask, Noise, log_determinant
 from bench.gap.fit import Fit
 from methods.base import Array
 
 SMALL = 4
 """Groups of more columns are taken as they are, without a choice of columns."""
-RANK = 1e-7
-"""Directions below this share of the largest singular value are none."""
+RANK = 1e-9
+"""Directions below this share of the largest eigenvalue of their scaled products are none."""
 
 
 @dataclass(frozen=True)
@@ -60,37 +60,78 @@ class Scores:
     by_chance: Array
 
 
-class Projected:
-    """Residuals and directions after all that the model's own freedom absorbs is taken out, for one correlation."""
+class Products:
+    """Inner products of residuals and directions after all that the model's own freedom absorbs is taken out.
 
-    def __init__(self, at: Fit, residuals: Array, directions: Array, seen: Mask, noise: Noise) -> None:
-        q = at.free.size
-        own = whitened(np.where(seen[..., None], at.jacobian, 0.0), seen, noise)
-        d = whitened(np.where(seen[..., None], directions, 0.0), seen, noise)
-        r = whitened(np.where(seen[..., None], residuals, 0.0), seen, noise)
-        runs = len(seen)
-        count = seen.shape[1] * seen.shape[2]
-        shared, d, r, inner = (part.reshape(runs, count, part.shape[3]) for part in (own[..., :q], d, r, own[..., q:]))
-        for i in range(runs):
-            basis = span(inner[i])
-            shared[i], d[i], r[i] = (part[i] - basis @ (basis.T @ part[i]) for part in (shared, d, r))
-        flat_shared, flat_d, flat_r = (part.reshape(runs * count, part.shape[2]) for part in (shared, d, r))
-        basis = span(flat_shared)
-        flat_d = flat_d - basis @ (basis.T @ flat_d)
-        flat_r = flat_r - basis @ (basis.T @ flat_r)
-        self.total = np.einsum("ns,ns->s", flat_r, flat_r)
-        self.gram = flat_d.T @ flat_d
-        self.cross = flat_d.T @ flat_r
+    Whitening by a correlation phi mixes products of samples with themselves and with those before them, so that one
+    pass over the samples serves every phi. All are computed run by run, since initial states are a run's own.
+    """
+
+    def __init__(self, at: Fit, residuals: Array, directions: Array, seen: Mask, sigma: Array) -> None:
+        self._own, self._states = at.free.size, at.jacobian.shape[3] - at.free.size
+        self._directions, self._runs = directions.shape[3], []
+        follows = np.zeros_like(seen)
+        follows[:, 1:] = seen[:, 1:] & seen[:, :-1]
+        for r in range(len(seen)):
+            left = np.concatenate([at.jacobian[r], directions[r]], axis=2) / sigma[:, None]
+            right = residuals[r] / sigma[:, None]
+            self._runs.append(_laid(left, right, seen[r], follows[r]))
+
+    def projected(self, phi: float) -> tuple[Array, Array, Array]:
+        """Sums of squares (S,) of the residuals, products of directions (K, K) and of both (K, S)."""
+        q, s = self._own, self._states
+        total, normal, cross = 0.0, 0.0, 0.0
+        for squares, products, mixed in self._runs:
+            n, c, t = (part[0] + (part[1] - phi * part[2] + phi * phi * part[3]) / (1.0 - phi * phi) for part in
+                       (products, mixed, squares))  # fmt: skip
+            own = slice(q, q + s)
+            rest = np.r_[0:q, q + s : len(n)]
+            inverse = _inverse(n[own, own])
+            total = total + t - np.einsum("ks,kl,ls->s", c[own], inverse, c[own])
+            cross = cross + c[rest] - n[rest][:, own] @ (inverse @ c[own])
+            normal = normal + n[np.ix_(rest, rest)] - n[rest][:, own] @ inverse @ n[own][:, rest]
+        total, normal, cross = (np.asarray(part) for part in (total, normal, cross))
+        inverse = _inverse(normal[:q, :q])
+        total = total - np.einsum("ks,kl,ls->s", cross[:q], inverse, cross[:q])
+        gram = normal[q:, q:] - normal[q:, :q] @ inverse @ normal[:q, q:]
+        return np.maximum(total, 0.0), gram, cross[q:] - normal[q:, :q] @ (inverse @ cross[:q])
 
 
-def span(columns: Array) -> Array:
-    """An orthonormal basis (n, k) of what the columns span."""
-    sizes = np.sqrt(np.einsum("nk,nk->k", columns, columns))
-    columns = columns[:, sizes > 0] / sizes[sizes > 0]
-    if not columns.size:
-        return np.zeros((len(columns), 0))
-    u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return u[:, s > RANK * s[0]]
+Parts = tuple[Array, Array, Array, Array]
+
+
+def _laid(left: Array, right: Array, seen: Mask, follows: Mask) -> tuple[Parts, Parts, Parts]:
+    """Products of samples without a forerunner, of those with one, of both with each other, and of the forerunners."""
+    here, later = seen & ~follows, follows[1:]
+    first, second = (_rows(part, here) for part in (left, right))
+    now, then = ((_rows(part[1:], later), _rows(part[:-1], later)) for part in (left, right))
+    mixed = now[0].T @ now[1]
+    products = (first.T @ first, now[0].T @ now[0], mixed + mixed.T, now[1].T @ now[1])
+    cross = (
+        first.T @ second, now[0].T @ then[0], now[0].T @ then[1] + now[1].T @ then[0], now[1].T @ then[1]
+    )  # fmt: skip
+    squares = (
+        np.square(second).sum(axis=0), np.square(then[0]).sum(axis=0),
+        2.0 * (then[0] * then[1]).sum(axis=0), np.square(then[1]).sum(axis=0),
+    )  # fmt: skip
+    return squares, products, cross
+
+
+def _rows(values: Array, mask: Mask) -> Array:
+    """Values (T, C, M) where the mask (T, C) holds, (n, M)."""
+    return values.reshape(-1, values.shape[2]) if mask.all() else values[mask]
+
+
+def _inverse(normal: Array) -> Array:
+    """Of a positive semidefinite matrix; directions that hardly count are left out."""
+    scale = np.sqrt(np.maximum(np.diagonal(normal), 0.0))
+    scale = np.where(scale > 0, scale, np.inf)
+    if not scale.size:
+        return normal
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    kept = values > RANK * max(float(values[-1]), 1e-300)
+    result: Array = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T / np.outer(scale, scale)
+    return result
 
 
 def groups(directions: Directions) -> list[Group]:
@@ -170,14 +211,15 @@ def score(
     nothing = np.full(shape[1], -np.inf)
     best = np.full(shape, -np.inf)
     which: dict[str, tuple[float, Group, Array, float]] = {}
+    products = Products(at, everything, directions.values, seen, noise.sigma)
     for phi in GRID:
-        projected = Projected(at, everything, directions.values, seen, noise.coloured(phi))
+        total, gram, cross = products.projected(phi)
         determinant = 2.0 * log_determinant(seen, np.full(seen.shape[2], phi))
-        floor = 1e-12 * projected.total + 1e-300
-        nothing = np.maximum(nothing, determinant - count * np.log(np.maximum(projected.total, floor)))
+        floor = 1e-12 * total + 1e-300
+        nothing = np.maximum(nothing, determinant - count * np.log(np.maximum(total, floor)))
         for g in members:
-            gain, c = explained(projected.gram, projected.cross, g)
-            value = determinant - count * np.log(np.maximum(projected.total - gain, floor))
+            gain, c = explained(gram, cross, g)
+            value = determinant - count * np.log(np.maximum(total - gain, floor))
             row = names.index(g.effect)
             if value[0] > which.get(g.effect, (-np.inf,))[0]:
                 which[g.effect] = (float(value[0]), g, c[:, 0], phi)

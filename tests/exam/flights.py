@@ -106,8 +106,8 @@ def _fly(air, now, end, state, floor, resting):
 
     meets.terminal, meets.direction = True, -1
     events = None if floor is None else meets
-    step = min(0.02, end - now)
-    solved = solve_ivp(rate, (now, end), state, events=events, dense_output=True, first_step=step, **TOLERANCES)
+    settings = {"dense_output": True, "first_step": min(0.02, end - now), **TOLERANCES}
+    solved = solve_ivp(rate, (now, end), state, "DOP853", events=events, **settings)
     if not solved.success:
         raise RuntimeError(solved.message)
     return solved
@@ -126,5 +126,3 @@ def _bounce(world, t, state):
     after[3:5] *= max(1.0 - lost / along, 0.0) if along > 0 else 1.0
     after[5] = e * speed if e * speed > AT_REST else 0.0
     return after, after[5] == 0.0
-
-

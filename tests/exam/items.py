@@ -1,13 +1,14 @@
 """The exam's questions: recordings of independent simulators in which a cause is hidden, drawn from a seed.
 
-`draw` chooses what is hidden and how strongly, `realise` writes the recording and, apart from it, the truth. Whatever is
-drawn follows from the item's name; an item is a recipe, no data.
+`draw` chooses what is hidden and how strongly, `realise` writes the recording and, apart from it, the truth. Whatever
+is drawn follows from the item's name; an item is a recipe, no data.
 """
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +25,22 @@ KINDS = ("clean", "single", "double", "foreign")
 SMALL = (0.1, 0.2, 0.3, 0.5)  # sizes asked for the power curve only
 
 APART = 1.0  # noise: what must be left when only one of two effects, or no foreign cause, is in the model
+TELLING = 0.4  # noise: what the simpler form of an effect must leave, or else the simpler one is the right answer
+SIMPLER = {
+    "friction.stribeck": ("friction.coulomb",),
+    "wind": ("drag.linear", "drag.quadratic", "force.bias", "gravity.tilt"),  # air that moves fast is a steady push
+}
 
-EQUIVALENT: tuple[tuple[str, frozenset[str]], ...] = (
-    ("slider", frozenset({"gravity.tilt", "force.bias", "input.bias"})),
-    ("pendulum", frozenset({"force.bias", "input.bias"})),
-    ("pendulum", frozenset({"input.gain", "gravity.scale"})),
-    ("ball", frozenset({"force.bias", "gravity.scale", "clock.skew"})),  # as long as no accelerometer is recorded
+EQUIVALENT: tuple[tuple[str, bool, frozenset[str]], ...] = (
+    ("slider", True, frozenset({"gravity.tilt", "force.bias", "input.bias"})),
+    ("pendulum", True, frozenset({"force.bias", "input.bias"})),
+    ("pendulum", True, frozenset({"input.gain", "gravity.scale"})),  # the inertia takes up the rest
+    ("pendulum", False, frozenset({"force.bias", "input.bias"})),
+    ("pendulum", False, frozenset({"gravity.tilt", "sensor.bias"})),  # gravity turned and scaled
+    ("ball", False, frozenset({"force.bias", "gravity.scale", "clock.skew"})),  # for no accelerometer is recorded
 )
-"""Effects that give the same motion for some parameters and initial states: exact, whatever the data."""
+"""Effects of a system, with an input or without, that give the same motion for some parameters and initial states:
+exactly, whatever the data."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +57,12 @@ class Item:
         stated: whether the recording states the noise.
         rate, seconds, runs: sampling in Hz, a run's length, how many.
         source: scipy or mujoco.
+        driven: whether there is an input.
+        channels: what is recorded.
         seed: what it was drawn from.
         parameters: the base parameters.
-        beyond: what the best effect of the library leaves of the gap, in units of the noise; of a foreign cause only.
+        beyond: what is left of the gap, in units of the noise, with the best other answer: of a foreign cause the best
+            effect of the library, of two effects one of them, of an effect in `SIMPLER` those.
     """
 
     name: str
@@ -64,6 +76,8 @@ class Item:
     seconds: float
     runs: int
     source: str
+    driven: bool
+    channels: tuple[str, ...]
     seed: int
     parameters: dict[str, float] = field(default_factory=dict)
     beyond: float | None = None
@@ -74,12 +88,14 @@ class Item:
     @classmethod
     def of(cls, document):
         """An item from its JSON."""
-        return cls(**{**document, "effects": {name: tuple(c) for name, c in document["effects"].items()}})
+        effects = {name: tuple(c) for name, c in document["effects"].items()}
+        return cls(**{**document, "effects": effects, "channels": tuple(document["channels"])})
 
 
-def same_class(system, effect):
+def same_class(system, driven, effect):
     """The effect and all that are equivalent to it."""
-    return frozenset({effect}).union(*(names for of, names in EQUIVALENT if of == system and effect in names))
+    classes = (names for *where, names in EQUIVALENT if where == [system, driven] and effect in names)
+    return frozenset({effect}).union(*classes)
 
 
 def draw(kind, system, seed, effect=None, size=None):
@@ -99,7 +115,8 @@ def draw(kind, system, seed, effect=None, size=None):
     setting = _setting(name, system, hidden)
     item = Item(
         name, system, kind, {}, 0.0, setting.noise.kind, setting.noise.stated, setting.rate, setting.seconds,
-        len(setting.scenarios), str(rng.choice(["scipy", "mujoco"])), seed, setting.parameters,
+        len(setting.scenarios), str(rng.choice(["scipy", "mujoco"])), setting.driven, setting.channels, seed,
+        setting.parameters,
     )  # fmt: skip
     wanted = size or float(np.exp(rng.uniform(np.log(3.0 if kind in ("double", "foreign") else 1.0), np.log(10.0))))
     return {"clean": _clean, "single": _single, "double": _double, "foreign": _foreign}[kind](
@@ -111,8 +128,14 @@ def _rng(name, purpose):
     return np.random.default_rng(list(f"{name} {purpose}".encode()))
 
 
+@lru_cache(maxsize=16)
 def _setting(name, system, hidden):
     return drawn_setting(system, _rng(name, "setting"), hidden)
+
+
+def setting_of(item):
+    """The circumstances in which an item was drawn."""
+    return _setting(item.name, item.system, tuple(item.effects))
 
 
 def _hidden(kind, system, effect, rng):
@@ -122,7 +145,8 @@ def _hidden(kind, system, effect, rng):
     first = effect or str(rng.choice(names))
     if kind != "double":
         return (first,)
-    return first, str(rng.choice([n for n in names if n not in same_class(system, first)]))
+    alike = same_class(system, True, first) | same_class(system, False, first)
+    return first, str(rng.choice([n for n in names if n not in alike]))
 
 
 def _clean(item, setting, hidden, wanted, rng):
@@ -132,7 +156,15 @@ def _clean(item, setting, hidden, wanted, rng):
 def _single(item, setting, hidden, wanted, rng):
     (name,) = hidden
     c = coefficients(name, setting, wanted, rng)
-    return None if c is None else replace(item, effects={name: c}, size=wanted)
+    if c is None:
+        return None
+    beyond = None
+    if name in SIMPLER and wanted >= 1.0:
+        observed = sizing.observed_by_batch(setting, {name: c})
+        beyond = min(rivals.left_with(setting, observed, simpler) for simpler in SIMPLER[name])
+        if beyond < TELLING:
+            return None
+    return replace(item, effects={name: c}, size=wanted, beyond=beyond)
 
 
 def coefficients(name, setting, wanted, rng):
@@ -178,16 +210,16 @@ def _foreign(item, setting, hidden, wanted, rng):
     return hides if beyond >= APART else None
 
 
-def realise(item, folder):
-    """Write NAME.csv and NAME.toml, and the truth as NAME.truth.json; the path of the first."""
-    setting = _setting(item.name, item.system, tuple(item.effects) if item.kind != "clean" else ())
+def realise(item, folder, truth=True):
+    """Write NAME.csv and NAME.toml, and beside them the truth as NAME.truth.json if wanted; the path of the first."""
+    setting = setting_of(item)
     runs = _runs(item, setting)
     system = SIMULATORS[item.system].system
     noise = setting.noise.sigma if item.stated else {}
     constants = {} if item.system == "slider" else setting.constants
     path = Path(folder) / f"{item.name}.csv"
-    truth = {path.with_suffix(".truth.json"): json.dumps(item.json(), indent=1) + "\n"}
-    write_recording(path, Recording(path, item.system, "", constants, noise, runs), system(), digits=9, beside=truth)
+    beside = {path.with_suffix(".truth.json"): json.dumps(item.json(), indent=1) + "\n"} if truth else {}
+    write_recording(path, Recording(path, item.system, "", constants, noise, runs), system(), digits=9, beside=beside)
     return path
 
 

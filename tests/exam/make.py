@@ -1,4 +1,4 @@
-"""Write a batch of the exam's recordings: ``python -m tests.exam.make --kind single --system ball --count 20 --out DIR``.
+"""Write a batch of recordings: ``python -m tests.exam.make --kind single --system ball --count 20 --out DIR``.
 
 With ``--each`` that many of every effect, else of whatever is drawn. Existing recordings are left as they are.
 """

@@ -9,7 +9,8 @@ from tests.exam.sizing import Fitter
 from tests.exam.worlds import SIMULATORS
 
 PROMISING = 4  # effects that are refitted, of those that close most of the gap to first order
-SHAPES = {  # of effects whose shape is not in proportion: first guesses, in the library's units
+STARTS = 3  # shapes from which one effect is refitted
+SHAPES = {  # first guesses of what shapes an effect rather than scales it, in the library's units
     "force.periodic": [(f,) for f in (0.2, 0.4, 0.7, 1.2, 2.0, 3.5)],
     "force.ripple": [(p,) for p in (0.1, 0.2, 0.4, 0.8, 1.6, 3.0, 6.0)],
     "friction.stribeck": [(s,) for s in (0.05, 0.2, 1.0)],
@@ -17,19 +18,22 @@ SHAPES = {  # of effects whose shape is not in proportion: first guesses, in the
 }
 
 
-def left_with(setting, observed, name, coefficients=None, starts=None):
-    """What base parameters, initial states and the effect of this name leave of observations (R, T, C), refitted."""
+def left_with(setting, observed, name, coefficients=None):
+    """What base parameters, initial states and the effect of this name leave of observations (R, T, C), refitted.
+
+    It starts from the truth: the setting's numbers and these coefficients, or from guesses where none are given.
+    """
     fit = Fitter(setting, [name])
     if coefficients is not None:
-        return fit(observed, _theta(fit, setting, coefficients), starts).left
-    guesses = [guess for _, guess in _guesses(setting, observed, name, Fitter(setting)(observed))]
-    return min(fit(observed, guess, starts).left for guess in guesses[:3])
+        return fit(observed, [*setting.parameters.values(), *coefficients]).left
+    guesses = _guesses(setting, observed, name, Fitter(setting)(observed))
+    return min(fit(observed, guess).left for _, guess in guesses[:STARTS])
 
 
-def best(setting, observed, without=()):
+def best(setting, observed):
     """The effect of the library that leaves least of observations (R, T, C), and how much."""
     bare = Fitter(setting)(observed)
-    names = [n for n in library.library(SIMULATORS[setting.system].system) if n not in without]
+    names = library.library(SIMULATORS[setting.system].system)
     names = [n for n in names if setting.driven or not (n.startswith("input.") or n == "backlash")]
     first = {n: _guesses(setting, observed, n, bare)[0] for n in names}
     promising = sorted(first, key=lambda n: first[n][0])[:PROMISING]
@@ -38,41 +42,31 @@ def best(setting, observed, without=()):
     return name, min(left[name], bare.left)
 
 
-def _theta(fit, setting, coefficients):
-    base = [setting.parameters[p.name] for p in SIMULATORS[setting.system].system.parameters]
-    theta = fit.theta.copy()
-    theta[:] = [*base, *coefficients][: theta.size]
-    return theta
-
-
 def _guesses(setting, observed, name, bare):
-    """(what would be left to first order, theta) by shape, the best first."""
-    fit, result = Fitter(setting, [name]), []
-    base = bare.theta.size
-    limits = [1.0]
-    if name == "input.saturation":  # nothing at first order: its limit is tried a little below the peak
+    """(what would be left to first order, theta) for every shape, the best first; `bare` is the fit without it."""
+    fit = Fitter(setting, [name])
+    if name == "input.saturation":  # it starts not at zero but at the peak, where its first order is none
         peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
-        limits = [0.9 * peak, 0.6 * peak]
-        thetas = [np.array([*bare.theta, limit]) for limit in limits]
-        return sorted((_left_at(fit, observed, theta, bare), theta) for theta in thetas)
-    for given in SHAPES.get(name, [()]):
-        theta = np.zeros(fit.theta.size)
-        theta[:base] = bare.theta
-        behind = given[: theta.size - base - 1]
-        if behind:
-            theta[-len(behind) :] = behind
-        rest, slope = fit._look(observed, theta, bare.starts)
-        free = np.ones(slope.shape[1], dtype=bool)
-        free[theta.size - len(behind) : theta.size] = False
-        step = fit._step(rest, slope[:, free], 1e-9)
-        left = float(np.sqrt(np.mean((rest - slope[:, free] @ step) ** 2)))
-        guess = theta.copy()
-        moved = step[: free[: theta.size].sum()] * fit.scales[: theta.size][free[: theta.size]]
-        guess[free[: theta.size]] += moved
-        result.append((left, np.clip(guess, fit.low, fit.high)))
+        guesses = [np.array([*bare.theta, share * peak]) for share in (0.9, 0.6)]
+        result = [(_left_at(fit, observed, guess, bare), guess) for guess in guesses]
+    else:
+        result = [_first_order(fit, observed, shape, bare) for shape in SHAPES.get(name, [()])]
     return sorted(result, key=lambda pair: pair[0])
 
 
 def _left_at(fit, observed, theta, bare):
-    rest, _ = fit._look(observed, theta, bare.starts)
+    rest, _ = fit.look(observed, theta, bare.starts)
     return float(np.sqrt(np.mean(rest**2)))
+
+
+def _first_order(fit, observed, shape, bare):
+    """One step of least squares from the effect at zero, its shape held; numbers a system lacks are left out."""
+    base, count = bare.theta.size, fit.theta.size
+    shape = shape[: count - base - 1]
+    scaled = count - len(shape)
+    theta = np.array([*bare.theta, *[0.0] * (scaled - base), *shape])
+    rest, slope = fit.look(observed, theta, bare.starts)
+    slope = np.delete(slope, np.s_[scaled:count], axis=1)
+    step = fit.step(rest, slope, 1e-9)
+    theta[:scaled] += step[:scaled] * fit.scales[:scaled]
+    return float(np.sqrt(np.mean((rest - slope @ step) ** 2))), np.clip(theta, fit.low, fit.high)

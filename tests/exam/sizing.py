@@ -49,15 +49,15 @@ class Fitter:
         """Fit observations (R, T, C), from `theta` and `starts` (default: the setting's)."""
         theta = self.theta if theta is None else np.asarray(theta, dtype=float)
         starts, damping = self.starts if starts is None else starts, 1e-6
-        rest, slope = self._look(observed, theta, starts)
+        rest, slope = self.look(observed, theta, starts)
         if not np.isfinite(rest).all():
             return Fit(np.inf, theta, starts)
         for _ in range(rounds):
-            step = self._step(rest, slope, damping)
+            step = self.step(rest, slope, damping)
             count = theta.size
             new = np.clip(theta + step[:count] * self.scales, self.low, self.high)
             begun = starts + step[count:].reshape(starts.shape)
-            tried, steeper = self._look(observed, new, begun)
+            tried, steeper = self.look(observed, new, begun)
             if not tried @ tried < rest @ rest:  # NaN is no improvement
                 damping *= 30.0
                 if damping > 1e3:
@@ -70,13 +70,13 @@ class Fitter:
         return Fit(float(np.sqrt(np.mean(rest**2))), theta, starts)
 
     @staticmethod
-    def _step(rest, slope, damping):
+    def step(rest, slope, damping):
         gram = slope.T @ slope
         diagonal = np.diag(gram)
         gram = gram + np.diag(damping * diagonal + 1e-9 * diagonal.max())
         return np.linalg.solve(gram, slope.T @ rest)
 
-    def _look(self, observed, theta, starts):
+    def look(self, observed, theta, starts):
         """What is left (N,), and how the simulation changes (N, P) with each fitted number in its scale."""
         runs, states, count = len(starts), len(self.states), theta.size
         moved = 1 + count + states

@@ -1,0 +1,75 @@
+"""One question answered: draw the item, write its recording, have it explained, mark the answer. Runs in a worker."""
+
+from __future__ import annotations
+
+import importlib
+import tempfile
+import time
+import traceback
+from dataclasses import asdict
+
+from tests.exam import rivals, sizing
+from tests.exam.items import Item, realise, setting_of
+from tests.exam.questions import Question
+from tests.exam.score import Mark, marked
+
+MOST_RIVALS = 6
+EXPLAIN = "bench.gap.explain:explain"
+
+
+def answered(question, offset, known=None, explain=EXPLAIN):
+    """A row about a question (a dictionary, as JSON): the item, the verdict, the mark.
+
+    Args:
+        question: as JSON.
+        offset: of the seeds.
+        known: the item as JSON if it was drawn before, {} if it was found not to show, None if it was not drawn.
+        explain: module:function to examine.
+    """
+    asked = Question(**question)
+    item = asked.drawn(offset) if known is None else Item.of(known) if known else None
+    row = {"question": asked.name, "part": asked.part, "kind": asked.kind, "system": asked.system}
+    row |= {"effect": asked.effect, "item": item.json() if item else {}}
+    return row if item is None else row | _answer(item, explain)
+
+
+def _answer(item, explain):
+    module, function = explain.split(":")
+    row = {"verdict": None, "seconds": None, "error": ""}
+    with tempfile.TemporaryDirectory() as folder:
+        path = realise(item, folder, truth=False)
+        path = path.rename(path.with_name("recording.csv"))  # the name tells what is hidden
+        path.with_name(f"{item.name}.toml").rename(path.with_suffix(".toml"))
+        begin = time.perf_counter()
+        try:
+            found = getattr(importlib.import_module(module), function)(path, system=None, engine="batch").verdict
+            row["verdict"] = {name: value for name, value in found.items() if name != "candidates"}
+        except Exception:
+            row["error"] = traceback.format_exc(limit=-4)
+        row["seconds"] = time.perf_counter() - begin
+    mark = marked(item, row["verdict"])
+    row["mark"] = asdict(mark) | {"found": mark.found, "found_class": mark.found_class}
+    return row | {"rivals": _rivals(item, row["verdict"], mark)}
+
+
+def lost(question, known, error):
+    """The row of a question whose worker did not come back."""
+    row = {name: question.json()[name] for name in ("part", "kind", "system", "effect")}
+    mark = asdict(Mark("failed", 0, 0, "", {})) | {"found": False, "found_class": False}
+    row |= {"question": question.name, "item": known or {}, "verdict": None, "seconds": None, "error": error}
+    return row | {"mark": mark, "rivals": {}}
+
+
+def _rivals(item, verdict, mark):
+    """By effect that was named without being hidden: what it leaves of the gap, in units of the noise, and how many
+    sigmas of evidence that is against it; few if it explains these data as well as the truth does."""
+    if item.kind != "single" or mark.found or not verdict or len(verdict["causes"]) != 1:
+        return {}
+    (cause,) = verdict["causes"]
+    names = [name for name in (cause["effect"], *cause["alternatives"]) if name not in item.effects][:MOST_RIVALS]
+    setting = setting_of(item)
+    observed = sizing.observed_by_batch(setting, item.effects)
+    phi = setting.noise.phi if item.noise == "ar1" else 0.0
+    samples = observed.size * (1 - phi) / (1 + phi)  # noise that repeats itself tells less
+    left = {name: rivals.left_with(setting, observed, name) for name in names}
+    return {name: {"leaves": rest, "sigmas": rest * samples**0.5} for name, rest in left.items()}

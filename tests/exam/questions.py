@@ -1,0 +1,90 @@
+"""The exam's sheet: which questions are asked. A question becomes an item when it is drawn."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sims import effects as library
+from tests.exam.items import SMALL, SYSTEMS, draw
+from tests.exam.worlds import FOREIGN, SIMULATORS
+
+CLEAN, EACH, DOUBLE, EACH_FOREIGN = 105, 4, 15, 4  # of each system, effect, system, foreign cause
+ATTEMPTS = 8  # drawings of one question, if the drawn sensors cannot show what it hides
+QUICK = (
+    ("single", "ball", "restitution.speed", 3.0), ("single", "ball", "drag.quadratic", 4.0),
+    ("single", "pendulum", "friction.coulomb", 3.0), ("single", "pendulum", "input.delay", 5.0),
+    ("single", "slider", "spring.linear", 3.0), ("single", "slider", "input.deadband", 5.0),
+    ("foreign", "ball", "updraft", None), ("foreign", "pendulum", "gust", None), ("foreign", "slider", "patch", None),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Question:
+    """What to draw: `part` is marks, or power for the power curve alone; `index` tells questions of one sort apart."""
+
+    part: str
+    kind: str
+    system: str
+    effect: str | None
+    index: int
+    size: float | None
+
+    @property
+    def name(self):
+        return f"{self.part}/{self.kind}/{self.system}/{self.effect or 'any'}/{self.index}"
+
+    def drawn(self, offset):
+        """The first of several drawings that shows; None if none does."""
+        first = 1000 * offset + 10 * self.index
+        items = (draw(self.kind, self.system, first + k, self.effect, self.size) for k in range(ATTEMPTS))
+        return next((item for item in items if item is not None), None)
+
+    def json(self):
+        return asdict(self)
+
+
+def sheet(offset):
+    """All questions of a whole exam."""
+    effects = [(system, name) for system in SYSTEMS for name in sorted(library.library(SIMULATORS[system].system))]
+    questions = [Question("marks", "clean", system, None, k, None) for system in SYSTEMS for k in range(CLEAN)]
+    questions += [
+        Question("marks", "single", system, name, k, _size(offset, system, name, k))
+        for system, name in effects
+        for k in range(EACH)
+    ]
+    questions += [Question("marks", "double", system, None, k, None) for system in SYSTEMS for k in range(DOUBLE)]
+    questions += [
+        Question("marks", "foreign", system, name, k, None)
+        for system in SYSTEMS
+        for name in FOREIGN[system]
+        for k in range(EACH_FOREIGN)
+    ]
+    return questions + [
+        Question("power", "single", system, name, 0, SMALL[place % len(SMALL)])
+        for place, (system, name) in enumerate(effects)
+    ]
+
+
+def quick():
+    """A few of every kind."""
+    questions = [Question("marks", "clean", system, None, k, None) for k, system in enumerate(SYSTEMS)]
+    questions += [Question("marks", kind, system, name, 0, size) for kind, system, name, size in QUICK]
+    return questions + [Question("marks", "double", system, None, 0, None) for system in SYSTEMS]
+
+
+def _size(offset, system, name, index):
+    """From 1 to 10, the questions about one effect spread evenly on a logarithmic scale."""
+    share = (index % EACH + np.random.default_rng([offset, index, *f"{system} {name}".encode()]).random()) / EACH
+    return float(f"{10**share:.3g}")
+
+
+def digest():
+    """Of the code that draws; items drawn by the same code need not be drawn again."""
+    here, text = Path(__file__).parent, hashlib.sha256()
+    for module in ("items", "settings", "shapes", "sizing", "rivals", "joints", "flights", "worlds"):
+        text.update((here / f"{module}.py").read_bytes())
+    return text.hexdigest()[:16]
