@@ -1,13 +1,15 @@
 # make compare   a small comparison, from a bare machine to the figure
+# make explain   a small diagnosis: makes a recording with a hidden cause, finds it, writes the report
 # make test      the tests
 # make check     lint, types and import rules
+# make exam      hides causes in hundreds of recordings and has explain find them (about an hour)
 # make benchmark measurements printed as ratios
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: compare test check benchmark install
+.PHONY: compare explain test check exam benchmark install
 install: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml
@@ -20,6 +22,13 @@ $(STAMP): requirements.lock pyproject.toml
 compare: $(STAMP)
 	$(BIN)/simgap compare ball-drop --targets 10 --seeds 2 --budget 50
 
+explain: $(STAMP)
+	rm -rf results/example
+	mkdir -p results/example
+	$(BIN)/simgap simulate pendulum --engine mujoco --effect drag.linear=2e-4 --noise q=0.01 qd=0.05 --out results/example/swing.csv
+	$(BIN)/simgap explain results/example/swing.csv --out results/example/explained
+	$(BIN)/simgap score results/example/explained/extended.toml results/example/swing.csv
+
 test: $(STAMP)
 	$(BIN)/python -m pytest
 
@@ -28,6 +37,9 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+exam: $(STAMP)
+	$(BIN)/python -m tests.exam --out results/reference/exam
 
 benchmark: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.harness

@@ -1,4 +1,4 @@
-"""Finds tuners, simulators and effects: the project's own, installed plugins' and those of `--plugin file.py`.
+"""Finds tuners, simulators and effects: the project's own, installed plugins' and those of `--plugin FILE`.
 
 All come in the same way, through the entry-point groups `simgap.tuners` and `simgap.simulators`, and are imported
 only when asked for. What cannot be imported is listed as skipped, with the reason.
@@ -83,7 +83,7 @@ class Registry(Generic[T]):
             InputError: the name is taken.
         """
         if found.name in self.names():
-            raise InputError(f"plugin {path}: {self.kind} '{found.name}' exists already; give the class another name")
+            raise InputError(f"plugin {path}: {self.kind} '{found.name}' exists already; give it another name")
         self._from_files[found.name] = found
 
 
@@ -96,11 +96,17 @@ _loaded: set[Path] = set()
 def load_plugins(paths: Iterable[str | Path]) -> None:
     """Register every tuner, simulator and effect that is defined in the files, once.
 
+    A file ending in .toml is an extended simulator as `simgap explain` writes it, loaded after what it may extend.
+
     Raises:
         InputError: a file is missing, does not run, or defines none of them.
     """
-    for path in (Path(p).resolve() for p in paths):
+    for path in sorted((Path(p).resolve() for p in paths), key=lambda p: p.suffix == ".toml"):
         if path in _loaded:
+            continue
+        if path.suffix == ".toml":
+            simulators.add(_extended(path), path)
+            _loaded.add(path)
             continue
         module = _run(path)
         found = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module.__name__]
@@ -115,6 +121,12 @@ def load_plugins(paths: Iterable[str | Path]) -> None:
             else:
                 effects.register(part)
         _loaded.add(path)
+
+
+def _extended(path: Path) -> type[Simulator]:
+    from bench.gap.extend import load
+
+    return load(path)
 
 
 def _run(path: Path) -> ModuleType:

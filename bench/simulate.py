@@ -6,7 +6,7 @@ The recording tells what a real one would; the truth goes to a file of its own, 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +119,7 @@ class _Maker:
     def __init__(self, wish: Wish) -> None:
         self.wish = wish
         self.kind = kind = simulators.get(wish.system)
-        self.usual = _DEFAULTS.get(wish.system, Defaults())
+        self.usual = _usual(kind)
         self.held_out = max(1, wish.runs // 3) if wish.held_out is None else wish.held_out
         if wish.held_out is None and wish.runs == 1:
             self.held_out = 0
@@ -227,6 +227,14 @@ def _noise(texts: Sequence[str], channels: Sequence[str]) -> dict[str, float]:
         if value < 0:
             raise InputError(f"--noise {name}={value:g}: expected at least 0")
     return values
+
+
+def _usual(kind: type[Simulator]) -> Defaults:
+    """Of its system; an extended simulator shows what the recording had that it was fitted to."""
+    if not issubclass(kind, Simulated):
+        return Defaults()
+    usual = _DEFAULTS.get(kind.system.name, Defaults())
+    return usual if kind.name == kind.system.name else replace(usual, observe=())
 
 
 def _pairs(option: str, texts: Sequence[str], known: Any = None, kind: str = "") -> dict[str, str]:

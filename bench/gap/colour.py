@@ -49,7 +49,7 @@ def whitened(values: Array, seen: Mask, noise: Noise) -> Array:
 
 
 def log_determinant(seen: Mask, phi: Array | float) -> float:
-    """Half the log determinant of the whitening of unit variance: -0.5 log(1 - phi^2) for each sample that follows one."""
+    """Half the log determinant of whitening at unit variance: -0.5 log(1 - phi^2) for each sample that follows one."""
     follows = (seen[:, 1:] & seen[:, :-1]).sum(axis=(0, 1))
     return float(-0.5 * (follows * np.log1p(-np.square(phi))).sum())
 
@@ -132,7 +132,7 @@ def _autoregression(values: Array, seen: Mask, largest: int) -> tuple[Array, Arr
     """Weights (p,) of an autoregression of values (R, T) and its centred innovations."""
     filled = np.where(seen, values, 0.0)
     count = int(seen.sum())
-    covariances = []
+    largest, covariances = min(largest, seen.shape[1] - 1), []
     for lag in range(largest + 1):
         both = seen[:, lag:] & seen[:, : seen.shape[1] - lag]
         pairs = max(int(both.sum()), 1)

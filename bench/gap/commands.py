@@ -10,8 +10,6 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 
-
-
 def add_explain(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap explain`."""
     parser.add_argument("recording", metavar="RECORDING.csv", type=Path, help="the table; its .toml stands beside it")
@@ -20,7 +18,9 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder to write (default: a new one below results/)")
     parser.add_argument("--seed", type=int, metavar="K", default=0, help="of all that is drawn (default: 0)")
     parser.add_argument("--free", metavar="A,B,...", default="", help="constants to estimate with the parameters")
-    parser.add_argument("--tuner", metavar="NAME", help="a tuner that finds where the base fit begins (default: a grid)")
+    parser.add_argument(
+        "--tuner", metavar="NAME", help="a tuner that finds where the base fit begins (default: a grid)"
+    )
     parser.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more systems")
     parser.set_defaults(command=explain)
 

@@ -30,7 +30,6 @@ from methods.base import Array
 from sims import effects as library
 from sims.base import InputError
 from sims.own import OwnSimulator
-from sims.recording import Recording
 from sims.simulated import Simulated
 
 LEAST = 2.0
@@ -73,7 +72,7 @@ def explain(
     seed: int = 0,
     free: Sequence[str] = (),
     tuner: str | None = None,
-    say: Say = lambda text: None,
+    say: Say = lambda _: None,
 ) -> Explanation:
     """Explain a recording.
 
@@ -99,7 +98,10 @@ class _Explainer:
         self.started, self.path, self.seed, self.tuner, self.say = time.perf_counter(), path, seed, tuner, say
         self.recording, kind = load(path, system)
         if not issubclass(kind, Simulated):
-            raise InputError(f"{path}: simulator {self.recording.system} takes no effects, so nothing can be missing from it")
+            raise InputError(
+                f"{path}: simulator {self.recording.system} takes no effects, so nothing can be missing from it"
+            )
+        extend.refuse_extended(kind)
         self.kind: type[Simulated] = kind
         self.engine = None if issubclass(kind, OwnSimulator) else engine
         self.fitting = World(kind, self.recording, self.recording.training(), self.engine, [Hat], free)
@@ -129,7 +131,7 @@ class _Explainer:
         held_out = HeldOut(self.measuring, self.noise) if self.measuring else None
         finding = self._still(search, base) or name(search, self.floor.stated, held_out)
         self.say("measuring the gain")
-        verdict = self._verdict(search, base, finding, rng)
+        verdict = self._verdict(search, finding, rng)
         story = self._story(search, base, finding, verdict)
         extended = self._extended(search, finding)
         for world in (self.fitting, self.measuring):
@@ -158,7 +160,7 @@ class _Explainer:
             return Finding("unidentifiable", model, model, (), nothing, vague)
         return None
 
-    def _verdict(self, search: Search, base: Base, finding: Finding, rng: np.random.Generator) -> dict[str, Any]:
+    def _verdict(self, search: Search, finding: Finding, rng: np.random.Generator) -> dict[str, Any]:
         world = self.fitting
         numbers = self._numbers(search, finding.model)
         causes = []
@@ -277,9 +279,9 @@ class _Explainer:
         places = show.places(world, before, after, sigma)
         held_out = None
         if self.measuring is not None and finding.measured is not None and finding.model.names in finding.measured:
-            sides = [finding.measured[names].simulated for names in ((), finding.model.names)]
-            held_out = show.side(self.measuring, *sides)
-            places += [p for p in show.places(self.measuring, *sides, sigma, " (held out)") if p.kind == "run"]
+            first, last = (finding.measured[names].simulated for names in ((), finding.model.names))
+            held_out = show.side(self.measuring, first, last)
+            places += [p for p in show.places(self.measuring, first, last, sigma, " (held out)") if p.kind == "run"]
         channels = tuple(
             Shown(c.name, c.unit, float(sigma[i]), bool(self.floor.stated[i]), float(self.floor.step[i]))
             for i, c in enumerate(world.simulator.channels)

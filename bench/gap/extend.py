@@ -93,7 +93,9 @@ def read(path: Path) -> Extended:
     """
     document = read_toml(path)
     if document.get("format") != FORMAT:
-        raise InputError(f"{path}: expected an extended simulator with format = {FORMAT}, found {document.get('format')!r}")
+        raise InputError(
+            f"{path}: expected an extended simulator with format = {FORMAT}, found {document.get('format')!r}"
+        )
     for key in document:
         if key not in ("format", "name", "system", "engine", "title", "observe", "constants", "parameters", "effects"):
             raise unknown(f"key of {path}", key, ["name", "system", "engine", "title", "observe", "constants", "..."])
@@ -157,23 +159,33 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
     values = _coefficients(extended, kind)
     own = [_at(p, extended.parameters[p.name]) if p.name in extended.parameters else p for p in kind.parameters]
     names, observed = list(extended.effects), list(extended.observe)
-    engine_of = {"engine": extended.engine} if extended.engine else {}
+    engine_of: dict[str, Any] = {"engine": extended.engine} if extended.engine else {}
     fresh = kind(extended.constants, observed, effects=names, **engine_of)
     added = [_at(p, n) for p, n in zip(fresh.parameters[len(own) :], values, strict=True)]
     fresh.close()
 
     def __init__(  # noqa: N807
-        self: Simulated, constants: Mapping[str, float] | None = None, observe: Sequence[str] | None = None, **settings: Any
+        self: Simulated,
+        constants: Mapping[str, float] | None = None,
+        observe: Sequence[str] | None = None,
+        **settings: Any,
     ) -> None:
         known = {**extended.constants, **(constants or {})}
         kind.__init__(self, known, observe or observed, effects=names, **{**engine_of, **settings})
         self.parameters = (*own, *added)
 
-    made: type[Simulated] = type(re.sub(r"\W", "_", extended.name), (kind,), {"__init__": __init__, "system": kind.system})
+    body = {"__init__": __init__, "system": kind.system, "extends": extended.system}
+    made: type[Simulated] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
     made.name = extended.name
     made.says = f"{extended.system} with {', '.join(names) or 'nothing added'}, fitted to: {extended.title}"
     made.parameters = (*own, *added)
     return made
+
+
+def refuse_extended(kind: type[Simulated]) -> None:
+    """Raise InputError if a simulator has been extended already: its effects cannot be chosen again."""
+    if hasattr(kind, "extends"):
+        raise InputError(f"simulator {kind.name} is extended already; name the system it extends, {kind.extends}")
 
 
 def _coefficients(extended: Extended, kind: type[Simulated]) -> list[Number]:
@@ -207,13 +219,23 @@ def load(path: Path) -> type[Simulated]:
     Raises:
         InputError: the file, or the system it names, is not usable.
     """
+    return opened(path)[2]
+
+
+def opened(path: Path) -> tuple[Extended, type[Simulated], type[Simulated]]:
+    """What is in a file, the simulator of its system, and the extended simulator.
+
+    Raises:
+        InputError: the file, or the system it names, is not usable.
+    """
     from bench.registry import simulators
 
     extended = read(path)
-    kind = simulators.get(extended.system)
-    if not issubclass(kind, Simulated):
-        raise InputError(f"{path}: system {extended.system} takes no effects")
     try:
-        return simulator_of(extended, kind)
+        kind = simulators.get(extended.system)
+        if not issubclass(kind, Simulated):
+            raise InputError(f"system {extended.system} takes no effects")
+        refuse_extended(kind)
+        return extended, kind, simulator_of(extended, kind)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -1,9 +1,10 @@
 """Least squares on trajectories: parameters that all runs share, initial states that each run has for itself.
 
 Levenberg-Marquardt for many models at once, so that one call of the engine serves all of them. Initial states are
-eliminated run by run (damping by Nielsen's rule, IMM-REP-1999-05; the Schur complement of the arrow-shaped normal equations; B. Triggs et al., Bundle adjustment,
-2000, doi:10.1007/3-540-44480-7_21, section 6), so the cost grows linearly with the number of runs. Noise that
-remembers is whitened first (`colour`), which makes the fit one of generalised least squares.
+eliminated run by run (damping by Nielsen's rule, IMM-REP-1999-05; the Schur complement of the arrow-shaped normal
+equations; B. Triggs et al., Bundle adjustment, 2000, doi:10.1007/3-540-44480-7_21, section 6), so the cost grows
+linearly with the number of runs. Noise that remembers is whitened first (`colour`), which makes the fit one of
+generalised least squares.
 """
 
 from __future__ import annotations
@@ -201,10 +202,9 @@ class Fitter:
             return p.theta, p.states
         residual = whitened(np.where(seen, self.world.observed - p.simulated, 0.0), seen, self.noise)
         jacobian = whitened(np.where(seen[..., None], p.jacobian, 0.0), seen, self.noise)
-        solved = arrow_step(
-            residual, jacobian, q, (p.states - self.world.guess) / prior_of(self.world), prior_of(self.world), self.world.known,
-            p.damping, _stuck(p, residual, jacobian),
-        )  # fmt: skip
+        prior = prior_of(self.world)
+        drift, stuck = (p.states - self.world.guess) / prior, _stuck(p, residual, jacobian)
+        solved = arrow_step(residual, jacobian, q, drift, prior, self.world.known, p.damping, stuck)
         theta = p.theta.copy()
         theta[p.free] = np.clip(theta[p.free] + solved.shared, p.low, p.high)
         p.promised = solved.promised

@@ -18,7 +18,7 @@ PRECISION = 1e-4
 
 @dataclass(frozen=True)
 class Floor:
-    """Noise of each channel, (C,) arrays: 1 sigma, whether it is stated, the step of a quantised one (0 if it is not)."""
+    """Noise of each channel, (C,) arrays: 1 sigma, whether it is stated, the step if quantised (0 if it is not)."""
 
     sigma: Array
     stated: NDArray[np.bool_]

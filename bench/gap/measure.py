@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -103,7 +104,9 @@ class Gain:
     high: float
 
 
-def gain(world: World, before: Array, after: Array, channels: Sequence[int], floor: float, rng: np.random.Generator) -> Gain:
+def gain(
+    world: World, before: Array, after: Array, channels: Sequence[int], floor: float, rng: np.random.Generator
+) -> Gain:
     """Share of the gap closed, (before - after) / (before - floor) in RMSE, with a bootstrap interval over runs.
 
     With a single run the resampling is over stretches of it (circular blocks; D. N. Politis, J. P. Romano 1992).
@@ -130,7 +133,7 @@ def _pieces(world: World, before: Array, after: Array, channels: Sequence[int]) 
     parts: list[tuple[int, slice]] = [(r, slice(None)) for r in range(len(world.tracks))]
     if len(parts) == 1:
         edges = np.linspace(0, world.lengths[0], 11).astype(int)
-        parts = [(0, slice(int(a), int(b))) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+        parts = [(0, slice(int(a), int(b))) for a, b in pairwise(edges) if b > a]
     rows = []
     for run, part in parts:
         seen = np.isfinite(world.observed[run, part][:, channels])

@@ -12,6 +12,7 @@ from bench.gap.measure import HeldOut, Measured, covariance
 from bench.gap.remains import Remains, remains
 from bench.gap.score import tail
 from bench.gap.search import ALPHA, SWITCH, Model, Names, Search
+from bench.gap.world import Mask
 from methods.base import Array
 from sims.simulated import effect_parameters
 
@@ -19,6 +20,8 @@ EXPLAINED = 0.7
 """Share of the gap that the effects must close to be taken for its explanation."""
 VAGUE = 0.5
 """A base parameter is not fixed by the data if its 1 sigma is more than this share of its bounds."""
+STRANGE = 1.5
+"""Held-out runs that miss by more than this many times the noise show something that the fitted runs do not."""
 NEAR = 30.0
 """Rivals this near in twice the log likelihood are fitted once more before they are judged."""
 
@@ -66,7 +69,7 @@ class Finding:
     measured: Mapping[Names, Measured] | None = None
 
 
-def name(search: Search, stated: Array, held_out: HeldOut | None) -> Finding:
+def name(search: Search, stated: Mask, held_out: HeldOut | None) -> Finding:
     """Search, check on held-out runs, collect alternatives, and judge.
 
     Args:
@@ -87,7 +90,11 @@ def name(search: Search, stated: Array, held_out: HeldOut | None) -> Finding:
     preferred = search.models.get(frozenset(cause.preferred for cause in causes), model)
     if preferred is not model:
         model, causes = preferred, _causes(search, preferred, merits)
-    return Finding(_verdict(search, model, causes, left), model, base, causes, left, (), measured)
+    verdict = _verdict(search, model, causes, left)
+    if measured is not None and held_out is not None and verdict in ("named", "ambiguous", "adequate"):
+        lost = _loses(held_out, measured, model, left)
+        verdict = ("partial" if causes else "unknown") if lost else verdict
+    return Finding(verdict, model, base, causes, left, (), measured)
 
 
 def unfixed(search: Search, base: Model) -> tuple[str, ...]:
@@ -176,6 +183,16 @@ def _in_range(search: Search, effect: str) -> bool:
     parameters = effect_parameters(world.effects[effect], world.simulator.system, world.channels)
     values = best.fit.theta[world.slots[effect]]
     return all(p.bounds[0] <= v <= p.bounds[1] for p, v in zip(parameters, values, strict=True))
+
+
+def _loses(held_out: HeldOut, measured: Mapping[Names, Measured], model: Model, left: Remains) -> bool:
+    """Whether held-out runs show a gap that the model does not close: something acts there that it has not learnt."""
+    noise = np.maximum(held_out.noise.sigma, np.where(left.structure, 0.0, np.nan_to_num(model.likelihood.sigma)))
+    before, after = (
+        float(np.sqrt(np.square((held_out.world.observed - measured[names].simulated) / noise)[held_out.seen].mean()))
+        for names in ((), model.names)
+    )
+    return not after < STRANGE or (before > STRANGE and before - max(after, 1.0) < EXPLAINED * (before - 1.0))
 
 
 def closed(search: Search, base: Model, model: Model, floor: Array) -> float:

@@ -1,7 +1,7 @@
 """Proposes the experiment that would tell two explanations apart: where their predictions differ most.
 
-A T-optimal design over a few changes that an experimenter can make (A. C. Atkinson, V. V. Fedorov, Biometrika 62(1), 57,
-1975, doi:10.1093/biomet/62.1.57), the rival's parameters held at what these data made of them.
+A T-optimal design over a few changes that an experimenter can make (A. C. Atkinson, V. V. Fedorov, Biometrika 62(1),
+57, 1975, doi:10.1093/biomet/62.1.57), the rival's parameters held at what these data made of them.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ TELLING = 2.0
 
 def next_experiment(search: Search, model: Model, rival: Model) -> dict[str, Any]:
     """What to record next: a sentence, the change, and how far apart the two models then are in units of the noise."""
-    world, best = search.world, (0.0, "", {})  # type: World, tuple[float, str, dict[str, Any]]
+    world = search.world
+    best: tuple[float, str, dict[str, Any]] = (0.0, "", {})
     for says, change, scenario, states in _changes(world):
         apart = _apart(world, scenario, states, model, rival, search.noise.sigma)
         if np.isfinite(apart) and apart > best[0]:
             best = apart, says, change
-    added = [" and ".join(sorted(set(m.names) - set(o.names))) for m, o in ((model, rival), (rival, model))]
+    added = [" and ".join(sorted({*m.names} - {*o.names})) for m, o in ((model, rival), (rival, model))]
     if best[0] < TELLING:
         shown = ", ".join(c.name for c in world.kind.channels if c.name not in world.channels)
-        other = f"; record {shown} besides" if shown else "; measure one of the causes directly"
-        says = f"No run of this kind would tell {added[0]} from {added[1]}: their predictions agree within the noise{other}"
-        return {"says": says, "change": {}, "apart": best[0]}
+        other = f"record {shown} besides" if shown else "measure one of the causes directly"
+        agree = f"No run of this kind would tell {added[0]} from {added[1]}: their predictions agree within the noise"
+        return {"says": f"{agree}; {other}", "change": {}, "apart": best[0]}
     says = f"{best[1]}: there {added[0]} and {added[1]} differ by {best[0]:.3g} times the noise"
     return {"says": says, "change": best[2], "apart": best[0]}
 
@@ -44,9 +45,12 @@ def _changes(world: World) -> Iterator[tuple[str, dict[str, Any], Scenario, Arra
     times = track.scenario.times
     longer = np.concatenate([times, times[-1] + (times[1:] - times[0])])
     longest = {n: np.concatenate([u, u[1:]]) for n, u in track.scenario.inputs.items()}
-    yield "Record twice as long", {"seconds": float(longer[-1] - longer[0])}, replace(
-        track.scenario, times=longer, inputs=longest
-    ), track.guess
+    yield (
+        "Record twice as long",
+        {"seconds": float(longer[-1] - longer[0])},
+        replace(track.scenario, times=longer, inputs=longest),
+        track.guess,
+    )
     for name, unit in ((n, u) for n, u in zip(world.states, _units(world), strict=True)):
         place = world.states.index(name)
         for share in (0.3, 2.0, -1.0):
@@ -56,7 +60,12 @@ def _changes(world: World) -> Iterator[tuple[str, dict[str, Any], Scenario, Arra
                 if share < 0:
                     continue
                 states[place] = max(states[place], 1.0)
-            yield f"Start with {name} = {states[place]:.3g} {unit}", {name: float(states[place])}, track.scenario, states
+            yield (
+                f"Start with {name} = {states[place]:.3g} {unit}",
+                {name: float(states[place])},
+                track.scenario,
+                states,
+            )
     for name, signal in track.scenario.inputs.items():
         for share in (0.3, 3.0):
             inputs = {**track.scenario.inputs, name: share * signal}

@@ -17,7 +17,7 @@ from bench.gap.candidates import Directions, Probe, simulate_with
 from bench.gap.colour import surrogates
 from bench.gap.score import score
 from bench.gap.search import Model, Search
-from bench.gap.world import World
+from bench.gap.world import Mask, World
 from methods.base import Array
 from sims.system import Coefficient, Force, Moment
 
@@ -75,7 +75,7 @@ class Remains:
         return self.p_value < CHANCE or bool(self.loud)
 
 
-def remains(search: Search, model: Model, stated: Array) -> Remains:
+def remains(search: Search, model: Model, stated: Mask) -> Remains:
     """Test what a fitted model leaves.
 
     Args:
@@ -93,7 +93,7 @@ def remains(search: Search, model: Model, stated: Array) -> Remains:
     )
     if Hat.name not in world.slots:
         return Remains(1.0, "", excess, loud)
-    found = hats(world, model, search)
+    found = hats(world, model)
     if not found.probes:
         return Remains(1.0, "", excess, loud)
     residual = search.residual(model.fit)
@@ -110,7 +110,7 @@ def _error(search: Search, model: Model, channel: int) -> float:
     return float(np.sqrt((1.0 + phi * phi) / (1.0 - phi * phi) / (2.0 * count)))
 
 
-def hats(world: World, model: Model, search: Search) -> Directions:
+def hats(world: World, model: Model) -> Directions:
     """What hats over every recorded variable would change about a model."""
     labels, added = [], []
     slow = 0.05 * _fastest(world)
@@ -163,7 +163,9 @@ def _fastest(world: World) -> float:
         if name in world.channels:
             c = world.channels.index(name)
             rates = [
-                np.diff(t.observed[::3, c]) / np.diff(t.scenario.times[::3]) for t in world.tracks if len(t.observed) > 3
+                np.diff(t.observed[::3, c]) / np.diff(t.scenario.times[::3])
+                for t in world.tracks
+                if len(t.observed) > 3
             ]
             squares.append(np.square(np.concatenate([np.zeros(1), *rates])))
     return float(np.sqrt(np.nanquantile(sum(squares), 0.98))) if squares else 0.0

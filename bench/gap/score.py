@@ -3,8 +3,8 @@
 What an effect changes is compared with the residual after taking out of both what the fitted parameters and initial
 states can absorb (a Lagrange multiplier test; C. R. Rao 1948, doi:10.1017/S0305004100023987; R. F. Engle, Handbook of
 Econometrics II, chapter 13). The score is twice the gain in log likelihood, each hypothesis with the correlation of
-noise that suits it best, so that noise that remembers is no cause. What the best of a whole library reaches by chance is
-found by doing the same to surrogate residuals (max-statistic calibration; P. H. Westfall, S. S. Young 1993).
+noise that suits it best, so that noise that remembers is no cause. What the best of a whole library reaches by chance
+is found by doing the same to surrogate residuals (max-statistic calibration; P. H. Westfall, S. S. Young 1993).
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ class Products:
     def projected(self, phi: float) -> tuple[Array, Array, Array]:
         """Sums of squares (S,) of the residuals, products of directions (K, K) and of both (K, S)."""
         q, s = self._own, self._states
-        total, normal, cross = 0.0, 0.0, 0.0
+        total: Array = np.zeros(())
+        normal, cross = total, total
         for squares, products, mixed in self._runs:
             n, c, t = (part[0] + (part[1] - phi * part[2] + phi * phi * part[3]) / (1.0 - phi * phi) for part in
                        (products, mixed, squares))  # fmt: skip
@@ -90,7 +91,6 @@ class Products:
             total = total + t - np.einsum("ks,kl,ls->s", c[own], inverse, c[own])
             cross = cross + c[rest] - n[rest][:, own] @ (inverse @ c[own])
             normal = normal + n[np.ix_(rest, rest)] - n[rest][:, own] @ inverse @ n[own][:, rest]
-        total, normal, cross = (np.asarray(part) for part in (total, normal, cross))
         inverse = _inverse(normal[:q, :q])
         total = total - np.einsum("ks,kl,ls->s", cross[:q], inverse, cross[:q])
         gram = normal[q:, q:] - normal[q:, :q] @ inverse @ normal[:q, q:]

@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 
 from bench.gap.colour import Noise
-from bench.gap.extend import read, simulator_of
+from bench.gap.extend import opened
 from bench.gap.floor import noise_floor
 from bench.gap.measure import HeldOut
 from bench.gap.world import World
-from bench.registry import simulators
 from sims.base import InputError, unknown
 from sims.own import OwnSimulator
 from sims.recording import read_recording
-from sims.simulated import Simulated
 
 
 def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, Any]:
@@ -31,11 +29,7 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
     Raises:
         InputError: a file cannot be read, or the recording is of another system.
     """
-    extended = read(model)
-    kind = simulators.get(extended.system)
-    if not issubclass(kind, Simulated):
-        raise InputError(f"{model}: system {extended.system} takes no effects")
-    simulator_of(extended, kind)  # refuses names that do not exist
+    extended, kind, _ = opened(model)
     data = read_recording(recording, kind, whole=True)
     data = replace(data, constants={**extended.constants, **data.constants})
     runs = data.held_out() if held_out else data.runs

@@ -122,10 +122,12 @@ class Search:
             against: (R, T, C) a residual for surrogates; the model's own if None.
         """
         key = frozenset(model.names)
-        lacking = [name for name in self.world.library if name not in key]
         if key not in self.scanned:
+            lacking = [name for name in self.world.library if name not in key]
             self.scanned[key] = (directions(self.world, model.fit, lacking), _NOTHING)
-        found = self.scanned[key][0]
+        found, scores = self.scanned[key]
+        if against is None and scores is not _NOTHING:
+            return scores
         residual = self.residual(model.fit)
         like = surrogates(residual if against is None else against, self.seen, SURROGATES, self.rng)
         scores = score(model.fit, residual, found, self.seen, self.weights(model), like)
@@ -139,7 +141,7 @@ class Search:
         return Noise(np.maximum(self.noise.sigma, left), self.noise.phi)
 
     def starts(self, model: Model, scores: Scores, most: int, patient: bool) -> list[Start]:
-        """Where to begin with the most promising candidates, at what their scores say and at less; all with patience."""
+        """Where to begin with the most promising candidates, at what scores say and at less; with all in patience."""
         found = self.scanned[frozenset(model.names)][0]
         promise = scores.score - scores.chance
         order = np.argsort(-promise, kind="stable")
@@ -174,7 +176,7 @@ class Search:
                 yield c
 
     def _nearest(self, starts: Sequence[Start], share: float) -> list[Start]:
-        """Of the starts with the same effects the one whose simulation comes nearest over the first share of the runs."""
+        """Of starts with the same effects the one whose simulation comes nearest over the first share of the runs."""
         if not starts:
             return []
         world, runs = self.world, len(self.world.tracks)
@@ -208,7 +210,7 @@ class Search:
         return max(there, key=lambda m: m.merit) if there else None
 
     def missing(self, model: Model, larger: Model) -> float:
-        """Probability that a model which lacks nothing would seem to gain as much as it does by becoming the larger one.
+        """Probability that a model which lacks nothing would seem to gain as much by becoming the larger one.
 
         The surrogates have the colour of what the larger model leaves, which is closer to the noise alone.
         """

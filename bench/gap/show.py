@@ -119,7 +119,8 @@ def profiles(world: World, before: Array, after: Array, sigma: Array) -> list[Pr
         good = np.isfinite(world.observed[:, :, c]) & np.isfinite(values)
         if not good.any() or np.ptp(values[good]) == 0:
             continue
-        edges = np.linspace(*np.quantile(values[good], [0.005, 0.995]), BINS + 1)
+        low, high = (float(v) for v in np.quantile(values[good], [0.005, 0.995]))
+        edges = np.linspace(low, high, BINS + 1)
         if not edges[-1] > edges[0]:
             continue
         bins = np.clip(np.searchsorted(edges, values[good], side="right") - 1, 0, BINS - 1)

@@ -23,6 +23,8 @@ LANE_SAMPLES = 400_000
 """Samples simulated in one call of the engine: beyond it more lanes cost memory and gain nothing."""
 TIME_STEP = 0.01
 """Longest step of the batch engine, seconds; it shortens its steps itself where motion or forces ask for it."""
+FINE_STEP = 0.0025
+"""The same where a sensor filters: a filter takes what it reads for linear over each step, which an impact is not."""
 FREED = 5.0
 """A constant that is set free is searched from a fifth of its value to five times it."""
 
@@ -79,8 +81,12 @@ class World:
         self.library = names
         chosen: list[str | type[Effect]] = [*names, *(e for e in extra if e.fits(kind.system))]
         observe = [c.name for c in kind.channels if c.name in runs[0].channels]
-        settings = {"time_step": TIME_STEP} if engine == "batch" else {}
-        self.simulator = kind(recording.constants, observe, engine=engine, effects=chosen, **settings)
+        steps: tuple[dict[str, Any], ...] = ({}, {})
+        if engine == "batch":
+            steps = {"time_step": TIME_STEP}, {"time_step": FINE_STEP}
+        self.simulator, self._fine = (
+            kind(recording.constants, observe, engine=engine, effects=chosen, **settings) for settings in steps
+        )
         own = list(self.simulator.system.parameters)
         self.own = len(own)
         self.freed = [self._freed(name) for name in free]
@@ -129,14 +135,16 @@ class World:
             size = max(1, LANE_SAMPLES // result.shape[1])
             for begin in range(0, lanes.size, size):
                 part = lanes[begin : begin + size]
-                seen = self._simulated(theta[part], runs[part], states[part], share)
+                simulator = self._fine if kind >= 2 else self.simulator
+                seen = self._simulated(simulator, theta[part], runs[part], states[part], share)
                 result[part, : seen.shape[1]] = seen
         return result
 
     def counted(self, share: float) -> Mask:
         """(R, T, C) the samples that are there in the first share of each run."""
         first = np.arange(self.observed.shape[1]) < np.ceil(share * self.lengths)[:, None]
-        return np.isfinite(self.observed) & first[:, :, None]
+        counted: Mask = np.isfinite(self.observed) & first[:, :, None]
+        return counted
 
     def _scenarios(self, share: float) -> list[Scenario]:
         """The first share of every run, made once."""
@@ -144,7 +152,7 @@ class World:
             self._parts[share] = [first_of(t.scenario, int(np.ceil(share * len(t.observed)))) for t in self.tracks]
         return self._parts[share]
 
-    def _simulated(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
+    def _simulated(self, simulator: Simulated, theta: Array, runs: Indices, states: Array, share: float) -> Array:
         whole = self._scenarios(share)
         scenarios = [whole[run] for run in runs]
         if self.freed:
@@ -155,11 +163,12 @@ class World:
                 for s, row in zip(scenarios, values, strict=True)
             ]
         lanes = np.delete(theta, np.arange(self.own, self.base.size), axis=1)
-        return self.simulator.simulate_lanes(lanes, scenarios, dict(zip(self.states, states.T, strict=True)))
+        return simulator.simulate_lanes(lanes, scenarios, dict(zip(self.states, states.T, strict=True)))
 
     def close(self) -> None:
         """Give back what the engine holds."""
         self.simulator.close()
+        self._fine.close()
 
     def _freed(self, name: str) -> Parameter:
         constants = {c.name: c for c in self.kind.constants}
@@ -180,7 +189,7 @@ class World:
         return slots
 
     def _delaying(self) -> tuple[Indices, Indices]:
-        """Where coefficients stand that move instants, and that need every step: lanes with them are simulated apart."""
+        """Where coefficients stand that move instants, and that need every step: such lanes are simulated apart."""
         found: tuple[list[int], list[int]] = ([], [])
         for effect in self.simulator.effects:
             places = range(*self.slots[effect.name].indices(len(self.parameters)))

@@ -44,9 +44,11 @@ def _power(groups):
             linewidth=1.1, capsize=2.5, label=label,
         )  # fmt: skip
     for size, part, _ in groups:
-        axis.annotate(f"{part['of']}", (size, 0.0), xytext=(0, 3), textcoords="offset points", ha="center", fontsize=7)
+        axis.annotate(
+            f"{part['of']}", (size, -0.07), xytext=(0, 0), textcoords="offset points", ha="center", fontsize=7
+        )
     axis.axhline(WANTED, color="#444444", linewidth=0.8, linestyle=(0, (2, 2)))
-    axis.set(xscale="log", ylim=(-0.02, 1.03), xlabel="size of the hidden effect [noise]", ylabel="share found")
+    axis.set(xscale="log", ylim=(-0.09, 1.03), xlabel="size of the hidden effect [noise]", ylabel="share found")
     ticks = [0.1, 0.2, 0.5, 1, 2, 5, 10]
     axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axis.minorticks_off()

@@ -119,9 +119,16 @@ def draw(kind, system, seed, effect=None, size=None):
         setting.parameters,
     )  # fmt: skip
     wanted = size or float(np.exp(rng.uniform(np.log(3.0 if kind in ("double", "foreign") else 1.0), np.log(10.0))))
+    # What is hidden must show in the runs for fitting: nobody could learn it from those held out.
+    shown = replace(setting, scenarios=setting.scenarios[: item.runs - held_out_of(item)])
     return {"clean": _clean, "single": _single, "double": _double, "foreign": _foreign}[kind](
-        item, setting, hidden, wanted, rng
+        item, shown, hidden, wanted, rng
     )
+
+
+def held_out_of(item):
+    """How many of the last runs are marked held_out."""
+    return max(1, item.runs // 3)
 
 
 def _rng(name, purpose):
@@ -224,7 +231,7 @@ def realise(item, folder, truth=True):
 
 
 def _runs(item, setting):
-    rng, held_out = _rng(item.name, "noise"), max(1, item.runs // 3)
+    rng, held_out = _rng(item.name, "noise"), held_out_of(item)
     hidden = {"foreign": item.effects} if item.kind == "foreign" else {"effects": item.effects}
     world, runs = setting.world(**hidden), []
     for number, scenario in enumerate(setting.scenarios):

@@ -82,7 +82,7 @@ def _library(item, verdict, sets):
     """One or two effects of the library: every one in a set of its own, and no set without one."""
     if verdict == "adequate":
         return "missed", 0, 0
-    if not sets:
+    if not sets or verdict == "unknown":  # what it lists then are no answers
         return "unnamed", 0, 0
     strict = _matched(item.effects, sets, lambda effect, names: effect in names)
     loose = _matched(item.effects, sets, lambda effect, names: bool(_same(item, effect) & set(names)))

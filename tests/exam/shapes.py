@@ -67,9 +67,9 @@ def _wind(far, setting, rng):
 
 
 def _stribeck(far, setting, rng):
-    """An extra as large as the rest, at speeds that the motion has for a good while."""
-    extra, typical = rng.uniform(1.0, 4.0), np.median(np.abs(_speeds(setting)))
-    speed = float(np.clip(typical * rng.uniform(0.15, 0.6), 0.02, 2.0))
+    """An extra larger than the rest, at speeds that the motion has for a good while."""
+    extra, typical = rng.uniform(2.0, 6.0), np.median(np.abs(_speeds(setting)))
+    speed = float(np.clip(typical * rng.uniform(0.15, 0.5), 0.02, 2.0))
     return lambda s: (far * s, extra * far * s, speed)
 
 

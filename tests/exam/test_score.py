@@ -50,6 +50,7 @@ DRAG, BIAS = {"drag.linear": (0.4,)}, {"force.bias": (0.4,)}
         (item(**DRAG), answer("named", ["drag.quadratic"]), "wrong", False, False),
         (item(**DRAG), answer("named", ["drag.linear"], ["force.bias"]), "extra", False, False),
         (item(**DRAG), answer("unknown"), "unnamed", False, False),
+        (item(**DRAG), answer("unknown", ["drag.linear"]), "unnamed", False, False),
         (item(**DRAG), ADEQUATE, "missed", False, False),
         (item(**DRAG), None, "failed", False, False),
         (item(**BIAS), answer("named", ["gravity.tilt"]), "class", False, True),
