@@ -2,7 +2,7 @@
 # make explain   a small diagnosis: makes a recording with a hidden cause, finds it, writes the report
 # make test      the tests
 # make check     lint, types and import rules
-# make exam      hides causes in hundreds of recordings and has explain find them (about an hour)
+# make exam      hides causes in hundreds of recordings and has explain find them (about an hour; QUICK=--quick)
 # make benchmark measurements printed as ratios
 PYTHON ?= python3
 VENV ?= .venv
@@ -38,14 +38,9 @@ check: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-exam: $(STAMP)
-	$(BIN)/python -m tests.exam --out results/reference/exam
-
 benchmark: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.harness
 	$(BIN)/python -m tests.benchmarks.engines
 
-# the exam of `explain`, on recordings of independent simulators: long, goes on where it was; `make exam QUICK=--quick`
-.PHONY: exam
 exam: $(STAMP)
 	$(BIN)/python -m tests.exam $(QUICK)
