@@ -306,7 +306,7 @@ class _Explainer:
         lines = []
         for channel in finding.remains.loud:
             times = finding.remains.excess[self.fitting.channels.index(channel)]
-            lines.append(f"channel {channel} still misses by {times:.3g} times its stated noise")
+            lines.append(f"channel {channel} still misses by {times:.3g} times its noise")
         if finding.remains.structure and finding.remains.where:
             lines.append(f"what is left behaves like a force that depends on {finding.remains.where}")
         untouched = [self.fitting.parameters[i].name for i in sorted(base.untouched)]

@@ -232,7 +232,7 @@ def replace_at(p: _Problem, theta: Array, states: Array) -> _Problem:
 def prior_of(world: World) -> Array:
     """(s,) what is known of initial states beforehand, 1 sigma."""
     system, shown = world.simulator.system, set(world.channels)
-    pairs = dict(zip(system.rates, system.coordinates, strict=True))
+    pairs = dict(zip(system.rates, system.coordinates, strict=False))
     measured = [name in shown or pairs.get(name) in shown for name in world.states]
     return np.where(measured, MEASURED, UNMEASURED)
 

@@ -20,8 +20,10 @@ EXPLAINED = 0.7
 """Share of the gap that the effects must close to be taken for its explanation."""
 VAGUE = 0.5
 """A base parameter is not fixed by the data if its 1 sigma is more than this share of its bounds."""
-STRANGE = 1.5
-"""Held-out runs that miss by more than this many times the noise show something that the fitted runs do not."""
+STRANGE = 0.5
+"""Held-out runs whose RMS exceeds the noise by more than this share show something that the fitted runs do not."""
+NOTICED, HELPS = 0.5, 0.1
+"""Where held-out runs exceed the noise by more than the first, an effect must take the second share off the excess."""
 NEAR = 30.0
 """Rivals this near in twice the log likelihood are fitted once more before they are judged."""
 
@@ -84,7 +86,7 @@ def name(search: Search, stated: Mask, held_out: HeldOut | None) -> Finding:
     model = polished(search, search.run())
     measured = _measured(search, model, held_out)
     merits = None if measured is None else {names: part.merit for names, part in measured.items()}
-    model = _kept(search, model, merits)
+    model = _kept(search, model, measured, held_out)
     left = remains(search, model, stated)
     causes = _causes(search, model, merits)
     preferred = search.models.get(frozenset(cause.preferred for cause in causes), model)
@@ -112,11 +114,11 @@ def unfixed(search: Search, base: Model) -> tuple[str, ...]:
 def polished(search: Search, model: Model) -> Model:
     """The best model after it and its rivals of the same size were fitted again by generalised least squares."""
     size, names = len(model.names), set(model.names)
-    near = [m for m in search.models.values() if len(m.names) == size and model.merit - m.merit < NEAR]
-    near += [m for m in search.models.values() if len(m.names) == size - 1 and set(m.names) < names]
+    near = [m for m in search.models.values() if len(m.names) == size and abs(model.merit - m.merit) < NEAR]
+    parts = [m for m in search.models.values() if len(m.names) == size - 1 and set(m.names) < names]
     noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), np.maximum(model.likelihood.phi, 0.0))
-    search.refit([m.fit.start() for m in near], noise)
-    return search.best(size) or model
+    search.refit([m.fit.start() for m in (*near, *parts)], noise)
+    return max((search.models[frozenset(m.names)] for m in near), key=lambda m: m.merit)
 
 
 def _measured(search: Search, model: Model, held_out: HeldOut | None) -> dict[Names, Measured] | None:
@@ -124,7 +126,7 @@ def _measured(search: Search, model: Model, held_out: HeldOut | None) -> dict[Na
     if held_out is None:
         return None
     base = search.models[frozenset()]
-    near = [m for m in search.models.values() if len(m.names) == len(model.names) and model.merit - m.merit < NEAR]
+    near = [m for m in search.models.values() if len(m.names) == len(model.names) and abs(model.merit - m.merit) < NEAR]
     parts = [m for m in search.models.values() if set(m.names) < set(model.names)]
     singles = sorted((m for m in search.models.values() if len(m.names) == 1), key=lambda m: -m.merit)[:SHOWN]
     chosen = {m.names: m for m in [base, model, *near, *parts, *singles]}
@@ -134,18 +136,30 @@ def _measured(search: Search, model: Model, held_out: HeldOut | None) -> dict[Na
 SHOWN = 6
 
 
-def _kept(search: Search, model: Model, merits: dict[Names, float] | None) -> Model:
-    """The model without effects that make held-out runs worse."""
-    if merits is None:
+def _kept(search: Search, model: Model, measured: Mapping[Names, Measured] | None, held_out: HeldOut | None) -> Model:
+    """The model without effects that make held-out runs worse, or hardly better while much is left of the gap."""
+    if measured is None or held_out is None:
         return model
-    while model.names:
+    while model.names and model.names in measured:
         smaller = [m for m in search.models.values() if len(m.names) == len(model.names) - 1]
-        smaller = [m for m in smaller if set(m.names) < set(model.names) and m.names in merits]
-        better = [m for m in smaller if merits[m.names] > merits.get(model.names, -np.inf)]
-        if not better:
+        smaller = [m for m in smaller if set(m.names) < set(model.names) and m.names in measured]
+        idle = [m for m in smaller if not _helps(held_out, measured[m.names], measured[model.names])]
+        if not idle:
             return model
-        model = max(better, key=lambda m: merits[m.names])
+        model = max(idle, key=lambda m: measured[m.names].merit)
     return model
+
+
+def _helps(held_out: HeldOut, without: Measured, having: Measured) -> bool:
+    """Whether an effect makes held-out runs better, and clearly so while they are far from the noise."""
+    before, after = (_excess(held_out, part.simulated, held_out.noise.sigma) for part in (without, having))
+    return having.merit > without.merit and (before < NOTICED or after < (1.0 - HELPS) * before)
+
+
+def _excess(held_out: HeldOut, simulated: Array, sigma: Array) -> float:
+    """RMS of held-out residuals in units of the noise, less one."""
+    left = (held_out.world.observed - simulated) / sigma
+    return float(np.sqrt(np.square(left[held_out.seen]).mean())) - 1.0
 
 
 def _causes(search: Search, model: Model, merits: dict[Names, float] | None) -> tuple[Cause, ...]:
@@ -188,11 +202,8 @@ def _in_range(search: Search, effect: str) -> bool:
 def _loses(held_out: HeldOut, measured: Mapping[Names, Measured], model: Model, left: Remains) -> bool:
     """Whether held-out runs show a gap that the model does not close: something acts there that it has not learnt."""
     noise = np.maximum(held_out.noise.sigma, np.where(left.structure, 0.0, np.nan_to_num(model.likelihood.sigma)))
-    before, after = (
-        float(np.sqrt(np.square((held_out.world.observed - measured[names].simulated) / noise)[held_out.seen].mean()))
-        for names in ((), model.names)
-    )
-    return not after < STRANGE or (before > STRANGE and before - max(after, 1.0) < EXPLAINED * (before - 1.0))
+    before, after = (_excess(held_out, measured[names].simulated, noise) for names in ((), model.names))
+    return not after < STRANGE or (before > STRANGE and before - max(after, 0.0) < EXPLAINED * before)
 
 
 def closed(search: Search, base: Model, model: Model, floor: Array) -> float:

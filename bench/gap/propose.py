@@ -77,14 +77,19 @@ def _units(world: World) -> list[str]:
     system = world.simulator.system
     units = {channel.name: channel.unit for channel in world.kind.channels}
     lengths = [units.get(name, "m") for name in system.coordinates]
-    return [*lengths, *(f"{unit}/s" for unit in lengths)]
+    rates = [f"{unit}/s" for unit in lengths]
+    rates += [units.get(name, "SI") for name in system.rates[len(lengths) :]]
+    return [*lengths, *rates]
 
 
 def _apart(world: World, scenario: Scenario, states: Array, model: Model, rival: Model, sigma: Array) -> float:
     theta = np.delete(np.stack([model.fit.theta, rival.fit.theta]), world.base[world.own :], axis=1)
-    if world.freed:
-        return np.nan
+    freed = [p.name for p in world.freed]
+    scenarios = [
+        replace(scenario, constants={**scenario.constants, **dict(zip(freed, fitted, strict=True))})
+        for fitted in (m.fit.theta[world.own : world.base.size].tolist() for m in (model, rival))
+    ]
     initial = {name: np.full(2, value) for name, value in zip(world.states, states.tolist(), strict=True)}
-    seen = world.simulator.simulate_lanes(theta, [scenario, scenario], initial)
+    seen = world.simulator.simulate_lanes(theta, scenarios, initial)
     world.simulations += 2
     return float(np.sqrt(np.square((seen[0] - seen[1]) / sigma).mean()))

@@ -53,6 +53,10 @@ class Hat(Force):
         return result
 
 
+SLOWEST = 7.0
+"""Estimated noise that is exceeded by more than this would have to remember for 30 samples: that is no sensor's."""
+
+
 @dataclass(frozen=True)
 class Remains:
     """What a model leaves unexplained.
@@ -61,7 +65,7 @@ class Remains:
         p_value: chance of the best force of any shape where nothing is missing; 1 where the test does not apply.
         where: what that force follows, e.g. ``position x``.
         excess: (C,) RMS left in units of the noise floor.
-        loud: names of channels whose stated noise is exceeded.
+        loud: names of channels whose noise is exceeded.
     """
 
     p_value: float
@@ -89,7 +93,7 @@ def remains(search: Search, model: Model, stated: Mask) -> Remains:
     loud = tuple(
         name
         for c, name in enumerate(world.channels)
-        if stated[c] and excess[c] > 1.0 + EXCESS + SIGMAS * _error(search, model, c)
+        if excess[c] > (1.0 + EXCESS + SIGMAS * _error(search, model, c) if stated[c] else SLOWEST)
     )
     if Hat.name not in world.slots:
         return Remains(1.0, "", excess, loud)

@@ -48,6 +48,7 @@ class Scores:
         p_value: probability that the highest score of a library, less its chance, is reached with nothing missing.
         phi: correlation of the noise under the best hypothesis.
         by_chance: (E, S) scores of the surrogates, less their chance.
+        white: (E,) scores if noise does not remember.
     """
 
     effects: tuple[str, ...]
@@ -58,6 +59,7 @@ class Scores:
     p_value: float
     phi: float
     by_chance: Array
+    white: Array
 
 
 class Products:
@@ -208,7 +210,7 @@ def score(
     members = groups(directions)
     names = list(dict.fromkeys(g.effect for g in members))
     count, shape = int(seen.sum()), (len(names), everything.shape[3])
-    nothing = np.full(shape[1], -np.inf)
+    nothing, white = np.full(shape[1], -np.inf), np.zeros(len(names))
     best = np.full(shape, -np.inf)
     which: dict[str, tuple[float, Group, Array, float]] = {}
     products = Products(at, everything, directions.values, seen, noise.sigma)
@@ -224,10 +226,14 @@ def score(
             if value[0] > which.get(g.effect, (-np.inf,))[0]:
                 which[g.effect] = (float(value[0]), g, c[:, 0], phi)
             best[row] = np.maximum(best[row], value)
-    return _ranked(names, best - nothing, which)
+            if phi == 0:
+                white[row] = max(white[row], count * float(np.log(total[0] / max(total[0] - gain[0], floor[0]))))
+    return _ranked(names, best - nothing, which, white)
 
 
-def _ranked(names: Sequence[str], gains: Array, which: dict[str, tuple[float, Group, Array, float]]) -> Scores:
+def _ranked(
+    names: Sequence[str], gains: Array, which: dict[str, tuple[float, Group, Array, float]], white: Array
+) -> Scores:
     observed, chance = gains[:, 0], np.zeros(len(names))
     p_value = 1.0
     if gains.shape[1] > 1:
@@ -238,7 +244,7 @@ def _ranked(names: Sequence[str], gains: Array, which: dict[str, tuple[float, Gr
     return Scores(
         tuple(ranked), observed[order], chance[order], tuple(which[n][1] for n in ranked),
         tuple(which[n][2] for n in ranked), p_value, which[ranked[0]][3] if ranked else 0.0,
-        (gains[:, 1:] - chance[:, None])[order],
+        (gains[:, 1:] - chance[:, None])[order], white[order],
     )  # fmt: skip
 
 

@@ -33,12 +33,21 @@ LOUD = 1.3
 """What is left that exceeds the noise floor by more is looked into by simulation whatever the scores say."""
 MOST_EFFECTS = 3
 NOMINATED = 7
+WHITE = 3
+"""So many of the best by sum of squares alone are refitted besides: far from the data, noise that remembers explains
+almost anything."""
 PROMISING = 0.25
 """Candidates are refitted that promise at least this share of the best one's score."""
 SIFTED = (12, 8)
 """Of models that are fitted with patience so many go on from each horizon to the next."""
 MOVES = 2
-BEAM = 3
+FAR = 0.5
+"""Excess over the noise above which the search looks further ahead."""
+HOPELESS = 0.5
+"""Share of the base model's excess that two effects leave where a third is not worth a try."""
+CLEARLY = 0.5
+"""Share of the excess over the noise to which other effects must bring a model to take the place of fewer."""
+BEAM, NEAREST = 3, 2
 RIVAL = 0.5
 """A model goes on in the beam if it has at least this share of the best one's gain."""
 SWITCH = 7.0
@@ -146,7 +155,9 @@ class Search:
         promise = scores.score - scores.chance
         order = np.argsort(-promise, kind="stable")
         chosen = [i for i in order if patient or promise[i] >= PROMISING * promise[order[0]]]
-        chosen = chosen if patient else chosen[:most]
+        if not patient:
+            near = [i for i in np.argsort(-scores.white, kind="stable")[:WHITE] if i not in chosen[:most]]
+            chosen = chosen[:most] + near
         result = []
         for i in chosen:
             for c in self._sizes(found, scores.group[i], scores.c[i], scores.effects[i]):
@@ -259,31 +270,64 @@ class Search:
         return model
 
     def run(self) -> Model:
-        """The model of all effects that the data show."""
+        """The model of all effects that the data show.
+
+        While much is left to explain the search goes on although no step of it pays by itself: of two effects that
+        only together come near the data neither is worth much alone.
+        """
         best = self.models[frozenset()]
         for size in range(1, MOST_EFFECTS + 1):
-            if self.plain(best, UNLIKELY if size == 1 else DOUBTFUL):
+            if self.plain(best, DOUBTFUL if best.names else UNLIKELY):
                 break
-            self.extend([best], NOMINATED)
-            larger = self.best(size)
-            if size == 1 and not (larger and self.plain(larger, ALPHA)):
-                self.extend([best], NOMINATED, patient=True)
-                larger = self.best(size)
-            if larger is None or larger.merit <= best.merit or self.missing(best, larger) > ALPHA:
+            larger = self._grown(size)
+            if larger is None:
                 break
             if size > 1:
-                self.extend(self._beam(size - 1), NOMINATED)
-                larger = self.drop(self.swap(self.drop(self.best(size) or larger)))
-            best = larger
-            if len(best.names) < size:
+                larger = self._conservative(best, self.drop(self.swap(self.drop(larger))))
+            if larger.merit > best.merit and self.missing(best, larger) <= ALPHA:
+                best = larger
+            elif self.excess(best) < FAR:
+                break
+            if size > 1 and self.excess(larger) > HOPELESS * self.excess(self.models[frozenset()]):
                 break
         return best
 
+    def _grown(self, size: int) -> Model | None:
+        """The best model of so many effects: first from the best smaller one, then from its rivals, or with patience."""
+        beam = self._beam(size - 1)
+        self.extend(beam[:1], NOMINATED)
+        first = self.best(size)
+        if first is not None and self.plain(first, ALPHA):
+            return first
+        if size == 1:
+            self.extend(beam, NOMINATED, patient=True)
+        else:
+            self.extend(beam[1:], NOMINATED)
+        return self.best(size)
+
+    def _conservative(self, best: Model, larger: Model) -> Model:
+        """The larger model, unless it puts other effects in place of the best one's and is hardly nearer to the noise.
+
+        Two effects mimic many a third; where neither account reaches the noise, the shorter one is built upon.
+        """
+        if set(best.names) <= set(larger.names) or self.excess(larger) < CLEARLY * self.excess(best):
+            return larger
+        there = [m for m in self.models.values() if set(best.names) < set(m.names) and m.merit > best.merit]
+        return max((m for m in there if len(m.names) == len(best.names) + 1), key=lambda m: m.merit, default=best)
+
+    def excess(self, model: Model) -> float:
+        """RMS of what a model leaves in units of the noise floor, less the one that noise itself leaves."""
+        left = self.residual(model.fit) / self.noise.sigma
+        return float(np.sqrt(np.square(left[self.seen]).mean())) - 1.0
+
     def _beam(self, size: int) -> list[Model]:
-        """The best models of so many effects that explain enough to be in the running."""
-        base = self.models[frozenset()].merit
+        """Models of so many effects to go on from: those of the most merit, and those that come nearest to the data."""
         there = sorted((m for m in self.models.values() if len(m.names) == size), key=lambda m: -m.merit)
-        return [m for m in there if m.merit - base >= RIVAL * (there[0].merit - base)][:BEAM] if size else []
+        base = self.models[frozenset()].merit
+        if not size or not there:
+            return there
+        rivals = [m for m in there if m.merit - base >= RIVAL * (there[0].merit - base)][:BEAM]
+        return rivals + [m for m in sorted(there, key=lambda m: m.fit.cost)[:NEAREST] if m not in rivals]
 
 
 def freedom(world: World, fit: Fit, noise: Noise) -> float:
@@ -297,4 +341,4 @@ def freedom(world: World, fit: Fit, noise: Noise) -> float:
 
 
 _LOST = Likelihood(-np.inf, np.zeros(0), np.zeros(0))
-_NOTHING = Scores((), np.zeros(0), np.zeros(0), (), (), 1.0, 0.0, np.zeros((0, 0)))
+_NOTHING = Scores((), np.zeros(0), np.zeros(0), (), (), 1.0, 0.0, np.zeros((0, 0)), np.zeros(0))

@@ -145,7 +145,7 @@ def _variables(world: World, simulated: Array) -> Iterator[tuple[str, str, Array
     yield "time", "s", times
     system = world.simulator.system
     units = {channel.name: channel.unit for channel in world.kind.channels}
-    primary = system.coordinates[system.primary]
+    primary = system.coordinates[system.primary] if system.coordinates else ""
     if primary in world.channels:
         yield "position", units[primary], simulated[:, :, world.channels.index(primary)]
     speed = speeds(world, simulated)

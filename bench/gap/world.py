@@ -212,10 +212,12 @@ class World:
         """Initial states (s,), and which of them are stated: from the first samples where they are not."""
         system, defaults = self.simulator.system, self.kind.states
         values = dict(defaults)
-        for coordinate, rate in zip(system.coordinates, system.rates, strict=True):
+        for coordinate, rate in zip(
+            system.coordinates, system.rates, strict=False
+        ):  # behind them: an own one's other states
             if coordinate in run.channels:
-                place, slope = beginning(run.times, run.channels[coordinate])
-                values[coordinate], values[rate] = place, slope
+                values[coordinate], values[rate] = beginning(run.times, run.channels[coordinate])
+        for rate in system.rates:
             if rate in run.channels:
                 values[rate] = beginning(run.times, run.channels[rate])[0]
         self._lift(values, run)
@@ -227,7 +229,7 @@ class World:
         """States of coordinates that nothing recorded has to do with: taken to be at their defaults."""
         system, shown = self.simulator.system, self.channels
         hidden = set()
-        for axis, (coordinate, rate) in enumerate(zip(system.coordinates, system.rates, strict=True)):
+        for axis, (coordinate, rate) in enumerate(zip(system.coordinates, system.rates, strict=False)):
             about = (coordinate, rate, f"accel_{coordinate}")
             if axis != system.primary and not any(name in shown for name in about):
                 hidden |= {coordinate, rate}

@@ -51,8 +51,8 @@ class Item:
         name: says kind, system, what was asked for, and seed.
         system, kind: see `SYSTEMS`, `KINDS`.
         effects: coefficients of what is hidden, by name; of a foreign cause its own numbers.
-        size: RMS of the gap that refitted base parameters and initial states leave, in units of the noise; of two
-            effects that of the smaller one on top of the other.
+        size: RMS of the gap that base parameters and initial states, refitted, leave in the runs for fitting, in units
+            of the noise; of two effects that of each by itself.
         noise: white, ar1 or quantised.
         stated: whether the recording states the noise.
         rate, seconds, runs: sampling in Hz, a run's length, how many.

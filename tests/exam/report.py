@@ -129,8 +129,8 @@ BREAKDOWNS = (
 INTRODUCTION = """Recordings of independent simulators (scipy and MuJoCo; never the engine that `explain` itself
 uses), in each one hidden effect, two, a cause that the library does not have, or none; `explain` sees the recording
 alone. `python -m tests.exam` makes all of this again. Size is the root mean square of the gap that base parameters and
-initial states leave when they are refitted, in units of the noise. Intervals are Wilson's, of alarms Clopper and
-Pearson's.
+initial states, refitted, leave in the runs for fitting, in units of the noise. Intervals are Wilson's, of alarms
+Clopper and Pearson's.
 
 `items.csv` has a row an item, `items.jsonl` all that was answered, `confusion.csv` counts what was named first.
 `figures/power` shows the share of effects that are found against their size, `figures/confusion` what is taken for

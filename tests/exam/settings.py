@@ -14,6 +14,7 @@ ALONG_GROUND = ("gravity.tilt", "lift.magnus", "wind", "contact.friction", "drag
 RANGES = {"ball": (2e-3, 2e-2), "pendulum": (1e-3, 1e-2), "slider": (1e-3, 1e-2)}  # sigma, m or rad
 RATES = {"pendulum": (3.0, 10.0), "slider": (2.0, 5.0)}  # how much noisier the rate is than the position, 1/s
 PENDULUM = Pendulum(observe=["q"], engine="batch")  # tells how far a drawn pendulum swings; gives no data
+MOST_RUNS = 6
 NOISES = ("white", "ar1", "quantised")
 
 
@@ -69,7 +70,7 @@ def setting(system, rng, hidden=(), short=False):
     """A setting drawn with `rng`, in which the effects named in `hidden` have a chance to show."""
     rate = int(rng.choice([50, 100, 200], p=[0.3, 0.5, 0.2]))
     seconds = float(rng.choice([2.0, 3.0, 4.0, 5.0, 6.0], p=[0.1, 0.2, 0.4, 0.2, 0.1]))
-    runs = 3 if short else int(rng.choice([3, 4, 5, 6], p=[0.25, 0.4, 0.2, 0.15]))
+    runs = 3 if short else int(rng.choice([3, 4, 5, MOST_RUNS], p=[0.25, 0.4, 0.2, 0.15]))
     times = np.arange(round(rate * seconds)) / rate
     draw = {"ball": _ball, "pendulum": _pendulum, "slider": _slider}[system]
     parameters, channels, scenarios = draw(rng, times, runs, hidden)

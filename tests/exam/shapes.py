@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from sims import effects as library
+from tests.exam.settings import MOST_RUNS
 from tests.exam.sizing import observed_by_batch
 from tests.exam.worlds import SIMULATORS
 
@@ -109,8 +110,8 @@ def foreign(name, setting, rng):
 
 
 def _begins(setting, lasting, rng):
-    """A beginning within each run, not the same in any two."""
-    return [float(rng.uniform(0.1, 0.9) * (setting.seconds - lasting)) for _ in setting.scenarios]
+    """A beginning within each run, held-out ones too, not the same in any two."""
+    return [float(rng.uniform(0.1, 0.9) * (setting.seconds - lasting)) for _ in range(MOST_RUNS)]
 
 
 def _patch(setting, rng):

@@ -1,6 +1,7 @@
 """The exam's questions: as large as wanted, the same for the same seed, and readable as recordings."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,8 +9,8 @@ from scipy.optimize import least_squares
 
 from sims.base import Scenario
 from sims.recording import read_recording
-from tests.exam import rivals, sizing
-from tests.exam.items import APART, EQUIVALENT, Item, coefficients, draw, realise, setting_of
+from tests.exam import rivals, shapes, sizing
+from tests.exam.items import APART, EQUIVALENT, Item, coefficients, draw, held_out_of, realise, setting_of
 from tests.exam.questions import Question, quick, sheet
 from tests.exam.settings import Noise, setting
 from tests.exam.worlds import SIMULATORS, World, constants_of, simulated, solved
@@ -18,6 +19,7 @@ from tests.exam.worlds import SIMULATORS, World, constants_of, simulated, solved
 def refitted(item):
     """The gap once more, by scipy's solvers and scipy's least squares."""
     drawn = setting_of(item)
+    drawn = replace(drawn, scenarios=drawn.scenarios[: item.runs - held_out_of(item)])
     hidden = drawn.world(item.effects)
     observed = np.array([solved(hidden, s, drawn.channels) for s in drawn.scenarios])
     names = list(drawn.parameters)
@@ -82,6 +84,16 @@ def test_a_foreign_cause_is_out_of_the_librarys_reach():
     assert APART <= item.beyond <= item.size
 
 
+@pytest.mark.parametrize("system", ["ball", "slider"])
+def test_a_gust_blows_in_every_run(system):
+    drawn = setting(system, np.random.default_rng(0), ("gust",))
+    numbers = shapes.foreign("gust", replace(drawn, scenarios=drawn.scenarios[:2]), np.random.default_rng(0))(0.5)
+    world = drawn.world(foreign={"gust": numbers})
+    for number, run in enumerate(drawn.scenarios):
+        change = solved(world, run, drawn.channels, number) - solved(drawn.world(), run, drawn.channels)
+        assert np.abs(change).max() > 0.01
+
+
 @pytest.mark.parametrize(("system", "driven", "names"), EQUIVALENT)
 def test_equivalent_effects_leave_nothing_of_each_other(system, driven, names):
     hidden = ("input.gain",) if driven else ("gravity.tilt",)
@@ -111,9 +123,7 @@ def test_files_are_recordings(tmp_path, kind, system):
     recording = read_recording(realise(item, tmp_path), SIMULATORS[system].system())
     assert recording.system == system
     assert len(recording.runs) == item.runs
-    assert [run.held_out for run in recording.runs] == [
-        k >= item.runs - max(1, item.runs // 3) for k in range(item.runs)
-    ]
+    assert [run.held_out for run in recording.runs] == [k >= item.runs - held_out_of(item) for k in range(item.runs)]
     assert bool(recording.noise) is item.stated
     assert all(run.times.size == round(item.rate * item.seconds) for run in recording.runs)
     drawn = setting_of(item)

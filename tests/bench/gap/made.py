@@ -55,7 +55,9 @@ def world(recorded, **options):
 
 def white(world, sigma):
     """White noise of every channel, or of each its own."""
-    return Noise(np.broadcast_to(np.asarray(sigma, dtype=float), (len(world.channels),)).copy(), np.zeros(1)).coloured(0.0)
+    return Noise(np.broadcast_to(np.asarray(sigma, dtype=float), (len(world.channels),)).copy(), np.zeros(1)).coloured(
+        0.0
+    )
 
 
 def searched(recorded, sigma, seed=0, **options):
