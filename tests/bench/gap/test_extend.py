@@ -16,7 +16,7 @@ MODEL = Extended(
     "pendulum_extended", "pendulum", "batch", "A swing, measured", {"inertia": Number(3.1e-3, "kg*m^2", 3.0e-3, 3.2e-3)},
     {
         "drag.linear": {"coefficient": Number(7e-4, "N*m*s/rad", None, None)},
-        "sensor.delay": {"delay": Number(0.013, "s", 0.012, 0.014)},
+        "sensor.delay": {"coefficient": Number(0.013, "s", 0.012, 0.014)},
     },
     {"mass": 0.2, "length": 0.15, "gravity": 9.7}, ["qd", "q"],
 )  # fmt: skip
