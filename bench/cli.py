@@ -70,6 +70,11 @@ def _parser() -> argparse.ArgumentParser:
     status.add_argument("--runs", action="store_true", help="list every run by its id")
     status.set_defaults(command=_status)
 
+    check = commands.add_parser("check", help="run the conformance suite on a tuner, a simulator or an effect")
+    check.add_argument("name", metavar="NAME", help="registered name, e.g. cma_es, pendulum or drag.linear")
+    check.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file that defines it")
+    check.set_defaults(command=_check)
+
     plot = commands.add_parser("plot", help="write table and figures of a comparison again")
     plot.add_argument("run", metavar="RUN", type=Path, help="the comparison's folder")
     plot.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more simulators")
@@ -224,6 +229,14 @@ class _Bars:
             bar.update()
 
         return step
+
+
+def _check(options: argparse.Namespace) -> int:
+    from bench.checks.command import run
+    from bench.registry import load_plugins
+
+    load_plugins(options.plugin)
+    return 0 if run(options.name, options.plugin, print) else 1
 
 
 def _plot(options: argparse.Namespace) -> int:
