@@ -2,12 +2,14 @@
 # make test      the tests
 # make check     lint, types and import rules
 # make benchmark measurements printed as ratios
+# make chaos     100 kills at random moments; what is resumed must equal what was never disturbed (about 10 minutes)
+# make reference the comparisons under results/reference, again (about 15 minutes)
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: compare test check benchmark install
+.PHONY: compare test check benchmark chaos reference install
 install: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml
@@ -32,3 +34,6 @@ check: $(STAMP)
 benchmark: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.harness
 	$(BIN)/python -m tests.benchmarks.engines
+
+chaos: $(STAMP)
+	$(BIN)/python -m tests.chaos --kills 100

@@ -33,8 +33,12 @@ def start(folder, experiment, address, environment):
     begun = ["--resume", str(folder)] if folder.exists() else [str(experiment), "--out", str(folder)]
     where = ["--cluster", address] if address else ["--jobs", "2"]
     command = [sys.executable, "-m", "bench.cli", "compare", *begun, *where, "--plugin", str(PLUGINS / "spring.py")]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    return subprocess.Popen(command, env=environment, text=True, **quiet)
+    with errors_of(folder).open("w") as errors:
+        return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=errors)
+
+
+def errors_of(folder):
+    return folder.with_suffix(".stderr")
 
 
 def victims(process, what, running):
@@ -53,7 +57,7 @@ def disturbed(folder, experiment, kills, rng, running, environment):
         time.sleep(rng.uniform(0.0, 2.5))
         if process.poll() is not None:
             if process.returncode != 0:
-                raise AssertionError(f"it ended by itself with {process.returncode}: {process.stderr.read()}")
+                raise AssertionError(f"it ended by itself with {process.returncode}: {errors_of(folder).read_text()}")
             return hits
         before = finished(folder)
         what = str(rng.choice(["runner", "cluster worker" if running else "worker"]))
@@ -72,9 +76,8 @@ def disturbed(folder, experiment, kills, rng, running, environment):
             if lost and (folder / "segments").exists():
                 raise AssertionError(f"lost {len(lost)} finished runs")
             process = start(folder, experiment, running and running.address, environment)
-    _, errors = process.communicate(timeout=600)
-    if process.returncode != 0:
-        raise AssertionError(f"it ended with {process.returncode}: {errors}")
+    if process.wait(timeout=600) != 0:
+        raise AssertionError(f"it ended with {process.returncode}: {errors_of(folder).read_text()}")
     return hits
 
 
@@ -82,20 +85,22 @@ def compare(folder, undisturbed):
     """Raise unless both folders hold the same, but for times."""
     for name, read in (("status.csv", pd.read_csv), ("table.csv", pd.read_csv), ("runs.parquet", pd.read_parquet)):
         a, b = (read(f / name) for f in (folder, undisturbed))
-        pd.testing.assert_frame_equal(*(f.drop(columns=[c for c in MEASURED if c in f]) for f in (a, b)), check_exact=True)
+        pd.testing.assert_frame_equal(
+            *(f.drop(columns=[c for c in MEASURED if c in f]) for f in (a, b)), check_exact=True
+        )
         if name == "status.csv" and a["run"].duplicated().any():
             raise AssertionError("runs are doubled")
 
 
-def chaos(folder, kills, seed, on_cluster):
+def chaos(folder, kills, seed, on_cluster, targets=60):
     """Rounds of a comparison, each disturbed, until there were `kills` kills; returns how many of each."""
     rng = np.random.default_rng(seed)
     experiment = folder / "chaos.toml"
-    document = {**SPRING, "targets": 60, "seeds": 2, "budget": 60, "training_budget": 60, "tuners": TUNERS}
+    document = {**SPRING, "targets": targets, "seeds": 2, "budget": 60, "training_budget": 60, "tuners": TUNERS}
     experiment.write_text(tomli_w.dumps(document))
     environment = {**os.environ, "SIMGAP_CACHE": str(folder / "cache")}
     undisturbed = folder / "undisturbed"
-    start(undisturbed, experiment, None, environment).communicate(timeout=600)
+    start(undisturbed, experiment, None, environment).wait(timeout=600)
     hits, rounds = Counter(), 0
     with cluster(folder) if on_cluster else _nobody() as running:
         while (left := kills - sum(hits.values())) > 0:
