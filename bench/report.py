@@ -12,6 +12,7 @@ from bench.figures import draw
 from bench.problem import Problem
 from bench.stats import FAILURES, summary, table
 from bench.store import read
+from bench.summary import NEEDED, summarise
 
 
 def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
@@ -23,7 +24,7 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     Raises:
         InputError: the folder is not that of a comparison.
     """
-    stored = read(folder)
+    stored = read(folder, [*NEEDED])
     if stored.runs.empty:
         say(f"no run was made; {folder}/status.csv says why")
         return 0
@@ -34,12 +35,15 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     single = parameters[0] if len(parameters) == 1 else None
     name = "" if single is None else single.name + (f" [{single.unit}]" if single.unit != "1" else "")
     figures = draw(folder, stored.experiment, stored.runs, f"{channel.name} [{channel.unit}]", name)
+    figures += summarise(folder, stored)
     for kind in lines["range"][lines["range"] != ""].unique():
         say("\n" + _text(lines, kind, f"{channel.name} [{channel.unit}]", name))
     failed = stored.statuses[stored.statuses["status"].isin(FAILURES)]
     for line in failure_lines(failed):
         say(line)
+    say("\n" + _seconds(lines))
     say(f"\ntable   {folder / 'table.csv'}")
+    say(f"more    {folder}/ert.csv, pairs.csv, break_even.csv, who_wins.csv")
     for figure in figures:
         say(f"figure  {figure}")
     return int((failed["status"] != "skipped").sum())
@@ -61,6 +65,14 @@ def _text(lines: pd.DataFrame, kind: str, channel: str, parameter: str) -> str:
     means.columns.name = None
     means.index.name = None
     return f"{title}\n{means.to_string(float_format=lambda v: f'{v:.2g}')}"
+
+
+def _seconds(lines: pd.DataFrame) -> str:
+    """What a tuner took beside what its simulations took, and its training."""
+    last = lines[lines["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
+    columns = {"tuner": "tuner_seconds", "simulator": "simulator_seconds", "one training": "fit_seconds"}
+    table = pd.DataFrame({name: last[column] for name, column in columns.items()}).rename_axis(None)
+    return f"mean seconds of a run\n{table.to_string(float_format=lambda v: f'{v:.2g}')}"
 
 
 def failure_lines(failed: pd.DataFrame) -> list[str]:
