@@ -75,8 +75,9 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file that defines it")
     check.set_defaults(command=_check)
 
-    plot = commands.add_parser("plot", help="write table and figures of a comparison again")
-    plot.add_argument("run", metavar="RUN", type=Path, help="the comparison's folder")
+    plot = commands.add_parser("plot", help="write table and figures of a comparison again, or of several together")
+    plot.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="a comparison's folder; several: ranks")
+    plot.add_argument("--out", metavar="DIR", type=Path, help="folder for what several comparisons give together")
     plot.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more simulators")
     plot.set_defaults(command=_plot)
 
@@ -163,7 +164,7 @@ def _chosen(options: argparse.Namespace) -> Experiment:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from bench.compare import begin, make, resume
+    from bench.compare import begin, make, only_resume, resume
     from bench.report import finish
 
     pool = None
@@ -172,7 +173,7 @@ def _compare(options: argparse.Namespace) -> int:
 
         pool = ClusterPool(options.cluster)
     if options.resume:
-        _only_resume(options)
+        only_resume(options)
         folder = options.resume
         plugins, results = resume(folder, options.plugin)
     else:
@@ -188,16 +189,6 @@ def _compare(options: argparse.Namespace) -> int:
         print(f"simgap: to finish: simgap compare --resume {folder}", file=sys.stderr)
         return INTERRUPTED if results.interrupted else 1
     return 1 if failed and not options.allow_failures else 0
-
-
-def _only_resume(options: argparse.Namespace) -> None:
-    """Refuse options that would change what is resumed."""
-    from sims.base import InputError
-
-    names = ("experiment", "tuners", "targets", "seeds", "budget", "timeout", "memory", "out")
-    given = [name for name in names if getattr(options, name) is not None]
-    if given:
-        raise InputError(f"--resume takes the configuration of its folder as it is; leave out {', '.join(given)}")
 
 
 def _status(options: argparse.Namespace) -> int:
@@ -243,10 +234,18 @@ def _plot(options: argparse.Namespace) -> int:
     from bench.problem import Problem
     from bench.registry import load_plugins
     from bench.report import finish
-    from bench.store import read
+    from bench.store import configuration
+    from sims.base import InputError
 
     load_plugins(options.plugin)
-    finish(options.run, Problem(read(options.run).experiment), print)
+    if len(options.runs) > 1 or options.out:
+        from bench.summary import across
+
+        if not options.out:
+            raise InputError("several comparisons give one result: name a folder for it with --out DIR")
+        across(options.runs, options.out, print)
+        return 0
+    finish(options.runs[0], Problem(configuration(options.runs[0]).experiment), print)
     return 0
 
 

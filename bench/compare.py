@@ -55,6 +55,18 @@ def resume(folder: Path, plugins: Sequence[str]) -> tuple[list[str], Results]:
     return everything, results
 
 
+def only_resume(options: object) -> None:
+    """Refuse options of the command line that would change what is resumed.
+
+    Raises:
+        InputError: there are some.
+    """
+    names = ("experiment", "tuners", "targets", "seeds", "budget", "timeout", "memory", "out")
+    given = [name for name in names if getattr(options, name) is not None]
+    if given:
+        raise InputError(f"--resume takes the configuration of its folder as it is; leave out {', '.join(given)}")
+
+
 def _unchanged(folder: Path, before: dict[str, str], now: dict[str, str]) -> None:
     """Refuse to mix runs of two configurations."""
     if not before:

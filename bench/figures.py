@@ -189,7 +189,7 @@ class Styles:
     def __init__(self, experiment: Experiment, runs: pd.DataFrame, metric: str) -> None:
         present = set(runs["tuner"].unique())
         self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
-        last = runs.sort_values("k").groupby(["tuner", "run"])[metric].last().groupby(level="tuner").median()
+        last = runs.drop_duplicates("run", keep="last").groupby("tuner")[metric].median()  # rows stand in order of k
         self.order: Sequence[str] = sorted(self._places, key=lambda label: float(last.get(label, np.inf)))
 
     def of(self, tuner: str) -> dict[str, Any]:
