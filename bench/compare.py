@@ -86,8 +86,8 @@ def _attach(folder: Path, results: Results) -> None:
     if not (folder / FOLDER).exists():
         results.kept.statuses = _complete(folder, ids)
         return
-    journal = Journal(folder)
     planned = read_plan(folder)
+    journal = Journal(folder)
     if planned is None:
         write_plan(folder, ids)
     foreign = [place for place, s in journal.statuses.items() if place >= len(ids) or ids[place] != s.run]

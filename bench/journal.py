@@ -220,9 +220,16 @@ def write_plan(folder: Path, ids: Sequence[str]) -> None:
 
 
 def read_plan(folder: Path) -> list[str] | None:
-    """The ids of the plan; None where there is none yet."""
+    """The ids of the plan; None where there is none yet.
+
+    Raises:
+        InputError: it is damaged.
+    """
     path = folder / FOLDER / "plan.txt"
-    return path.read_text(encoding="utf-8").splitlines() if path.is_file() else None
+    try:
+        return path.read_text(encoding="utf-8").splitlines() if path.is_file() else None
+    except ValueError:
+        raise InputError(f"{path}: expected the ids of the runs as UTF-8 text, found other bytes") from None
 
 
 def replace_text(path: Path, text: str) -> None:
