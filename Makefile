@@ -3,7 +3,7 @@
 # make check     lint, types and import rules
 # make benchmark measurements printed as ratios
 # make chaos     100 kills at random moments; what is resumed must equal what was never disturbed (about 10 minutes)
-# make reference the comparisons under results/reference, again (about 15 minutes)
+# make reference the comparison of results/reference/comparison again, below results/ (about 10 minutes)
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -34,6 +34,15 @@ check: $(STAMP)
 benchmark: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.harness
 	$(BIN)/python -m tests.benchmarks.engines
+	$(BIN)/python -m tests.benchmarks.scale
+	$(BIN)/python -m tests.benchmarks.peers
 
 chaos: $(STAMP)
 	$(BIN)/python -m tests.chaos --kills 100
+
+PROBLEMS := ball-drop slider-push pendulum-swing servo-step ball-wind ball-crossengine
+REFERENCE := results/comparison
+
+reference: $(STAMP)
+	for e in $(PROBLEMS); do $(BIN)/simgap compare $$e --targets 5 --seeds 1 --budget 30 --out $(REFERENCE)/$$e || exit 1; done
+	$(BIN)/simgap plot $(PROBLEMS:%=$(REFERENCE)/%) --out $(REFERENCE)/all

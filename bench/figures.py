@@ -6,6 +6,7 @@ Made for print: every tuner has its own marker and line style beside its colour,
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -224,7 +225,9 @@ def finish(
     heading: str = "best at the end first",
 ) -> None:  # fmt: skip
     """Legend, title and caption."""
-    handles = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
+    handles: dict[str, Any] = {}
+    for axis in reversed(axes):  # a panel may lack a tuner that another has
+        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
     labels = [label for label in style.order if label in handles]
     figure.legend(
         [handles[label] for label in labels],
@@ -240,7 +243,7 @@ def finish(
         if axis.get_ylabel() == axes[0].get_ylabel():
             axis.set_ylabel("")
     figure.suptitle(experiment.title or experiment.name, fontsize=11)
-    figure.supxlabel(caption, fontsize=7.5, color="#444444")
+    figure.supxlabel(textwrap.fill(caption, int(17 * figure.get_figwidth())), fontsize=7.5, color="#444444")
 
 
 def save(folder: Path, name: str, figure: Figure) -> Path:

@@ -13,7 +13,7 @@ from bench.amortisation import COSTS, Price, break_even, winners
 from bench.curves import Curves
 from bench.experiment import Experiment
 from bench.figures import Styles, canvas, finish, save
-from bench.runtimes import solved
+from bench.runtimes import percentile_interval, resampled, solved
 from bench.stats import checkpoints
 from methods.base import Array
 
@@ -79,19 +79,23 @@ def amortisation_figure(
         axis.set_title(TITLES[kind], fontsize=10)
     caption = (
         f"To reach an error of {level:.2g} for good: training + targets × expected simulations (ERT). Rings: a learned "
-        "tuner passes a search tuner. A tuner without a line never got there; intervals are in break_even.csv."
+        "tuner passes a search tuner; bars: 95 % bootstrap interval. A tuner without a line never got there."
     )
     finish(figure, axes, style, experiment, caption)
     return save(folder, "amortisation", figure)
 
 
 def _mark_even(axis: Axes, prices: Mapping[str, Price]) -> None:
+    """A ring at each break-even point, with its 95 % interval as a bar."""
     for learned in prices.values():
         for search in prices.values():
             if learned.fit_simulations and not search.fit_simulations:
                 even = float(break_even(learned, search))
                 if 1 <= even <= 1e4:
                     total = even * float(search.effort.ert())
+                    picked = resampled(len(learned.effort.successes), "break-even")
+                    low, high = np.clip(percentile_interval(break_even(learned, search, picked)), 1, 1e4)
+                    axis.plot([low, high], [total, total], color="#333333", linewidth=1.0, alpha=0.6, zorder=4)
                     axis.plot(even, total, "o", markersize=9, markerfacecolor="none", color="#333333", zorder=5)
 
 

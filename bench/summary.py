@@ -13,7 +13,7 @@ from bench.curves import Curves, Rows, primary
 from bench.experiment import Entry, Experiment
 from bench.figures import Styles
 from bench.paired import PROBLEMS, nemenyi, pairs, ranks
-from bench.runtimes import effort, ert_table, solved, thresholds
+from bench.runtimes import ert_table, solved, thresholds
 from bench.store import Stored, read
 from methods.base import Array
 from sims.base import InputError
@@ -40,32 +40,39 @@ def summarise(folder: Path, stored: Stored) -> list[Path]:
     spread, levels = thresholds(curves, metric == "param_error")
     ert_table(curves, levels, experiment.budget).to_csv(folder / "ert.csv", index=False)
     pairs(curves).to_csv(folder / "pairs.csv", index=False)
-    level = _level(curves, levels, experiment.budget)
-    held = _prices(rows, curves, level, experiment, stored.costs)
-    evens = [break_even_table(experiment.name, kind, level, table) for kind, table in held.items()]
+    held = {
+        level: _prices(rows, curves, level, experiment, stored.costs) for level in levels[:3]
+    }  # at every level as tables, at one as figures
+    evens = [
+        break_even_table(experiment.name, kind, level, table)
+        for level, kinds in held.items()
+        for kind, table in kinds.items()
+    ]
     pd.concat([e for e in evens if len(e)] or [pd.DataFrame(columns=EVEN_COLUMNS)]).to_csv(
         folder / "break_even.csv", index=False
     )
     won = [
-        (experiment.name, kind, level, *line) for kind, table in held.items() for line in winners(table, figures.SHARED)
+        (experiment.name, kind, level, *line)
+        for level, kinds in held.items()
+        for kind, table in kinds.items()
+        for line in winners(table, figures.SHARED)
     ]
     pd.DataFrame(won, columns=WINNER_COLUMNS).to_csv(folder / "who_wins.csv", index=False)
+    level = _telling(held)
     style = Styles(experiment, runs, metric)
     made = [figures.runtime_figure(folder, experiment, style, curves, spread)]
-    made.append(figures.cost_figure(folder, experiment, style, held, level))
+    made.append(figures.cost_figure(folder, experiment, style, held[level], level))
     if any(fit for fit, _ in stored.costs.values()):
-        made.append(figures.amortisation_figure(folder, experiment, style, held, level))
+        made.append(figures.amortisation_figure(folder, experiment, style, held[level], level))
     return made
 
 
-def _level(curves: Curves, levels: Sequence[float], budget: int) -> float:
-    """The tightest level that some tuner reaches in at least half of its runs; the loosest where there is none."""
-    for level in reversed(levels[:3]):
-        for tuner in curves.tuners():
-            spent = effort(curves.of(tuner=tuner), level, budget)
-            if 2 * spent.successes.sum() >= spent.runs:
-                return level
-    return levels[0]
+def _telling(held: Mapping[float, Mapping[str, Mapping[str, Price]]]) -> float:
+    """The tightest level that at least half of the tuners reach in some run, in every range; else the loosest."""
+    for level in sorted(held):
+        if all(2 * sum(np.isfinite(p.effort.ert()) for p in t.values()) >= len(t) for t in held[level].values()):
+            return level
+    return max(held)
 
 
 def _prices(

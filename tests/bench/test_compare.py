@@ -149,7 +149,7 @@ def test_every_chaos_tuner_has_its_status_and_the_others_do_not_change_by_a_bit(
     plugins = ["--plugin", SPRING_PLUGIN, "--plugin", CHAOS]
     hang_shorter = {**os.environ, "PYTHONPATH": os.getcwd()}
     code = (
-        "import sys, bench.pools, bench.cli; bench.pools.GRACE = -18.5\n"
+        "import sys, bench.pools, bench.cli; bench.pools.GRACE = -12.0\n"
         "if __name__ == '__main__':\n    sys.exit(bench.cli.main(sys.argv[1:]))\n"
     )
     (tmp_path / "go.py").write_text(code)
