@@ -4,12 +4,14 @@
 # make check     lint, types and import rules
 # make exam      hides causes in hundreds of recordings and has explain find them (about an hour; QUICK=--quick)
 # make benchmark measurements printed as ratios
+# make chaos     100 kills at random moments; what is resumed must equal what was never disturbed (about 10 minutes)
+# make reference the comparison of results/reference/comparison again, below results/ (about 10 minutes)
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: compare explain test check exam benchmark install
+.PHONY: compare explain test check exam benchmark chaos reference install
 install: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml
@@ -41,6 +43,18 @@ check: $(STAMP)
 benchmark: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.harness
 	$(BIN)/python -m tests.benchmarks.engines
+	$(BIN)/python -m tests.benchmarks.scale
+	$(BIN)/python -m tests.benchmarks.peers
+
+chaos: $(STAMP)
+	$(BIN)/python -m tests.chaos --kills 100
+
+PROBLEMS := ball-drop slider-push pendulum-swing servo-step ball-wind ball-crossengine
+REFERENCE := results/comparison
+
+reference: $(STAMP)
+	for e in $(PROBLEMS); do $(BIN)/simgap compare $$e --targets 5 --seeds 1 --budget 30 --out $(REFERENCE)/$$e || exit 1; done
+	$(BIN)/simgap plot $(PROBLEMS:%=$(REFERENCE)/%) --out $(REFERENCE)/all
 
 exam: $(STAMP)
 	$(BIN)/python -m tests.exam $(QUICK)

@@ -1,4 +1,4 @@
-"""The command line: `simgap compare`, `plot`, `simulate`, `inspect`, `explain`, `score`, `list`.
+"""The command line of simgap; `simgap --help` lists its commands.
 
 Heavy packages are imported by the commands that need them, so that `simgap --help` is quick. A fault of the user's is
 one line on stderr and exit code 2; an internal error keeps its traceback.
@@ -49,7 +49,9 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
 
     compare = commands.add_parser("compare", help="run an experiment: tuners x targets x seeds; write table and figure")
-    compare.add_argument("experiment", metavar="EXPERIMENT", help="name (see `simgap list experiments`) or TOML file")
+    compare.add_argument(
+        "experiment", metavar="EXPERIMENT", nargs="?", help="name (see `simgap list experiments`) or TOML file"
+    )
     compare.add_argument("--tuners", metavar="A,B,...", help="only these tuners, by label or registered name")
     compare.add_argument("--targets", type=_positive, metavar="N", help="targets in each range")
     compare.add_argument("--seeds", type=_positive, metavar="N", help="seeds of each tuner that uses chance")
@@ -57,10 +59,26 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--jobs", type=_positive, metavar="N", default=2, help="worker processes (default: 2)")
     compare.add_argument("--out", metavar="DIR", help="folder to write (default: a new one below results/)")
     compare.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more tuners")
+    compare.add_argument("--resume", metavar="DIR", type=Path, help="finish what is missing in this folder instead")
+    compare.add_argument("--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler")
+    compare.add_argument("--timeout", type=_seconds, metavar="S", help="seconds that a run may take, then it is killed")
+    compare.add_argument("--memory", type=_positive, metavar="MIB", help="memory that a run may take")
+    compare.add_argument("--allow-failures", action="store_true", help="exit with 0 although runs failed")
     compare.set_defaults(command=_compare)
 
-    plot = commands.add_parser("plot", help="write table and figures of a comparison again")
-    plot.add_argument("run", metavar="RUN", type=Path, help="the comparison's folder")
+    status = commands.add_parser("status", help="what a comparison's folder holds, and what is missing")
+    status.add_argument("run", metavar="DIR", type=Path, help="the comparison's folder")
+    status.add_argument("--runs", action="store_true", help="list every run by its id")
+    status.set_defaults(command=_status)
+
+    check = commands.add_parser("check", help="run the conformance suite on a tuner, a simulator or an effect")
+    check.add_argument("name", metavar="NAME", help="registered name, e.g. cma_es, pendulum or drag.linear")
+    check.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file that defines it")
+    check.set_defaults(command=_check)
+
+    plot = commands.add_parser("plot", help="write table and figures of a comparison again, or of several together")
+    plot.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="a comparison's folder; several: ranks")
+    plot.add_argument("--out", metavar="DIR", type=Path, help="folder for what several comparisons give together")
     plot.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more simulators")
     plot.set_defaults(command=_plot)
 
@@ -116,13 +134,27 @@ def _positive(text: str) -> int:
     return value
 
 
-def _compare(options: argparse.Namespace) -> int:
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"expected a number of seconds above 0, found '{text}'")
+    return value
+
+
+def _chosen(options: argparse.Namespace) -> Experiment:
+    """The experiment that the options of `compare` describe."""
     from bench.experiment import load
     from bench.registry import load_plugins, tuners
-    from sims.base import unknown
+    from sims.base import InputError, unknown
 
+    if options.experiment is None:
+        raise InputError("expected an experiment (see `simgap list experiments`), or --resume DIR")
     load_plugins(options.plugin)
-    experiment = load(options.experiment).chosen(targets=options.targets, budget=options.budget)
+    changes = {name: getattr(options, name) for name in ("targets", "budget", "timeout", "memory")}
+    experiment = load(options.experiment).chosen(**changes)
     if options.seeds:
         experiment = experiment.with_seeds(options.seeds)
     if options.tuners:
@@ -132,26 +164,41 @@ def _compare(options: argparse.Namespace) -> int:
             if label not in known:
                 raise unknown("tuner", label, sorted(known))
         experiment = experiment.with_tuners(labels)
-    return _run(experiment, options)
+    return experiment
 
 
-def _run(experiment: Experiment, options: argparse.Namespace) -> int:
+def _compare(options: argparse.Namespace) -> int:
+    from bench.compare import begin, make, only_resume, resume
     from bench.report import finish
-    from bench.runner import prepare, run
-    from bench.store import new_folder, write_configuration, write_results
 
-    results = prepare(experiment)
-    folder = new_folder(experiment, options.out)
-    write_configuration(folder, experiment, options.plugin, options.jobs)
+    pool = None
+    if options.cluster:
+        from bench.cluster import ClusterPool
+
+        pool = ClusterPool(options.cluster)
+    if options.resume:
+        only_resume(options)
+        folder = options.resume
+        plugins, results = resume(folder, options.plugin)
+    else:
+        plugins = options.plugin
+        folder, results = begin(_chosen(options), plugins, options.out, options.jobs)
     with _Bars() as bars:
-        run(results, options.plugin, options.jobs, bars.start)
-    write_results(folder, results)
-    finish(folder, results.problem, print)
-    if results.interrupted:
-        done = len(results.statuses)
-        print(f"simgap: interrupted; {done} of {results.planned} runs are finished and kept", file=sys.stderr)
-        return INTERRUPTED
-    return 0
+        complete = make(folder, results, plugins, options.jobs, bars.start, pool)
+    failed = finish(folder, results.problem, print)
+    if not complete:
+        done, planned = len(results.kept.statuses), len(results.plan)
+        what = "interrupted" if results.interrupted else results.stopped or "stopped"
+        print(f"simgap: {what}; {done} of {planned} runs are finished and kept", file=sys.stderr)
+        print(f"simgap: to finish: simgap compare --resume {folder}", file=sys.stderr)
+        return INTERRUPTED if results.interrupted else 1
+    return 1 if failed and not options.allow_failures else 0
+
+
+def _status(options: argparse.Namespace) -> int:
+    from bench.compare import status
+
+    return 0 if status(options.run, options.runs, print) else 1
 
 
 class _Bars:
@@ -179,14 +226,30 @@ class _Bars:
         return step
 
 
+def _check(options: argparse.Namespace) -> int:
+    from bench.checks.command import run
+    from bench.registry import load_plugins
+
+    load_plugins(options.plugin)
+    return 0 if run(options.name, options.plugin, print) else 1
+
+
 def _plot(options: argparse.Namespace) -> int:
     from bench.problem import Problem
     from bench.registry import load_plugins
     from bench.report import finish
-    from bench.store import read
+    from bench.store import configuration
+    from sims.base import InputError
 
     load_plugins(options.plugin)
-    finish(options.run, Problem(read(options.run).experiment), print)
+    if len(options.runs) > 1 or options.out:
+        from bench.summary import across
+
+        if not options.out:
+            raise InputError("several comparisons give one result: name a folder for it with --out DIR")
+        across(options.runs, options.out, print)
+        return 0
+    finish(options.runs[0], Problem(configuration(options.runs[0]).experiment), print)
     return 0
 
 

@@ -123,7 +123,8 @@ def drive(
             used += n
             tuner_time.append((n, now - before))
             simulator_time.append((n, after - now))
-            points.setflags(write=False)
+            points.setflags(write=False)  # the tuner gets these very arrays: sorting them would spoil the record
+            loss.setflags(write=False)
             proposals.append(points)
             losses.append(loss)
             for i, value in enumerate(loss.tolist()):

@@ -62,6 +62,7 @@ class Experiment:
         same_targets_as: another experiment whose targets are met; its own where empty.
         training_budget: simulations that a learned tuner may train with.
         timeout: seconds a run may take.
+        memory: MiB that a run may take beside what its worker holds; 0 is no limit.
         noise: standard deviation of the sensor noise added to simulated targets, by channel.
         settings: the simulator's own settings, e.g. its time step.
         world: settings of the simulator that makes the targets, where it is another: another engine, effects with
@@ -69,6 +70,7 @@ class Experiment:
         constants: constants other than the simulator's defaults.
         parameters: changes to parameters' nominal, bounds, training range.
         initial: initial state: a number, or [low, high] for uniform between.
+        inputs: input signals by name, as `simgap simulate` writes them, e.g. ``sine:2:0.5`` (`bench.signals`).
         sampling: sample times of simulated targets.
         recording: the measured data, for range real.
         tuners: the entries.
@@ -87,12 +89,14 @@ class Experiment:
     same_targets_as: str = ""
     training_budget: int = 1600
     timeout: float = 3600.0
+    memory: int = 0
     noise: Mapping[str, float] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     world: Mapping[str, Any] = field(default_factory=dict)
     constants: Mapping[str, float] = field(default_factory=dict)
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     initial: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
     sampling: Sampling = field(default_factory=Sampling)
     recording: Source | None = None
     tuners: tuple[Entry, ...] = ()
@@ -101,6 +105,8 @@ class Experiment:
         for what in ("targets", "seeds", "budget"):
             if getattr(self, what) < 1:
                 raise InputError(f"experiment {self.name}: {what} must be at least 1, found {getattr(self, what)}")
+        if self.memory < 0 or not self.timeout > 0:
+            raise InputError(f"experiment {self.name}: expected timeout > 0 and memory >= 0")
         for name in self.ranges:
             if name not in RANGES:
                 raise unknown("range", name, RANGES)
@@ -183,12 +189,14 @@ _TYPES: dict[str, type | tuple[type, ...]] = {
     "same_targets_as": str,
     "training_budget": int,
     "timeout": (int, float),
+    "memory": int,
     "noise": dict,
     "settings": dict,
     "world": dict,
     "constants": dict,
     "parameters": dict,
     "initial": dict,
+    "inputs": dict,
     "sampling": dict,
     "recording": dict,
 }
@@ -206,6 +214,8 @@ def _field(path: Path, key: str, value: Any) -> Any:
         return {k: dict(_parameter(path, k, v)) for k, v in value.items()}
     if key == "initial":
         return {k: _initial(path, f"initial.{k}", v) for k, v in value.items()}
+    if key == "inputs":
+        return {k: str(_checked(path, f"inputs.{k}", v, str)) for k, v in value.items()}
     if key == "sampling":
         return Sampling(**_table(path, key, value, {"rate": (int, float), "samples": int}))
     if key == "recording":

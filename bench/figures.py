@@ -6,6 +6,7 @@ Made for print: every tuner has its own marker and line style beside its colour,
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,11 +65,11 @@ def draw(folder: Path, experiment: Experiment, runs: pd.DataFrame, channel_unit:
     import matplotlib
 
     matplotlib.use("Agg")
-    made = [_save(folder, "error-vs-simulations", _samples_figure(experiment, runs, channel_unit, parameter))]
+    made = [save(folder, "error-vs-simulations", _samples_figure(experiment, runs, channel_unit, parameter))]
     if experiment.world:
-        made.append(_save(folder, "misfit-vs-simulations", _misfit_figure(experiment, runs, channel_unit)))
+        made.append(save(folder, "misfit-vs-simulations", _misfit_figure(experiment, runs, channel_unit)))
     if "wide" in experiment.ranges and runs.loc[runs["range"] == "wide", "outside"].gt(0).any():
-        made.append(_save(folder, "error-vs-distance", _distance_figure(experiment, runs, parameter)))
+        made.append(save(folder, "error-vs-distance", _distance_figure(experiment, runs, parameter)))
     return made
 
 
@@ -82,7 +83,7 @@ def _samples_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: st
         label = _parameter_label(parameter)
         ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
         panels = [(runs[runs["range"] == r], metric, _TITLES[r], label) for r in ranges]
-    figure, axes = _canvas(len(panels))
+    figure, axes = canvas(len(panels))
     style = Styles(experiment, runs, panels[0][1])
     for axis, (part, metric, title, label) in zip(axes, panels, strict=True):
         _samples_panel(axis, part, metric, experiment.budget, style)
@@ -90,14 +91,14 @@ def _samples_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: st
         what = "starts" if "real" in experiment.ranges else "targets"
         axis.set_title(f"{title} ({targets} {what})", fontsize=10)
         axis.set_ylabel(f"{label}, median")
-    _finish(figure, axes, style, experiment)
+    finish(figure, axes, style, experiment)
     return figure
 
 
 def _misfit_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: str) -> Figure:
     """What tuning leaves where the targets come from another simulator: the floor that no parameter removes."""
     ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
-    figure, axes = _canvas(len(ranges))
+    figure, axes = canvas(len(ranges))
     style = Styles(experiment, runs, "obs_error")
     for axis, kind in zip(axes, ranges, strict=True):
         part = runs[runs["range"] == kind]
@@ -110,7 +111,7 @@ def _misfit_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: str
         )  # fmt: skip
         axis.set_title(f"{_TITLES[kind]} ({part['target'].nunique()} targets)", fontsize=10)
         axis.set_ylabel(f"RMSE of {channel_unit}, median")
-    _finish(figure, axes, style, experiment)
+    finish(figure, axes, style, experiment)
     return figure
 
 
@@ -146,7 +147,7 @@ def _distance_figure(experiment: Experiment, runs: pd.DataFrame, parameter: str)
     bins = pd.Series(places, index=distances.index)
     counts = [int((bins == b).sum()) for b in range(-1, 4)]
     names = ["inside", *(f"{edges[b]:.2f}–{edges[b + 1]:.2f}" for b in range(4))]
-    figure, axes = _canvas(len(moments))
+    figure, axes = canvas(len(moments))
     style = Styles(experiment, runs, metric)
     for axis, k in zip(axes, moments, strict=True):
         for tuner, group in wide.groupby("tuner", sort=False):
@@ -157,7 +158,7 @@ def _distance_figure(experiment: Experiment, runs: pd.DataFrame, parameter: str)
         axis.set_title(f"After {k} simulations", fontsize=10)
         axis.set_xlabel("distance of the target from the training range,\nin widths of that range; n targets")
         axis.set_ylabel(f"{_parameter_label(parameter)}, median")
-    _finish(figure, axes, style, experiment)
+    finish(figure, axes, style, experiment)
     return figure
 
 
@@ -189,7 +190,7 @@ class Styles:
     def __init__(self, experiment: Experiment, runs: pd.DataFrame, metric: str) -> None:
         present = set(runs["tuner"].unique())
         self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
-        last = runs.sort_values("k").groupby(["tuner", "run"])[metric].last().groupby(level="tuner").median()
+        last = runs.drop_duplicates("run", keep="last").groupby("tuner")[metric].median()  # rows stand in order of k
         self.order: Sequence[str] = sorted(self._places, key=lambda label: float(last.get(label, np.inf)))
 
     def of(self, tuner: str) -> dict[str, Any]:
@@ -208,7 +209,8 @@ class Styles:
         return (self._places[tuner] - (len(self._places) - 1) / 2) * 0.6 / max(len(self._places), 1)
 
 
-def _canvas(panels: int) -> tuple[Figure, list[Axes]]:
+def canvas(panels: int) -> tuple[Figure, list[Axes]]:
+    """A figure with so many panels side by side, which share their vertical axis."""
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(1, panels, figsize=(1.2 + 4.3 * panels, 4.6), squeeze=False, sharey=True)
@@ -218,14 +220,20 @@ def _canvas(panels: int) -> tuple[Figure, list[Axes]]:
     return figure, list(axes[0])
 
 
-def _finish(figure: Figure, axes: list[Axes], style: Styles, experiment: Experiment) -> None:
-    handles = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
+def finish(
+    figure: Figure, axes: list[Axes], style: Styles, experiment: Experiment, caption: str = _CAPTION,
+    heading: str = "best at the end first",
+) -> None:  # fmt: skip
+    """Legend, title and caption."""
+    handles: dict[str, Any] = {}
+    for axis in reversed(axes):  # a panel may lack a tuner that another has
+        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
     labels = [label for label in style.order if label in handles]
     figure.legend(
         [handles[label] for label in labels],
         labels,
         loc="outside right upper",
-        title="best at the end first",
+        title=heading,
         fontsize=9,
         title_fontsize=8,
         frameon=False,
@@ -235,10 +243,11 @@ def _finish(figure: Figure, axes: list[Axes], style: Styles, experiment: Experim
         if axis.get_ylabel() == axes[0].get_ylabel():
             axis.set_ylabel("")
     figure.suptitle(experiment.title or experiment.name, fontsize=11)
-    figure.supxlabel(_CAPTION, fontsize=7.5, color="#444444")
+    figure.supxlabel(textwrap.fill(caption, int(17 * figure.get_figwidth())), fontsize=7.5, color="#444444")
 
 
-def _save(folder: Path, name: str, figure: Figure) -> Path:
+def save(folder: Path, name: str, figure: Figure) -> Path:
+    """Write a figure as PNG and PDF below `folder`/figures and close it; returns the PNG."""
     from matplotlib import pyplot as plt
 
     target = folder / "figures"

@@ -16,6 +16,7 @@ from bench.experiment import Experiment
 from bench.measured import Side, measured
 from bench.registry import simulators
 from bench.seeds import rng_for
+from bench.signals import signal
 from methods.base import Array, BudgetExceededError
 from sims.base import InputError, Scenario, Simulator, UnitCube, adjusted, unknown
 
@@ -48,10 +49,11 @@ class Target:
 
 
 class Problem:
-    """What an experiment tunes: simulator, unit cube, observed channels and their scale."""
+    """What an experiment tunes: simulator, unit cube, observed channels and their scale; counts what it simulates."""
 
     def __init__(self, experiment: Experiment) -> None:
         self.experiment = experiment
+        self.simulated = 0
         kind = simulators.get(experiment.simulator)
         observe = experiment.observe or tuple(c.name for c in kind.channels)
         self.simulator = self._simulator(kind, observe, experiment.settings)
@@ -89,18 +91,21 @@ class Problem:
 
     def simulate(self, points: Array, scenarios: tuple[Scenario, ...]) -> Array:
         """Observations (n, T, C) of unit-cube points (n, dim), the scenarios' samples one after another."""
+        self.simulated += len(points)
         theta = self.cube.physical(points)
         if len(scenarios) == 1:
             return self.simulator.simulate(theta, scenarios[0])
         return np.concatenate([self.simulator.simulate(theta, s) for s in scenarios], axis=1)
 
     def scenarios(self, rng: np.random.Generator) -> tuple[Scenario, ...]:
-        """The recording's training runs, or one run with an initial state drawn as the experiment says."""
+        """The recording's training runs, or one run with initial state and inputs drawn as the experiment says."""
         if self._measured:
             return self._measured.fitting.scenarios
         sampling = self.experiment.sampling
         initial = {k: rng.uniform(*v) if isinstance(v, tuple) else v for k, v in self.experiment.initial.items()}
-        return (Scenario(np.arange(sampling.samples) / sampling.rate, initial),)
+        times = np.arange(sampling.samples) / sampling.rate
+        inputs = {name: signal(text, times, rng) for name, text in self.experiment.inputs.items()}
+        return (Scenario(times, initial, inputs),)
 
     def target(self, kind: str, index: int) -> Target:
         """Target `index` of range `kind`; it depends on the experiment's name, not on tuners, seeds or budgets."""

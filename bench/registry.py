@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import re
 import sys
 from collections.abc import Iterable
 from functools import lru_cache
@@ -114,6 +115,7 @@ def load_plugins(paths: Iterable[str | Path]) -> None:
         if not parts:
             raise InputError(f"plugin {path}: defines neither a Tuner nor a Simulator nor an Effect")
         for part in parts:
+            _named(part, path)
             if issubclass(part, Tuner):
                 tuners.add(part, path)
             elif issubclass(part, Simulator):
@@ -129,6 +131,19 @@ def _extended(path: Path) -> type[Simulator]:
     return load(path)
 
 
+_NAME = re.compile(r"[A-Za-z0-9][\w.+-]{0,60}$")
+
+
+def _named(part: type, path: Path) -> None:
+    """Refuse a name that tables, files and command lines could not hold."""
+    name = getattr(part, "name", None)
+    if not (isinstance(name, str) and _NAME.match(name)):
+        raise InputError(f"plugin {path}: class {part.__name__}: expected name = 'plain_name', found {name!r:.80}")
+    requires = getattr(part, "requires", ())
+    if not (isinstance(requires, tuple | list) and all(isinstance(r, str) for r in requires)):
+        raise InputError(f"plugin {path}: class {part.__name__}: expected requires = ('package', ...)")
+
+
 def _run(path: Path) -> ModuleType:
     if not path.is_file():
         raise InputError(f"plugin {path}: no such file")
@@ -141,6 +156,6 @@ def _run(path: Path) -> ModuleType:
         spec.loader.exec_module(module)
     except SyntaxError as error:
         raise InputError(f"plugin {path}, line {error.lineno}: {error.msg}") from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(f"plugin {path}: {type(error).__name__}: {error}") from error
     return module

@@ -1,27 +1,23 @@
-"""Runs an experiment: tuners x targets x seeds in worker processes, hard time limits, nothing lost on Ctrl-C."""
+"""Runs an experiment: tuners x targets x seeds in worker processes; every finished run is kept the moment it ends."""
 
 from __future__ import annotations
 
 import math
-import multiprocessing
-import os
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 from bench.experiment import Entry, Experiment
+from bench.guard import limits
+from bench.identity import Identities
+from bench.pools import Call, DeathError, LocalPool, LostError, Pool
 from bench.problem import Problem, Target
 from bench.registry import SkippedError, tuners
 from bench.scores import Status, rows, status_of, unfinished
 from bench.training import Training, build, train
-from bench.worker import Order, Outcome, initialise, perform
+from bench.worker import Order, Outcome, perform
 from sims.base import InputError
-
-_GRACE = 30.0
-"""Seconds by which the hard limit, which kills, exceeds the soft one, which a cooperative run meets by itself."""
-
 
 Progress = Callable[[str, int], Callable[[], None]]
 """Called with a title and a number of steps; gives the function to call after each step."""
@@ -31,17 +27,48 @@ def _silent(_title: str, _steps: int) -> Callable[[], None]:
     return lambda: None
 
 
+class Keep(Protocol):
+    """Where finished runs go, each by its place in the plan; `statuses` says which there are."""
+
+    statuses: dict[int, Status]
+
+    def add(self, place: int, columns: Mapping[str, Any], status: Status) -> None:
+        """Keep the rows and the status of a finished run."""
+        ...
+
+
+class Memory:
+    """Keeps runs in memory."""
+
+    def __init__(self) -> None:
+        self.columns: dict[int, Mapping[str, Any]] = {}
+        self.statuses: dict[int, Status] = {}
+
+    def add(self, place: int, columns: Mapping[str, Any], status: Status) -> None:
+        """Keep the rows and the status of a finished run."""
+        self.columns[place], self.statuses[place] = columns, status
+
+
 @dataclass
 class Results:
-    """What a comparison has so far: columns and status of each run by its place in the plan, and what training cost."""
+    """A comparison: its problem, its plan once there is one, where its runs are kept, and what training cost."""
 
     problem: Problem
-    columns: dict[int, dict[str, Any]] = field(default_factory=dict)
-    statuses: dict[int, Status] = field(default_factory=dict)
+    kept: Keep = field(default_factory=Memory)
+    plan: list[Job] = field(default_factory=list)
     trainings: dict[tuple[str, int], Training] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
-    planned: int = 0
     interrupted: bool = False
+    stopped: str = ""
+
+    def skipped_rows(self) -> list[dict[str, Any]]:
+        """Rows of status.csv for tuners that could not be used."""
+        simulator = self.problem.experiment.simulator
+        fixed = {"target": "", "seed": 0, "status": "skipped", "simulations": 0, "seconds": 0.0}
+        return [
+            {"run": label, "tuner": label, "simulator": simulator, **fixed, "reason": reason}
+            for label, reason in self.skipped.items()
+        ]
 
 
 @dataclass(frozen=True)
@@ -72,14 +99,31 @@ def check(experiment: Experiment) -> dict[str, str]:
 
 
 def prepare(experiment: Experiment) -> Results:
-    """Check an experiment whole before any work: its simulator, recording, tuners and their options.
+    """Check an experiment whole before any work: its simulator, recording, tuners and their options; plan its runs.
 
     Raises:
         InputError: a fault in it.
     """
     if not experiment.tuners:
         raise InputError(f"experiment {experiment.name}: names no tuner; add a [tuners.NAME] table or use --tuners")
-    return Results(Problem(experiment), skipped=check(experiment))
+    if experiment.memory:
+        limits()
+    results = Results(Problem(experiment), skipped=check(experiment))
+    entries = [entry for entry in experiment.tuners if entry.label not in results.skipped]
+    results.plan = list(_plan(experiment, entries, results.problem.targets()))
+    results.problem.close()
+    return results
+
+
+def _plan(experiment: Experiment, entries: list[Entry], targets: list[Target]) -> Iterator[Job]:
+    """Every run, target by target, so that the time left can be estimated from the time gone."""
+    name = Identities(experiment).run
+    for target in targets:
+        for entry in entries:
+            budget = entry.budget or experiment.budget
+            for seed in range(seeds_of(experiment, entry)):
+                run = name(entry, target.sealed, seed, budget)
+                yield Job(Order(run, entry, seed, target.sealed, budget), target)
 
 
 def run(
@@ -87,44 +131,70 @@ def run(
     plugins: Sequence[str] = (),
     jobs: int = 2,
     progress: Progress = _silent,
+    pool: Pool | None = None,
 ) -> None:
-    """Make every run of a prepared experiment; `results` gets each as it ends.
+    """Make every run of a prepared experiment that is not kept already; `results.kept` gets each as it ends.
 
     Args:
         results: from `prepare`.
         plugins: plugin files that workers need; the caller has loaded them in this process.
         jobs: worker processes. The results do not depend on their number.
         progress: told of every step.
+        pool: where to run instead, e.g. on a cluster.
+
+    Raises:
+        InputError: workers cannot be had.
     """
-    experiment = results.problem.experiment
-    targets = results.problem.targets()
-    results.problem.close()
-    entries = [entry for entry in experiment.tuners if entry.label not in results.skipped]
-    with _Pool(jobs, plugins) as pool:
+    with pool or LocalPool(jobs) as workers:
+        workers.load(plugins)
         try:
-            failures = _train(pool, experiment, entries, results, progress)
-            plan = list(_plan(experiment, entries, targets, results.trainings))
-            results.planned = len(plan)
-            step = progress("running", len(plan))
-            untrained = {i for i, job in enumerate(plan) if (job.order.entry.label, job.order.seed) in failures}
-            for i in sorted(untrained):
-                _file(results, i, plan[i], failures[plan[i].order.entry.label, plan[i].order.seed])
-                step()
-            ready = [i for i in range(len(plan)) if i not in untrained]
-            calls = [(perform, (experiment, plan[i].order)) for i in ready]
-            for place, outcome in pool.results(calls, experiment.timeout):
-                _file(results, ready[place], plan[ready[place]], outcome)
-                step()
+            _run(results, workers, progress)
         except KeyboardInterrupt:
             results.interrupted = True
+        except LostError as error:
+            results.stopped = str(error)
 
 
-def _train(
-    pool: _Pool, experiment: Experiment, entries: list[Entry], results: Results, progress: Progress
-) -> dict[tuple[str, int], Exception]:
+def _run(results: Results, pool: Pool, progress: Progress) -> None:
+    missing = [place for place in range(len(results.plan)) if place not in results.kept.statuses]
+    failures = _train(pool, results, progress)
+    step = progress("running", len(missing))
+    ready: list[int] = []
+    for place in missing:
+        order = results.plan[place].order
+        if (failure := failures.get((order.entry.label, order.seed))) is not None:
+            _file(results, place, failure)
+            step()
+        else:
+            ready.append(place)
+    calls = _Calls(results, ready)
+    for i, outcome in pool.results(calls, results.problem.experiment.timeout):
+        _file(results, ready[i], outcome)
+        step()
+
+
+class _Calls(Sequence[Call]):
+    """The calls for these places of the plan, each made when it is asked for: a million of them would fill memory."""
+
+    def __init__(self, results: Results, places: list[int]) -> None:
+        self._results, self._places = results, places
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, i: Any) -> Any:
+        order = self._results.plan[self._places[i]].order
+        training = self._results.trainings.get((order.entry.label, order.seed))
+        if training is not None:
+            order = replace(order, weights=training.path)
+        return perform, (self._results.problem.experiment, order)
+
+
+def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, int], Exception]:
     """Train every learned entry with each of its seeds; returns the reasons of those that failed."""
-    learned = [e for e in entries if tuners.get(e.tuner).learned]
-    wanted = [(e, seed) for e in learned for seed in range(seeds_of(experiment, e))]
+    experiment = results.problem.experiment
+    usable = [e for e in experiment.tuners if e.label not in results.skipped and tuners.get(e.tuner).learned]
+    wanted = [(e, seed) for e in usable for seed in range(seeds_of(experiment, e))]
     failures: dict[tuple[str, int], Exception] = {}
     if wanted:
         step = progress("training", len(wanted))
@@ -139,67 +209,15 @@ def _train(
     return failures
 
 
-def _plan(
-    experiment: Experiment,
-    entries: list[Entry],
-    targets: list[Target],
-    trainings: dict[tuple[str, int], Training],
-) -> Iterator[Job]:
-    """Every run, target by target, so that the time left can be estimated from the time gone."""
-    for target in targets:
-        for entry in entries:
-            for seed in range(seeds_of(experiment, entry)):
-                training = trainings.get((entry.label, seed))
-                weights = training.path if training else None
-                yield Job(Order(entry, seed, target.sealed, entry.budget or experiment.budget, weights), target)
-
-
-def _file(results: Results, place: int, job: Job, outcome: Outcome | Exception) -> None:
+def _file(results: Results, place: int, outcome: Outcome | Exception) -> None:
     """Keep what a worker gave back: an outcome, or the error that ended it."""
-    problem = results.problem
+    problem, job = results.problem, results.plan[place]
     if isinstance(outcome, TimeoutError):
         reason = f"killed past its limit of {problem.experiment.timeout:g} s"
         outcome = unfinished(problem, job.target, "timeout", reason)
+    elif isinstance(outcome, DeathError):
+        outcome = unfinished(problem, job.target, "crashed", str(outcome))
     elif isinstance(outcome, Exception):
         reason = "".join(traceback.format_exception(outcome))
         outcome = unfinished(problem, job.target, "crashed", reason)
-    results.columns[place] = rows(problem, job.order, job.target, outcome)
-    results.statuses[place] = status_of(problem, job.order, outcome)
-
-
-class _Pool:
-    """Worker processes, each a fresh interpreter with one arithmetic thread; a task past its limit is killed."""
-
-    _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-    def __init__(self, jobs: int, plugins: Sequence[str]) -> None:
-        from pebble import ProcessPool
-
-        self._jobs = jobs
-        for name in self._THREADS:
-            os.environ.setdefault(name, "1")
-        context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPool(jobs, initializer=initialise, initargs=(list(plugins),), context=context)
-
-    def __enter__(self) -> _Pool:
-        return self
-
-    def __exit__(self, kind: object, *rest: object) -> None:
-        self._pool.stop()  # type: ignore[no-untyped-call]
-        self._pool.join()
-
-    def results(self, calls: Sequence[tuple[Any, tuple[Any, ...]]], seconds: float) -> Iterator[tuple[int, Any]]:
-        """Place and result (or exception) of each call, as they finish; few are handed over ahead of time."""
-        limit = None if math.isinf(seconds) else seconds + _GRACE
-        waiting: dict[Future[Any], int] = {}
-        following = iter(enumerate(calls))
-        while True:
-            while len(waiting) < 4 * self._jobs and (item := next(following, None)) is not None:
-                place, (function, arguments) = item
-                waiting[self._pool.schedule(function, args=arguments, timeout=limit)] = place
-            if not waiting:
-                return
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                place = waiting.pop(future)
-                error = future.exception()
-                yield place, future.result() if error is None else error
+    results.kept.add(place, rows(problem, job.order, job.target, outcome), status_of(problem, job.order, outcome))

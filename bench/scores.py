@@ -27,11 +27,6 @@ class Status:
     seconds: float
 
 
-def run_name(order: Order) -> str:
-    """The run's id: tuner, target and seed."""
-    return f"{order.entry.label}/{order.target.name}/{order.seed}"
-
-
 def unfinished(problem: Problem, target: Target, status: str, reason: str) -> Outcome:
     """The outcome of a run of which nothing but its end is known: it stands where it started, with no simulation."""
     nothing, start = np.empty(0), target.sealed.start[None]
@@ -43,7 +38,7 @@ def status_of(problem: Problem, order: Order, outcome: Outcome) -> Status:
     """The status row of a run."""
     trace = outcome.trace
     return Status(
-        run=run_name(order),
+        run=order.run,
         tuner=order.entry.label,
         simulator=problem.experiment.simulator,
         target=order.target.name,
@@ -60,7 +55,7 @@ def rows(problem: Problem, order: Order, target: Target, outcome: Outcome) -> di
     trace = outcome.trace
     k = len(trace.losses)
     columns: dict[str, Any] = {
-        "run": [run_name(order)] * (k + 1),
+        "run": [order.run] * (k + 1),
         "experiment": [problem.experiment.name] * (k + 1),
         "tuner": [order.entry.label] * (k + 1),
         "simulator": [problem.experiment.simulator] * (k + 1),

@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
+from bench.curves import Curves, Rows, mean_over_seeds
 from bench.seeds import rng_for
 from methods.base import Array
 
@@ -22,7 +24,7 @@ METRICS = ("param_abs_error", "param_error", "obs_error", "heldout_error")
 FAILURES = ("crashed", "timeout", "diverged", "skipped")
 COLUMNS = [
     "experiment", "tuner", "range", "simulations", "metric", "median", "mean", "low", "high",
-    "runs", "failures", "fit_simulations", "fit_seconds",
+    "runs", "failures", "fit_simulations", "fit_seconds", "tuner_seconds", "simulator_seconds",
 ]  # fmt: skip
 
 
@@ -48,36 +50,45 @@ def table(
         resamples: bootstrap resamples.
     """
     points = checkpoints(budget)
-    failed = statuses[statuses["status"].isin(FAILURES)].groupby("run").size()
+    rows = Rows(runs, statuses, budget)
+    spent = [rows.spent(name) if name in runs else None for name in ("tuner_seconds", "simulator_seconds")]
+    curves = {m: rows.curves(m) for m in METRICS if m in runs and runs[m].notna().any()}
     lines = []
-    metrics = [m for m in METRICS if m in runs and runs[m].notna().any()]
-    for (experiment, tuner, kind), group in runs.groupby(["experiment", "tuner", "range"], sort=False):
-        names = group["run"].unique()
+    for (experiment, tuner, kind), part in rows.keys.groupby(["experiment", "tuner", "range"], sort=False):
+        mine = part.index.to_numpy()
         fit = (trainings or {}).get(str(tuner), (0.0, 0.0))
-        for metric in metrics:
-            curves = target_curves(group, metric, points).to_numpy(dtype=np.float64)
-            low, high = interval(curves, np.mean, str(tuner), str(kind), metric, resamples=resamples)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RuntimeWarning)  # a column of failures alone has no mean: NaN, shown
-                median, mean = np.nanmedian(curves, axis=0), np.nanmean(curves, axis=0)
-            for i, k in enumerate(points):
-                values = (median[i], mean[i], low[i], high[i], len(names), int(failed.reindex(names).sum()), *fit)
-                lines.append((experiment, tuner, kind, k, metric, *values))
+        seconds = [np.full(len(points), np.nan) if s is None else s[mine][:, points].mean(axis=0) for s in spent]
+        counts = len(mine), int(rows.failed[mine].sum())
+        for metric, curve in curves.items():
+            values = _over_targets(curve, mine, points, (str(tuner), str(kind), metric), resamples)
+            lines += [
+                (experiment, tuner, kind, k, metric, *values[:, i], *counts, *fit, seconds[0][i], seconds[1][i])
+                for i, k in enumerate(points)
+            ]
     skipped = statuses[statuses["status"] == "skipped"]
-    nothing = (0, "", *[np.nan] * 4, 0, 1, 0.0, 0.0)
+    nothing = (0, "", *[np.nan] * 4, 0, 1, 0.0, 0.0, np.nan, np.nan)
     lines += [(runs["experiment"].iloc[0] if len(runs) else "", t, "", *nothing) for t in skipped["tuner"]]
     return pd.DataFrame(lines, columns=COLUMNS)
 
 
-def run_curves(runs: pd.DataFrame, metric: str, points: list[int]) -> pd.DataFrame:
-    """One row a run (index target, run), one column for each of `points`: the metric after so many simulations."""
-    wide = runs.pivot(index=["target", "run"], columns="k", values=metric)
-    return wide.reindex(columns=range(max(points) + 1)).ffill(axis=1)[points]
+def _over_targets(
+    curves: Curves, mine: NDArray[np.int64], points: list[int], names: tuple[str, str, str], resamples: int
+) -> Array:
+    """(4, len(points)): median, mean, low and high over targets of the runs in rows `mine`."""
+    _, groups = curves.where(np.isin(np.arange(len(curves.used)), mine)).by_target()
+    values = mean_over_seeds(curves.values[mine][:, points], groups)
+    low, high = interval(values, np.mean, *names, resamples=resamples)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a column of failures alone has no mean: NaN, shown
+        return np.array([np.nanmedian(values, axis=0), np.nanmean(values, axis=0), low, high])
 
 
 def target_curves(runs: pd.DataFrame, metric: str, points: list[int]) -> pd.DataFrame:
     """One row a target (sorted), one column for each of `points`: the mean over the seeds of its runs."""
-    return run_curves(runs, metric, points).groupby(level="target").mean()
+    rows = Rows(runs, pd.DataFrame({"run": [], "status": []}), max(points))
+    names, groups = (curves := rows.curves(metric)).by_target()
+    values = mean_over_seeds(curves.values[:, points], groups)
+    return pd.DataFrame(values, index=pd.Index(names, name="target"), columns=points)
 
 
 def interval(values: Array, statistic: Callable[..., Any], *names: str, resamples: int = 2000) -> tuple[Array, Array]:

@@ -5,32 +5,34 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime, timezone
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from bench import __version__
 from bench.experiment import Experiment, parse
+from bench.journal import FOLDER, Journal, replace_text
 from sims.base import InputError
 from sims.recording import read_toml
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from bench.runner import Results
+    from bench.training import Training
+
+STATUS_COLUMNS = ["run", "tuner", "simulator", "target", "seed", "status", "reason", "simulations", "seconds"]
 
 
-def new_folder(experiment: Experiment, out: str | None, results: Path = Path("results")) -> Path:
-    """Make the folder of a new run: `out`, or one below results/ named for the experiment and the time.
+def free_folder(experiment: Experiment, out: str | None, results: Path = Path("results")) -> Path:
+    """Where a new run may be written: `out`, or a folder below results/ named for the experiment and the time.
 
     Raises:
-        InputError: `out` exists and has something in it, or cannot be made.
+        InputError: `out` exists and has something in it.
     """
     stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
     folder = Path(out) if out else results / f"{experiment.name}-{stamp}"
@@ -39,33 +41,54 @@ def new_folder(experiment: Experiment, out: str | None, results: Path = Path("re
         number += 1
         folder = results / f"{experiment.name}-{stamp}-{number}"
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"--out {folder}: exists and is not empty; results are never overwritten, name another folder")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {folder}: cannot be made ({error.strerror})") from None
+        raise InputError(
+            f"--out {folder}: exists and is not empty; results are never overwritten: "
+            f"name another folder, or finish what is in it with --resume {folder}"
+        )
     return folder
 
 
-def write_configuration(folder: Path, experiment: Experiment, plugins: Sequence[str], jobs: int) -> None:
-    """Write experiment.toml and environment.json."""
+class Configuration(NamedTuple):
+    """What a folder is for: the experiment, how it was started, and hashes of what must not change."""
+
+    experiment: Experiment
+    plugins: list[str]
+    fingerprint: dict[str, str]
+
+
+def create(folder: Path, configuration: Configuration, jobs: int) -> None:
+    """Make the folder with experiment.toml and environment.json in it, all at once or not at all.
+
+    Raises:
+        InputError: it cannot be made.
+    """
     import tomli_w
 
-    text = tomli_w.dumps(_plain(experiment.document()))
-    (folder / "experiment.toml").write_text(text, encoding="utf-8")
+    experiment = configuration.experiment
     environment = {
         "simgap": __version__,
         "experiment": experiment.name,
-        "plugins": [str(Path(p).resolve()) for p in plugins],
+        "plugins": [str(Path(p).resolve()) for p in configuration.plugins],
         "jobs": jobs,
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "python": sys.version,
         "platform": platform.platform(),
         "machine": platform.machine(),
         "processors": os.cpu_count(),
+        "fingerprint": configuration.fingerprint,
         "packages": dict(sorted({d.metadata["Name"]: d.version for d in distributions()}.items())),
     }
-    (folder / "environment.json").write_text(json.dumps(environment, indent=1) + "\n", encoding="utf-8")
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+        text = tomli_w.dumps(_plain(experiment.document()))
+        (partial / "experiment.toml").write_text(text, encoding="utf-8")
+        (partial / "environment.json").write_text(json.dumps(environment, indent=1) + "\n", encoding="utf-8")
+        (partial / FOLDER).mkdir()
+        partial.replace(folder)
+    except OSError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise InputError(f"--out {folder}: cannot be made ({error.strerror})") from None
 
 
 def _plain(value: Any) -> Any:
@@ -77,27 +100,66 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def write_results(folder: Path, results: Results) -> None:
-    """Write runs.parquet, status.csv and training.csv in the order of the plan."""
+def configuration(folder: Path) -> Configuration:
+    """What the folder of a comparison is for.
+
+    Raises:
+        InputError: it is no such folder, or a file in it is damaged.
+    """
+    path = folder / "experiment.toml"
+    if not path.is_file():
+        raise InputError(f"{folder}: expected the folder of a comparison with experiment.toml in it, found none")
+    environment = _environment(folder)
+    plugins, fingerprint = environment.get("plugins", []), environment.get("fingerprint", {})
+    if not _texts(plugins) or not isinstance(fingerprint, dict) or not _texts(list(fingerprint.values())):
+        raise InputError(f"{folder / 'environment.json'}: expected lists of plugins and hashes, found something else")
+    experiment = parse(str(environment["experiment"]), read_toml(path), path)
+    return Configuration(experiment, plugins, fingerprint)
+
+
+def _texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, str) for item in value)
+
+
+def _environment(folder: Path) -> dict[str, Any]:
+    path = folder / "environment.json"
+    try:
+        environment = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{folder}: not a complete comparison: {path.name}: {_line(error)}") from None
+    if not isinstance(environment, dict) or not isinstance(environment.get("experiment"), str):
+        raise InputError(f"{folder}: not a complete comparison: {path.name} does not name the experiment")
+    return environment
+
+
+def _line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def write_results(
+    folder: Path, journal: Journal, trainings: Mapping[tuple[str, int], Training], skipped: Iterable[Mapping[str, Any]]
+) -> None:
+    """Write runs.parquet, training.csv and status.csv in the order of the plan, each whole or not at all."""
     import pandas as pd
+    import pyarrow as pa
+    from pyarrow import parquet
 
-    columns = [results.columns[i] for i in sorted(results.columns)]
-    runs = pd.DataFrame({name: np.concatenate([c[name] for c in columns]) for name in (columns[0] if columns else ())})
-    statuses = pd.DataFrame([asdict(results.statuses[i]) for i in sorted(results.statuses)] + _skipped(results))
-    runs.to_parquet(folder / "runs.parquet", compression="zstd", index=False)
-    statuses.to_csv(folder / "status.csv", index=False)
-    trained = [(label, seed, t.simulations, t.seconds) for (label, seed), t in sorted(results.trainings.items())]
+    partial = folder / ".runs.parquet.partial"
+    writer = None
+    for rows in journal.tables():
+        writer = writer or parquet.ParquetWriter(partial, rows.schema, compression="zstd")
+        writer.write_table(rows)
+    if writer is None:
+        parquet.write_table(pa.table({}), partial)
+    else:
+        writer.close()
+    partial.replace(folder / "runs.parquet")
+    trained = [(label, seed, t.simulations, t.seconds) for (label, seed), t in sorted(trainings.items())]
     training = pd.DataFrame(trained, columns=["tuner", "seed", "simulations", "seconds"])
-    training.to_csv(folder / "training.csv", index=False)
-
-
-def _skipped(results: Results) -> list[dict[str, Any]]:
-    simulator = results.problem.experiment.simulator
-    fixed = {"target": "", "seed": 0, "status": "skipped", "simulations": 0, "seconds": 0.0}
-    return [
-        {"run": label, "tuner": label, "simulator": simulator, **fixed, "reason": reason}
-        for label, reason in results.skipped.items()
-    ]
+    replace_text(folder / "training.csv", training.to_csv(index=False))
+    rows_of_statuses = [asdict(journal.statuses[place]) for place in sorted(journal.statuses)] + list(skipped)
+    statuses = pd.DataFrame(rows_of_statuses, columns=STATUS_COLUMNS)
+    replace_text(folder / "status.csv", statuses.to_csv(index=False))
 
 
 class Stored(NamedTuple):
@@ -109,30 +171,42 @@ class Stored(NamedTuple):
     costs: dict[str, tuple[float, float]]
 
 
-def read(folder: Path) -> Stored:
-    """Read the folder of a comparison.
+def read(folder: Path, columns: Sequence[str] | None = None) -> Stored:
+    """Read the folder of a comparison that was finished or interrupted.
+
+    Args:
+        folder: the comparison's.
+        columns: of the runs, where not all are wanted; those that there are not are left out.
 
     Raises:
         InputError: the folder lacks a file of a comparison, or one is damaged.
     """
     import pandas as pd
+    from pyarrow import ArrowException, parquet
 
-    configuration = folder / "experiment.toml"
-    if not configuration.is_file():
-        raise InputError(f"{folder}: expected the folder of a comparison with experiment.toml in it, found none")
+    experiment = configuration(folder).experiment
+    path = folder / "runs.parquet"
+    if not path.exists() and (folder / FOLDER).exists():
+        raise InputError(f"{folder}: not finished, and nothing written yet; simgap compare --resume {folder}")
     try:
-        name = json.loads((folder / "environment.json").read_text(encoding="utf-8"))["experiment"]
-        runs = pd.read_parquet(folder / "runs.parquet")
+        there = parquet.read_schema(path).names
+        runs = parquet.read_table(path, columns=[c for c in there if columns is None or c in columns]).to_pandas()
         statuses = pd.read_csv(folder / "status.csv", keep_default_na=False)
         training = pd.read_csv(folder / "training.csv")
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{folder}: not a complete comparison: {str(error).splitlines()[0]}") from None
-    experiment = parse(str(name), read_toml(configuration), configuration)
-    return Stored(experiment, runs, statuses, _costs(training))
+        missing = {"run", "tuner", "k"} - set(runs.columns) if len(runs.columns) else set()
+        missing |= {"run", "tuner", "status", "reason"} - set(statuses.columns)
+        if missing:
+            raise InputError(f"{folder}: not a complete comparison: no column {', '.join(sorted(missing))}")
+        costs = _costs(training)
+    except (OSError, ValueError, KeyError, ArrowException) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{folder}: not a complete comparison: {_line(error)}") from None
+    return Stored(experiment, runs, statuses, costs)
 
 
 def _costs(training: pd.DataFrame) -> dict[str, tuple[float, float]]:
     """Simulations and seconds of one training, the mean over seeds, by tuner."""
     means = training.groupby("tuner")[["simulations", "seconds"]].mean()
-    values = means.to_numpy(dtype=np.float64)
+    values = means.to_numpy(dtype=float)
     return {str(name): (float(row[0]), float(row[1])) for name, row in zip(means.index, values, strict=True)}

@@ -62,35 +62,37 @@ def folder() -> Path:
 def key(experiment: Experiment, entry: Entry, seed: int) -> str:
     """The hash of everything that determines the trained weights."""
     document = experiment.document()
-    training = ("simulator", "observe", "noise", "settings", "constants", "parameters", "initial", "sampling")
+    training = ("simulator", "observe", "noise", "settings", "constants", "parameters", "initial", "inputs", "sampling")
     what = {name: document[name] for name in training} | {
-        "recording": _recording_digest(experiment),
+        "recording": recording_digest(experiment),
         "tuner": entry.tuner,
         "options": dict(entry.options),
         "budget": experiment.training_budget,
         "seed": seed,
-        "source": [_source(tuners.get(entry.tuner)), _source(simulators.get(experiment.simulator))],
-        "versions": [sys.version, *(_version(name) for name in ("numpy", "pybullet", "torch"))],
+        "source": [source(tuners.get(entry.tuner)), source(simulators.get(experiment.simulator))],
+        "versions": [sys.version, *(package_version(name) for name in ("numpy", "pybullet", "torch"))],
     }
     text = json.dumps(what, sort_keys=True, default=str)
     return f"{entry.tuner}-{experiment.simulator}-{seed}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 
-def _recording_digest(experiment: Experiment) -> str:
+def recording_digest(experiment: Experiment) -> str:
+    """Hash of the recording's two files; empty where the experiment has none."""
     if experiment.recording is None:
         return ""
     table = find_recording(experiment.recording.path)
     return hashlib.sha256(table.read_bytes() + table.with_suffix(".toml").read_bytes()).hexdigest()
 
 
-def _source(kind: type) -> str:
+def source(kind: type) -> str:
     """Digest of the source of the package folder (or plugin file) that a class comes from."""
     path = Path(inspect.getfile(kind))
     files = sorted(path.parent.glob("*.py")) if kind.__module__.split(".")[0] in ("methods", "sims") else [path]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
-def _version(name: str) -> str:
+def package_version(name: str) -> str:
+    """Name and version of an installed package, or that it is absent."""
     try:
         return f"{name} {version(name)}"
     except PackageNotFoundError:

@@ -5,8 +5,6 @@ No true parameter ever enters a worker: it gets `SealedTarget`s and returns trac
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -14,8 +12,8 @@ from time import perf_counter
 from bench.drive import Trace, drive
 from bench.evaluate import Evaluator
 from bench.experiment import Entry, Experiment
+from bench.guard import memory_limit
 from bench.problem import Problem, SealedTarget
-from bench.registry import load_plugins
 from bench.seeds import rng_for
 from bench.training import build, trained
 from methods.base import Array, Task
@@ -23,8 +21,9 @@ from methods.base import Array, Task
 
 @dataclass(frozen=True)
 class Order:
-    """One run to make: a tuner on a target with a seed; `weights` is the file of a learned tuner's tensors."""
+    """One run to make: its id, a tuner on a target with a seed; `weights` is the file of a learned tuner's tensors."""
 
+    run: str
     entry: Entry
     seed: int
     target: SealedTarget
@@ -49,10 +48,8 @@ class Outcome:
     seconds: float
 
 
-def initialise(plugins: Sequence[str]) -> None:
-    """Prepare a worker: an interrupt is the parent's to handle, plugins are there, one thread does the arithmetic."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    load_plugins(plugins)
+class CheatError(RuntimeError):
+    """A tuner had points simulated behind the harness's back."""
 
 
 _problems: dict[int, tuple[Experiment, Problem]] = {}
@@ -69,7 +66,11 @@ def problem_of(experiment: Experiment) -> Problem:
 
 
 def perform(experiment: Experiment, order: Order) -> Outcome:
-    """Make one run; failures of the tuner or the simulator are a status of its trace."""
+    """Make one run; failures of the tuner or the simulator are a status of its trace.
+
+    Raises:
+        CheatError: more was simulated than the tuner asked the harness for.
+    """
     problem = problem_of(experiment)
     target = order.target
     tuner = build(order.entry) if order.weights is None else trained(order.entry, order.weights)
@@ -84,9 +85,14 @@ def perform(experiment: Experiment, order: Order) -> Outcome:
         lengths=tuple(s.times.size for s in target.fitting.scenarios),
     )
     rng = rng_for(experiment.name, order.entry.tuner, target.name, order.seed)
+    before = problem.simulated
     started = perf_counter()
-    trace = drive(tuner, task, evaluator, rng, experiment.timeout)
+    with memory_limit(experiment.memory):
+        trace = drive(tuner, task, evaluator, rng, experiment.timeout)
     seconds = perf_counter() - started
+    beside = problem.simulated - before - len(trace.losses)
+    if beside > 0 and trace.status != "crashed":  # a simulator that raises has simulated, and nothing came of it
+        raise CheatError(f"{beside} simulations beside the budget")
     heldout = None
     if target.held_out.scenarios:
         heldout = Evaluator(problem, target.held_out).rmse(trace.proposals[:0], trace.recommendations)

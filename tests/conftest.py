@@ -28,3 +28,18 @@ def recordings():
     if not folder.is_dir():
         pytest.skip(f"no recordings: {folder} is missing (set SIMGAP_DATA)")
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registries_as_before():
+    """What a module's tests register is gone after it, but for the test simulator."""
+    from bench import registry
+    from sims import effects
+
+    parts = (registry.tuners._from_files, registry.simulators._from_files, effects._from_files)
+    before, loaded = [dict(p) for p in parts], set(registry._loaded)
+    yield
+    for part, kept in zip(parts, before, strict=True):
+        for name in [n for n in part if n not in kept and n != "spring"]:
+            del part[name]
+    registry._loaded.intersection_update(loaded | {PLUGINS / "spring.py"})

@@ -4,9 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bench.compare import begin, make
 from bench.registry import load_plugins
 from bench.runner import Results, prepare, run
-from bench.store import read, write_configuration, write_results
+from bench.store import read
 from tests.conftest import PLUGINS
 from tests.experiments import spring_experiment
 
@@ -26,13 +27,13 @@ def compared(experiment, jobs=2) -> Results:
 
 
 def frame(results):
-    return pd.concat([pd.DataFrame(results.columns[i]) for i in sorted(results.columns)], ignore_index=True)
+    columns = results.kept.columns
+    return pd.concat([pd.DataFrame(columns[i]) for i in sorted(columns)], ignore_index=True)
 
 
-def tables(results, folder):
-    folder.mkdir()
-    write_configuration(folder, results.problem.experiment, PLUGIN_FILES, 1)
-    write_results(folder, results)
+def tables(experiment, folder, jobs):
+    folder, results = begin(experiment, PLUGIN_FILES, str(folder), jobs)
+    assert make(folder, results, PLUGIN_FILES, jobs, lambda *_: lambda: None, None)
     return read(folder)
 
 
@@ -56,8 +57,8 @@ def two_workers():
 
 
 def test_table_does_not_depend_on_the_number_of_workers(two_workers, tmp_path):
-    one_worker = compared(spring_experiment(tuners=EVERYTHING), jobs=1)
-    first, second = tables(one_worker, tmp_path / "1"), tables(two_workers, tmp_path / "2")
+    experiment = spring_experiment(tuners=EVERYTHING)
+    first, second = (tables(experiment, tmp_path / str(jobs), jobs) for jobs in (1, 2))
     pd.testing.assert_frame_equal(first.runs.drop(columns=MEASURED), second.runs.drop(columns=MEASURED))
     unlike = ["seconds"]
     pd.testing.assert_frame_equal(first.statuses.drop(columns=unlike), second.statuses.drop(columns=unlike))
@@ -70,7 +71,7 @@ def test_other_tuners_in_the_comparison_change_nothing(two_workers):
 
 
 def test_every_end_has_its_status_and_keeps_its_rows(two_workers):
-    statuses = pd.DataFrame([vars(s) for s in two_workers.statuses.values()])
+    statuses = pd.DataFrame([vars(s) for s in two_workers.kept.statuses.values()])
     kinds = {tuner: set(group["status"]) for tuner, group in statuses.groupby("tuner")}
     assert kinds["crashing"] == kinds["dying"] == {"crashed"}
     assert kinds["nan_proposing"] == {"diverged"}
@@ -127,7 +128,7 @@ def test_obs_error_is_the_rmse_of_the_recommended_simulation(two_workers):
 def test_tuner_that_searches_everything_for_the_truth_finds_none(tmp_path, monkeypatch):
     monkeypatch.setenv("SNOOPED", str(tmp_path / "numbers.json"))
     results = compared(spring_experiment(tuners={"snooping": {}}, targets=1, seeds=1, ranges=["in"]), jobs=1)
-    assert next(iter(results.statuses.values())).status == "converged"
+    assert next(iter(results.kept.statuses.values())).status == "converged"
     found = np.array(json.loads((tmp_path / "numbers.json").read_text()))
     found = found[np.isfinite(found)]
     target = results.problem.targets()[0]
@@ -148,9 +149,9 @@ def test_snooping_would_find_a_truth_that_is_there():
 
 @pytest.mark.slow
 def test_hanging_tuner_is_killed_at_its_limit(monkeypatch):
-    monkeypatch.setattr("bench.runner._GRACE", 0.5)
+    monkeypatch.setattr("bench.pools.GRACE", 0.5)
     results = compared(spring_experiment(tuners={"hanging": {}, "random": {}}, targets=1, seeds=1, timeout=1.0))
-    statuses = {s.tuner: s for s in results.statuses.values()}
+    statuses = {s.tuner: s for s in results.kept.statuses.values()}
     assert statuses["hanging"].status == "timeout"
     assert statuses["random"].status == "done"
 

@@ -77,7 +77,7 @@ def measure(problem, name):
         ratios.append(seconds / plain)
         started = perf_counter()
         rmse = evaluator.rmse(trace.proposals, trace.recommendations)
-        rows(problem, Order(Entry("drawing", "drawing"), 0, target.sealed, EVALUATIONS), target,
+        rows(problem, Order("run", Entry("drawing", "drawing"), 0, target.sealed, EVALUATIONS), target,
              Outcome(trace, rmse, None, 0.0))  # fmt: skip
         scoring.append((perf_counter() - started) / EVALUATIONS * 1e6)
     return {

@@ -1,5 +1,6 @@
 """Every check has a subject that breaks exactly what it checks, and a sound one that passes them all."""
 
+import os
 import random
 
 import numpy as np
@@ -41,6 +42,30 @@ class LeavesTheCube(Sound):
     def tune(self, task, rng):
         yield Ask(task.start, recommend=task.start + 2.0)
         yield from super().tune(task, rng)
+
+
+class NeedsAnOption(Sound):
+    def __init__(self, width):
+        self.width = width
+
+
+class SortsWhatItIsShown(Sound):
+    def tune(self, task, rng):
+        while True:
+            seen = yield rng.uniform(size=(3, task.dim))
+            seen.losses.sort()
+
+
+class DependsOnItsProcess(Sound):
+    def tune(self, task, rng):
+        while True:
+            yield rng.uniform(size=(1, task.dim)) * (os.getpid() % 1000) / 1000
+
+
+class NoBetterThanChance(Sound):
+    def tune(self, task, rng):
+        while True:
+            yield rng.uniform(size=(1, task.dim))
 
 
 class DrawsGlobally(Sound):
@@ -105,6 +130,10 @@ class HoldsAFunction(Sound):
 
 
 BROKEN_TUNERS = {
+    "check_api_is_complete": NeedsAnOption,
+    "check_arguments_are_not_changed": SortsWhatItIsShown,
+    "check_same_run_in_other_processes": DependsOnItsProcess,
+    "check_beats_random_search": NoBetterThanChance,
     "check_runs_in_one_and_in_ten_dimensions": OneDimensional,
     "check_budget_is_exact": ChokesOnSmallBudgets,
     "check_proposals_stay_in_the_unit_cube": LeavesTheCube,
@@ -124,6 +153,23 @@ def test_tuner_check_rejects_its_broken_subject_and_no_sound_one(check):
     check(Sound)
     with pytest.raises(CheckError, match=r"(?s)expected .*; found .*; see "):
         check(BROKEN_TUNERS[check.__name__])
+
+
+def test_a_learned_tuner_without_storage_and_a_tune_that_does_not_yield_are_rejected():
+    class Unfinished(Sound):
+        learned = True
+
+        def fit(self, simulator, rng, budget):
+            pass
+
+    class Returns(Sound):
+        def tune(self, task, rng):
+            return [task.start]
+
+    with pytest.raises(CheckError, match="no state, restore"):
+        tuners.check_api_is_complete(Unfinished)
+    with pytest.raises(CheckError, match=r"expected a generator .* found list"):
+        tuners.check_api_is_complete(Returns)
 
 
 def test_training_outside_the_training_range_or_beyond_the_budget_is_rejected():

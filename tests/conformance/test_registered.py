@@ -2,7 +2,7 @@
 
 import pytest
 
-from bench.checks import EFFECT_CHECKS, SIMULATOR_CHECKS, TUNER_CHECKS
+from bench.checks import EFFECT_CHECKS, SIMULATOR_CHECKS, TUNER_CHECKS, CheckError
 from bench.registry import SkippedError, simulators, tuners
 from sims import effects
 
@@ -17,7 +17,12 @@ def subject(registry, name):
 @pytest.mark.parametrize("check", TUNER_CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", tuners.names())
 def test_tuner(name, check):
-    check(subject(tuners, name))
+    kind = subject(tuners, name)
+    if reason := kind.known_failures.get(check.__name__):
+        with pytest.raises(CheckError):  # one that passes is no known failure any more
+            check(kind)
+        pytest.skip(f"known failure: {reason}")
+    check(kind)
 
 
 @pytest.mark.parametrize("check", SIMULATOR_CHECKS, ids=lambda check: check.__name__)

@@ -219,6 +219,5 @@ def test_compare_tunes_it_in_worker_processes(path, tmp_path, capsys):
 
     runs = pd.read_parquet(out / "runs.parquet")
     assert list(runs.k) == [0, 1, 2, 3, 4]
-    assert {"proposal_drag.linear", "proposal_sensor.delay"} <= set(runs.columns) or any(
-        "drag.linear" in column for column in runs.columns
-    )
+    assert {"proposal_drag.linear", "true_drag.linear", "recommendation_sensor.delay"} <= set(runs.columns)
+    assert runs["true_drag.linear"].between(5.6e-4, 8.4e-4).all()

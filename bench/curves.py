@@ -1,0 +1,114 @@
+"""Runs as one matrix: a row a run, a column for each number of simulations; what all statistics start from."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from methods.base import Array
+
+FAILED = ("crashed", "timeout", "diverged")
+
+
+@dataclass(frozen=True)
+class Curves:
+    """One metric of all runs.
+
+    Attributes:
+        keys: a row a run: run, experiment, tuner, range, target, seed.
+        values: (R, K + 1) the metric after k simulations; a run that ended early keeps its last value.
+        used: (R,) simulations that each run made.
+        failed: (R,) whether it crashed, timed out or diverged.
+    """
+
+    keys: pd.DataFrame
+    values: Array
+    used: NDArray[np.int64]
+    failed: NDArray[np.bool_]
+
+    def where(self, mask: NDArray[np.bool_]) -> Curves:
+        """The runs for which `mask` (R,) holds."""
+        return Curves(self.keys[mask].reset_index(drop=True), self.values[mask], self.used[mask], self.failed[mask])
+
+    def of(self, **values: str) -> Curves:
+        """The runs whose keys have these values."""
+        mask = np.ones(len(self.keys), dtype=bool)
+        for name, value in values.items():
+            mask &= (self.keys[name] == value).to_numpy(dtype=bool)
+        return self.where(mask)
+
+    def tuners(self) -> list[str]:
+        """Labels in the order in which they first come."""
+        return [str(t) for t in dict.fromkeys(self.keys["tuner"])]
+
+    def by_target(self) -> tuple[list[str], list[NDArray[np.int64]]]:
+        """Names of the targets, sorted, and the rows of each."""
+        codes, names = pd.factorize(self.keys["target"], sort=True)
+        return [str(n) for n in names], [np.flatnonzero(codes == i) for i in range(len(names))]
+
+    def final(self) -> Array:
+        """(R,) the metric at the end; infinite for a run that failed: it delivered nothing one could have trusted."""
+        return np.where(self.failed | np.isnan(self.values[:, -1]), np.inf, self.values[:, -1])
+
+
+KEYS = ["run", "experiment", "tuner", "range", "target", "seed"]
+
+
+class Rows:
+    """Rows of runs.parquet, laid out once for every metric that is asked for.
+
+    Args:
+        runs: at least `KEYS`, k and the metrics.
+        statuses: rows of status.csv.
+        budget: largest number of simulations of interest.
+    """
+
+    def __init__(self, runs: pd.DataFrame, statuses: pd.DataFrame, budget: int) -> None:
+        self._runs, self._budget = runs, budget
+        codes, names = pd.factorize(runs["run"])
+        self._codes, self._k = codes, runs["k"].to_numpy(dtype=np.int64)
+        first = np.zeros(len(names), dtype=np.int64)
+        first[codes[::-1]] = np.arange(len(codes))[::-1]
+        self.keys = runs[[k for k in KEYS if k in runs]].iloc[first].reset_index(drop=True)
+        self.used = np.zeros(len(names), dtype=np.int64)
+        np.maximum.at(self.used, codes, self._k)
+        bad = set(statuses.loc[statuses["status"].isin(FAILED), "run"])
+        self.failed = self.keys["run"].isin(bad).to_numpy(dtype=bool)
+
+    def matrix(self, name: str) -> Array:
+        """(R, budget + 1) a column of the rows, run by run; NaN behind the end of a run."""
+        values = np.full((len(self.keys), self._budget + 1), np.nan)
+        within = self._k <= self._budget
+        column = self._runs[name].to_numpy(dtype=np.float64)
+        values[self._codes[within], self._k[within]] = column[within]
+        return values
+
+    def curves(self, metric: str) -> Curves:
+        """A metric after k simulations; a run that ended early keeps its last value."""
+        values = self.matrix(metric)
+        last = np.minimum(self.used, self._budget)[:, None]
+        columns = np.minimum(np.arange(self._budget + 1)[None], last)
+        return Curves(self.keys, np.take_along_axis(values, columns, axis=1), self.used, self.failed)
+
+    def spent(self, name: str) -> Array:
+        """(R, budget + 1) a column of seconds, added up over the simulations so far."""
+        return np.nancumsum(self.matrix(name), axis=1)
+
+
+def mean_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Array:
+    """(targets, ...) the mean of each target's rows of `values` (R, ...), without those that are NaN."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # nothing but NaN has no mean: NaN
+        return np.array([np.nanmean(values[rows], axis=0) for rows in groups])
+
+
+def primary(runs: pd.DataFrame) -> str:
+    """The metric that decides: the parameters' error where the truth is known, else the error on held-out runs."""
+    candidates: tuple[Any, ...] = ("param_error", "heldout_error", "obs_error")
+    return next(str(m) for m in candidates if m in runs and runs[m].notna().any())
