@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 
 from bench.gap.fit import Fit
-from bench.gap.world import Mask, World
+from bench.gap.world import CYCLES, Mask, World
 from methods.base import Array
 from sims.base import Parameter
 from sims.simulated import effect_parameters
@@ -103,8 +103,8 @@ def _first(world: World, name: str) -> Iterator[Probe]:
 def _grid(world: World, parameter: Parameter) -> Array:
     low, high = parameter.bounds
     if parameter.unit == "Hz":
-        seconds = max(float(t.scenario.times[-1] - t.scenario.times[0]) for t in world.tracks)
-        count = int(np.clip(2.0 * (high - low) * seconds, 4, FREQUENCIES))
+        low = min(max(low, CYCLES / world.longest), high / 2.0)
+        count = int(np.clip(2.0 * (high - low) * world.longest, 4, FREQUENCIES))
         return low + (high - low) * np.linspace(0.0, 1.0, count) ** 1.3
     return np.geomspace(low, high, SHAPES)
 

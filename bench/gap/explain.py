@@ -19,7 +19,7 @@ from bench.gap.floor import Floor, noise_floor
 from bench.gap.measure import Gain, HeldOut, gain, intervals
 from bench.gap.name import Finding, name
 from bench.gap.propose import next_experiment
-from bench.gap.remains import Hat
+from bench.gap.remains import CHANCE, Hat, Remains
 from bench.gap.score import tail
 from bench.gap.search import Model, Search
 from bench.gap.story import Shown, Story, Tuned
@@ -34,6 +34,8 @@ from sims.simulated import Simulated
 
 LEAST = 2.0
 """Samples for each unknown without which nothing can be said."""
+HUGE = 1e9
+"""Values so many times a channel's typical size are none."""
 STILL = 6.0
 """A channel whose range is below so many sigmas shows no motion."""
 Say = Callable[[str], None]
@@ -121,6 +123,13 @@ class _Explainer:
                 f"for {unknowns} parameters and initial states"
             )
 
+        parts = [part.observed for part in (world, self.measuring) if part is not None]
+        for c, channel in enumerate(world.simulator.channels):
+            largest = max(float(np.nanmax(np.abs(part[..., c]), initial=0.0)) for part in parts)
+            if largest >= HUGE * channel.scale:
+                expected = f"expected values of about {channel.scale:g} {channel.unit}, found {largest:.3g}"
+                raise InputError(f"{self.path}: column {channel.name}: {expected}; is the unit right?")
+
     def run(self) -> Explanation:
         self.say("fitting the base model")
         base = fit_base(self.fitting, self.noise, self._given())
@@ -152,9 +161,8 @@ class _Explainer:
         world, model = self.fitting, search.models[frozenset()]
         ranges = np.nanmax(world.observed, axis=(0, 1)) - np.nanmin(world.observed, axis=(0, 1))
         small = model.likelihood.sigma < 3.0 * self.floor.sigma
-        if (ranges < STILL * self.floor.sigma).all() and small.all() and len(base.untouched) == world.base.size:
-            from bench.gap.remains import Remains
-
+        still = (ranges < STILL * self.floor.sigma).all() and small.all() and len(base.untouched) == world.base.size
+        if still or not ranges.any():
             vague = tuple(world.parameters[i].name for i in world.base)
             nothing = Remains(1.0, "", model.likelihood.sigma / self.floor.sigma, ())
             return Finding("unidentifiable", model, model, (), nothing, vague)
@@ -264,7 +272,8 @@ class _Explainer:
     def _next(self, search: Search, finding: Finding) -> dict[str, Any] | None:
         if finding.verdict == "unidentifiable":
             names = " and ".join(finding.vague)
-            return {"says": f"Measure {names} apart, or record runs in which they act differently from each other"}
+            differently = "they act differently from each other" if len(finding.vague) > 1 else "it makes a difference"
+            return {"says": f"Measure {names} apart, or record runs in which {differently}"}
         for cause in finding.causes:
             for other in cause.alternatives:
                 rest = {n for n in finding.model.names if n != cause.effect}
@@ -320,7 +329,8 @@ class _Explainer:
             lines.append("the effects that help most do not close enough of the gap to be its explanation")
         if finding.verdict in ("partial", "unknown") and finding.remains.structure:
             chance = finding.remains.p_value
-            lines.append(f"structure is left over (chance {chance:.2g}) that the sensor's noise does not have")
+            told = f"structure is left over (chance {chance:.2g}) that the sensor's noise does not have"
+            lines.append(told if chance < CHANCE else "what is left over exceeds the stated noise of the sensors")
         for cause in finding.causes:
             if cause.alternatives:
                 others = ", ".join(cause.alternatives)

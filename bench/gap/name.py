@@ -24,6 +24,8 @@ STRANGE = 0.5
 """Held-out runs whose RMS exceeds the noise by more than this share show something that the fitted runs do not."""
 NOTICED, HELPS = 0.5, 0.1
 """Where held-out runs exceed the noise by more than the first, an effect must take the second share off the excess."""
+SIMILAR = 1.2
+"""Where structure is left, causes are alike that leave no more than so many times the same excess over the noise."""
 NEAR = 30.0
 """Rivals this near in twice the log likelihood are fitted once more before they are judged."""
 
@@ -83,15 +85,17 @@ def name(search: Search, stated: Mask, held_out: HeldOut | None) -> Finding:
     vague = unfixed(search, base)
     if vague:
         return Finding("unidentifiable", base, base, (), remains(search, base, stated), vague)
-    model = polished(search, search.run())
+    model = settled(search, search.run(), stated)
     measured = _measured(search, model, held_out)
-    merits = None if measured is None else {names: part.merit for names, part in measured.items()}
     model = _kept(search, model, measured, held_out)
     left = remains(search, model, stated)
-    causes = _causes(search, model, merits)
+    judge = _Judge(search, measured, held_out, left)
+    causes = judge.causes(model)
     preferred = search.models.get(frozenset(cause.preferred for cause in causes), model)
     if preferred is not model:
-        model, causes = preferred, _causes(search, preferred, merits)
+        model, causes = preferred, judge.causes(preferred)
+    if measured is not None and held_out is not None and model.names not in measured:
+        measured[model.names] = held_out.measure([model.fit.theta])[0]
     verdict = _verdict(search, model, causes, left)
     if measured is not None and held_out is not None and verdict in ("named", "ambiguous", "adequate"):
         lost = _loses(held_out, measured, model, left)
@@ -111,14 +115,24 @@ def unfixed(search: Search, base: Model) -> tuple[str, ...]:
     return tuple(found)
 
 
-def polished(search: Search, model: Model) -> Model:
-    """The best model after it and its rivals of the same size were fitted again by generalised least squares."""
+def settled(search: Search, model: Model, stated: Mask) -> Model:
+    """The best model after it and its rivals of the same size were fitted once more, to the end.
+
+    By generalised least squares where what is left is noise; by ordinary ones where structure is left, which is none
+    and would pull the fit away from the data.
+    """
     size, names = len(model.names), set(model.names)
-    near = [m for m in search.models.values() if len(m.names) == size and abs(model.merit - m.merit) < NEAR]
+    near = [m for m in search.models.values() if len(m.names) == size and _is_near(search, m, model)]
     parts = [m for m in search.models.values() if len(m.names) == size - 1 and set(m.names) < names]
-    noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), np.maximum(model.likelihood.phi, 0.0))
-    search.refit([m.fit.start() for m in (*near, *parts)], noise)
+    noise = None
+    if not remains(search, model, stated).structure:
+        noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), np.maximum(model.likelihood.phi, 0.0))
+    search.refit([m.fit.start() for m in (*near, *parts)], noise, race=False)
     return max((search.models[frozenset(m.names)] for m in near), key=lambda m: m.merit)
+
+
+def _is_near(search: Search, other: Model, model: Model) -> bool:
+    return abs(model.merit - other.merit) < NEAR or search.excess(other) < 1.5 * search.excess(model)
 
 
 def _measured(search: Search, model: Model, held_out: HeldOut | None) -> dict[Names, Measured] | None:
@@ -126,7 +140,7 @@ def _measured(search: Search, model: Model, held_out: HeldOut | None) -> dict[Na
     if held_out is None:
         return None
     base = search.models[frozenset()]
-    near = [m for m in search.models.values() if len(m.names) == len(model.names) and abs(model.merit - m.merit) < NEAR]
+    near = [m for m in search.models.values() if len(m.names) == len(model.names) and _is_near(search, m, model)]
     parts = [m for m in search.models.values() if set(m.names) < set(model.names)]
     singles = sorted((m for m in search.models.values() if len(m.names) == 1), key=lambda m: -m.merit)[:SHOWN]
     chosen = {m.names: m for m in [base, model, *near, *parts, *singles]}
@@ -162,29 +176,55 @@ def _excess(held_out: HeldOut, simulated: Array, sigma: Array) -> float:
     return float(np.sqrt(np.square(left[held_out.seen]).mean())) - 1.0
 
 
-def _causes(search: Search, model: Model, merits: dict[Names, float] | None) -> tuple[Cause, ...]:
-    """The model's effects, strongest first."""
-    return tuple(sorted((_cause(search, model, n, merits) for n in model.names), key=lambda cause: -cause.gain))
+@dataclass(frozen=True)
+class _Judge:
+    """Collects what would explain the same as well."""
 
+    search: Search
+    measured: Mapping[Names, Measured] | None
+    held_out: HeldOut | None
+    left: Remains
 
-def _cause(search: Search, model: Model, effect: str, merits: dict[Names, float] | None) -> Cause:
-    rest = search.without(model, effect)
-    gain = model.likelihood.value - rest.likelihood.value
-    scores = search.scanned[frozenset(rest.names)][1] if frozenset(rest.names) in search.scanned else search.scan(rest)
-    chance = dict(zip(scores.effects, scores.chance.tolist(), strict=True)).get(effect, 0.0)
-    p_value = min(search.tests.get(frozenset(rest.names), 1.0), tail(scores.by_chance, np.array([gain - chance])))
-    rivals = [(0.0, effect)]
-    for other in search.models.values():
-        added = set(other.names) - set(rest.names)
-        if len(other.names) == len(model.names) and set(rest.names) < set(other.names) and effect not in added:
+    def causes(self, model: Model) -> tuple[Cause, ...]:
+        """The model's effects, strongest first."""
+        return tuple(sorted((self._cause(model, name) for name in model.names), key=lambda cause: -cause.gain))
+
+    def _cause(self, model: Model, effect: str) -> Cause:
+        search, rest = self.search, self.search.without(model, effect)
+        key = frozenset(rest.names)
+        gain = model.likelihood.value - rest.likelihood.value
+        scores = search.scanned[key][1] if key in search.scanned else search.scan(rest)
+        chance = dict(zip(scores.effects, scores.chance.tolist(), strict=True)).get(effect, 0.0)
+        p_value = min(search.tests.get(key, 1.0), tail(scores.by_chance, np.array([gain - chance])))
+        rivals = [(0.0, effect)]
+        for other in list(search.models.values()):
+            added = set(other.names) - set(rest.names)
+            if len(other.names) == len(model.names) and set(rest.names) < set(other.names) and effect not in added:
+                behind = self._behind(model, other)
+                if behind < SWITCH:
+                    rivals.append((behind, added.pop()))
+        ordered = [n for _, n in sorted(rivals, key=lambda rival: (not _in_range(search, rival[1]), rival))]
+        alternatives = tuple(n for n in ordered if n != effect)
+        return Cause(effect, alternatives, float(np.clip(p_value, 0.0, 1.0)), float(gain), ordered[0])
+
+    def _behind(self, model: Model, other: Model) -> float:
+        """How far another model is behind, in twice the log likelihood; negative if it is ahead.
+
+        Where structure is left that neither has, likelihoods compare nothing but how each mimics it; then what counts
+        is how much of the gap is left.
+        """
+        both = self.measured is not None and other.names in self.measured and model.names in self.measured
+        if not self.left.structure:
             behind = model.merit - other.merit
-            if merits is not None and other.names in merits and model.names in merits:
-                behind += merits[model.names] - merits[other.names]
-            if behind < SWITCH:
-                rivals.append((behind, added.pop()))
-    ordered = [n for _, n in sorted(rivals, key=lambda rival: (not _in_range(search, rival[1]), rival))]
-    alternatives = tuple(n for n in ordered if n != effect)
-    return Cause(effect, alternatives, float(np.clip(p_value, 0.0, 1.0)), float(gain), ordered[0])
+            if both and self.measured is not None:
+                behind += self.measured[model.names].merit - self.measured[other.names].merit
+            return behind
+        ratios = [max(self.search.excess(other), 0.1) / max(self.search.excess(model), 0.1)]
+        if both and self.measured is not None and self.held_out is not None:
+            sides = [_excess(self.held_out, self.measured[m.names].simulated, self.held_out.noise.sigma) for m in
+                     (other, model)]  # fmt: skip
+            ratios.append(max(sides[0], 0.1) / max(sides[1], 0.1))
+        return SWITCH * float(np.mean(np.log(ratios))) / float(np.log(SIMILAR))
 
 
 def _in_range(search: Search, effect: str) -> bool:

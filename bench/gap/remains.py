@@ -24,8 +24,9 @@ from sims.system import Coefficient, Force, Moment
 BINS = 7
 AGAINST, ALONG = 0, 2
 TIME, SPEED, POSITION = 0, 1, 2
-CHANCE = 0.001
-"""Chance at which structure would be seen where there is none."""
+CHANCE, UNSURE = 1e-3, 1e-4
+"""Chance at which structure would be seen where there is none; the second where the recording states no noise, and a
+noise that remembers may be all there is."""
 EXCESS, SIGMAS = 0.05, 4.0
 """What is left may exceed the stated noise by this share and so many standard errors: no sensor is known better."""
 
@@ -66,17 +67,19 @@ class Remains:
         where: what that force follows, e.g. ``position x``.
         excess: (C,) RMS left in units of the noise floor.
         loud: names of channels whose noise is exceeded.
+        chance: below which the p value counts.
     """
 
     p_value: float
     where: str
     excess: Array
     loud: tuple[str, ...]
+    chance: float = CHANCE
 
     @property
     def structure(self) -> bool:
         """Whether there is structure left."""
-        return self.p_value < CHANCE or bool(self.loud)
+        return self.p_value < self.chance or bool(self.loud)
 
 
 def remains(search: Search, model: Model, stated: Mask) -> Remains:
@@ -104,7 +107,8 @@ def remains(search: Search, model: Model, stated: Mask) -> Remains:
     like = surrogates(residual, search.seen, 150, search.rng)
     scores = score(model.fit, residual, found, search.seen, search.weights(model), like)
     promise = scores.score - scores.chance
-    return Remains(scores.p_value, scores.effects[int(np.argmax(promise))], excess, loud)
+    where = scores.effects[int(np.argmax(promise))]
+    return Remains(scores.p_value, where, excess, loud, CHANCE if stated.all() else UNSURE)
 
 
 def _error(search: Search, model: Model, channel: int) -> float:

@@ -22,6 +22,8 @@ from methods.base import Array
 
 SMALL = 4
 """Groups of more columns are taken as they are, without a choice of columns."""
+ABSORBED = 1e-12
+"""Of a direction's sum of squares less than this share is left where the model's own freedom absorbs it."""
 RANK = 1e-9
 """Directions below this share of the largest eigenvalue of their scaled products are none."""
 
@@ -83,11 +85,12 @@ class Products:
         """Sums of squares (S,) of the residuals, products of directions (K, K) and of both (K, S)."""
         q, s = self._own, self._states
         total: Array = np.zeros(())
-        normal, cross = total, total
+        normal, cross, whole = total, total, total
         for squares, products, mixed in self._runs:
             n, c, t = (part[0] + (part[1] - phi * part[2] + phi * phi * part[3]) / (1.0 - phi * phi) for part in
                        (products, mixed, squares))  # fmt: skip
             own = slice(q, q + s)
+            whole = whole + np.diagonal(n)[q + s :]
             rest = np.r_[0:q, q + s : len(n)]
             inverse = _inverse(n[own, own])
             total = total + t - np.einsum("ks,kl,ls->s", c[own], inverse, c[own])
@@ -96,7 +99,10 @@ class Products:
         inverse = _inverse(normal[:q, :q])
         total = total - np.einsum("ks,kl,ls->s", cross[:q], inverse, cross[:q])
         gram = normal[q:, q:] - normal[q:, :q] @ inverse @ normal[:q, q:]
-        return np.maximum(total, 0.0), gram, cross[q:] - normal[q:, :q] @ (inverse @ cross[:q])
+        kept = np.diagonal(gram) > ABSORBED * whole  # of the others only rounding is left
+        gram = np.where(kept[:, None] & kept, (gram + gram.T) / 2.0, 0.0)
+        both = np.where(kept[:, None], cross[q:] - normal[q:, :q] @ (inverse @ cross[:q]), 0.0)
+        return np.maximum(total, 0.0), gram, both
 
 
 Parts = tuple[Array, Array, Array, Array]

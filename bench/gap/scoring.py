@@ -15,7 +15,7 @@ from bench.gap.measure import HeldOut
 from bench.gap.world import World
 from sims.base import InputError, unknown
 from sims.own import OwnSimulator
-from sims.recording import read_recording
+from sims.recording import read_recording, system_of
 
 
 def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, Any]:
@@ -30,6 +30,8 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
         InputError: a file cannot be read, or the recording is of another system.
     """
     extended, kind, _ = opened(model)
+    if (other := system_of(recording)) not in (extended.system, extended.name):
+        raise InputError(f"{recording}: expected a recording of {extended.system}, as {model} is; found one of {other}")
     data = read_recording(recording, kind, whole=True)
     data = replace(data, constants={**extended.constants, **data.constants})
     runs = data.held_out() if held_out else data.runs

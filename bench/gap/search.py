@@ -62,7 +62,8 @@ class Model:
         fit: the fit.
         likelihood: of its residual.
         merit: twice the log likelihood less the log of the number of samples for each parameter and initial state that
-            the data fix (G. Schwarz, Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136).
+            the data fix (G. Schwarz, Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136); for an effect with many
+            shapes, less what the best of them gains by chance.
     """
 
     fit: Fit
@@ -101,26 +102,41 @@ class Search:
         """Take a fit into account; the better of two fits of the same effects is kept."""
         free = fit.free.size + freedom(self.world, fit, self.noise)
         found = likelihood(self.residual(fit), self.seen, free) if np.isfinite(fit.cost) else _LOST
-        merit = found.value - free * float(np.log(max(int(self.seen.sum()), 2)))
+        merit = found.value - free * self._price - sum(self._chance(name) for name in fit.effects)
         model, key = Model(fit, found, merit), frozenset(fit.effects)
         if key not in self.models or merit > self.models[key].merit:
             self.models[key] = model
             self.scanned.pop(key, None)
         return self.models[key]
 
-    def refit(self, starts: Sequence[Start], noise: Noise | None = None, patient: bool = False) -> None:
+    @property
+    def _price(self) -> float:
+        """What each number that the data fix costs a model: the log of the number of samples."""
+        return float(np.log(max(int(self.seen.sum()), 2)))
+
+    def _chance(self, name: str) -> float:
+        """What an effect costs beside that: its shapes are tried by the dozen, and the best of them gains by chance."""
+        scores = self.scanned.get(frozenset(), (None, _NOTHING))[1]
+        known = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
+        slot = self.world.slots[name]
+        return max(known.get(name, 0.0) - (slot.stop - slot.start) * self._price, 0.0)
+
+    def refit(
+        self, starts: Sequence[Start], noise: Noise | None = None, patient: bool = False, race: bool = True
+    ) -> None:
         """Fit models from their starts and enter them.
 
         Args:
             starts: where to begin.
             noise: weighs the samples; the search's own if None.
             patient: fit the beginnings of the runs first, as the base model's fit does, and go on with the best.
+            race: give up what falls far behind.
         """
         noise = noise or self.noise
         for (share, iterations), kept in zip(HORIZONS[:-1], SIFTED, strict=True) if patient else ():
             fits = Fitter(self.world, noise, self.frozen, share).fit(starts, iterations)
             starts = [fit.start() for fit in sorted(fits, key=lambda fit: fit.cost)[:kept]]
-        for fit in Fitter(self.world, noise, self.frozen).fit(starts, 24, race=True):
+        for fit in Fitter(self.world, noise, self.frozen).fit(starts, 24, race=race):
             self.enter(fit)
 
     def scan(self, model: Model, against: Array | None = None) -> Scores:
@@ -293,7 +309,7 @@ class Search:
         return best
 
     def _grown(self, size: int) -> Model | None:
-        """The best model of so many effects: first from the best smaller one, then from its rivals, or with patience."""
+        """The best model of so many effects: from the best smaller one, then from its rivals, or with patience."""
         beam = self._beam(size - 1)
         self.extend(beam[:1], NOMINATED)
         first = self.best(size)

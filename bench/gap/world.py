@@ -111,6 +111,11 @@ class World:
         return [c.name for c in self.simulator.channels]
 
     @property
+    def longest(self) -> float:
+        """Seconds that the longest run takes."""
+        return max(float(t.scenario.times[-1] - t.scenario.times[0]) for t in self.tracks) or 1.0
+
+    @property
     def effects(self) -> dict[str, Effect]:
         """Every effect at hand, by name."""
         return {effect.name: effect for effect in self.simulator.effects}
@@ -278,11 +283,15 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
     bounds = []
     for parameter in effect_parameters(world.effects[name], world.simulator.system, world.channels):
         low, high = parameter.bounds
+        if parameter.unit == "Hz":
+            low = min(max(low, CYCLES / world.longest), high / 2.0)
         bounds.append((low, high) if low > 0 else (0.0 if low == 0 else BEYOND * low, BEYOND * high))
     return bounds
 
 
 BEYOND = 20.0
+CYCLES = 1.0
+"""What comes and goes must do so about once in the longest run, else any slow change would be called periodic."""
 
 
 def plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -85,7 +85,7 @@ def correlated(rng, phi, sigma, shape):
 
 
 def covariance_of(seen, phi):
-    """(n, n) correlation matrix of the seen samples of one channel (R, T): each unbroken stretch is an autoregression."""
+    """(n, n) correlations of the seen samples of one channel (R, T): each unbroken stretch is an autoregression."""
     stretch = np.cumsum(~(seen & np.pad(seen, ((0, 0), (1, 0)))[:, :-1]).ravel())[seen.ravel()]
     time = np.tile(np.arange(seen.shape[1]), len(seen))[seen.ravel()]
     near = stretch[:, None] == stretch[None]

@@ -1,4 +1,4 @@
-"""What verdict.json must look like, checked by hand: `verdict.schema.json` of the design, and no key it does not have."""
+"""What verdict.json must look like, checked by hand: the design's keys and types, and no key besides."""
 
 import json
 from math import isfinite

@@ -13,7 +13,8 @@ from sims.base import InputError, Scenario
 from sims.pendulum.simulator import Pendulum
 
 MODEL = Extended(
-    "pendulum_extended", "pendulum", "batch", "A swing, measured", {"inertia": Number(3.1e-3, "kg*m^2", 3.0e-3, 3.2e-3)},
+    "pendulum_extended", "pendulum", "batch", "A swing, measured",
+    {"inertia": Number(3.1e-3, "kg*m^2", 3.0e-3, 3.2e-3)},
     {
         "drag.linear": {"coefficient": Number(7e-4, "N*m*s/rad", None, None)},
         "sensor.delay": {"coefficient": Number(0.013, "s", 0.012, 0.014)},
@@ -179,7 +180,7 @@ def test_it_makes_recordings_as_its_system_does(path):
     assert 0.5 <= made.truth["runs"]["1"]["initial"]["q"] <= 1.5, "drawn as for any pendulum"
     assert made.recording.constants["mass"] == 0.2
     assert list(made.recording.runs[0].channels) == ["qd", "q"]
-    with pytest.raises(InputError, match="effect drag.linear is named twice"):
+    with pytest.raises(InputError, match=r"effect drag.linear is named twice"):
         make(Wish("pendulum_extended", runs=1, effects=["drag.linear=1"]))
 
 
@@ -188,7 +189,7 @@ def test_an_extended_simulator_is_not_extended_again(path, tmp_path):
     twice = tmp_path / "twice.toml"
     write(replace(MODEL, name="twice", system="pendulum_extended", effects={}), twice)
     with pytest.raises(
-        InputError, match="twice.toml: simulator pendulum_extended is extended already; name .* pendulum"
+        InputError, match=r"twice.toml: simulator pendulum_extended is extended already; name .* pendulum"
     ):
         load_plugins([twice])
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bench.gap.remains import CHANCE, Hat, hats, remains
+from bench.gap.remains import CHANCE, SLOWEST, Hat, hats, remains
 from sims.pendulum.simulator import Pendulum
 from sims.slider.simulator import Slider
 from sims.system import Coefficient, Force
@@ -48,7 +48,8 @@ def test_a_gust_is_caught(stated):
     assert found.p_value < CHANCE
     assert found.where == "time, along q"
     assert (found.excess > 2).all()
-    assert found.loud == (("q", "qd") if stated else ())
+    assert found.loud == ("q", "qd")
+    assert (found.excess > SLOWEST).all(), "so much that even an estimated noise is exceeded"
 
 
 def test_a_rough_place_is_caught():
@@ -77,7 +78,7 @@ def test_noise_that_is_louder_than_stated_is_structure():
     assert found.loud == ("q",)
     assert found.structure
     assert found.excess[0] == pytest.approx(1.5, rel=0.08)
-    assert not remains(*loud, np.array([False, True])).structure, "an estimated noise cannot be exceeded"
+    assert not remains(*loud, np.array([False, True])).structure, "an estimated noise may be exceeded by half"
 
 
 def test_hats_cover_time_position_and_speed():

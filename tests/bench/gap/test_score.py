@@ -129,6 +129,15 @@ def test_what_the_model_absorbs_is_no_evidence():
     directions[..., 0] = 3.0 * jacobian[..., 0] - jacobian[..., 3]
     found = score(linear_fit(jacobian, Q), residual, Directions(probes(), directions), seen, Noise(SIGMA, np.zeros(2)))
     assert found.score[found.effects.index("a")] == pytest.approx(0.0, abs=1e-6)
+    directions[..., 1] = 1e9 * jacobian[..., 1] + directions[..., 2]  # of two alike little but rounding is left
+    directions[..., 3] = 1e9 * jacobian[..., 1] + directions[..., 2]
+    products = Products(linear_fit(jacobian, Q), residual[..., None], directions, seen, SIGMA)
+    for phi in GRID:
+        _, gram, cross = products.projected(phi)
+        np.testing.assert_array_equal(gram, gram.T)
+        assert not gram[[0, 1, 3]].any()
+        assert not cross[[0, 1, 3]].any()
+        assert np.linalg.eigvalsh(gram[2:3, 2:3])[0] > 0
 
 
 def test_directions_of_an_effect_act_together_within_a_group():

@@ -51,7 +51,7 @@ def test_a_wrong_model_errs_by_more(files):
     model, recording = files
     write(replace(MODEL, effects={}), model)
     without = scored(model, recording)
-    assert without["rmse"]["q"] > 0.03
+    assert without["rmse"]["q"] > 0.015
     assert without["normalised_rmse"] == pytest.approx(
         np.sqrt(np.mean([(without["rmse"]["q"] / 0.003) ** 2, (without["rmse"]["qd"] / 0.02) ** 2])), rel=1e-9
     )
@@ -66,7 +66,7 @@ def test_held_out_runs_alone(files):
     assert (found["runs"], found["samples"]) == (1, 90)
     text = recording.with_suffix(".toml").read_text()
     recording.with_suffix(".toml").write_text(text.replace("held_out = true", "held_out = false"))
-    with pytest.raises(InputError, match="swing.csv: --held-out: no run is marked held_out"):
+    with pytest.raises(InputError, match=r"swing.csv: --held-out: no run is marked held_out"):
         scored(model, recording, held_out=True)
 
 
@@ -96,15 +96,12 @@ def test_what_cannot_be_scored_is_one_line(files, tmp_path):
             scored(model, tmp_path / other)
         assert str(caught.value).isprintable()
     write(replace(MODEL, effects={"drag.linear": {"coefficient": Number(1e6, "N*m*s/rad", None, None)}}), model)
-    try:
-        assert scored(model, recording)["normalised_rmse"] > 10
-    except InputError as error:
-        assert "the simulation failed" in str(error)
+    with pytest.raises(InputError, match="the simulation failed with the parameters of"):
+        scored(model, recording)
 
 
 def test_another_system_is_refused(files, tmp_path):
     model, _ = files
-    simulate(Wish("slider", runs=1, seconds=0.5), tmp_path / "push.csv")
-    with pytest.raises(InputError, match="slider") as caught:
-        scored(model, tmp_path / "push.csv")
-    assert "pendulum" in str(caught.value)
+    simulate(Wish("servo", runs=1, seconds=0.5), tmp_path / "arm.csv")
+    with pytest.raises(InputError, match=r"arm.csv: expected a recording of pendulum, as .* is; found one of servo"):
+        scored(model, tmp_path / "arm.csv")

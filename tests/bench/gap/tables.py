@@ -1,0 +1,29 @@
+"""Recordings on disk, made of columns."""
+
+import numpy as np
+
+
+def table(folder, runs, channels=("q", "qd"), system="pendulum", noise=None, inputs=(), more=""):
+    """Write odd.csv and odd.toml; each run is its times and one column a channel, then a column an input."""
+    units = {"q": "rad", "qd": "rad/s", "x": "m", "v": "m/s", "z": "m", "u": "N*m" if system == "pendulum" else "N"}
+    rows = [",".join(["run", "t", *channels, *inputs])]
+    for number, columns in enumerate(runs, start=1):
+        for row in zip(*columns, strict=True):
+            rows.append(",".join([str(number), *("" if np.isnan(v) else f"{v:.10g}" for v in row)]))
+    (folder / "odd.csv").write_text("\n".join(rows) + "\n")
+    lines = [f'system = "{system}"', more]
+    for name in channels:
+        lines += [f"[channels.{name}]", f'unit = "{units[name]}"', f"noise = {noise[name]}" if noise else ""]
+    for name in inputs:
+        lines += [f"[inputs.{name}]", f'unit = "{units[name]}"']
+    (folder / "odd.toml").write_text("\n".join(lines) + "\n")
+    return folder / "odd.csv"
+
+
+def swing(times, angle=0.8, pulse=8.17, decay=0.0, rng=None, sigma=(0.003, 0.02)):
+    """Times, angle and rate of a small free swing in closed form, with noise of `rng`."""
+    envelope = angle * np.exp(-decay * times)
+    q, qd = envelope * np.cos(pulse * times), -pulse * envelope * np.sin(pulse * times)
+    if rng is not None:
+        q, qd = q + sigma[0] * rng.standard_normal(times.size), qd + sigma[1] * rng.standard_normal(times.size)
+    return times, q, qd

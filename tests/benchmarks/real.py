@@ -1,0 +1,97 @@
+"""explain on the measured recordings: ``python -m tests.benchmarks.real [NAME ...] [--out DIR]``.
+
+Writes a folder for each recording (verdict, extended simulator, report) and the table of results/reference/real. What is
+published of each recording, and the held-out errors of a quick independent fit, stand in the README of the recordings.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.gap.explain import explain
+from bench.gap.scoring import scored
+from sims.pendulum.simulator import Pendulum
+from sims.recording import Run, read_recording
+from sims.recording_write import write_recording
+
+DATA = Path(os.environ.get("SIMGAP_DATA", Path(__file__).parents[3] / "shared" / "data"))
+PUBLISHED = {
+    "pendulum_free_swing/recording": "linear damping",
+    "servo_pendulum/recording": "friction that grows with the load, besides viscous friction",
+    "smartphone_fall/fall": "quadratic air drag, and an offset",
+    "smartphone_fall/up_down": "quadratic air drag, and an offset that varies by run",
+    "ball_drops/bowling_ball": "nothing measurable",
+}
+HEAD = (
+    "| recording | published | verdict | causes (what explains it as well) | held-out RMSE: base | extended | floor "
+    "| gap closed | s |\n|---|---|---|---|---|---|---|---|---|\n"
+)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--out", type=Path, default=Path("results/reference/real"))
+    options = parser.parse_args()
+    paths = sorted(path for path in DATA.glob("*/*.csv") if path.with_suffix(".toml").is_file())
+    for path in paths:
+        name = f"{path.parent.name}/{path.stem}"
+        if options.names and not any(wanted in name for wanted in options.names):
+            continue
+        folder = options.out / path.parent.name / path.stem
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        explain(path).write(folder)
+        for figure in folder.glob("*.p*"):  # they stand in the report
+            figure.unlink()
+        if name.startswith("pendulum"):
+            (folder / "open_loop.json").write_text(json.dumps(open_loop(folder / "extended.toml", path)) + "\n")
+        print(row(options.out, folder), flush=True)
+    folders = sorted(found.parent for found in options.out.glob("*/*/verdict.json"))
+    (options.out / "table.md").write_text(HEAD + "\n".join(row(options.out, folder) for folder in folders) + "\n")
+
+
+def open_loop(model, path):
+    """Error over the held-out runs as one run of 25 s, of which they were cut."""
+    recording = read_recording(path, Pendulum, whole=True)
+    parts, begin = recording.held_out(), 0.0
+    times, channels = [], {name: [] for name in parts[0].channels}
+    for run in parts:
+        step = float(np.median(np.diff(run.times)))
+        times.append(run.times - run.times[0] + begin)
+        begin = float(times[-1][-1]) + step
+        for name, values in run.channels.items():
+            channels[name].append(values)
+    joined = {name: np.concatenate(values) for name, values in channels.items()}
+    run = Run("joined", np.concatenate(times), joined, {}, {}, {}, False)
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "joined.csv"
+        write_recording(target, replace(recording, runs=(run,)), Pendulum)
+        return scored(model, target)
+
+
+def row(out, folder):
+    """A row of the table."""
+    verdict = json.loads((folder / "verdict.json").read_text())
+    name = str(folder.relative_to(out))
+    causes = "; ".join(
+        c["effect"] + (f" ({', '.join(c['alternatives'])})" if c["alternatives"] else "") for c in verdict["causes"]
+    )
+    held = verdict["heldout"]
+    numbers = ["–"] * 4
+    if held:
+        share = f"{held['gap_closed']:.0%}"
+        numbers = [*(f"{held[k]:.3g} {held['unit']}" for k in ("rmse_base", "rmse_extended", "noise_floor")), share]
+    published = PUBLISHED.get(name, "air drag")
+    cells = [f"[{name}]({name}/report.html)", published, verdict["verdict"], causes or "–", *numbers]
+    return "| " + " | ".join([*cells, f"{verdict['seconds']:.0f}"]) + " |"
+
+
+if __name__ == "__main__":
+    main()
