@@ -127,8 +127,9 @@ def settled(search: Search, model: Model, stated: Mask) -> Model:
     noise = None
     if not remains(search, model, stated).structure:
         noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), np.maximum(model.likelihood.phi, 0.0))
+    rivals = [m for m in near if abs(model.merit - m.merit) < NEAR]
     search.refit([m.fit.start() for m in (*near, *parts)], noise, race=False)
-    return max((search.models[frozenset(m.names)] for m in near), key=lambda m: m.merit)
+    return max((search.models[frozenset(m.names)] for m in rivals), key=lambda m: m.merit)
 
 
 def _is_near(search: Search, other: Model, model: Model) -> bool:

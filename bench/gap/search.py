@@ -119,7 +119,7 @@ class Search:
         scores = self.scanned.get(frozenset(), (None, _NOTHING))[1]
         known = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         slot = self.world.slots[name]
-        return max(known.get(name, 0.0) - (slot.stop - slot.start) * self._price, 0.0)
+        return float(max(known.get(name, 0.0) - (slot.stop - slot.start) * self._price, 0.0))
 
     def refit(
         self, starts: Sequence[Start], noise: Noise | None = None, patient: bool = False, race: bool = True

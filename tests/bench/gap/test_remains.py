@@ -78,7 +78,7 @@ def test_noise_that_is_louder_than_stated_is_structure():
     assert found.loud == ("q",)
     assert found.structure
     assert found.excess[0] == pytest.approx(1.5, rel=0.08)
-    assert not remains(*loud, np.array([False, True])).structure, "an estimated noise may be exceeded by half"
+    assert not remains(*loud, np.array([False, True])).structure, "half as much again as an estimated noise is none"
 
 
 def test_hats_cover_time_position_and_speed():
