@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from bench.gap.base import HORIZONS
 from bench.gap.colour import Noise, likelihood, whitened
-from bench.gap.fit import Fit, Fitter, Start, prior_of
+from bench.gap.fit import RESPONSE, Fit, Fitter, Start, prior_of
 from bench.gap.search import Model, Search, freedom
 from bench.gap.world import Mask, World
 from methods.base import Array
@@ -57,12 +57,37 @@ class HeldOut:
         return Measured(fit.simulated, value)
 
 
+def central(world: World, fit: Fit, noise: Noise) -> Fit:
+    """The fit with its Jacobian by central differences.
+
+    One-sided ones are good enough to descend by, but their curvature makes parameters look different that are not.
+    """
+    q, runs, size = fit.free.size, *fit.states.shape
+    bounds = np.array([world.parameters[i].bounds for i in fit.free]).reshape(-1, 2)
+    bounds = np.stack([np.minimum(bounds[:, 0], fit.theta[fit.free]), np.maximum(bounds[:, 1], fit.theta[fit.free])], 1)
+    moved = np.sqrt(np.mean(np.square(fit.jacobian / noise.sigma[:, None]), axis=(0, 1, 2)))
+    largest = np.concatenate([1e-2 * (bounds[:, 1] - bounds[:, 0]), np.full(size, 1e-2)])
+    steps = np.clip(RESPONSE / np.maximum(moved, 1e-300), 1e-5 * largest, largest)
+    theta, states = np.tile(fit.theta, (2, q + size, 1)), np.tile(fit.states, (2, q + size, 1, 1))
+    for side, sign in enumerate((-1.0, 1.0)):
+        for j, place in enumerate(fit.free):
+            theta[side, j, place] = np.clip(theta[side, j, place] + sign * steps[j], *bounds[j])
+        for j in range(size):
+            states[side, q + j, :, j] += sign * steps[q + j]
+    rows = np.repeat(theta.reshape(-1, theta.shape[2]), runs, axis=0)
+    lanes = np.tile(np.arange(runs), 2 * (q + size))
+    seen = world.simulate(rows, lanes, states.reshape(-1, size)).reshape(2, q + size, *fit.simulated.shape)
+    apart = np.concatenate([np.diagonal(theta[1][:q][:, fit.free] - theta[0][:q][:, fit.free]), 2.0 * steps[q:]])
+    jacobian = np.moveaxis(seen[1] - seen[0], 0, -1) / apart
+    return replace(fit, jacobian=np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0))
+
+
 def covariance(search: Search, model: Model) -> Array:
     """(q, q) of the fitted parameters, from the curvature, with the noise's own correlation.
 
     Generalised least squares (W. H. Greene, Econometric Analysis, chapter 9): initial states are eliminated run by run.
     """
-    world, fit, q = search.world, model.fit, model.fit.free.size
+    world, fit, q = search.world, central(search.world, model.fit, search.noise), model.fit.free.size
     noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), model.likelihood.phi)
     jacobian = whitened(np.where(search.seen[..., None], fit.jacobian, 0.0), search.seen, noise)
     j = jacobian.reshape(len(jacobian), -1, jacobian.shape[3])
