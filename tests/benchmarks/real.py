@@ -1,7 +1,7 @@
 """explain on the measured recordings: ``python -m tests.benchmarks.real [NAME ...] [--out DIR]``.
 
 Writes a folder for each recording (verdict, extended simulator, report) and the table of results/reference/real. What
-is published of each recording, and the held-out errors of a quick independent fit, stand in the README of the recordings.
+is published of each, and the held-out errors of a quick independent fit, stand in the README of the recordings.
 """
 
 import argparse

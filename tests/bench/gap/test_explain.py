@@ -164,7 +164,9 @@ def test_a_free_swing_does_not_fix_gravity_and_length_besides(tmp_path):
     for name in ("gravity", "length"):
         assert found.verdict["parameters"][name]["low"] is None
     one = explained(path, free=("gravity",))
-    assert one.verdict["verdict"] not in ("named", "partial"), "only the ratio to the inertia shows"
+    assert one.verdict["verdict"] == "unidentifiable", "only the ratio to the inertia shows"
+    assert one.story.vague == ("inertia", "gravity")
+    assert one.verdict["parameters"]["gravity"]["low"] is None
 
 
 def test_a_torque_that_is_known_fixes_gravity(tmp_path):

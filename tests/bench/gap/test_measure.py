@@ -5,7 +5,7 @@ import pytest
 
 from bench.gap.colour import Noise
 from bench.gap.fit import Fitter, Start
-from bench.gap.measure import HeldOut, covariance, gain, intervals
+from bench.gap.measure import HeldOut, central, covariance, gain, intervals
 from bench.gap.search import Search
 from sims.pendulum.simulator import Pendulum
 from sims.slider.simulator import Slider
@@ -100,6 +100,18 @@ def test_the_covariance_is_that_of_all_unknowns_at_once():
         rows[r, :, 0], rows[r, :, 1 + 2 * r : 3 + 2 * r] = flattened[:, 0], flattened[:, 1:]
     normal = np.einsum("rnk,rnl->kl", rows, rows) + np.diag([0, *[1e-4] * 4])
     assert covariance(search, model)[0, 0] == pytest.approx(np.linalg.inv(normal)[0, 0], rel=1e-6)
+
+
+def test_parameters_that_act_alike_have_no_interval():
+    """Inertia and gravity of a free swing: one-sided differences would tell them apart by their own error."""
+    made = recorded(Pendulum(), [3.3e-3], [{"q": 0.8}, {"q": 1.2}], np.arange(90) / 60, [0.003, 0.02], seed=5)
+    search, model = searched(made, [0.003, 0.02], candidates=[], free=["gravity"])
+    spread = np.sqrt(np.diagonal(covariance(search, model))) / model.fit.theta[:2]
+    assert (spread > 5).all()
+    assert np.isnan([intervals(search, model)[i][1] for i in range(2)]).all()
+    exact = central(search.world, model.fit, search.noise).jacobian
+    ratio = exact[..., 0] * model.fit.theta[0] + exact[..., 1] * model.fit.theta[1]
+    assert np.abs(ratio).max() < 1e-3 * np.abs(exact[..., 0] * model.fit.theta[0]).max()
 
 
 def test_what_the_data_do_not_bound_has_no_interval():

@@ -1,0 +1,42 @@
+"""The same cause is named whichever engine explains: two external simulators, on data that each system's batch engine
+did not make."""
+
+import pytest
+
+from bench.gap.explain import explain
+from bench.simulate import Wish, write
+
+CASES = {
+    "pendulum": ("drag.linear=6e-4", "mujoco", ("q",)),
+    "slider": ("friction.coulomb=0.4", "pybullet", ("x",)),
+    "ball": ("drag.quadratic=0.05", "mujoco", ("z",)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("system", CASES)
+def test_the_same_cause_is_named(system, engine, tmp_path):
+    effect, source, observe = CASES[system]
+    wish = Wish(
+        system,
+        effects=[effect],
+        noise=["0.004"],
+        observe=observe,
+        runs=3,
+        seconds=1.5,
+        rate=40.0,
+        engine=source,
+        seed=3,
+    )
+    path = tmp_path / "data.csv"
+    write(wish, path)
+    verdict = explain(path, engine=engine).verdict
+    assert verdict["engine"] == engine
+    (cause,) = verdict["causes"]
+    name, size = effect.split("=")
+    assert name in (cause["effect"], *cause["alternatives"])
+    assert verdict["verdict"] in ("named", "ambiguous")
+    if cause["effect"] == name:
+        found = cause["coefficients"]["coefficient"]
+        assert found["value"] == pytest.approx(float(size), rel=0.2)
