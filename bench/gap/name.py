@@ -124,10 +124,10 @@ def settled(search: Search, model: Model, stated: Mask) -> Model:
     size, names = len(model.names), set(model.names)
     near = [m for m in search.models.values() if len(m.names) == size and _is_near(search, m, model)]
     parts = [m for m in search.models.values() if len(m.names) == size - 1 and set(m.names) < names]
-    noise = None
-    if not remains(search, model, stated).structure:
+    noise, noisy = None, not remains(search, model, stated).structure
+    if noisy:
         noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), np.maximum(model.likelihood.phi, 0.0))
-    rivals = [m for m in near if abs(model.merit - m.merit) < NEAR]
+    rivals = [m for m in near if noisy and abs(model.merit - m.merit) < NEAR] or [model]
     search.refit([m.fit.start() for m in (*near, *parts)], noise, race=False)
     return max((search.models[frozenset(m.names)] for m in rivals), key=lambda m: m.merit)
 
