@@ -91,7 +91,7 @@ def _between(parameter: Parameter, share: float) -> float:
 
 
 def _costs(world: World, noise: Noise, starts: Sequence[Start]) -> Array:
-    """Sums of squares over the first samples, of which a tenth of the worst does not count."""
+    """Sums of squares of each start over the first samples of the runs."""
     runs = len(world.tracks)
     theta = np.repeat([s.theta for s in starts], runs, axis=0)
     states = np.concatenate([s.states for s in starts])

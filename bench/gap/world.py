@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -292,8 +292,3 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
 BEYOND = 20.0
 CYCLES = 1.0
 """What comes and goes must do so about once in the longest run, else any slow change would be called periodic."""
-
-
-def plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values without the entries that are None."""
-    return {key: value for key, value in values.items() if value is not None}
