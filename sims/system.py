@@ -218,6 +218,7 @@ class Effect(ABC):
         needs: what the system must have: ``input``; ``ground`` to strike; ``guide``, which a body that flies freely
             lacks; ``gravity``; ``push``, a say in what horizontal acceleration does to it; ``space`` of three
             dimensions; or empty.
+        contains: simpler effects that it turns into where some of its coefficients are zero.
         hook: which of the engine's hooks it uses; set by the hook classes.
     """
 
@@ -226,6 +227,7 @@ class Effect(ABC):
     source: ClassVar[str] = ""
     coefficients: ClassVar[tuple[Coefficient, ...]]
     needs: ClassVar[str] = ""
+    contains: ClassVar[tuple[str, ...]] = ()
     hook: ClassVar[str]
 
     @classmethod

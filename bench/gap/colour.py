@@ -20,6 +20,10 @@ GRID = (0.0, 0.3, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98)
 """Correlations among which a likelihood is maximised."""
 
 
+LAGS = 20
+"""Correlations that the portmanteau test adds up."""
+
+
 @dataclass(frozen=True)
 class Noise:
     """Noise of each channel: sigma (C,) in its unit, phi (C,)."""
@@ -101,6 +105,25 @@ def _fine(residual: Array, seen: Mask) -> Array:
     around = np.clip(rough + np.array([-0.1, -0.05, -0.02, 0.0, 0.01, 0.02, 0.05, 0.1]), -0.5, 0.995)
     found: Array = np.unique(np.append(around, 0.0))
     return found
+
+
+def forgets(residual: Array, seen: Mask, found: Likelihood) -> float:
+    """Probability that a residual (R, T, C) is nothing but first-order noise with the correlation found.
+
+    The portmanteau test of what whitening leaves (G. M. Ljung, G. E. P. Box, Biometrika 65(2), 297, 1978,
+    doi:10.1093/biomet/65.2.297); of several channels the least probable counts, times their number.
+    """
+    from scipy.special import chdtrc
+
+    least = 1.0
+    for c, phi in enumerate(found.phi.tolist()):
+        here = seen[:, :, c : c + 1]
+        w = whitened(residual[:, :, c : c + 1], here, Noise(np.ones(1), np.array([phi])))[:, :, 0]
+        power, count, total = max(float((w * w).sum()), 1e-300), max(int(here.sum()), 2), 0.0
+        for lag in range(1, min(LAGS, w.shape[1] - 1) + 1):
+            total += (float((w[:, lag:] * w[:, :-lag]).sum()) / power) ** 2 / max(count - lag * len(w), 1)
+        least = min(least, float(chdtrc(LAGS - 1, count * (count + 2.0) * total)))
+    return min(1.0, least * len(found.phi))
 
 
 def surrogates(residual: Array, seen: Mask, count: int, rng: np.random.Generator, largest: int = 6) -> Array:

@@ -134,11 +134,11 @@ class _Explainer:
         self.say("fitting the base model")
         base = fit_base(self.fitting, self.noise, self._given())
         rng = rng_for("explain", self.recording.system, self.seed)
-        search = Search(self.fitting, self.noise, base.untouched, rng)
+        search = Search(self.fitting, self.noise, base.untouched, rng, self.floor.stated)
         search.enter(base.fit)
         self.say("looking for what is missing")
         held_out = HeldOut(self.measuring, self.noise) if self.measuring else None
-        finding = self._still(search, base) or name(search, self.floor.stated, held_out)
+        finding = self._still(search, base) or name(search, held_out)
         self.say("measuring the gain")
         verdict = self._verdict(search, finding, rng)
         story = self._story(search, base, finding, verdict)

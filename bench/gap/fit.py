@@ -108,14 +108,16 @@ class Fitter:
     share: float = 1.0
     parameters: bool = True
 
-    def fit(self, starts: Sequence[Start], iterations: int = 12, race: bool = False) -> list[Fit]:
-        """Fit each model from its start; in a race, those that fall far behind are left unfinished."""
+    def fit(
+        self, starts: Sequence[Start], iterations: int = 12, race: bool = False, reached: float = np.inf
+    ) -> list[Fit]:
+        """Fit each model from its start; in a race, those far behind the best, or the cost reached, stay unfinished."""
         problems = [self._problem(start) for start in starts]
         seen = self.world.counted(self.share)
         for problem, (simulated, jacobian) in zip(problems, self._derivatives(problems), strict=True):
             self._take(problem, problem.theta, problem.states, simulated, jacobian, seen)
         for taken in range(iterations):
-            best = min(p.cost for p in problems)
+            best = min(reached, *(p.cost for p in problems))
             for p in problems if race and taken >= RACED else ():
                 p.done |= p.cost - HOPE * p.promised > best + BEATEN
             active = [p for p in problems if not p.done]

@@ -12,7 +12,6 @@ from bench.gap.measure import HeldOut, Measured, covariance
 from bench.gap.remains import Remains, remains
 from bench.gap.score import tail
 from bench.gap.search import ALPHA, SWITCH, Model, Names, Search
-from bench.gap.world import Mask
 from methods.base import Array
 from sims.simulated import effect_parameters
 
@@ -73,22 +72,21 @@ class Finding:
     measured: Mapping[Names, Measured] | None = None
 
 
-def name(search: Search, stated: Mask, held_out: HeldOut | None) -> Finding:
+def name(search: Search, held_out: HeldOut | None) -> Finding:
     """Search, check on held-out runs, collect alternatives, and judge.
 
     Args:
         search: with the base model entered.
-        stated: (C,) whether the recording states the noise of each channel.
         held_out: the runs for measuring; None if there are none.
     """
     base = search.models[frozenset()]
     vague = unfixed(search, base)
     if vague:
-        return Finding("unidentifiable", base, base, (), remains(search, base, stated), vague)
-    model = settled(search, search.run(), stated)
+        return Finding("unidentifiable", base, base, (), remains(search, base), vague)
+    model = settled(search, search.run())
     measured = _measured(search, model, held_out)
     model = _kept(search, model, measured, held_out)
-    left = remains(search, model, stated)
+    left = remains(search, model)
     judge = _Judge(search, measured, held_out, left)
     causes = judge.causes(model)
     preferred = search.models.get(frozenset(cause.preferred for cause in causes), model)
@@ -115,7 +113,7 @@ def unfixed(search: Search, base: Model) -> tuple[str, ...]:
     return tuple(found)
 
 
-def settled(search: Search, model: Model, stated: Mask) -> Model:
+def settled(search: Search, model: Model) -> Model:
     """The best model after it and its rivals of the same size were fitted once more, to the end.
 
     By generalised least squares where what is left is noise; by ordinary ones where structure is left, which is none
@@ -124,11 +122,11 @@ def settled(search: Search, model: Model, stated: Mask) -> Model:
     size, names = len(model.names), set(model.names)
     near = [m for m in search.models.values() if len(m.names) == size and _is_near(search, m, model)]
     parts = [m for m in search.models.values() if len(m.names) == size - 1 and set(m.names) < names]
-    noise, noisy = None, not remains(search, model, stated).structure
+    noise, noisy = None, not remains(search, model).structure
     if noisy:
         noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), np.maximum(model.likelihood.phi, 0.0))
     rivals = [m for m in near if noisy and abs(model.merit - m.merit) < NEAR] or [model]
-    search.refit([m.fit.start() for m in (*near, *parts)], noise, race=False)
+    search.refit([m.fit.start() for m in (*near, *parts)], noise)
     return max((search.models[frozenset(m.names)] for m in rivals), key=lambda m: m.merit)
 
 

@@ -17,7 +17,7 @@ from bench.gap.candidates import Directions, Probe, simulate_with
 from bench.gap.colour import surrogates
 from bench.gap.score import score
 from bench.gap.search import Model, Search
-from bench.gap.world import Mask, World
+from bench.gap.world import World
 from methods.base import Array
 from sims.system import Coefficient, Force, Moment
 
@@ -82,15 +82,14 @@ class Remains:
         return self.p_value < self.chance or bool(self.loud)
 
 
-def remains(search: Search, model: Model, stated: Mask) -> Remains:
+def remains(search: Search, model: Model) -> Remains:
     """Test what a fitted model leaves.
 
     Args:
         search: whose model it is.
         model: the model.
-        stated: (C,) whether the recording states the noise of each channel.
     """
-    world = search.world
+    world, stated = search.world, search.stated
     left = np.where(np.isfinite(model.likelihood.sigma), model.likelihood.sigma, 0.0)
     excess = left / search.noise.sigma
     loud = tuple(

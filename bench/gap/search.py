@@ -14,10 +14,10 @@ import numpy as np
 
 from bench.gap.base import HORIZONS
 from bench.gap.candidates import Directions, directions
-from bench.gap.colour import Likelihood, Noise, likelihood, surrogates
+from bench.gap.colour import Likelihood, Noise, forgets, likelihood, surrogates
 from bench.gap.fit import Fit, Fitter, Start, prior_of
 from bench.gap.score import Group, Scores, score, tail
-from bench.gap.world import BEYOND, Mask, World, coefficient_bounds
+from bench.gap.world import Mask, World, coefficient_bounds
 from methods.base import Array
 
 Names = tuple[str, ...]
@@ -29,8 +29,9 @@ CERTAIN = 1e-6
 """A chance below which surrogates of another colour are not asked."""
 UNLIKELY, DOUBTFUL = 0.1, 0.015
 """Chance of the linear scores above which no effect, or no further one, is tried by simulation."""
-LOUD = 1.3
-"""What is left that exceeds the noise floor by more is looked into by simulation whatever the scores say."""
+LOUD, FORGOT = 1.3, 0.01
+"""What is left that exceeds the noise floor by more is looked into by simulation whatever the scores say; but for an
+estimated floor, where the chance that it is first-order noise is above the second."""
 MOST_EFFECTS = 3
 NOMINATED = 7
 WHITE = 3
@@ -84,9 +85,12 @@ class Search:
     noise: Noise
     frozen: frozenset[int]
     rng: np.random.Generator
+    stated: Mask
     models: dict[frozenset[str], Model] = field(default_factory=dict)
     scanned: dict[frozenset[str], tuple[Directions, Scores]] = field(default_factory=dict)
     tests: dict[frozenset[str], float] = field(default_factory=dict)
+    chances: dict[str, float] = field(default_factory=dict)
+    _lessened: set[frozenset[str]] = field(default_factory=set)
 
     @property
     def seen(self) -> Mask:
@@ -116,10 +120,8 @@ class Search:
 
     def _chance(self, name: str) -> float:
         """What an effect costs beside that: its shapes are tried by the dozen, and the best of them gains by chance."""
-        scores = self.scanned.get(frozenset(), (None, _NOTHING))[1]
-        known = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         slot = self.world.slots[name]
-        return float(max(known.get(name, 0.0) - (slot.stop - slot.start) * self._price, 0.0))
+        return float(max(self.chances.get(name, 0.0) - (slot.stop - slot.start) * self._price, 0.0))
 
     def refit(
         self, starts: Sequence[Start], noise: Noise | None = None, patient: bool = False, race: bool = True
@@ -136,8 +138,14 @@ class Search:
         for (share, iterations), kept in zip(HORIZONS[:-1], SIFTED, strict=True) if patient else ():
             fits = Fitter(self.world, noise, self.frozen, share).fit(starts, iterations)
             starts = [fit.start() for fit in sorted(fits, key=lambda fit: fit.cost)[:kept]]
-        for fit in Fitter(self.world, noise, self.frozen).fit(starts, 24, race=race):
+        best = self._reached(starts) if race and noise is self.noise else np.inf
+        for fit in Fitter(self.world, noise, self.frozen).fit(starts, 24, race=race, reached=best):
             self.enter(fit)
+
+    def _reached(self, starts: Sequence[Start]) -> float:
+        """The least sum of squares of the models known that have no more effects than the largest of these."""
+        most = max(len(start.effects) for start in starts)
+        return min((m.fit.cost for m in self.models.values() if 0 < len(m.names) <= most), default=np.inf)
 
     def scan(self, model: Model, against: Array | None = None) -> Scores:
         """Score every effect that the model lacks.
@@ -148,7 +156,8 @@ class Search:
         """
         key = frozenset(model.names)
         if key not in self.scanned:
-            lacking = [name for name in self.world.library if name not in key]
+            held = {*key, *(part for name in key for part in self.world.effects[name].contains)}
+            lacking = [name for name in self.world.library if name not in held]
             self.scanned[key] = (directions(self.world, model.fit, lacking), _NOTHING)
         found, scores = self.scanned[key]
         if against is None and scores is not _NOTHING:
@@ -158,6 +167,8 @@ class Search:
         scores = score(model.fit, residual, found, self.seen, self.weights(model), like)
         self.scanned[key] = (found, scores)
         self.tests[key] = scores.p_value
+        if not key and not self.chances:  # kept, so that merits stay comparable when a better base fit turns up
+            self.chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         return scores
 
     def weights(self, model: Model) -> Noise:
@@ -177,10 +188,16 @@ class Search:
         result = []
         for i in chosen:
             for c in self._sizes(found, scores.group[i], scores.c[i], scores.effects[i]):
-                theta = model.fit.theta.copy()
-                theta[self.world.slots[scores.effects[i]]] = c
-                result.append(Start((*model.names, scores.effects[i]), theta, model.fit.states))
+                result.append(self._with(model, scores.effects[i], c))
         return self._nearest(result, HORIZONS[0][0] if patient else 1.0)
+
+    def _with(self, model: Model, name: str, c: Array) -> Start:
+        """The model with one more effect, which takes the place of those that it contains."""
+        theta, held = model.fit.theta.copy(), self.world.effects[name].contains
+        theta[self.world.slots[name]] = c
+        for part in set(held) & set(model.names):
+            theta[self.world.slots[part]] = 0.0
+        return Start((*(n for n in model.names if n not in held), name), theta, model.fit.states)
 
     def _sizes(self, found: Directions, group: Group, scored: Array, name: str) -> Iterator[Array]:
         """Coefficients to begin with: as scored, less, and at shares of the plausible range where one scales it."""
@@ -196,7 +213,7 @@ class Search:
                 c[place] = share * float(np.clip(size, *bounds[place]))
             yield c
         if len(group.columns) == 1:
-            reach = bounds[first.place][1] / BEYOND
+            reach = self.world.parameters[self.world.slots[name].start + first.place].bounds[1]
             for share in (0.2, 0.7, 1.5, *((-0.2, -0.7, -1.5) if first.signed else ())):
                 c = first.c.copy()
                 c[first.place] = share * reach
@@ -226,7 +243,7 @@ class Search:
         for model in beam:
             key = frozenset(model.names)
             scores = self.scanned[key][1] if key in self.scanned else self.scan(model)
-            found = self.starts(model, scores, most, patient)
+            found = self.starts(self.models[key], scores, most, patient)
             starts += [s for s in found if patient or frozenset(s.effects) not in self.models]
         if starts:
             self.refit(starts, patient=patient)
@@ -242,7 +259,8 @@ class Search:
         The surrogates have the colour of what the larger model leaves, which is closer to the noise alone.
         """
         gain = larger.likelihood.value - model.likelihood.value
-        scores = self.scanned[frozenset(model.names)][1]
+        model = self.models[frozenset(model.names)]
+        scores = self.scan(model)
         if (first := self._gained(scores, larger, gain)) < CERTAIN:
             return first
         scores = self.scan(model, self.residual(larger.fit))
@@ -255,20 +273,41 @@ class Search:
 
     def plain(self, model: Model, doubt: float) -> bool:
         """Whether nothing suggests that the model lacks something: neither a score nor the size of what it leaves."""
-        left = np.nanmax(model.likelihood.sigma / self.noise.sigma)
-        return self.scan(model).p_value > doubt and float(left) < LOUD
+        return self.scan(model).p_value > doubt and self._quiet(model)
+
+    def _quiet(self, model: Model) -> bool:
+        """Whether what a model leaves may be noise: as small as the floor, or larger where the floor is an estimate.
+
+        The floor is estimated as if noise forgot itself; what is left may exceed it if it is of first order.
+        """
+        loud = np.nan_to_num(model.likelihood.sigma, nan=np.inf) >= LOUD * self.noise.sigma
+        if not loud.any():
+            return True
+        if (loud & self.stated).any():
+            return False
+        return forgets(self.residual(model.fit), self.seen, model.likelihood) > FORGOT
 
     def without(self, model: Model, name: str) -> Model:
         """The model with one of its effects taken away."""
-        rest = tuple(n for n in model.names if n != name)
-        if frozenset(rest) not in self.models:
+        rest = frozenset(n for n in model.names if n != name)
+        if rest not in self.models:
+            self._lessen(model, [name])
+        return self.models[rest]
+
+    def _lessen(self, model: Model, names: Iterable[str]) -> None:
+        """Fit the model without each of these effects, from where it stands itself."""
+        starts = []
+        for name in names:
             theta = model.fit.theta.copy()
             theta[self.world.slots[name]] = 0.0
-            self.refit([Start(rest, theta, model.fit.states)])
-        return self.models[frozenset(rest)]
+            starts.append(Start(tuple(n for n in model.names if n != name), theta, model.fit.states))
+        self.refit(starts)
 
     def drop(self, model: Model) -> Model:
-        """The model without effects that it does not need."""
+        """The model without effects that it does not need; each smaller one is fitted from here, known or not."""
+        if len(model.names) > 1 and frozenset(model.names) not in self._lessened:
+            self._lessened.add(frozenset(model.names))
+            self._lessen(model, model.names)
         for name in model.names:
             smaller = self.without(model, name)
             if smaller.merit >= model.merit:
@@ -302,7 +341,7 @@ class Search:
                 larger = self._conservative(best, self.drop(self.swap(self.drop(larger))))
             if larger.merit > best.merit and self.missing(best, larger) <= ALPHA:
                 best = larger
-            elif self.excess(best) < FAR:
+            elif self.excess(best) < FAR or self._quiet(best):
                 break
             if size > 1 and self.excess(larger) > HOPELESS * self.excess(self.models[frozenset()]):
                 break

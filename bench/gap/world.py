@@ -14,7 +14,7 @@ from sims import effects as library
 from sims.base import InputError, Parameter, Scenario, unknown
 from sims.recording import Recording, Run
 from sims.simulated import Simulated, effect_parameters
-from sims.system import Effect, Input, Sensor
+from sims.system import Effect, Friction, Input, Sensor
 
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
@@ -23,6 +23,9 @@ LANE_SAMPLES = 400_000
 """Samples simulated in one call of the engine: beyond it more lanes cost memory and gain nothing."""
 TIME_STEP = 0.01
 """Longest step of the batch engine, seconds; it shortens its steps itself where motion or forces ask for it."""
+TURN, PATIENCE = 0.14, 4.0
+"""Radians of an oscillation in a step of the batch engine: its phase is then off by 3e-6 of itself. A lane is given up
+that needs so many times the planned steps."""
 FINE_STEP = 0.0025
 """The same where a sensor filters: a filter takes what it reads for linear over each step, which an impact is not."""
 FREED = 5.0
@@ -83,7 +86,8 @@ class World:
         observe = [c.name for c in kind.channels if c.name in runs[0].channels]
         steps: tuple[dict[str, Any], ...] = ({}, {})
         if engine == "batch":
-            steps = {"time_step": TIME_STEP}, {"time_step": FINE_STEP}
+            pace = {"turn": TURN, "patience": PATIENCE}
+            steps = {"time_step": TIME_STEP, **pace}, {"time_step": FINE_STEP, **pace}
         self.simulator, self._fine = (
             kind(recording.constants, observe, engine=engine, effects=chosen, **settings) for settings in steps
         )
@@ -285,10 +289,12 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
         low, high = parameter.bounds
         if parameter.unit == "Hz":
             low = min(max(low, CYCLES / world.longest), high / 2.0)
-        bounds.append((low, high) if low > 0 else (0.0 if low == 0 else BEYOND * low, BEYOND * high))
+        beyond = DRY if isinstance(world.effects[name], Friction) else BEYOND
+        bounds.append((low, high) if low > 0 else (0.0 if low == 0 else beyond * low, beyond * high))
     return bounds
 
 
-BEYOND = 20.0
+BEYOND, DRY = 20.0, 4.0
+"""The second for dry friction: what is stronger only sticks."""
 CYCLES = 1.0
 """What comes and goes must do so about once in the longest run, else any slow change would be called periodic."""

@@ -36,6 +36,7 @@ class Stribeck(Friction):
     says = "friction is greatest at rest and falls as motion picks up"
     source = _SURVEY
     needs = "guide"
+    contains = ("friction.coulomb",)
     coefficients = (
         Coefficient("coulomb", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),
         Coefficient("extra", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),

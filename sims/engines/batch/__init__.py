@@ -13,7 +13,7 @@ import numpy as np
 
 from sims.base import InputError
 from sims.engines.batch.field import Field, acts
-from sims.engines.batch.pace import divisions
+from sims.engines.batch.pace import TURN, divisions
 from sims.engines.batch.parabola import fly
 from sims.engines.batch.stepping import Stepping
 from sims.engines.ground import Ground, Indices, Mask
@@ -30,33 +30,54 @@ class Batch:
 
     Args:
         time_step: longest step in seconds; steps are shorter where a lane's motion is too fast for it.
+        turn: radians by which an oscillation may turn in a step; see `sims.engines.batch.pace`.
+        patience: a lane is given up, and NaN, that needs so many times the planned steps; so a search through forces
+            that bend sharply at every reversal never waits for what is no answer. Without a limit by default.
 
     Raises:
-        InputError: a time step that is not a positive number.
+        InputError: a setting that is not a positive number.
     """
 
     name = "batch"
     requires = REQUIRES
 
-    def __init__(self, time_step: float = TIME_STEP) -> None:
+    def __init__(self, time_step: float = TIME_STEP, turn: float = TURN, patience: float = np.inf) -> None:
         if not (np.isfinite(time_step) and time_step > 0):
             raise InputError(f"engine batch: time_step must be a positive number of seconds, found {time_step}")
-        self.largest_step = float(time_step)
+        for name, value in (("turn", turn), ("patience", patience)):
+            if not value > 0:
+                raise InputError(f"engine batch: {name} must be a positive number, found {value}")
+        self.largest_step, self._turn, self._patience = float(time_step), float(turn), float(patience)
 
     def integrate(self, lanes: Lanes) -> Motion:
         """Integrate every lane over its steps; a lane whose numbers overflow is NaN throughout."""
         with np.errstate(all="ignore"):
             moved, order = _sorted(lanes)
             if not moved.any():
-                motion = _moved(lanes)
+                motion = self._moved(lanes)
             else:
                 parts = [order[moved[order] == kind] for kind in (False, True)]
-                motion = _joined([(part, _moved(_take(lanes, part))) for part in parts if part.size], lanes)
+                motion = _joined([(part, self._moved(_take(lanes, part))) for part in parts if part.size], lanes)
         lost = ~(np.isfinite(motion.x[:, -1]) & np.isfinite(motion.v[:, -1])).all(axis=1)
         if lost.any():
             for values in (motion.x, motion.v, motion.a):
                 values[lost] = np.nan
         return motion
+
+    def _moved(self, lanes: Lanes) -> Motion:
+        """The motion of lanes that are all stepped or all in free flight."""
+        field = Field(lanes)
+        ground = Ground(lanes) if lanes.system.bounces else None
+        if field.free:
+            still = np.zeros((len(lanes.x), 1))
+            return fly(lanes, field.force(still, lanes.x, lanes.v) / field.mass, ground)
+        spans = np.max(lanes.steps, axis=1, keepdims=True, initial=0.0)
+        parts = divisions(lanes, field, spans, self._turn)
+        slow = (parts > FEW)[:, 0]
+        if slow.any() and not slow.all():  # few lanes in many short steps would keep the others waiting in every one
+            apart = [(part, self._moved(_take(lanes, part))) for part in map(np.flatnonzero, (~slow, slow))]
+            return _joined(apart, lanes)
+        return Stepping(lanes, field, ground, spans, parts).run(self._patience)
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
         """Nothing: it carries every system."""
@@ -66,9 +87,15 @@ class Batch:
         """It holds nothing."""
 
 
-def engine(system: type[System], *, time_step: float = TIME_STEP) -> Batch:  # noqa: ARG001
+def engine(
+    system: type[System],  # noqa: ARG001
+    *,
+    time_step: float = TIME_STEP,
+    turn: float = TURN,
+    patience: float = np.inf,
+) -> Batch:
     """A new engine; see `Batch`."""
-    return Batch(time_step)
+    return Batch(time_step, turn, patience)
 
 
 def _sorted(lanes: Lanes) -> tuple[Mask, Indices]:
@@ -79,21 +106,6 @@ def _sorted(lanes: Lanes) -> tuple[Mask, Indices]:
         return np.full(len(lanes.x), steps), np.arange(len(lanes.x))
     moved: Mask = np.any(forces, axis=0) | steps
     return moved, np.lexsort(forces)
-
-
-def _moved(lanes: Lanes) -> Motion:
-    """The motion of lanes that are all stepped or all in free flight."""
-    field = Field(lanes)
-    ground = Ground(lanes) if lanes.system.bounces else None
-    if field.free:
-        still = np.zeros((len(lanes.x), 1))
-        return fly(lanes, field.force(still, lanes.x, lanes.v) / field.mass, ground)
-    spans = np.max(lanes.steps, axis=1, keepdims=True, initial=0.0)
-    parts = divisions(lanes, field, spans)
-    slow = (parts > FEW)[:, 0]
-    if slow.any() and not slow.all():  # few lanes in many short steps would keep the others waiting in every one
-        return _joined([(part, _moved(_take(lanes, part))) for part in map(np.flatnonzero, (~slow, slow))], lanes)
-    return Stepping(lanes, field, ground, spans, parts).run()
 
 
 def _take(lanes: Lanes, i: Indices) -> Lanes:

@@ -58,6 +58,10 @@ class Clock:
         if lanes.size:
             self._kept[self._step[lanes] // self._every, lanes] = state[:, lanes].T
 
+    def keep_last(self, state: Array) -> None:
+        """Keep the state (3 D, L) as the one behind the last sample: nothing follows."""
+        self._kept[-1] = state.T
+
     def finish(self, ended: Mask | None = None) -> None:
         """Lanes `ended` (L,), or all, go on to their next step."""
         if ended is not None and self._common is not None and not ended.all():

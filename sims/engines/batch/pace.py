@@ -20,14 +20,17 @@ DIVISIONS = 64  # parts of a step at most
 INSTANTS, NUDGE = 6, 1e-5
 
 
-def divisions(lanes: Lanes, field: Field, spans: Array) -> Array:
-    """(L, 1) into how many parts steps of `spans` (L, 1) seconds must be divided; what cannot be told is one."""
+def divisions(lanes: Lanes, field: Field, spans: Array, turn: float = TURN) -> Array:
+    """(L, 1) into how many parts steps of `spans` (L, 1) seconds must be divided; what cannot be told is one.
+
+    An oscillation then turns by `turn` radians in each at most, and decay is held to a share in proportion.
+    """
     parts = np.ones_like(spans)
     for inputs in _instants(lanes):
         field.feel(inputs)
         for x, v in ((lanes.x, lanes.v), (0.0 * lanes.x, 0.0 * lanes.v)):
             turning, decaying = _rates(field, x, v)
-            needed = np.maximum(np.sqrt(turning) * spans / TURN, decaying * spans / DECAY)
+            needed = np.maximum(np.sqrt(turning) * spans, decaying * spans * (TURN / DECAY)) / turn
             parts = np.fmax(parts, np.ceil(needed))
     return np.minimum(parts, DIVISIONS)
 

@@ -49,6 +49,9 @@ class Stepping:
         self._rows = self._state.reshape(3 * dim, count)
         self._x, self._v, self._a = (part.T for part in self._state)
         self._x[...], self._v[...] = lanes.x, lanes.v
+        shared = lanes.steps.strides[0] == 0
+        self._planned = np.count_nonzero(lanes.steps[:1] if shared else lanes.steps, axis=1)
+        self._taken = np.zeros(count)
         self._longest = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
         self._bends = field.dry or bool(field.pushed.any())
         self._eventful = ground is not None or self._bends or bool((parts > 1).any())
@@ -64,15 +67,16 @@ class Stepping:
         if ground is not None:
             self._start_on(ground)
 
-    def run(self) -> Motion:
-        """All steps."""
+    def run(self, patience: float = np.inf) -> Motion:
+        """All steps; a lane that needs more than `patience` times the planned ones is NaN from there on."""
         clock, dynamics = self._clock, self._dynamics
+        hurries = self._eventful and np.isfinite(patience)
         while True:
             self._field.feel(clock.inputs())
             k1 = dynamics.begin(clock.t, self._x, self._v)
             self._a[...] = k1
             clock.keep(self._rows)
-            if clock.over:
+            if clock.over or (hurries and self._overdue(patience)):
                 return clock.motion()
             if self._eventful:
                 h = np.minimum(clock.left, self._limit)
@@ -82,6 +86,22 @@ class Stepping:
             else:
                 self._x[...], self._v[...], _ = self._stepped(clock.left, k1)[:3]
                 clock.finish()
+
+    def _overdue(self, patience: float) -> bool:
+        """Count a step of every lane on its way, and give up those with too many; whether none is left."""
+        self._taken += self._clock.left[:, 0] > 0
+        late = self._taken > patience * self._planned
+        if not late.any():
+            return False
+        self._rows[:, late] = np.nan
+        self._limit, self._try[late], self._goal[late] = (
+            np.where(late[:, None], self._longest, self._limit),
+            np.inf,
+            NOTHING,
+        )
+        if late.all():
+            self._clock.keep_last(self._rows)
+        return bool(late.all())
 
     def _stepped(self, h: Array, k1: Array) -> tuple[Array, Array, Array, Array]:
         """Position, velocity and (to third order) acceleration a step of h (L, 1) later; how the acceleration bent."""
