@@ -16,13 +16,12 @@ from bench.gap.base import Base, fit_base
 from bench.gap.colour import Noise
 from bench.gap.extend import Extended, Number
 from bench.gap.floor import Floor, noise_floor
-from bench.gap.measure import Gain, HeldOut, gain, intervals
+from bench.gap.measure import HeldOut
 from bench.gap.name import Finding, name
-from bench.gap.propose import next_experiment
 from bench.gap.remains import CHANCE, Hat, Remains
-from bench.gap.score import tail
-from bench.gap.search import Model, Search
+from bench.gap.search import Search
 from bench.gap.story import Shown, Story, Tuned
+from bench.gap.verdict import Answer
 from bench.gap.world import World
 from bench.inspection import load
 from bench.seeds import rng_for
@@ -111,6 +110,7 @@ class _Explainer:
         self.measuring = World(kind, self.recording, held_out, self.engine, [Hat], free) if held_out else None
         self.floor: Floor = noise_floor(self.fitting, self.recording)
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
+        self.answer = Answer(self.recording, self.fitting, self.measuring, self.floor, self.engine)
         self._check()
 
     def _check(self) -> None:
@@ -140,7 +140,7 @@ class _Explainer:
         held_out = HeldOut(self.measuring, self.noise) if self.measuring else None
         finding = self._still(search, base) or name(search, held_out)
         self.say("measuring the gain")
-        verdict = self._verdict(search, finding, rng)
+        verdict = self.answer.verdict(search, finding, rng, self.started)
         story = self._story(search, base, finding, verdict)
         extended = self._extended(search, finding)
         for world in (self.fitting, self.measuring):
@@ -168,122 +168,8 @@ class _Explainer:
             return Finding("unidentifiable", model, model, (), nothing, vague)
         return None
 
-    def _verdict(self, search: Search, finding: Finding, rng: np.random.Generator) -> dict[str, Any]:
-        world = self.fitting
-        numbers = self._numbers(search, finding.model)
-        causes = []
-        for cause in finding.causes:
-            effect = world.effects[cause.effect]
-            there = effect.on(world.simulator.system)
-            names = [c.name for c in there]
-            places = range(*world.slots[cause.effect].indices(len(world.parameters)))
-            causes.append(
-                {
-                    "effect": cause.effect,
-                    "alternatives": list(cause.alternatives),
-                    "says": effect.says,
-                    "coefficients": {n: _estimate(numbers[i]) for n, i in zip(names, places, strict=True)},
-                    "p_value": cause.p_value,
-                }
-            )
-        simulations = world.simulations + (self.measuring.simulations if self.measuring else 0)
-        result = {
-            "verdict": finding.verdict,
-            "system": self.recording.system,
-            "engine": self.engine or "its own",
-            "causes": causes,
-            "parameters": {world.parameters[i].name: _estimate(numbers[i]) for i in world.base.tolist()},
-            "heldout": self._heldout(finding, rng),
-            "candidates": self._candidates(search, finding),
-            "next_experiment": self._next(search, finding),
-            "simulations": int(simulations),
-            "seconds": 0.0,
-        }
-        result["seconds"] = time.perf_counter() - self.started
-        return result
-
-    def _numbers(self, search: Search, model: Model) -> dict[int, Number]:
-        """Every parameter and coefficient by its place; without an interval where it was not fitted."""
-        world = self.fitting
-        known = intervals(search, model)
-        result = {}
-        for place, parameter in enumerate(world.parameters):
-            value, low, high = known.get(place, (float(model.fit.theta[place]), np.nan, np.nan))
-            bounded = np.isfinite(low) and np.isfinite(high)
-            result[place] = Number(value, parameter.unit, low if bounded else None, high if bounded else None)
-        return result
-
-    def _counted(self) -> list[int]:
-        """Channels that share the unit of the one that sensor effects act on."""
-        world = self.fitting
-        units = [c.unit for c in world.simulator.channels]
-        reading = world.simulator.system.reading(world.channels)
-        return [c for c, unit in enumerate(units) if unit == units[world.channels.index(reading)]]
-
-    def _sigma(self, finding: Finding) -> Array:
-        """(C,) the noise floor: stated, or what a model that leaves no structure leaves."""
-        left = finding.model.likelihood.sigma
-        usable = ~self.floor.stated & np.isfinite(left) & (left > self.floor.sigma)
-        return np.where(usable & (not finding.remains.structure), left, self.floor.sigma)
-
-    def _heldout(self, finding: Finding, rng: np.random.Generator) -> dict[str, Any] | None:
-        if self.measuring is None or finding.measured is None or finding.model.names not in finding.measured:
-            return None
-        counted = self._counted()
-        floor = float(np.sqrt(np.square(self._sigma(finding)[counted]).mean()))
-        before, after = (finding.measured[names].simulated for names in ((), finding.model.names))
-        if not (np.isfinite(before[np.isfinite(self.measuring.observed)]).all()):
-            return None
-        found = gain(self.measuring, before, after, counted, floor, rng)
-        return _heldout(found, self.fitting.simulator.channels[counted[0]].unit)
-
-    def _candidates(self, search: Search, finding: Finding) -> list[dict[str, Any]]:
-        """Every effect of the library with its evidence about the base model, the strongest first."""
-        if frozenset() not in search.scanned:
-            return []
-        scores = search.scanned[frozenset()][1]
-        base = search.models[frozenset()].likelihood.value
-        rows = []
-        for i, effect in enumerate(scores.effects):
-            alone = search.models.get(frozenset({effect}))
-            score = float(scores.score[i])
-            if alone is not None:
-                score = max(score, float(alone.likelihood.value - base))
-            p_value = tail(scores.by_chance, np.array([score - scores.chance[i]]))
-            rows.append({
-                "effect": effect, "score": max(score, 0.0), "p_value": float(np.clip(p_value, 0.0, 1.0)),
-                "heldout_gain": self._share(finding, (effect,)),
-            })  # fmt: skip
-        return sorted(rows, key=lambda row: -row["score"])
-
-    def _share(self, finding: Finding, names: tuple[str, ...]) -> float | None:
-        """Share of the held-out gap that a model closes; None where it was not measured."""
-        if self.measuring is None or finding.measured is None or names not in finding.measured:
-            return None
-        counted, seen = self._counted(), np.isfinite(self.measuring.observed)
-        floor = float(np.sqrt(np.square(self._sigma(finding)[counted]).mean()))
-        before, after = (
-            float(np.sqrt(np.square((self.measuring.observed - s)[..., counted][seen[..., counted]]).mean()))
-            for s in (finding.measured[()].simulated, finding.measured[names].simulated)
-        )
-        share = (before - max(after, floor)) / (before - floor) if before > floor * 1.001 else 0.0
-        return float(np.clip(share, -9.0, 1.0)) if np.isfinite(share) else None
-
-    def _next(self, search: Search, finding: Finding) -> dict[str, Any] | None:
-        if finding.verdict == "unidentifiable":
-            names = " and ".join(finding.vague)
-            differently = "they act differently from each other" if len(finding.vague) > 1 else "it makes a difference"
-            return {"says": f"Measure {names} apart, or record runs in which {differently}"}
-        for cause in finding.causes:
-            for other in cause.alternatives:
-                rest = {n for n in finding.model.names if n != cause.effect}
-                rival = search.models.get(frozenset({*rest, other}))
-                if rival is not None:
-                    return next_experiment(search, finding.model, rival)
-        return None
-
     def _story(self, search: Search, base: Base, finding: Finding, verdict: dict[str, Any]) -> Story:
-        world, sigma = self.fitting, self._sigma(finding)
+        world, sigma = self.fitting, self.answer.sigma(finding)
         before, after = finding.base.fit.simulated, finding.model.fit.simulated
         places = show.places(world, before, after, sigma)
         held_out = None
@@ -303,7 +189,7 @@ class _Explainer:
         )  # fmt: skip
 
     def _tuned(self, search: Search, base: Base, finding: Finding) -> tuple[Tuned, ...]:
-        sides = [self._numbers(search, model) for model in (finding.base, finding.model)]
+        sides = [self.answer.numbers(search, model) for model in (finding.base, finding.model)]
         result = []
         for i in self.fitting.base.tolist():
             before, after = (_triple(side[i]) for side in sides)
@@ -341,7 +227,7 @@ class _Explainer:
         return lines
 
     def _extended(self, search: Search, finding: Finding) -> Extended:
-        world, numbers = self.fitting, self._numbers(search, finding.model)
+        world, numbers = self.fitting, self.answer.numbers(search, finding.model)
         own = {world.parameters[i].name: numbers[i] for i in range(world.own)}
         freed = {p.name: numbers[world.own + i].value for i, p in enumerate(world.freed)}
         added = {}
@@ -355,19 +241,6 @@ class _Explainer:
         )  # fmt: skip
 
 
-def _estimate(number: Number) -> dict[str, Any]:
-    return {"value": number.value, "unit": number.unit, "low": number.low, "high": number.high}
-
-
 def _triple(number: Number) -> tuple[float, float, float]:
     low, high = (np.nan if bound is None else bound for bound in (number.low, number.high))
     return number.value, low, high
-
-
-def _heldout(found: Gain, unit: str) -> dict[str, Any] | None:
-    """As in verdict.json; an interval that the data do not give is null."""
-    values = {
-        "rmse_base": found.base, "rmse_extended": found.extended, "noise_floor": found.floor,
-        "gap_closed": found.closed, "low": found.low, "high": found.high,
-    }  # fmt: skip
-    return {**{k: v if np.isfinite(v) else None for k, v in values.items()}, "unit": unit}

@@ -11,7 +11,8 @@ import numpy as np
 from bench.gap.base import HORIZONS
 from bench.gap.colour import Noise, likelihood, whitened
 from bench.gap.fit import RESPONSE, Fit, Fitter, Start, prior_of
-from bench.gap.search import Model, Search, freedom
+from bench.gap.models import Model, freedom
+from bench.gap.search import Search
 from bench.gap.world import Mask, World
 from methods.base import Array
 

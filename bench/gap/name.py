@@ -9,9 +9,10 @@ import numpy as np
 
 from bench.gap.colour import Noise
 from bench.gap.measure import HeldOut, Measured, covariance
+from bench.gap.models import Model, Names
 from bench.gap.remains import Remains, remains
 from bench.gap.score import tail
-from bench.gap.search import ALPHA, SWITCH, Model, Names, Search
+from bench.gap.search import ALPHA, SWITCH, Search
 from methods.base import Array
 from sims.simulated import effect_parameters
 

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap.search import Model, Search
+from bench.gap.models import Model
+from bench.gap.search import Search
 from bench.gap.world import World
 from methods.base import Array
 from sims.base import Scenario

@@ -15,8 +15,9 @@ import numpy as np
 
 from bench.gap.candidates import Directions, Probe, simulate_with
 from bench.gap.colour import surrogates
+from bench.gap.models import Model
 from bench.gap.score import score
-from bench.gap.search import Model, Search
+from bench.gap.search import Search
 from bench.gap.world import World
 from methods.base import Array
 from sims.system import Coefficient, Force, Moment

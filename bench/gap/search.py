@@ -14,13 +14,12 @@ import numpy as np
 
 from bench.gap.base import HORIZONS
 from bench.gap.candidates import Directions, directions
-from bench.gap.colour import Likelihood, Noise, forgets, likelihood, surrogates
-from bench.gap.fit import Fit, Fitter, Start, prior_of
+from bench.gap.colour import forgets, surrogates
+from bench.gap.fit import Start
+from bench.gap.models import Model, Models, Names
 from bench.gap.score import Group, Scores, score, tail
-from bench.gap.world import Mask, World, coefficient_bounds
+from bench.gap.world import coefficient_bounds
 from methods.base import Array
-
-Names = tuple[str, ...]
 
 SURROGATES = 120
 ALPHA = 0.003
@@ -39,8 +38,6 @@ WHITE = 3
 almost anything."""
 PROMISING = 0.25
 """Candidates are refitted that promise at least this share of the best one's score."""
-SIFTED = (12, 8)
-"""Of models that are fitted with patience so many go on from each horizon to the next."""
 MOVES = 2
 FAR = 0.5
 """Excess over the noise above which the search looks further ahead."""
@@ -55,97 +52,17 @@ SWITCH = 7.0
 """Twice the log likelihood by which two models must differ to be told apart: odds of 33 to 1."""
 
 
-@dataclass(frozen=True)
-class Model:
-    """A fitted model and its merit.
-
-    Attributes:
-        fit: the fit.
-        likelihood: of its residual.
-        merit: twice the log likelihood less the log of the number of samples for each parameter and initial state that
-            the data fix (G. Schwarz, Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136); for an effect with many
-            shapes, less what the best of them gains by chance.
-    """
-
-    fit: Fit
-    likelihood: Likelihood
-    merit: float
-
-    @property
-    def names(self) -> Names:
-        """Its effects."""
-        return self.fit.effects
-
-
 @dataclass
-class Search:
-    """The models of one recording that have been fitted, and what has been scored about them."""
+class Search(Models):
+    """The search, and what has been scored about the models on its way."""
 
-    world: World
-    noise: Noise
-    frozen: frozenset[int]
-    rng: np.random.Generator
-    stated: Mask
-    models: dict[frozenset[str], Model] = field(default_factory=dict)
     scanned: dict[frozenset[str], tuple[Directions, Scores]] = field(default_factory=dict)
     tests: dict[frozenset[str], float] = field(default_factory=dict)
-    chances: dict[str, float] = field(default_factory=dict)
     _lessened: set[frozenset[str]] = field(default_factory=set)
 
-    @property
-    def seen(self) -> Mask:
-        """(R, T, C) samples that there are."""
-        return np.isfinite(self.world.observed)
-
-    def residual(self, fit: Fit) -> Array:
-        """(R, T, C) observed less simulated, zero where nothing was seen."""
-        residual: Array = np.where(self.seen, self.world.observed - fit.simulated, 0.0)
-        return residual
-
-    def enter(self, fit: Fit) -> Model:
-        """Take a fit into account; the better of two fits of the same effects is kept."""
-        free = fit.free.size + freedom(self.world, fit, self.noise)
-        found = likelihood(self.residual(fit), self.seen, free) if np.isfinite(fit.cost) else _LOST
-        merit = found.value - free * self._price - sum(self._chance(name) for name in fit.effects)
-        model, key = Model(fit, found, merit), frozenset(fit.effects)
-        if key not in self.models or merit > self.models[key].merit:
-            self.models[key] = model
-            self.scanned.pop(key, None)
-        return self.models[key]
-
-    @property
-    def _price(self) -> float:
-        """What each number that the data fix costs a model: the log of the number of samples."""
-        return float(np.log(max(int(self.seen.sum()), 2)))
-
-    def _chance(self, name: str) -> float:
-        """What an effect costs beside that: its shapes are tried by the dozen, and the best of them gains by chance."""
-        slot = self.world.slots[name]
-        return float(max(self.chances.get(name, 0.0) - (slot.stop - slot.start) * self._price, 0.0))
-
-    def refit(
-        self, starts: Sequence[Start], noise: Noise | None = None, patient: bool = False, race: bool = True
-    ) -> None:
-        """Fit models from their starts and enter them.
-
-        Args:
-            starts: where to begin.
-            noise: weighs the samples; the search's own if None.
-            patient: fit the beginnings of the runs first, as the base model's fit does, and go on with the best.
-            race: give up what falls far behind.
-        """
-        noise = noise or self.noise
-        for (share, iterations), kept in zip(HORIZONS[:-1], SIFTED, strict=True) if patient else ():
-            fits = Fitter(self.world, noise, self.frozen, share).fit(starts, iterations)
-            starts = [fit.start() for fit in sorted(fits, key=lambda fit: fit.cost)[:kept]]
-        best = self._reached(starts) if race and noise is self.noise else np.inf
-        for fit in Fitter(self.world, noise, self.frozen).fit(starts, 24, race=race, reached=best):
-            self.enter(fit)
-
-    def _reached(self, starts: Sequence[Start]) -> float:
-        """The least sum of squares of the models known that have no more effects than the largest of these."""
-        most = max(len(start.effects) for start in starts)
-        return min((m.fit.cost for m in self.models.values() if 0 < len(m.names) <= most), default=np.inf)
+    def replaced(self, key: frozenset[str]) -> None:
+        """What was scored about the model before holds no longer."""
+        self.scanned.pop(key, None)
 
     def scan(self, model: Model, against: Array | None = None) -> Scores:
         """Score every effect that the model lacks.
@@ -170,11 +87,6 @@ class Search:
         if not key and not self.chances:  # kept, so that merits stay comparable when a better base fit turns up
             self.chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         return scores
-
-    def weights(self, model: Model) -> Noise:
-        """Channels weigh by what the model leaves of them where that is more than their noise."""
-        left = np.where(np.isfinite(model.likelihood.sigma), model.likelihood.sigma, 0.0)
-        return Noise(np.maximum(self.noise.sigma, left), self.noise.phi)
 
     def starts(self, model: Model, scores: Scores, most: int, patient: bool) -> list[Start]:
         """Where to begin with the most promising candidates, at what scores say and at less; with all in patience."""
@@ -247,11 +159,6 @@ class Search:
             starts += [s for s in found if patient or frozenset(s.effects) not in self.models]
         if starts:
             self.refit(starts, patient=patient)
-
-    def best(self, size: int) -> Model | None:
-        """The best model with so many effects."""
-        there = [m for m in self.models.values() if len(m.names) == size]
-        return max(there, key=lambda m: m.merit) if there else None
 
     def missing(self, model: Model, larger: Model) -> float:
         """Probability that a model which lacks nothing would seem to gain as much by becoming the larger one.
@@ -370,11 +277,6 @@ class Search:
         there = [m for m in self.models.values() if set(best.names) < set(m.names) and m.merit > best.merit]
         return max((m for m in there if len(m.names) == len(best.names) + 1), key=lambda m: m.merit, default=best)
 
-    def excess(self, model: Model) -> float:
-        """RMS of what a model leaves in units of the noise floor, less the one that noise itself leaves."""
-        left = self.residual(model.fit) / self.noise.sigma
-        return float(np.sqrt(np.square(left[self.seen]).mean())) - 1.0
-
     def _beam(self, size: int) -> list[Model]:
         """Models of so many effects to go on from: those of the most merit, and those that come nearest to the data."""
         there = sorted((m for m in self.models.values() if len(m.names) == size), key=lambda m: -m.merit)
@@ -385,15 +287,4 @@ class Search:
         return rivals + [m for m in sorted(there, key=lambda m: m.fit.cost)[:NEAREST] if m not in rivals]
 
 
-def freedom(world: World, fit: Fit, noise: Noise) -> float:
-    """How many initial states the data fix, all runs together: one that a model does not use gives it no freedom."""
-    seen = np.isfinite(world.observed)
-    states = np.where(seen[..., None], fit.jacobian[..., fit.free.size :], 0.0) / noise.sigma[:, None]
-    columns = states.reshape(len(states), seen.shape[1] * seen.shape[2], states.shape[3]) * prior_of(world)
-    columns = np.where(world.known[:, None, :], 0.0, columns)
-    powers = np.linalg.eigvalsh(np.matmul(columns.transpose(0, 2, 1), columns))
-    return float((powers / (1.0 + np.maximum(powers, 0.0))).clip(0.0, 1.0).sum())
-
-
-_LOST = Likelihood(-np.inf, np.zeros(0), np.zeros(0))
 _NOTHING = Scores((), np.zeros(0), np.zeros(0), (), (), 1.0, 0.0, np.zeros((0, 0)), np.zeros(0))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from sims import effects as library
 from sims.ball.simulator import Ball
 from sims.base import InputError, Parameter, Scenario
 from sims.effects.friction import Coulomb
@@ -285,3 +286,34 @@ def test_refuses_settings_it_cannot_use(settings, says):
 @pytest.mark.slow
 def test_ball_rollouts_are_fifty_times_as_many_as_in_pybullet():
     assert engines.ball()["ratio"] > 50.0
+
+
+def test_a_lane_that_needs_too_many_steps_is_given_up_and_no_other():
+    times = np.arange(201) / 100.0
+    kinds = {"drag.linear": 0.1, "friction.stribeck": (0.02, 4.0, 0.02)}
+    whole = Slider(engine="batch", effects=list(kinds), time_step=0.01)
+    hasty = Slider(engine="batch", effects=list(kinds), time_step=0.01, patience=1.5)
+    scenario = Scenario(times, {"x": 0.0, "v": 0.0}, {"u": 6.0 * np.sin(40.0 * times)})
+    theta = np.array([[1.0, 0.1, 0.0, 0.0, 0.02], [1.0, 0.0, 0.02, 4.0, 0.02], [1.3, 0.2, 0.0, 0.0, 0.02]])
+    expected, found = whole.simulate(theta, scenario), hasty.simulate(theta, scenario)
+    assert np.isfinite(expected).all()
+    np.testing.assert_array_equal(found[[0, 2]], expected[[0, 2]])
+    assert np.isnan(found[1]).any(), "reversals forty times a second, in a friction that falls within 0.02 m/s"
+    np.testing.assert_array_equal(hasty.simulate(theta[1:2], scenario), found[1:2])
+    np.testing.assert_array_equal(Slider(engine="batch", effects=list(kinds), time_step=0.01, patience=50.0).simulate(
+        theta, scenario), expected)  # fmt: skip
+
+
+@pytest.mark.parametrize(("simple", "rich"), [("friction.coulomb", "friction.stribeck"), ("drag.quadratic", "wind")])
+def test_an_effect_becomes_the_one_it_contains(simple, rich):
+    effect = library.get(rich)
+    assert effect.contains == (simple,)
+    scenario = Scenario(np.arange(101) / 50.0, {"x": 0.0, "v": 2.0}, {"u": np.sin(np.arange(101) / 9.0)})
+    one, other = (Slider(engine="batch", effects=[name]) for name in (simple, rich))
+    theta = np.zeros((1, len(other.parameters)))
+    theta[0, :2] = 1.0, 0.4
+    if rich == "friction.stribeck":
+        theta[0, -1] = 0.1
+    np.testing.assert_allclose(
+        other.simulate(theta, scenario), one.simulate(np.array([[1.0, 0.4]]), scenario), atol=1e-9
+    )

@@ -60,12 +60,17 @@ def white(world, sigma):
     )
 
 
-def searched(recorded, sigma, seed=0, **options):
+def marked(world, stated):
+    """(C,) whether the noise of each channel is stated: of all, or of each its own."""
+    return np.broadcast_to(np.asarray(stated, dtype=bool), (len(world.channels),)).copy()
+
+
+def searched(recorded, sigma, seed=0, stated=True, **options):
     """A search with the fitted base model entered, and that model."""
     there = world(recorded, **options)
     noise = white(there, sigma)
     base = fit_base(there, noise)
-    search = Search(there, noise, base.untouched, np.random.default_rng(seed))
+    search = Search(there, noise, base.untouched, np.random.default_rng(seed), marked(there, stated))
     return search, search.enter(base.fit)
 
 

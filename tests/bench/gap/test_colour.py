@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bench.gap.colour import Noise, likelihood, log_determinant, surrogates, whitened
+from bench.gap.colour import Noise, forgets, likelihood, log_determinant, surrogates, whitened
 from tests.bench.gap.made import correlated, covariance_of
 
 
@@ -133,3 +133,17 @@ def test_surrogates_of_nothing_are_nothing():
     assert not surrogates(np.zeros((1, 30, 1)), seen, 5, np.random.default_rng(0)).any()
     few = surrogates(np.array([1.0, -2.0, 3.0]).reshape(1, 3, 1), seen[:, :3], 9, np.random.default_rng(0))
     assert set(np.abs(few).ravel()) <= {1.0, 2.0, 3.0}
+
+
+def test_first_order_noise_is_told_from_structure_that_is_as_large():
+    seen = np.ones((4, 300, 2), dtype=bool)
+    chances = {"noise": [], "structure": []}
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        noise = correlated(rng, 0.7, np.array([1.0, 5.0]), seen.shape)
+        wave = np.sin(np.arange(300) / 15.0 + rng.uniform(0, 6))[None, :, None] * np.ones(seen.shape)
+        mixed = rng.standard_normal(seen.shape) * np.array([1.0, 5.0]) + 1.2 * wave
+        for name, values in (("noise", noise), ("structure", mixed)):
+            chances[name].append(forgets(values, seen, likelihood(values, seen)))
+    assert np.mean(np.array(chances["noise"]) > 0.01) > 0.9
+    assert max(chances["structure"]) < 1e-6

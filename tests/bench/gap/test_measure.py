@@ -9,7 +9,7 @@ from bench.gap.measure import HeldOut, central, covariance, gain, intervals
 from bench.gap.search import Search
 from sims.pendulum.simulator import Pendulum
 from sims.slider.simulator import Slider
-from tests.bench.gap.made import correlated, recorded, recording, searched, white, world
+from tests.bench.gap.made import correlated, marked, recorded, recording, searched, white, world
 
 
 def errors(rmse, runs=6, samples=200, seed=0):
@@ -79,7 +79,7 @@ def test_intervals_cover_the_truth(phi):
     for _ in range(60):
         there.observed[...] = clean + correlated(rng, phi, 0.004, clean.shape)
         fit = Fitter(there, noise).fit([Start(("drag.linear",), theta, there.guess)], 12)[0]
-        search = Search(there, noise, frozenset(), rng)
+        search = Search(there, noise, frozenset(), rng, marked(there, True))
         found = intervals(search, search.enter(fit))
         held.append([found[i][1] <= theta[i] <= found[i][2] for i in range(2)])
     assert 0.88 <= np.mean(held) <= 0.99
@@ -119,7 +119,7 @@ def test_what_the_data_do_not_bound_has_no_interval():
     there = world(made, candidates=["drag.quadratic"])
     noise = white(there, [0.01, 0.05])
     start = Start(("drag.quadratic",), np.array([3.3e-3, 1e-3]), there.guess)
-    search = Search(there, noise, frozenset(), np.random.default_rng(0))
+    search = Search(there, noise, frozenset(), np.random.default_rng(0), marked(there, True))
     model = search.enter(Fitter(there, noise).fit([start], 3)[0])
     assert np.isnan(intervals(search, model)[1][1:]).all()
 

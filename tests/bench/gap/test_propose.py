@@ -9,7 +9,7 @@ from bench.gap.propose import TELLING, next_experiment
 from bench.gap.search import Search
 from sims.base import Scenario
 from sims.pendulum.simulator import Pendulum
-from tests.bench.gap.made import recording, white, world
+from tests.bench.gap.made import marked, recording, white, world
 
 
 def rivals(made, sigma, effects, **options):
@@ -17,7 +17,7 @@ def rivals(made, sigma, effects, **options):
     there = world(made, candidates=list(effects), **options)
     noise = white(there, sigma)
     base = fit_base(there, noise)
-    search = Search(there, noise, base.untouched, np.random.default_rng(0))
+    search = Search(there, noise, base.untouched, np.random.default_rng(0), marked(there, True))
     models = []
     for name in effects:
         start = Start((name,), base.fit.theta, base.fit.states)

@@ -34,8 +34,7 @@ def left(kind, effect, size, starts, seed=0, stated=True, sigma=(0.003, 0.02)):
     simulator = kind(effects=[effect]) if effect else kind()
     theta = [simulator.parameters[0].nominal, *([size] if effect else [])]
     made = recorded(simulator, theta, starts, TIMES, sigma, seed, stated)
-    search, model = searched(made, sigma, seed, extra=[Hat])
-    return remains(search, model, np.array([stated, stated]))
+    return remains(*searched(made, sigma, seed, stated, extra=[Hat]))
 
 
 SWINGS = [{"q": 0.8}, {"q": -1.1}, {"q": 0.4, "qd": 2.0}]
@@ -73,12 +72,13 @@ def test_clean_recordings_are_quiet():
 def test_noise_that_is_louder_than_stated_is_structure():
     made = recorded(Pendulum(), [3.3e-3], SWINGS, TIMES, (0.003, 0.02), seed=3)
     quiet, loud = (searched(made, sigma, extra=[Hat]) for sigma in ((0.003, 0.02), (0.002, 0.02)))
-    assert remains(*quiet, np.array([True, True])).loud == ()
-    found = remains(*loud, np.array([True, True]))
+    assert remains(*quiet).loud == ()
+    found = remains(*loud)
     assert found.loud == ("q",)
     assert found.structure
     assert found.excess[0] == pytest.approx(1.5, rel=0.08)
-    assert not remains(*loud, np.array([False, True])).structure, "half as much again as an estimated noise is none"
+    loud[0].stated = np.array([False, True])
+    assert not remains(*loud).structure, "half as much again as an estimated noise is none"
 
 
 def test_hats_cover_time_position_and_speed():
@@ -102,5 +102,5 @@ def test_hats_cover_time_position_and_speed():
 def test_without_hats_only_the_stated_noise_speaks():
     made = recorded(Pendulum(), [3.3e-3], SWINGS, TIMES, (0.003, 0.02), seed=4)
     search, model = searched(made, (0.003, 0.02))
-    found = remains(search, model, np.array([True, True]))
+    found = remains(search, model)
     assert (found.p_value, found.where, found.structure) == (1.0, "", False)
