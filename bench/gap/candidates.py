@@ -13,7 +13,7 @@ from itertools import product
 
 import numpy as np
 
-from bench.gap.fit import Fit
+from bench.gap.fit import Fit, Start
 from bench.gap.world import CYCLES, Mask, World
 from methods.base import Array
 from sims.base import Parameter
@@ -25,7 +25,8 @@ LEVELS = (0.15, 0.35, 0.6, 0.85)
 """Shares of the largest input at which limits, dead bands and plays are tried besides."""
 NOTHING = 1e-11
 """Share of the largest observation below which a change is rounding."""
-SHAPES, FREQUENCIES = 12, 48
+SHAPES, FREQUENCIES, SPREAD = 12, 96, 1.5
+"""Sizes tried of a shape, frequencies at most, and how much closer slow ones lie than fast ones, as a power."""
 MODIFIED = (-0.7, -0.25, 0.0, 0.25, 0.7)
 
 
@@ -103,10 +104,34 @@ def _first(world: World, name: str) -> Iterator[Probe]:
 def _grid(world: World, parameter: Parameter) -> Array:
     low, high = parameter.bounds
     if parameter.unit == "Hz":
-        low = min(max(low, CYCLES / world.longest), high / 2.0)
-        count = int(np.clip(2.0 * (high - low) * world.longest, 4, FREQUENCIES))
-        return low + (high - low) * np.linspace(0.0, 1.0, count) ** 1.3
+        return _frequencies(min(max(low, CYCLES / world.longest), high / 2.0), high, world.longest)
+    if parameter.name.endswith(".period") and (travel := world.travel) > 0:
+        return 1.0 / _frequencies(1.0 / high, 1.0 / low, travel)
     return np.geomspace(low, high, SHAPES)
+
+
+def neighbours(world: World, fit: Fit) -> Iterator[Start]:
+    """The model with what repeats in it a little faster or slower: least squares stops at the nearest such minimum."""
+    for name in fit.effects:
+        for place in range(*world.slots[name].indices(len(world.parameters))):
+            parameter, value = world.parameters[place], float(fit.theta[place])
+            for cycles in (-1.0, -0.5, 0.5, 1.0):
+                if parameter.unit == "Hz":
+                    moved = value + cycles / world.longest
+                elif parameter.name.endswith(".period") and world.travel > 0 and value > 0:
+                    moved = 1.0 / max(1.0 / value + cycles / world.travel, 1.0 / parameter.bounds[1])
+                else:
+                    break
+                theta = fit.theta.copy()
+                theta[place] = np.clip(moved, *parameter.bounds)
+                yield Start(fit.effects, theta, fit.states)
+
+
+def _frequencies(low: float, high: float, extent: float) -> Array:
+    """Frequencies from low to high, half a cycle over the extent apart where they lie closest."""
+    count = int(np.clip(2.0 * (high - low) * extent, 4, FREQUENCIES))
+    found: Array = low + (high - low) * np.linspace(0.0, 1.0, count) ** SPREAD
+    return found
 
 
 def _moving(world: World, probes: Sequence[Probe], values: Array) -> Mask:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.gap.candidates import neighbours
 from bench.gap.colour import Noise
 from bench.gap.measure import HeldOut, Measured, covariance
 from bench.gap.models import Model, Names
@@ -127,7 +128,7 @@ def settled(search: Search, model: Model) -> Model:
     if noisy:
         noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), np.maximum(model.likelihood.phi, 0.0))
     rivals = [m for m in near if noisy and abs(model.merit - m.merit) < NEAR] or [model]
-    search.refit([m.fit.start() for m in (*near, *parts)], noise)
+    search.refit([*(m.fit.start() for m in (*near, *parts)), *neighbours(search.world, model.fit)], noise)
     return max((search.models[frozenset(m.names)] for m in rivals), key=lambda m: m.merit)
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,8 @@ SMALL = 4
 """Groups of more columns are taken as they are, without a choice of columns."""
 ABSORBED = 1e-12
 """Of a direction's sum of squares less than this share is left where the model's own freedom absorbs it."""
+MANY, PEAKS = 12, 3
+"""An effect with more shapes than the first is begun from so many of them."""
 RANK = 1e-9
 """Directions below this share of the largest eigenvalue of their scaled products are none."""
 
@@ -37,6 +40,9 @@ class Group:
     positive: tuple[bool, ...]
 
 
+Peak = tuple[Group, Array]
+
+
 @dataclass(frozen=True)
 class Scores:
     """Scores of the library about one model.
@@ -45,8 +51,8 @@ class Scores:
         effects: names, the highest score first.
         score: twice the gain in log likelihood of each.
         chance: its 90 % quantile over surrogates (0 without them).
-        group: the best group of each.
-        c: coefficients of that group's columns, in units of the directions.
+        peaks: of each its best group with the coefficients of its columns, in units of the directions; behind it, where
+            an effect has shapes by the dozen, further ones that are better than their neighbours.
         p_value: probability that the highest score of a library, less its chance, is reached with nothing missing.
         phi: correlation of the noise under the best hypothesis.
         by_chance: (E, S) scores of the surrogates, less their chance.
@@ -56,8 +62,7 @@ class Scores:
     effects: tuple[str, ...]
     score: Array
     chance: Array
-    group: tuple[Group, ...]
-    c: tuple[Array, ...]
+    peaks: tuple[tuple[Peak, ...], ...]
     p_value: float
     phi: float
     by_chance: Array
@@ -218,28 +223,45 @@ def score(
     count, shape = int(seen.sum()), (len(names), everything.shape[3])
     nothing, white = np.full(shape[1], -np.inf), np.zeros(len(names))
     best = np.full(shape, -np.inf)
-    which: dict[str, tuple[float, Group, Array, float]] = {}
+    which: dict[str, list[_Found]] = {n: [_Found(-np.inf, g, np.zeros(0), 0.0) for g in members if g.effect == n]
+                                      for n in names}  # fmt: skip
     products = Products(at, everything, directions.values, seen, noise.sigma)
     for phi in GRID:
         total, gram, cross = products.projected(phi)
         determinant = 2.0 * log_determinant(seen, np.full(seen.shape[2], phi))
         floor = 1e-12 * total + 1e-300
         nothing = np.maximum(nothing, determinant - count * np.log(np.maximum(total, floor)))
-        for g in members:
-            gain, c = explained(gram, cross, g)
-            value = determinant - count * np.log(np.maximum(total - gain, floor))
-            row = names.index(g.effect)
-            if value[0] > which.get(g.effect, (-np.inf,))[0]:
-                which[g.effect] = (float(value[0]), g, c[:, 0], phi)
-            best[row] = np.maximum(best[row], value)
-            if phi == 0:
-                white[row] = max(white[row], count * float(np.log(total[0] / max(total[0] - gain[0], floor[0]))))
+        for row, name in enumerate(names):
+            for i, found in enumerate(which[name]):
+                gain, c = explained(gram, cross, found.group)
+                value = determinant - count * np.log(np.maximum(total - gain, floor))
+                if value[0] > found.value:
+                    which[name][i] = _Found(float(value[0]), found.group, c[:, 0], phi)
+                best[row] = np.maximum(best[row], value)
+                if phi == 0:
+                    white[row] = max(white[row], count * float(np.log(total[0] / max(total[0] - gain[0], floor[0]))))
     return _ranked(names, best - nothing, which, white)
 
 
-def _ranked(
-    names: Sequence[str], gains: Array, which: dict[str, tuple[float, Group, Array, float]], white: Array
-) -> Scores:
+class _Found(NamedTuple):
+    """The likeliest hypothesis about a group: twice its log likelihood, coefficients, correlation of the noise."""
+
+    value: float
+    group: Group
+    c: Array
+    phi: float
+
+
+def _peaks(found: Sequence[_Found]) -> tuple[Peak, ...]:
+    """The best, and of a dozen and more the next that are better than their neighbours."""
+    values = np.array([f.value for f in found])
+    around = np.concatenate([[-np.inf], values, [-np.inf]])
+    local = (values >= around[:-2]) & (values >= around[2:]) if len(found) > MANY else values == values.max()
+    order = [i for i in np.argsort(-values, kind="stable") if local[i]]
+    return tuple((found[i].group, found[i].c) for i in order[: PEAKS if len(found) > MANY else 1])
+
+
+def _ranked(names: Sequence[str], gains: Array, which: dict[str, list[_Found]], white: Array) -> Scores:
     observed, chance = gains[:, 0], np.zeros(len(names))
     p_value = 1.0
     if gains.shape[1] > 1:
@@ -247,9 +269,9 @@ def _ranked(
         p_value = tail(gains[:, 1:] - chance[:, None], observed - chance)
     order = np.argsort(-observed, kind="stable")
     ranked = [names[i] for i in order]
+    phi = max(which[ranked[0]], key=lambda found: found.value).phi if ranked else 0.0
     return Scores(
-        tuple(ranked), observed[order], chance[order], tuple(which[n][1] for n in ranked),
-        tuple(which[n][2] for n in ranked), p_value, which[ranked[0]][3] if ranked else 0.0,
+        tuple(ranked), observed[order], chance[order], tuple(_peaks(which[n]) for n in ranked), p_value, phi,
         (gains[:, 1:] - chance[:, None])[order], white[order],
     )  # fmt: skip
 

@@ -99,8 +99,9 @@ class Search(Models):
             chosen = chosen[:most] + near
         result = []
         for i in chosen:
-            for c in self._sizes(found, scores.group[i], scores.c[i], scores.effects[i]):
-                result.append(self._with(model, scores.effects[i], c))
+            for peak, (group, scored) in enumerate(scores.peaks[i]):
+                for c in self._sizes(found, group, scored, scores.effects[i]):
+                    result.append((peak, self._with(model, scores.effects[i], c)))
         return self._nearest(result, HORIZONS[0][0] if patient else 1.0)
 
     def _with(self, model: Model, name: str, c: Array) -> Start:
@@ -131,22 +132,23 @@ class Search(Models):
                 c[first.place] = share * reach
                 yield c
 
-    def _nearest(self, starts: Sequence[Start], share: float) -> list[Start]:
-        """Of starts with the same effects the one whose simulation comes nearest over the first share of the runs."""
-        if not starts:
+    def _nearest(self, numbered: Sequence[tuple[int, Start]], share: float) -> list[Start]:
+        """Of starts of one number and the same effects the one nearest to the data over the first share of the runs."""
+        if not numbered:
             return []
+        starts = [start for _, start in numbered]
         world, runs = self.world, len(self.world.tracks)
         theta = np.repeat([s.theta for s in starts], runs, axis=0)
         states = np.concatenate([s.states for s in starts])
         seen = world.simulate(theta, np.tile(np.arange(runs), len(starts)), states, share)
         seen = seen.reshape(len(starts), runs, *seen.shape[1:])
         counted = world.counted(share)
-        best: dict[Names, tuple[float, Start]] = {}
-        for start, part in zip(starts, seen, strict=True):
+        best: dict[tuple[int, Names], tuple[float, Start]] = {}
+        for (number, start), part in zip(numbered, seen, strict=True):
             left = np.where(counted, world.observed - part, 0.0) / self.noise.sigma
             cost = float(np.square(left).sum())
-            if cost < best.get(start.effects, (np.inf,))[0]:
-                best[start.effects] = cost, start
+            if cost < best.get((number, start.effects), (np.inf,))[0]:
+                best[number, start.effects] = cost, start
         return [start for _, start in best.values()]
 
     def extend(self, beam: Iterable[Model], most: int, patient: bool = False) -> None:
@@ -287,4 +289,4 @@ class Search(Models):
         return rivals + [m for m in sorted(there, key=lambda m: m.fit.cost)[:NEAREST] if m not in rivals]
 
 
-_NOTHING = Scores((), np.zeros(0), np.zeros(0), (), (), 1.0, 0.0, np.zeros((0, 0)), np.zeros(0))
+_NOTHING = Scores((), np.zeros(0), np.zeros(0), (), 1.0, 0.0, np.zeros((0, 0)), np.zeros(0))

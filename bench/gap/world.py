@@ -120,6 +120,16 @@ class World:
         return max(float(t.scenario.times[-1] - t.scenario.times[0]) for t in self.tracks) or 1.0
 
     @property
+    def travel(self) -> float:
+        """The range of the primary coordinate in the run where it is largest; 0 where it is not recorded."""
+        system = self.simulator.system
+        name = system.coordinates[system.primary]
+        if name not in self.channels:
+            return 0.0
+        values = self.observed[:, :, self.channels.index(name)]
+        return float(np.nan_to_num(np.nanmax(values, axis=1) - np.nanmin(values, axis=1)).max())
+
+    @property
     def effects(self) -> dict[str, Effect]:
         """Every effect at hand, by name."""
         return {effect.name: effect for effect in self.simulator.effects}
