@@ -88,7 +88,8 @@ def test_scores_are_gains_in_log_likelihood_at_the_best_correlation():
     assert found.effects == tuple(sorted(expected, key=lambda name: -expected[name]))
     np.testing.assert_allclose(found.score, [expected[name] for name in found.effects], rtol=1e-6)
     assert found.effects[0] == "a", "it makes the difference"
-    assert found.c[0][0] == pytest.approx(0.4, abs=0.15)
+    (peak,) = found.peaks[0]
+    assert peak[1][0] == pytest.approx(0.4, abs=0.15)
     assert found.p_value == 1.0, "without surrogates nothing is known of chance"
 
 
@@ -195,3 +196,19 @@ def test_the_tail_beyond_the_surrogates_is_exponential():
         assert np.log(tail(drawn, np.array([value]))) == pytest.approx(-value / 2, rel=0.12)
     assert tail(drawn, np.zeros(0)) == 1.0
     assert tail(np.zeros((1, 10)), np.array([5.0])) == pytest.approx(1 / 11), "ten surrogates cannot say more"
+
+
+def test_an_effect_of_many_shapes_keeps_the_best_that_beat_their_neighbours():
+    rng = np.random.default_rng(8)
+    t = np.arange(400) / 100.0
+    frequencies = np.linspace(0.5, 8.0, 40)
+    waves = np.stack([f(2 * np.pi * hertz * t) for hertz in frequencies for f in (np.sin, np.cos)], axis=-1)
+    made = 0.5 * np.sin(2 * np.pi * frequencies[10] * t) + 0.3 * np.cos(2 * np.pi * frequencies[30] * t)
+    residual = (made + 0.1 * rng.standard_normal(400))[None, :, None]
+    seen = np.ones(residual.shape, dtype=bool)
+    found = Directions(tuple(Probe("wave", k // 2, k % 2, np.ones(3), True) for k in range(80)), waves[None, :, None])
+    fit = linear_fit(1e-9 * rng.standard_normal((1, 400, 1, 2)), 1)
+    (peaks,) = score(fit, residual, found, seen, Noise(np.array([0.1]), np.zeros(1))).peaks
+    assert [group.columns[0] // 2 for group, _ in peaks[:2]] == [10, 30]
+    np.testing.assert_allclose(peaks[0][1], [0.5, 0.0], atol=0.03)
+    assert len(peaks) == 3
