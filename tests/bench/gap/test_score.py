@@ -209,6 +209,8 @@ def test_an_effect_of_many_shapes_keeps_the_best_that_beat_their_neighbours():
     found = Directions(tuple(Probe("wave", k // 2, k % 2, np.ones(3), True) for k in range(80)), waves[None, :, None])
     fit = linear_fit(1e-9 * rng.standard_normal((1, 400, 1, 2)), 1)
     (peaks,) = score(fit, residual, found, seen, Noise(np.array([0.1]), np.zeros(1))).peaks
-    assert [group.columns[0] // 2 for group, _ in peaks[:2]] == [10, 30]
-    np.testing.assert_allclose(peaks[0][1], [0.5, 0.0], atol=0.03)
+    by_place = {group.columns[0] // 2: c for group, c in peaks}
+    assert {10, 30} <= set(by_place)
+    np.testing.assert_allclose(by_place[10], [0.5, 0.0], atol=0.05)
+    np.testing.assert_allclose(by_place[30], [0.0, 0.3], atol=0.05)
     assert len(peaks) == 3
