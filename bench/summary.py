@@ -20,8 +20,8 @@ from sims.base import InputError
 
 WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
 NEEDED = (
-    "run", "experiment", "tuner", "target", "seed", "range", "k", "param_error", "param_abs_error", "obs_error",
-    "heldout_error", "outside", "tuner_seconds", "simulator_seconds",
+    "run", "experiment", "tuner", "target", "seed", "range", "k", "param_error", "param_abs_error", "stiff_error",
+    "sloppy_error", "obs_error", "heldout_error", "outside", "tuner_seconds", "simulator_seconds",
 )  # fmt: skip
 """Columns of the runs that tables and figures use."""
 
