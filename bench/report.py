@@ -82,7 +82,7 @@ def _directions(lines: pd.DataFrame, kind: str, channel: str) -> str:
     part = part.assign(column=part["metric"].map(titles) + " " + part["simulations"].astype(str))
     order = [f"{t} {k}" for t in titles.values() for k in sorted(part["simulations"].unique())]
     means = part.pivot(index="tuner", columns="column", values="mean")
-    means = means[[c for c in order if c in means]]
+    means = means[[c for c in order if c in means]].dropna(axis=1, how="all")
     means = means.sort_values(by=means.columns[-1])
     means.columns.name = None
     means.index.name = None
