@@ -145,7 +145,7 @@ def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path)
     [
         (
             ["compare", "bal-drop"],
-            "unknown experiment 'bal-drop'; there are: arm-drive, arm-swing, ball-crossengine, ball-drop, ball-drop-published",
+            "unknown experiment 'bal-drop'; there are: arm-drive, arm-swing, ball-crossengine, ball-drop",
         ),
         (["compare", "none.toml"], "none.toml: no such file"),
         (["compare", "ball-drop", "--tuners", "cma"], "unknown tuner 'cma'; there are: bayes, cma_es"),

@@ -1,16 +1,18 @@
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from bench.compare import begin, make
-from bench.experiment import load
+from bench.experiment import load, parse
 from bench.identifiability import STIFF, of_jacobian, spectrum
 from bench.problem import Problem
 from bench.report import finish
 from bench.store import read
 from sims.base import InputError, Parameter
+from sims.recording import tomllib
 from tests.conftest import PLUGINS
 from tests.experiments import spring_experiment
 
@@ -109,6 +111,14 @@ def test_servo_that_is_always_driven_cannot_tell_resistance_from_drag():
     problem.close()
 
 
+def test_a_phase_with_the_motor_off_tells_them_apart():
+    experiment = load("servo-friction")
+    inputs = {**experiment.inputs, "torque_enable": "square:1:0.25"}  # off where it is -1
+    problem = Problem(dataclasses.replace(experiment, inputs=inputs, targets=1))
+    assert problem.spectrum(problem.targets()[0]).stiff.all()
+    problem.close()
+
+
 def test_pendulum_tells_no_common_factor_of_all_that_acts_on_it():
     experiment = load("pendulum-driven")
     settings = {"engine": "pybullet", "effects": [*experiment.settings["effects"], "gravity.scale"]}
@@ -182,6 +192,16 @@ def test_held_out_scenarios_change_nothing_else():
         assert b.sealed.held_out.observed.shape == (180, 1)
         first = starts[1] * np.exp(-b.truth[1] * np.arange(60) / 20) * np.cos(b.truth[0] * np.arange(60) / 20)
         np.testing.assert_allclose(b.sealed.held_out.observed[:60, 0], first, atol=1e-12)  # without noise
+
+
+def test_the_page_s_own_example_is_an_experiment():
+    page = (Path(__file__).parents[2] / "docs" / "problems.md").read_text()
+    document = tomllib.loads(page.split("```toml")[1].split("```")[0])
+    problem = Problem(parse("mine", document, Path("mine.toml")).chosen(targets=1))
+    assert [p.name for p in problem.cube.parameters] == ["inertia", "drag.linear", "friction.coulomb", "input.gain"]
+    held_out = problem.targets()[0].sealed.held_out.scenarios
+    np.testing.assert_allclose(held_out[2].inputs["u"], 0.1 * np.sin(2 * np.pi * 0.7 * held_out[2].times))
+    problem.close()
 
 
 def test_it_can_be_switched_off():

@@ -1,9 +1,12 @@
 """The arm against the two-link equations of motion, written here from their textbook form and solved by scipy."""
 
+import importlib.util
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from bench.registry import simulators
 from sims.arm.simulator import Arm
 from sims.base import InputError, Scenario
 
@@ -110,3 +113,9 @@ def test_what_it_cannot_have_is_refused_by_name():
         Arm(effects=["friction.coulomb"])
     with pytest.raises(InputError, match="arm steps itself; it has no engine 'mujoco'"):
         Arm(engine="mujoco")
+
+
+def test_without_pybullet_it_is_listed_as_skipped(monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pybullet" else find(name))
+    assert simulators.describe("arm") == "skipped: needs pybullet, not installed (pip install pybullet)"
