@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 COLUMNS = ["experiment", "target", "range", "direction", "eigenvalue", "sigma", "stiff"]
 _FLOOR, _CEILING = 1e-6, 1e4  # 1 sigma in training ranges, beyond which a figure shows no difference
+_WHERE = {"in": "truth in training range", "wide": "truth in bounds"}
 _ROWS = {
     "stiff_error": "along stiff directions\n[training widths]",
     "sloppy_error": "along sloppy directions\n[training widths]",
@@ -67,44 +68,10 @@ def spectra_figure(folder: Path, experiment: Experiment, table: pd.DataFrame) ->
     from matplotlib import pyplot as plt
 
     names = [c for c in table.columns if c not in COLUMNS]
-    ranges = list(dict.fromkeys(table["range"]))
     figure, (left, right) = plt.subplots(
-        1, 2, figsize=(3.6 + 0.9 * len(names), 1.9 + 0.42 * len(names)), width_ratios=[1, 1.25]
+        1, 2, figsize=(4.8 + 0.8 * len(names), 2.2 + 0.4 * len(names)), width_ratios=[1, 1.25]
     )
-    for place, (kind, look) in enumerate(zip(ranges, (("o", "#0072B2"), ("^", "#D55E00")), strict=False)):
-        part = table[table["range"] == kind]
-        spread = (part.groupby("direction").cumcount() / max(part["target"].nunique() - 1, 1) - 0.5) * 0.3
-        sigma = part["sigma"].clip(_FLOOR, _CEILING)
-        label = f"{TITLES[kind].lower()} (n = {part['target'].nunique()})"
-        across = part["direction"] + spread + (place - 0.5 * (len(ranges) - 1)) * 0.4
-        left.plot(across, sigma, look[0], color=look[1], markersize=3.5, alpha=0.75, linestyle="none", label=label)
-    left.axhline(STIFF, color="#444444", linewidth=0.8, linestyle="--")
-    left.annotate(
-        "sloppy",
-        (0.01, STIFF),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, 3),
-        textcoords="offset points",
-        ha="left",
-        fontsize=8,
-    )
-    left.annotate(
-        "stiff",
-        (0.01, STIFF),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, -9),
-        textcoords="offset points",
-        ha="left",
-        fontsize=8,
-    )
-    left.set_yscale("log")
-    left.set_ylim(bottom=left.get_ylim()[0] / 10)  # room for the legend
-    left.set_xticks(range(1, len(names) + 1))
-    left.set_xlabel("direction, the stiffest first")
-    left.set_ylabel("1 sigma that no estimate can beat\n[training widths]")
-    left.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
-    left.spines[["top", "right"]].set_visible(False)
-    left.legend(fontsize=7.5, frameon=False, loc="lower right")
+    _spectra(left, table, len(names))
     _directions(right, table, names)
     figure.suptitle(f"{experiment.title or experiment.name}: what the data can know", fontsize=11)
     caption = (
@@ -114,6 +81,31 @@ def spectra_figure(folder: Path, experiment: Experiment, table: pd.DataFrame) ->
     )
     figure.supxlabel(textwrap.fill(caption, int(15 * figure.get_figwidth())), fontsize=7.5, color="#444444")
     return save(folder, "identifiability", figure)
+
+
+def _spectra(axis: Axes, table: pd.DataFrame, dim: int) -> None:
+    """Every target's 1 sigma along each direction, the ranges beside each other."""
+    ranges = list(dict.fromkeys(table["range"]))
+    for place, (kind, look) in enumerate(zip(ranges, (("o", "#0072B2"), ("^", "#D55E00")), strict=False)):
+        part = table[table["range"] == kind]
+        spread = (part.groupby("direction").cumcount() / max(part["target"].nunique() - 1, 1) - 0.5) * 0.3
+        sigma = part["sigma"].clip(_FLOOR, _CEILING)
+        label = f"{_WHERE.get(kind, kind)} (n = {part['target'].nunique()})"
+        across = part["direction"] + spread + (place - 0.5 * (len(ranges) - 1)) * 0.4
+        axis.plot(across, sigma, look[0], color=look[1], markersize=3.5, alpha=0.75, linestyle="none", label=label)
+    axis.axhline(STIFF, color="#444444", linewidth=0.8, linestyle="--")
+    for name, above in (("sloppy", 3), ("stiff", -9)):
+        axis.annotate(
+            name, (0.01, STIFF), (0, above), xycoords=("axes fraction", "data"), textcoords="offset points", fontsize=8
+        )
+    axis.set_yscale("log")
+    axis.set_ylim(bottom=axis.get_ylim()[0] / 10)  # room for the legend
+    axis.set_xticks(range(1, dim + 1))
+    axis.set_xlabel("direction, the stiffest first")
+    axis.set_ylabel("1 sigma that no estimate can beat\n[training widths]")
+    axis.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(fontsize=7.5, frameon=False, loc="lower right")
 
 
 def _directions(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
