@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 from sims.base import Channel, Constant, Parameter
 from sims.bullet import NO_LIMIT
@@ -22,6 +23,7 @@ from sims.own import BulletWorld, OwnSimulator
 _HERE = (0.0, 0.0, 0.0, 1.0)
 _AXIS = (0.0, 1.0, 0.0)
 _PARTS = 16  # of a step in which dry friction changes sides
+_OF_THE_WORLD = ("_world", "_place", "_push", "_state", "_go")
 _STILL = 1e-6  # rad/s: a joint that is slower is at rest
 
 
@@ -91,6 +93,8 @@ class Arm(OwnSimulator):
             p.changeDynamics(self._arm, joint, localInertiaDiagonal=(inertia,) * 3, jointDamping=damping)
         self._friction = [theta["friction1"], theta["friction2"]]
         self._step = 0.0
+        self._place, self._push, self._state = p.resetJointState, p.setJointMotorControl2, p.getJointState
+        self._go, self._torque = p.stepSimulation, p.TORQUE_CONTROL  # looked up once: a run has thousands of each
         self._q, self._v = [initial["q1"], initial["q2"]], [initial["qd1"], initial["qd2"]]
 
     def step(self, inputs: Mapping[str, float], seconds: float) -> None:
@@ -106,7 +110,7 @@ class Arm(OwnSimulator):
         self._pace(seconds)
         q, v = self._q, self._v
         for joint in (0, 1):
-            self._world.resetJointState(self._arm, joint, q[joint], v[joint])
+            self._place(self._arm, joint, q[joint], v[joint])
         v1, v2 = self._advance(torques), self._advance(torques)
         self._q = [q[i] + seconds * (v[i] + v1[i]) / 2 for i in (0, 1)]
         self._v = [(v[i] + v2[i]) / 2 for i in (0, 1)]
@@ -123,6 +127,10 @@ class Arm(OwnSimulator):
         """Leave Bullet; the next run starts it again."""
         self.__dict__.pop("_world", None)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy gets a world of its own.
+        return {name: value for name, value in self.__dict__.items() if name not in _OF_THE_WORLD}
+
     def _pace(self, seconds: float) -> None:
         if seconds != self._step:  # Bullet turns a motor's force into an impulse when the motor is set
             p = self._world
@@ -133,9 +141,8 @@ class Arm(OwnSimulator):
 
     def _advance(self, torques: tuple[float, float]) -> tuple[float, float]:
         """One step of Bullet's; the joints' rates after it."""
-        p = self._world
         for joint in (0, 1):
-            p.setJointMotorControl2(self._arm, joint, p.TORQUE_CONTROL, force=torques[joint])
-        p.stepSimulation()
-        first, second = p.getJointStates(self._arm, (0, 1))
-        return first[1], second[1]
+            if torques[joint]:  # Bullet forgets them after each step
+                self._push(self._arm, joint, self._torque, force=torques[joint])
+        self._go()
+        return self._state(self._arm, 0)[1], self._state(self._arm, 1)[1]

@@ -1,5 +1,6 @@
 """The arm against the two-link equations of motion, written here from their textbook form and solved by scipy."""
 
+import copy
 import importlib.util
 
 import numpy as np
@@ -106,6 +107,14 @@ def test_a_run_does_not_depend_on_the_runs_before():
     once = arm.simulate(np.stack([RUBBING, DAMPED, RUBBING]), scenario)
     np.testing.assert_array_equal(once[0], once[2])
     np.testing.assert_array_equal(once[1], Arm().simulate(DAMPED[None], scenario)[0])
+
+
+def test_a_copy_has_a_world_of_its_own():
+    arm, scenario = Arm(), Scenario(TIMES, START)
+    before = arm.simulate(RUBBING[None], scenario)
+    other = copy.deepcopy(arm)
+    arm.close()
+    np.testing.assert_array_equal(other.simulate(RUBBING[None], scenario), before)
 
 
 def test_what_it_cannot_have_is_refused_by_name():
