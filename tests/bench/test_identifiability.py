@@ -6,6 +6,7 @@ import pandas as pd
 import pytest
 
 from bench.compare import begin, make
+from bench.curves import primary
 from bench.experiment import load, parse
 from bench.identifiability import STIFF, of_jacobian, spectrum
 from bench.problem import Problem
@@ -227,3 +228,13 @@ def test_faults_are_one_line(change, message):
 def test_an_unknown_state_of_held_out_scenarios_is_refused():
     with pytest.raises(InputError, match="unknown initial state"):
         Problem(spring_experiment(held_out={"initial": {"y": 1.0}})).targets()
+
+
+def test_what_nobody_could_know_decides_nothing():
+    runs = pd.DataFrame({"run": ["a", "a", "b"], "param_error": [0.3, 0.2, 0.4], "stiff_error": [0.1, 0.05, np.nan]})
+    assert primary(runs.assign(sloppy_error=np.nan)).metric == "param_error"
+    decisive = primary(runs.assign(sloppy_error=[0.5, 0.6, 0.7]))
+    assert decisive.metric == "stiff_error"
+    assert decisive.in_widths
+    assert decisive.runs["run"].tolist() == ["a", "a"]
+    assert primary(runs.drop(columns="stiff_error")).metric == "param_error"
