@@ -6,12 +6,13 @@
 # make benchmark measurements printed as ratios
 # make chaos     100 kills at random moments; what is resumed must equal what was never disturbed (about 10 minutes)
 # make reference the comparison of results/reference/comparison again, below results/ (about 10 minutes)
+# make multi     the comparison of results/reference/multi again, below results/ (about 15 minutes; TUNERS=a,b,... for others)
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: compare explain test check exam benchmark chaos reference install
+.PHONY: compare explain test check exam benchmark chaos reference multi install
 install: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml
@@ -55,6 +56,14 @@ REFERENCE := results/comparison
 reference: $(STAMP)
 	for e in $(PROBLEMS); do $(BIN)/simgap compare $$e --targets 5 --seeds 1 --budget 30 --out $(REFERENCE)/$$e || exit 1; done
 	$(BIN)/simgap plot $(PROBLEMS:%=$(REFERENCE)/%) --out $(REFERENCE)/all
+
+SEVERAL := ball-tilt pendulum-driven servo-friction arm-swing
+MULTI := results/multi
+
+multi: $(STAMP)
+	for e in $(SEVERAL); do $(BIN)/simgap compare $$e --targets 3 --seeds 2 --budget 50 $(if $(TUNERS),--tuners $(TUNERS)) --out $(MULTI)/$$e --allow-failures || exit 1; done
+	$(BIN)/simgap plot $(SEVERAL:%=$(MULTI)/%) --out $(MULTI)/all
+	$(BIN)/python -m tests.benchmarks.multi $(MULTI) > $(MULTI)/tables.md
 
 exam: $(STAMP)
 	$(BIN)/python -m tests.exam $(QUICK)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.journal import FOLDER, Journal, finished, read_plan, write_plan
+from bench.journal import FOLDER, Journal, finished, read_plan, replace_text, write_plan
 from bench.store import Configuration, configuration, create, free_folder, write_results
 from sims.base import InputError
 
@@ -126,12 +126,22 @@ def make(folder: Path, results: Results, plugins: Sequence[str], jobs: int, bar:
         run(results, plugins, jobs, bar, pool)
     finally:
         write_results(folder, journal, results.trainings, results.skipped_rows())
+        _write_spectra(folder, results)
         complete = len(journal.statuses) == len(results.plan)
         if complete:
             journal.discard()
         else:
             journal.close()
     return complete
+
+
+def _write_spectra(folder: Path, results: Results) -> None:
+    """Write identifiability.csv, a row a target and direction, where there are several parameters."""
+    if results.spectra:
+        from bench.figures_identifiability import spectra_table
+
+        table = spectra_table(results.problem.experiment, results.spectra, results.problem.cube.parameters)
+        replace_text(folder / "identifiability.csv", table.to_csv(index=False))
 
 
 def status(folder: Path, every: bool, say: Say) -> bool:

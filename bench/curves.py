@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -108,7 +108,22 @@ def mean_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Array
         return np.array([np.nanmean(values[rows], axis=0) for rows in groups])
 
 
-def primary(runs: pd.DataFrame) -> str:
-    """The metric that decides: the parameters' error where the truth is known, else the error on held-out runs."""
+class Decisive(NamedTuple):
+    """What decides a comparison: a metric, the runs that have it, and whether it counts in training widths."""
+
+    metric: str
+    runs: pd.DataFrame
+    in_widths: bool
+
+
+def primary(runs: pd.DataFrame) -> Decisive:
+    """The metric that decides: the parameters' error where the truth is known, else the error on held-out runs.
+
+    Where some target's data leave a direction sloppy, it is the error along stiff directions: nobody could know the
+    others. A target without a stiff direction then decides nothing.
+    """
+    if "sloppy_error" in runs and runs["sloppy_error"].notna().any() and runs["stiff_error"].notna().any():
+        return Decisive("stiff_error", runs[runs["stiff_error"].notna()], in_widths=True)
     candidates: tuple[Any, ...] = ("param_error", "heldout_error", "obs_error")
-    return next(str(m) for m in candidates if m in runs and runs[m].notna().any())
+    metric = next(str(m) for m in candidates if m in runs and runs[m].notna().any())
+    return Decisive(metric, runs, metric == "param_error")

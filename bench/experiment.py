@@ -12,6 +12,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from bench.tables import checked, pair, table_of
 from sims.base import InputError, unknown
 from sims.recording import read_toml
 
@@ -35,6 +36,15 @@ class Sampling:
 
     rate: float = 100.0
     samples: int = 400
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Unseen scenarios of a simulated target; initial states and inputs are the experiment's where not given."""
+
+    scenarios: int = 3
+    initial: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -72,6 +82,9 @@ class Experiment:
         initial: initial state: a number, or [low, high] for uniform between.
         inputs: input signals by name, as `simgap simulate` writes them, e.g. ``sine:2:0.5`` (`bench.signals`).
         sampling: sample times of simulated targets.
+        held_out: unseen scenarios on which the tuned simulator's prediction is measured; for simulated targets.
+        identifiability: whether to find what the data of each simulated target identify, where there are several
+            parameters (`bench.identifiability`): two simulations a parameter and target, beside all budgets.
         recording: the measured data, for range real.
         tuners: the entries.
     """
@@ -98,6 +111,8 @@ class Experiment:
     initial: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
     inputs: Mapping[str, str] = field(default_factory=dict)
     sampling: Sampling = field(default_factory=Sampling)
+    held_out: HeldOut | None = None
+    identifiability: bool = True
     recording: Source | None = None
     tuners: tuple[Entry, ...] = ()
 
@@ -112,6 +127,8 @@ class Experiment:
                 raise unknown("range", name, RANGES)
         if ("real" in self.ranges) != (self.recording is not None) or (self.recording and len(self.ranges) != 1):
             raise InputError(f"experiment {self.name}: range 'real' and a [recording] go together, and alone")
+        if self.held_out and (self.recording or self.held_out.scenarios < 1):
+            raise InputError(f"experiment {self.name}: [held_out] needs simulated targets and scenarios of at least 1")
 
     def document(self) -> dict[str, Any]:
         """The whole configuration as TOML tables; `parse` of it gives an equal experiment."""
@@ -165,7 +182,7 @@ def parse(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
         InputError: an unknown key or a value of another type, naming file and key.
     """
     values = dict(document)
-    entries = _checked(path, "tuners", values.pop("tuners", {}), dict)
+    entries = checked(path, "tuners", values.pop("tuners", {}), dict)
     fields = {k: _field(path, k, v) for k, v in values.items()}
     if not fields.get("simulator"):
         raise InputError(f'{path}: expected simulator = "NAME", found none')
@@ -198,6 +215,8 @@ _TYPES: dict[str, type | tuple[type, ...]] = {
     "initial": dict,
     "inputs": dict,
     "sampling": dict,
+    "held_out": dict,
+    "identifiability": bool,
     "recording": dict,
 }
 
@@ -205,76 +224,59 @@ _TYPES: dict[str, type | tuple[type, ...]] = {
 def _field(path: Path, key: str, value: Any) -> Any:
     if key not in _TYPES:
         raise unknown(f"entry of {path}", key, [*_TYPES, "tuners"])
-    _checked(path, key, value, _TYPES[key])
+    checked(path, key, value, _TYPES[key])
     if key in ("observe", "ranges"):
-        return tuple(_checked(path, key, v, str) for v in value)
+        return tuple(checked(path, key, v, str) for v in value)
     if key in ("noise", "constants"):
-        return {k: float(_checked(path, f"{key}.{k}", v, (int, float))) for k, v in value.items()}
+        return {k: float(checked(path, f"{key}.{k}", v, (int, float))) for k, v in value.items()}
     if key == "parameters":
         return {k: dict(_parameter(path, k, v)) for k, v in value.items()}
     if key == "initial":
-        return {k: _initial(path, f"initial.{k}", v) for k, v in value.items()}
+        return _initial(path, key, value)
     if key == "inputs":
-        return {k: str(_checked(path, f"inputs.{k}", v, str)) for k, v in value.items()}
+        return _inputs(path, key, value)
+    if key == "held_out":
+        return _held_out(path, value)
     if key == "sampling":
-        return Sampling(**_table(path, key, value, {"rate": (int, float), "samples": int}))
+        return Sampling(**table_of(path, key, value, {"rate": (int, float), "samples": int}))
     if key == "recording":
-        return Source(**_table(path, key, value, {"path": str}))
+        return Source(**table_of(path, key, value, {"path": str}))
     return value
 
 
 def _parameter(path: Path, name: str, table: Any) -> dict[str, Any]:
-    changes = _table(path, f"parameters.{name}", table, {
+    changes = table_of(path, f"parameters.{name}", table, {
         "nominal": (int, float), "bounds": list, "training": list, "log": bool
     })  # fmt: skip
     for key in ("bounds", "training"):
         if key in changes:
-            changes[key] = _pair(path, f"parameters.{name}.{key}", changes[key])
+            changes[key] = pair(path, f"parameters.{name}.{key}", changes[key])
     return changes
 
 
-def _initial(path: Path, where: str, value: Any) -> float | tuple[float, float]:
-    if isinstance(value, list):
-        return _pair(path, where, value)
-    return float(_checked(path, where, value, (int, float)))
+def _initial(path: Path, where: str, value: Any) -> dict[str, float | tuple[float, float]]:
+    return {
+        k: pair(path, f"{where}.{k}", v)
+        if isinstance(v, list)
+        else float(checked(path, f"{where}.{k}", v, (int, float)))
+        for k, v in value.items()
+    }
 
 
-def _pair(path: Path, where: str, value: Any) -> tuple[float, float]:
-    if len(value) != 2:
-        raise InputError(f"{path}: {where}: expected [low, high], found {value!r}")
-    low, high = (float(_checked(path, where, v, (int, float))) for v in value)
-    if not low < high:
-        raise InputError(f"{path}: {where}: expected low < high, found {value!r}")
-    return low, high
+def _inputs(path: Path, where: str, value: Any) -> dict[str, str]:
+    return {k: str(checked(path, f"{where}.{k}", v, str)) for k, v in value.items()}
+
+
+def _held_out(path: Path, value: Any) -> HeldOut:
+    given = table_of(path, "held_out", value, {"scenarios": int, "initial": dict, "inputs": dict})
+    initial = _initial(path, "held_out.initial", given.pop("initial", {}))
+    return HeldOut(initial=initial, inputs=_inputs(path, "held_out.inputs", given.pop("inputs", {})), **given)
 
 
 def _entry(path: Path, label: str, table: Any) -> Entry:
     where = f"tuners.{label}"
-    fields = _table(path, where, table, {"tuner": str, "options": dict, "seeds": int, "budget": int})
+    fields = table_of(path, where, table, {"tuner": str, "options": dict, "seeds": int, "budget": int})
     for key in ("seeds", "budget"):
         if fields.get(key, 1) < 1:
             raise InputError(f"{path}: {where}.{key}: expected at least 1, found {fields[key]}")
     return Entry(label, fields.pop("tuner", label), **fields)
-
-
-def _table(path: Path, where: str, value: Any, types: Mapping[str, type | tuple[type, ...]]) -> dict[str, Any]:
-    for key, found in _checked(path, where, value, dict).items():
-        if key not in types:
-            raise unknown(f"entry of [{where}] in {path}", key, list(types))
-        _checked(path, f"{where}.{key}", found, types[key])
-    return dict(value)
-
-
-def _checked(path: Path, where: str, value: Any, types: type | tuple[type, ...]) -> Any:
-    kinds = types if isinstance(types, tuple) else (types,)
-    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-        wanted = {
-            str: "text",
-            int: "a whole number",
-            float: "a number",
-            dict: "a table",
-            list: "a list",
-            bool: "a bool",
-        }
-        raise InputError(f"{path}: {where}: expected {wanted[kinds[-1]]}, found {value!r}")
-    return value

@@ -39,12 +39,12 @@ _LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (6, 
 _FLOOR = 1e-9
 """Errors below this are drawn here: less than rounding in the observation."""
 _RESAMPLES = 500
-_CAPTION = (
+CAPTION = (
     "Line: median over targets of the recommendation's error (mean over seeds). Band or bar: 95 % bootstrap interval "
     f"of the median. Errors below {_FLOOR:g} are drawn there."
 )
 
-_TITLES = {
+TITLES = {
     "in": "Targets in the training range",
     "wide": "Targets anywhere in the bounds",
     "obs_error": "Runs tuned on",
@@ -77,16 +77,16 @@ def _samples_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: st
     """One panel a range (or, for a recording, held-out runs beside the runs tuned on)."""
     if "real" in experiment.ranges:
         metrics = [m for m in ("heldout_error", "obs_error") if runs[m].notna().any()]
-        panels = [(runs, m, _TITLES[m], f"RMSE of {channel_unit}") for m in metrics]
+        panels = [(runs, m, TITLES[m], f"RMSE of {channel_unit}") for m in metrics]
     else:
         metric = _parameter_metric(runs)
         label = _parameter_label(parameter)
         ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
-        panels = [(runs[runs["range"] == r], metric, _TITLES[r], label) for r in ranges]
+        panels = [(runs[runs["range"] == r], metric, TITLES[r], label) for r in ranges]
     figure, axes = canvas(len(panels))
     style = Styles(experiment, runs, panels[0][1])
     for axis, (part, metric, title, label) in zip(axes, panels, strict=True):
-        _samples_panel(axis, part, metric, experiment.budget, style)
+        samples_panel(axis, part, metric, experiment.budget, style)
         targets = part["target"].nunique()
         what = "starts" if "real" in experiment.ranges else "targets"
         axis.set_title(f"{title} ({targets} {what})", fontsize=10)
@@ -102,20 +102,21 @@ def _misfit_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: str
     style = Styles(experiment, runs, "obs_error")
     for axis, kind in zip(axes, ranges, strict=True):
         part = runs[runs["range"] == kind]
-        _samples_panel(axis, part, "obs_error", experiment.budget, style)
+        samples_panel(axis, part, "obs_error", experiment.budget, style)
         floor = float(part.groupby("target")["obs_error"].min().median())
         axis.axhline(floor, color="#444444", linewidth=0.8, linestyle=(0, (2, 2)))
         axis.annotate(
             f"least that any tuner reached: {floor:.2g} (median)", (0, floor), xytext=(4, -10),
             textcoords="offset points", fontsize=7.5,
         )  # fmt: skip
-        axis.set_title(f"{_TITLES[kind]} ({part['target'].nunique()} targets)", fontsize=10)
+        axis.set_title(f"{TITLES[kind]} ({part['target'].nunique()} targets)", fontsize=10)
         axis.set_ylabel(f"RMSE of {channel_unit}, median")
     finish(figure, axes, style, experiment)
     return figure
 
 
-def _samples_panel(axis: Axes, runs: pd.DataFrame, metric: str, budget: int, style: Styles) -> None:
+def samples_panel(axis: Axes, runs: pd.DataFrame, metric: str, budget: int, style: Styles) -> None:
+    """Each tuner's median of a metric over targets against simulations, with its interval."""
     points = sorted({*checkpoints(budget), *np.unique(np.geomspace(1, budget, 40).astype(int)).tolist()})
     for tuner, group in runs.groupby("tuner", sort=False):
         curves = np.maximum(target_curves(group, metric, points).to_numpy(dtype=np.float64), _FLOOR)
@@ -221,7 +222,7 @@ def canvas(panels: int) -> tuple[Figure, list[Axes]]:
 
 
 def finish(
-    figure: Figure, axes: list[Axes], style: Styles, experiment: Experiment, caption: str = _CAPTION,
+    figure: Figure, axes: list[Axes], style: Styles, experiment: Experiment, caption: str = CAPTION,
     heading: str = "best at the end first",
 ) -> None:  # fmt: skip
     """Legend, title and caption."""

@@ -25,8 +25,8 @@ _WORLD = (
     "parameters", "initial", "inputs", "sampling",
 )  # fmt: skip
 _RUN_MAKING = (
-    "drive", "evaluate", "experiment", "guard", "measured", "problem", "scores", "seeds", "signals", "training",
-    "worker",
+    "drive", "evaluate", "experiment", "guard", "identifiability", "measured", "problem", "scores", "seeds", "signals",
+    "tables", "training", "worker",
 )  # fmt: skip
 _PACKAGES = ("cma", "mujoco", "nlopt", "numpy", "pybullet", "scikit-learn", "scikit-optimize", "scipy", "torch")
 

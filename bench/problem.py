@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from bench.experiment import Experiment
+from bench.identifiability import Spectrum, spectrum
 from bench.measured import Side, measured
 from bench.registry import simulators
 from bench.seeds import rng_for
@@ -101,15 +102,34 @@ class Problem:
         """The recording's training runs, or one run with initial state and inputs drawn as the experiment says."""
         if self._measured:
             return self._measured.fitting.scenarios
+        return (self._scenario(rng, self.experiment.initial, self.experiment.inputs),)
+
+    def _scenario(
+        self, rng: np.random.Generator, initial: Mapping[str, float | tuple[float, float]], inputs: Mapping[str, str]
+    ) -> Scenario:
         sampling = self.experiment.sampling
-        initial = {k: rng.uniform(*v) if isinstance(v, tuple) else v for k, v in self.experiment.initial.items()}
+        start = {k: rng.uniform(*v) if isinstance(v, tuple) else v for k, v in initial.items()}
         times = np.arange(sampling.samples) / sampling.rate
-        inputs = {name: signal(text, times, rng) for name, text in self.experiment.inputs.items()}
-        return (Scenario(times, initial, inputs),)
+        return Scenario(times, start, {name: signal(text, times, rng) for name, text in inputs.items()})
+
+    def _held_out(self, theta: Array, names: tuple[str, str, int]) -> Side:
+        """Unseen scenarios, and what the target's world does in them, without sensor noise: what is to be predicted.
+
+        Args:
+            theta: (1, p) the target's parameters.
+            names: of the target, on which the scenarios depend and on nothing else.
+        """
+        experiment, wanted = self.experiment, self.experiment.held_out
+        if wanted is None:
+            return Side((), np.empty((0, len(self.channels))))
+        initial, inputs = {**experiment.initial, **wanted.initial}, {**experiment.inputs, **wanted.inputs}
+        drawn = [self._scenario(rng_for(*names, "held-out", i), initial, inputs) for i in range(wanted.scenarios)]
+        return Side(tuple(drawn), np.concatenate([self._world.simulate(theta, s)[0] for s in drawn]))
 
     def target(self, kind: str, index: int) -> Target:
         """Target `index` of range `kind`; it depends on the experiment's name, not on tuners, seeds or budgets."""
-        rng = rng_for(self.experiment.same_targets_as or self.experiment.name, "target", kind, index)
+        met = self.experiment.same_targets_as or self.experiment.name
+        rng = rng_for(met, "target", kind, index)
         box = np.array([[0.0], [1.0]]) if kind == "wide" else self.cube.training
         draw = rng.uniform(box[0], box[1], size=(2, self.cube.dim))
         start, truth = draw[0], draw[1]
@@ -120,8 +140,24 @@ class Problem:
         theta = self.cube.physical(truth[None])[:, : len(self._world.parameters)]
         observed = self._world.simulate(theta, scenarios[0])[0]
         observed = observed + self.noise * rng.standard_normal(observed.shape)
-        held_out = Side((), np.empty((0, len(self.channels))))
+        held_out = self._held_out(theta, (met, kind, index))
         return Target(SealedTarget(name, kind, start, Side(scenarios, observed), held_out), self.cube.physical(truth))
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether there is more than one parameter, and so combinations that data may tell or not, and it is asked."""
+        return self.cube.dim > 1 and self.experiment.identifiability
+
+    def spectrum(self, target: Target) -> Spectrum | None:
+        """What the target's data identify; None where the truth is unknown or nothing is asked."""
+        if target.truth is None or not self.identifiable:
+            return None
+        scenarios = target.sealed.fitting.scenarios
+
+        def simulate(theta: Array) -> Array:
+            return np.concatenate([self.simulator.simulate(theta, s) for s in scenarios], axis=1)
+
+        return spectrum(simulate, target.truth, self.cube.parameters, self.scale)
 
     def targets(self) -> list[Target]:
         """All targets of the experiment; the ranges take turns, so that a part of the work is a part of each."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from bench.figures import draw
+from bench.figures_identifiability import identifiability_figures
 from bench.problem import Problem
 from bench.stats import FAILURES, summary, table
 from bench.store import read
@@ -36,8 +37,11 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     name = "" if single is None else single.name + (f" [{single.unit}]" if single.unit != "1" else "")
     figures = draw(folder, stored.experiment, stored.runs, f"{channel.name} [{channel.unit}]", name)
     figures += summarise(folder, stored)
+    figures += identifiability_figures(folder, stored.experiment, stored.runs, f"{channel.name} [{channel.unit}]")
     for kind in lines["range"][lines["range"] != ""].unique():
         say("\n" + _text(lines, kind, f"{channel.name} [{channel.unit}]", name))
+        if more := _directions(lines, kind, f"{channel.name} [{channel.unit}]"):
+            say("\n" + more)
     failed = stored.statuses[stored.statuses["status"].isin(FAILURES)]
     for line in failure_lines(failed):
         say(line)
@@ -65,6 +69,27 @@ def _text(lines: pd.DataFrame, kind: str, channel: str, parameter: str) -> str:
     means.columns.name = None
     means.index.name = None
     return f"{title}\n{means.to_string(float_format=lambda v: f'{v:.2g}')}"
+
+
+def _directions(lines: pd.DataFrame, kind: str, channel: str) -> str:
+    """Errors along stiff and sloppy directions, and of prediction, of one range; empty where there are none."""
+    titles = {"stiff_error": "stiff", "sloppy_error": "sloppy", "heldout_error": "unseen"}
+    part = lines[(lines["range"] == kind) & lines["metric"].isin(titles)]
+    if kind == "real" or part.empty:
+        return ""
+    budget = part["simulations"].max()
+    part = part[part["simulations"].isin([k for k in (3, 10, budget) if k <= budget])]
+    part = part.assign(column=part["metric"].map(titles) + " " + part["simulations"].astype(str))
+    order = [f"{t} {k}" for t in titles.values() for k in sorted(part["simulations"].unique())]
+    means = part.pivot(index="tuner", columns="column", values="mean")
+    means = means[[c for c in order if c in means]].dropna(axis=1, how="all")
+    means = means.sort_values(by=means.columns[-1])
+    means.columns.name = None
+    means.index.name = None
+    title = "mean error along stiff and sloppy directions [training widths]"
+    if "heldout_error" in set(part["metric"]):
+        title += f" and RMSE of {channel} in unseen scenarios"
+    return f"{title}, after N simulations\n{means.to_string(float_format=lambda v: f'{v:.2g}')}"
 
 
 def _seconds(lines: pd.DataFrame) -> str:

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 from bench.experiment import Entry, Experiment
 from bench.guard import limits
+from bench.identifiability import Spectrum
 from bench.identity import Identities
 from bench.pools import Call, DeathError, LocalPool, LostError, Pool
 from bench.problem import Problem, Target
@@ -51,12 +52,16 @@ class Memory:
 
 @dataclass
 class Results:
-    """A comparison: its problem, its plan once there is one, where its runs are kept, and what training cost."""
+    """A comparison: its problem, its plan once there is one, where its runs are kept, and what training cost.
+
+    `spectra` says what each target's data identify, by its name, where that can be asked.
+    """
 
     problem: Problem
     kept: Keep = field(default_factory=Memory)
     plan: list[Job] = field(default_factory=list)
     trainings: dict[tuple[str, int], Training] = field(default_factory=dict)
+    spectra: dict[str, Spectrum] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
     interrupted: bool = False
     stopped: str = ""
@@ -157,6 +162,7 @@ def run(
 
 def _run(results: Results, pool: Pool, progress: Progress) -> None:
     missing = [place for place in range(len(results.plan)) if place not in results.kept.statuses]
+    _identify(results, progress)
     failures = _train(pool, results, progress)
     step = progress("running", len(missing))
     ready: list[int] = []
@@ -171,6 +177,18 @@ def _run(results: Results, pool: Pool, progress: Progress) -> None:
     for i, outcome in pool.results(calls, results.problem.experiment.timeout):
         _file(results, ready[i], outcome)
         step()
+
+
+def _identify(results: Results, progress: Progress) -> None:
+    """Find what each target's data identify, which only the parent process can: it takes the truth."""
+    problem, targets = results.problem, {job.target.sealed.name: job.target for job in results.plan}
+    if any(target.truth is not None for target in targets.values()) and problem.identifiable:
+        step = progress("identifiability", len(targets))
+        for name, target in targets.items():
+            if (found := problem.spectrum(target)) is not None:
+                results.spectra[name] = found
+            step()
+        problem.close()
 
 
 class _Calls(Sequence[Call]):
@@ -220,4 +238,5 @@ def _file(results: Results, place: int, outcome: Outcome | Exception) -> None:
     elif isinstance(outcome, Exception):
         reason = "".join(traceback.format_exception(outcome))
         outcome = unfinished(problem, job.target, "crashed", reason)
-    results.kept.add(place, rows(problem, job.order, job.target, outcome), status_of(problem, job.order, outcome))
+    columns = rows(problem, job.order, job.target, outcome, results.spectra.get(job.target.sealed.name))
+    results.kept.add(place, columns, status_of(problem, job.order, outcome))

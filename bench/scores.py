@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bench.drive import Trace
+from bench.identifiability import Spectrum
 from bench.problem import Problem, Target
 from bench.worker import Order, Outcome
 
@@ -50,8 +51,13 @@ def status_of(problem: Problem, order: Order, outcome: Outcome) -> Status:
     )
 
 
-def rows(problem: Problem, order: Order, target: Target, outcome: Outcome) -> dict[str, Any]:
-    """Columns of runs.parquet for one run, one entry for each k = 0..simulations."""
+def rows(
+    problem: Problem, order: Order, target: Target, outcome: Outcome, spectrum: Spectrum | None = None
+) -> dict[str, Any]:
+    """Columns of runs.parquet for one run, one entry for each k = 0..simulations.
+
+    With a spectrum the parameters' error is there along stiff and along sloppy directions too.
+    """
     trace = outcome.trace
     k = len(trace.losses)
     columns: dict[str, Any] = {
@@ -66,6 +72,9 @@ def rows(problem: Problem, order: Order, target: Target, outcome: Outcome) -> di
         "loss": _after_start(trace.losses),
     }
     columns |= _parameter_columns(problem, target, outcome)
+    if spectrum is not None and target.truth is not None:
+        away = problem.cube.physical(trace.recommendations) - target.truth
+        columns["stiff_error"], columns["sloppy_error"] = spectrum.errors(away / problem.cube.training_widths())
     columns["obs_error"] = outcome.obs_rmse[:, problem.error_channel]
     nothing = np.full((k + 1, len(problem.channels)), np.nan)
     heldout = nothing if outcome.heldout_rmse is None else outcome.heldout_rmse

@@ -20,7 +20,7 @@ from bench.seeds import rng_for
 from methods.base import Array
 
 CHECKPOINTS = (0, 1, 2, 3, 5, 10, 20, 50, 100)
-METRICS = ("param_abs_error", "param_error", "obs_error", "heldout_error")
+METRICS = ("param_abs_error", "param_error", "stiff_error", "sloppy_error", "obs_error", "heldout_error")
 FAILURES = ("crashed", "timeout", "diverged", "skipped")
 COLUMNS = [
     "experiment", "tuner", "range", "simulations", "metric", "median", "mean", "low", "high",

@@ -20,8 +20,8 @@ from sims.base import InputError
 
 WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
 NEEDED = (
-    "run", "experiment", "tuner", "target", "seed", "range", "k", "param_error", "param_abs_error", "obs_error",
-    "heldout_error", "outside", "tuner_seconds", "simulator_seconds",
+    "run", "experiment", "tuner", "target", "seed", "range", "k", "param_error", "param_abs_error", "stiff_error",
+    "sloppy_error", "obs_error", "heldout_error", "outside", "tuner_seconds", "simulator_seconds",
 )  # fmt: skip
 """Columns of the runs that tables and figures use."""
 
@@ -33,11 +33,11 @@ def summarise(folder: Path, stored: Stored) -> list[Path]:
     matplotlib.use("Agg")
     from bench import figures_statistics as figures
 
-    experiment, runs = stored.experiment, stored.runs
+    experiment = stored.experiment
+    metric, runs, in_widths = primary(stored.runs)
     rows = Rows(runs, stored.statuses, experiment.budget)
-    metric = primary(runs)
     curves = rows.curves(metric)
-    spread, levels = thresholds(curves, metric == "param_error")
+    spread, levels = thresholds(curves, in_widths)
     ert_table(curves, levels, experiment.budget).to_csv(folder / "ert.csv", index=False)
     pairs(curves).to_csv(folder / "pairs.csv", index=False)
     held = {
@@ -105,9 +105,9 @@ def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> No
         stored = read(folder, NEEDED)
         if stored.runs.empty:
             raise InputError(f"{folder}: holds no runs")
-        metric = primary(stored.runs)
-        curves = Rows(stored.runs, stored.statuses, stored.experiment.budget).curves(metric)
-        spread, levels = thresholds(curves, metric == "param_error")
+        metric, runs, in_widths = primary(stored.runs)
+        curves = Rows(runs, stored.statuses, stored.experiment.budget).curves(metric)
+        spread, levels = thresholds(curves, in_widths)
         erts.append(ert_table(curves, levels, stored.experiment.budget))
         shares += _shares(curves, spread)
         all_curves.append(curves)

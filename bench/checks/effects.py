@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 import numpy as np
 
 from bench.checks.base import CheckError, require, same_bits
-from bench.registry import simulators
+from bench.registry import SkippedError, simulators
 from methods.base import Array
 from sims import effects
 from sims.base import InputError, Scenario
+from sims.own import OwnSimulator
 from sims.simulated import Simulated
 from sims.system import Contact, Effect, Force, Friction, Input, Moment, Sensor, Signal, System
 
@@ -19,22 +21,32 @@ _NAME = re.compile(r"[a-z]+(\.[a-z_]+)?$")
 _SAMPLES, _RATE = 60, 30.0
 
 
-def _hosts(effect: type[Effect]) -> Iterator[type[Simulated]]:
-    """Registered simulators of declared systems that can have the effect."""
+def _declared() -> Iterator[type[Simulated]]:
+    """Registered simulators of declared systems whose packages are installed."""
     for name in simulators.names():
-        kind = simulators.get(name)
-        if issubclass(kind, Simulated) and not effect.misses(kind.system):
-            yield kind
+        with suppress(SkippedError):
+            kind = simulators.get(name)
+            if issubclass(kind, Simulated):
+                yield kind
+
+
+def _hosts(effect: type[Effect]) -> Iterator[type[Simulated]]:
+    """Those that can have the effect."""
+    return (kind for kind in _declared() if not effect.misses(kind.system))
 
 
 def _made(host: type[Simulated], effect: type[Effect]) -> Simulated:
-    """The host with this effect on the batch engine, whether or not the effect is registered."""
+    """The host with this effect, registered or not; on the batch engine, or on its own where it steps itself."""
     known = effects.names()
     if effect.name not in known or effects.get(effect.name) is not effect:
         if effect.name in known:
             raise CheckError(f"expected a name of its own; found {effect.name}; see {effect.__name__}.name")
         effects.register(effect)
-    return host(engine="batch", effects=[effect.name])
+    return host(engine=_engine(host), effects=[effect.name])
+
+
+def _engine(host: type[Simulated]) -> str | None:
+    return None if issubclass(host, OwnSimulator) else "batch"
 
 
 def _scenario(system: type[System]) -> Scenario:
@@ -117,7 +129,7 @@ def check_it_shows_and_stays_finite(effect: type[Effect]) -> None:
     Several places, since a limit acts at its low end, where a force may pull a system away for good.
     """
     for host in _hosts(effect):
-        simulator, plain, scenario = _made(host, effect), host(engine="batch"), _scenario(host.system)
+        simulator, plain, scenario = _made(host, effect), host(engine=_engine(host)), _scenario(host.system)
         thetas = np.concatenate([_theta(simulator, share) for share in (0.05, 0.3, 0.7)])
         seen = simulator.simulate(thetas, scenario)
         look = f"{effect.__name__} on {host.name}"
@@ -138,15 +150,14 @@ def check_lanes_are_independent(effect: type[Effect]) -> None:
 
 def check_impossible_hosts_are_refused(effect: type[Effect]) -> None:
     """A system that cannot have it says so by name."""
-    for name in simulators.names():
-        host = simulators.get(name)
-        if issubclass(host, Simulated) and effect.misses(host.system):
+    for host in _declared():
+        if effect.misses(host.system):
             try:
                 _made(host, effect)
             except InputError as error:
                 require(effect.name in str(error), "a message that names the effect", error, effect.__name__)
                 continue
-            raise CheckError(f"expected {name} to refuse it; found that it did not; see {effect.__name__}.needs")
+            raise CheckError(f"expected {host.name} to refuse it; found that it did not; see {effect.__name__}.needs")
 
 
 EFFECT_CHECKS: tuple[Callable[[type[Effect]], None], ...] = (

@@ -75,5 +75,7 @@ def test_simulators_and_effects_are_checked_by_name(capsys):
 def test_unknown_name_is_one_line(capsys):
     assert main(["check", "cma_ess"]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("simgap: unknown tuner, simulator or effect 'cma_ess'; there are: backlash, ball, bayes")
+    assert error.startswith(
+        "simgap: unknown tuner, simulator or effect 'cma_ess'; there are: arm, backlash, ball, bayes"
+    )
     assert error.count("\n") == 1

@@ -79,13 +79,14 @@ def test_compare_writes_the_folder_it_promises_and_a_plugin_tuner_is_in_it(exper
     assert list(lines.columns) == COLUMNS
     assert set(lines["tuner"]) == {"random", "nelder_mead", "corners"}
     assert set(lines["simulations"]) == {0, 1, 2, 3, 5, 6}
-    assert set(lines["metric"]) == {"param_error", "obs_error"}
+    assert set(lines["metric"]) == {"param_error", "stiff_error", "sloppy_error", "obs_error"}
     corners = lines[(lines["tuner"] == "corners") & (lines["metric"] == "param_error")]
     assert set(corners["runs"]) == {6}
     runs = pd.read_parquet(folder / "runs.parquet")
     assert set(runs.columns) >= {
         "run", "experiment", "tuner", "simulator", "target", "seed", "range", "k", "loss", "param_error", "obs_error",
-        "heldout_error", "tuner_seconds", "simulator_seconds", "outside", "proposal_rate", "recommendation_rate",
+        "heldout_error", "stiff_error", "sloppy_error", "tuner_seconds", "simulator_seconds", "outside",
+        "proposal_rate", "recommendation_rate",
     }  # fmt: skip
     assert len(runs) == 2 * 3 * (2 + 1 + 2) * 7, "nelder_mead uses no chance: one seed"
     statuses = pd.read_csv(folder / "status.csv")
@@ -144,7 +145,7 @@ def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path)
     [
         (
             ["compare", "bal-drop"],
-            "unknown experiment 'bal-drop'; there are: ball-crossengine, ball-drop, ball-drop-published",
+            "unknown experiment 'bal-drop'; there are: arm-drive, arm-swing, ball-crossengine, ball-drop",
         ),
         (["compare", "none.toml"], "none.toml: no such file"),
         (["compare", "ball-drop", "--tuners", "cma"], "unknown tuner 'cma'; there are: bayes, cma_es"),

@@ -61,7 +61,8 @@ def test_faults_are_one_line_that_names_file_and_entry(change, message):
 
 def test_unknown_experiment_lists_those_there_are():
     with pytest.raises(
-        InputError, match=r"unknown experiment 'ball'; there are: ball-crossengine, ball-drop, .*pendulum-real"
+        InputError,
+        match=r"unknown experiment 'ball'; there are: arm-drive, .*pendulum-real",
     ):
         load("ball")
 
