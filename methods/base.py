@@ -114,13 +114,12 @@ class Practice(Protocol):
 
 
 class Watch(Protocol):
-    """Looks on while a learned tuner trains; what is learned is the same without it.
+    """Looks on while a learned tuner trains; what is learned is the same without it."""
 
-    Attributes:
-        ground: more simulations of the training range, which only measure; the training budget does not count them.
-    """
-
-    ground: Practice
+    @property
+    def ground(self) -> Practice:
+        """More simulations of the training range, which only measure; the training budget does not count them."""
+        ...
 
     def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
         """Told of each pass over the data of one stage of the training: its number from 1, and the losses."""
