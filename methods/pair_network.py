@@ -137,7 +137,7 @@ def train(
     """
     import torch
 
-    with _reproducible(device := "cuda" if torch.cuda.is_available() else "cpu"), torch.enable_grad():
+    with reproducible(device := "cuda" if torch.cuda.is_available() else "cpu"), torch.enable_grad():
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         weights = _initial(rows.shape[-1], parameters.shape[-1], design, generator, device)
         loss = _loss(design, weights, alone)
@@ -146,7 +146,7 @@ def train(
 
 
 @contextmanager
-def _reproducible(device: str) -> Iterator[None]:
+def reproducible(device: str) -> Iterator[None]:
     """Sums in a fixed order; on the CPU the machine's other cores are left to other runs."""
     import torch
 
