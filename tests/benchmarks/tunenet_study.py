@@ -23,7 +23,7 @@ from bench.seeds import rng_for
 from methods.base import Ask, Task
 from methods.pair_fit import Fitted, PairTuner, Prepared, Reading, rehearse
 from methods.pair_network import PUBLISHED, Design
-from methods.tunenet import Search, TuneNet, TuneNetPublished
+from methods.tunenet import SETTLED, Search, TuneNet, TuneNetPublished
 
 AT = (1, 2, 3, 5, 10)
 SEEDS, TARGETS, MEMBERS = 2, 100, 5
@@ -67,6 +67,8 @@ class Variant(PairTuner):
             difference = estimate(seen.observations)
             if self.step == "broyden":
                 guess = search.after(seen.proposals[0], difference)
+                if np.abs(guess - search.best).max() <= SETTLED:
+                    return "the estimate no longer changes"
             else:
                 guess = np.clip(seen.proposals[0] + difference, 0.0, 1.0)
 
