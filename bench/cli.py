@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench import __version__
+from bench.ahead import add_train
 from bench.gap.commands import add_explain, add_score
 
 if TYPE_CHECKING:
@@ -56,6 +57,9 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--targets", type=_positive, metavar="N", help="targets in each range")
     compare.add_argument("--seeds", type=_positive, metavar="N", help="seeds of each tuner that uses chance")
     compare.add_argument("--budget", type=_positive, metavar="N", help="simulations on one target")
+    compare.add_argument(
+        "--training-budget", type=_positive, metavar="N", help="simulations that a tuner may learn from"
+    )
     compare.add_argument("--jobs", type=_positive, metavar="N", default=2, help="worker processes (default: 2)")
     compare.add_argument("--out", metavar="DIR", help="folder to write (default: a new one below results/)")
     compare.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file with more tuners")
@@ -65,6 +69,8 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--memory", type=_positive, metavar="MIB", help="memory that a run may take")
     compare.add_argument("--allow-failures", action="store_true", help="exit with 0 although runs failed")
     compare.set_defaults(command=_compare)
+
+    add_train(commands.add_parser("train", help="train a learned tuner ahead of the comparisons that use it"))
 
     status = commands.add_parser("status", help="what a comparison's folder holds, and what is missing")
     status.add_argument("run", metavar="DIR", type=Path, help="the comparison's folder")
@@ -153,7 +159,7 @@ def _chosen(options: argparse.Namespace) -> Experiment:
     if options.experiment is None:
         raise InputError("expected an experiment (see `simgap list experiments`), or --resume DIR")
     load_plugins(options.plugin)
-    changes = {name: getattr(options, name) for name in ("targets", "budget", "timeout", "memory")}
+    changes = {name: getattr(options, name) for name in ("targets", "budget", "training_budget", "timeout", "memory")}
     experiment = load(options.experiment).chosen(**changes)
     if options.seeds:
         experiment = experiment.with_seeds(options.seeds)
@@ -168,6 +174,7 @@ def _chosen(options: argparse.Namespace) -> Experiment:
 
 
 def _compare(options: argparse.Namespace) -> int:
+    from bench.bars import Bars
     from bench.compare import begin, make, only_resume, resume
     from bench.report import finish
 
@@ -183,7 +190,7 @@ def _compare(options: argparse.Namespace) -> int:
     else:
         plugins = options.plugin
         folder, results = begin(_chosen(options), plugins, options.out, options.jobs)
-    with _Bars() as bars:
+    with Bars() as bars:
         complete = make(folder, results, plugins, options.jobs, bars.start, pool)
     failed = finish(folder, results.problem, print)
     if not complete:
@@ -199,31 +206,6 @@ def _status(options: argparse.Namespace) -> int:
     from bench.compare import status
 
     return 0 if status(options.run, options.runs, print) else 1
-
-
-class _Bars:
-    """Progress bars on stderr, one after another; tqdm estimates the time left."""
-
-    def __enter__(self) -> _Bars:
-        self._close: Callable[[], None] = lambda: None
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
-
-    def start(self, title: str, total: int) -> Callable[[], None]:
-        """Begin a bar of `total` steps; returns what advances it."""
-        from tqdm import tqdm
-
-        self._close()
-        pause = 0.5 if sys.stderr.isatty() else 30.0  # a log wants few lines
-        bar = tqdm(total=total, desc=title, unit="run", file=sys.stderr, dynamic_ncols=True, mininterval=pause)
-        self._close = bar.close
-
-        def step() -> None:
-            bar.update()
-
-        return step
 
 
 def _check(options: argparse.Namespace) -> int:

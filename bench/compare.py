@@ -61,7 +61,7 @@ def only_resume(options: object) -> None:
     Raises:
         InputError: there are some.
     """
-    names = ("experiment", "tuners", "targets", "seeds", "budget", "timeout", "memory", "out")
+    names = ("experiment", "tuners", "targets", "seeds", "budget", "training_budget", "timeout", "memory", "out")
     given = [name for name in names if getattr(options, name) is not None]
     if given:
         raise InputError(f"--resume takes the configuration of its folder as it is; leave out {', '.join(given)}")

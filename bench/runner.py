@@ -16,7 +16,7 @@ from bench.pools import Call, DeathError, LocalPool, LostError, Pool
 from bench.problem import Problem, Target
 from bench.registry import SkippedError, tuners
 from bench.scores import Status, rows, status_of, unfinished
-from bench.training import Training, build, train
+from bench.training import Training, WeightsError, build, train
 from bench.worker import Order, Outcome, perform
 from sims.base import InputError
 
@@ -221,6 +221,8 @@ def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, 
             entry, seed = wanted[place]
             if isinstance(trained, Training):
                 results.trainings[entry.label, seed] = trained
+            elif isinstance(trained, WeightsError):  # a fault of the user's: nothing has been run yet
+                raise trained
             else:
                 failures[entry.label, seed] = trained
             step()

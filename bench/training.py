@@ -1,42 +1,54 @@
 """Trains learned tuners once for each simulator and seed, and keeps what they learned as plain tensors.
 
 The file's name is a hash of everything that went in: the tuner's and simulator's source and options, the training range
-and scenarios, budget, seed, and the versions of the packages that compute. Nothing is ever unpickled.
+and scenarios, budget, seed, the versions of the packages that compute and the device. The file holds the same hash, so
+that one which was put in another's place is noticed. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import inspect
 import json
 import os
 import sys
 import zipfile
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.experiment import Entry, Experiment
 from bench.measured import find_recording
 from bench.problem import Problem
 from bench.registry import simulators, tuners
 from bench.seeds import rng_for
-from methods.base import Array, Tuner
+from methods.base import Array, Tuner, Watch
 from sims.base import InputError
 
 _COUNTS = "__simulations_and_seconds__"
+_KEY = "__key__"
+
+
+class WeightsError(InputError):
+    """A file of trained weights that cannot be used."""
 
 
 @dataclass(frozen=True)
 class Training:
-    """What one training cost, and where its tensors lie."""
+    """What one training cost when it was done, and where its tensors lie; `found` where that was earlier."""
 
     path: Path
     simulations: int
     seconds: float
+    found: bool = False
 
 
 def build(entry: Entry) -> Tuner:
@@ -64,16 +76,31 @@ def key(experiment: Experiment, entry: Entry, seed: int) -> str:
     document = experiment.document()
     training = ("simulator", "observe", "noise", "settings", "constants", "parameters", "initial", "inputs", "sampling")
     what = {name: document[name] for name in training} | {
+        "experiment": experiment.name,  # the seed's stream depends on it
         "recording": recording_digest(experiment),
         "tuner": entry.tuner,
         "options": dict(entry.options),
         "budget": experiment.training_budget,
         "seed": seed,
         "source": [source(tuners.get(entry.tuner)), source(simulators.get(experiment.simulator))],
-        "versions": [sys.version, *(package_version(name) for name in ("numpy", "pybullet", "torch"))],
+        "versions": [sys.version, *(package_version(name) for name in _PACKAGES)],
+        "device": device(),
     }
     text = json.dumps(what, sort_keys=True, default=str)
     return f"{entry.tuner}-{experiment.simulator}-{seed}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+_PACKAGES = ("mujoco", "numpy", "pybullet", "sbi", "scipy", "torch")
+
+
+@cache
+def device() -> str:
+    """Where networks are trained here: the GPU's name, or cpu."""
+    if importlib.util.find_spec("torch") is None:
+        return "cpu"
+    import torch
+
+    return str(torch.cuda.get_device_name()) if torch.cuda.is_available() else "cpu"
 
 
 def recording_digest(experiment: Experiment) -> str:
@@ -99,47 +126,84 @@ def package_version(name: str) -> str:
         return f"{name} absent"
 
 
-def train(experiment: Experiment, entry: Entry, seed: int) -> Training:
-    """Train, or find trained: the tensors' file and what the training cost when it was done."""
-    path = folder() / f"{key(experiment, entry, seed)}.npz"
-    if (costs := _read(path)) is not None:
-        simulations, seconds = costs[_COUNTS]
-        return Training(path, int(simulations), float(seconds))
+def train(experiment: Experiment, entry: Entry, seed: int, watch: Watch | None = None, anew: bool = False) -> Training:
+    """Train, or find trained: the tensors' file and what the training cost when it was done.
+
+    Args:
+        experiment: the training ground and budget.
+        entry: the tuner with its options.
+        seed: of the training.
+        watch: looks on, if it comes to training.
+        anew: train even where there are weights, and replace them.
+
+    Raises:
+        WeightsError: there is a file, and it is damaged or foreign.
+    """
+    name = key(experiment, entry, seed)
+    path = folder() / f"{name}.npz"
+    if path.exists() and not anew:
+        simulations, seconds = _checked(path, name)[_COUNTS]
+        trained(entry, path)
+        return Training(path, int(simulations), float(seconds), found=True)
     tuner = build(entry)
-    practice = Problem(experiment).practice(experiment.training_budget)
+    tuner.watch = watch
+    problem = Problem(experiment)
+    practice = problem.practice(experiment.training_budget)
     started = perf_counter()
     tuner.fit(practice, rng_for(experiment.name, "fit", entry.tuner, seed), experiment.training_budget)
     seconds = perf_counter() - started
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.stem}.{os.getpid()}.npz")  # so that a reader never meets half a file
-    np.savez(partial, allow_pickle=False, **tuner.state(), **{_COUNTS: np.array([practice.used, seconds])})
-    partial.replace(path)
+    problem.close()
+    about = {_COUNTS: np.array([practice.used, seconds]), _KEY: np.frombuffer(name.encode(), dtype=np.uint8)}
+    _write(path, {**tuner.state(), **about})
     return Training(path, practice.used, seconds)
+
+
+def _write(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
+    """Write a whole file or none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.stem}.{os.getpid()}.partial")  # so that a reader never meets half a file
+    try:
+        with partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def trained(entry: Entry, path: Path) -> Tuner:
     """The tuner with the tensors of `path`.
 
     Raises:
-        InputError: the file is truncated or foreign.
+        WeightsError: the file is missing, damaged, or foreign.
     """
     tuner = build(entry)
-    state = _read(path)
-    if state is None:
-        raise InputError(f"{path}: expected trained weights of {entry.label}, found none; delete it and run again")
-    state.pop(_COUNTS)
+    state = _checked(path, path.stem)
+    del state[_COUNTS], state[_KEY]
     try:
         tuner.restore(state)
     except ValueError as error:
-        raise InputError(f"{path}: not the weights of {entry.label}: {error}") from None
+        raise WeightsError(f"{path}: not the weights of {entry.label}: {error}; {_REMEDY}") from None
     return tuner
 
 
-def _read(path: Path) -> dict[str, Array] | None:
-    """The arrays of an .npz file; None where it is missing or damaged."""
+_REMEDY = "delete it to have it trained again"
+
+
+def _checked(path: Path, name: str) -> dict[str, Array]:
+    """The arrays of a file of trained weights.
+
+    Raises:
+        WeightsError: it is missing, damaged, or was trained for something else than `name`.
+    """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError):
-        return None
-    return arrays if _COUNTS in arrays else None
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            arrays = {member: file[member] for member in file.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, AttributeError):
+        raise WeightsError(f"{path}: expected trained weights, found none or a damaged file; {_REMEDY}") from None
+    counts, held = arrays.get(_COUNTS, np.empty(0)), arrays.get(_KEY, np.empty(0))
+    if counts.shape != (2,) or counts.dtype != np.float64 or held.dtype != np.uint8 or held.ndim != 1:
+        raise WeightsError(f"{path}: expected trained weights, found arrays {sorted(arrays)[:4]}; {_REMEDY}")
+    found = held.tobytes().decode("utf-8", "replace")
+    if found != name:
+        raise WeightsError(f"{path}: expected the weights of {name}, found those of {found:.80}; {_REMEDY}")
+    return arrays

@@ -113,6 +113,19 @@ class Practice(Protocol):
         ...
 
 
+class Watch(Protocol):
+    """Looks on while a learned tuner trains; what is learned is the same without it."""
+
+    @property
+    def ground(self) -> Practice:
+        """More simulations of the training range, which only measure; the training budget does not count them."""
+        ...
+
+    def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
+        """Told of each pass over the data of one stage of the training: its number from 1, and the losses."""
+        ...
+
+
 class BudgetExceededError(RuntimeError):
     """A learned tuner asked for more training simulations than it was given."""
 
@@ -130,6 +143,7 @@ class Tuner:
         stochastic: whether `tune` uses its generator; where not, one seed tells all.
         learned: whether `fit` must have been called before `tune`.
         known_failures: conformance checks (by function name) that it fails on purpose, with the reason.
+        watch: looks on during `fit`, where the tuner tells it of its progress.
     """
 
     name: ClassVar[str] = ""
@@ -137,6 +151,7 @@ class Tuner:
     stochastic: ClassVar[bool] = True
     learned: ClassVar[bool] = False
     known_failures: ClassVar[Mapping[str, str]] = {}
+    watch: Watch | None = None
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

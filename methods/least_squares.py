@@ -49,6 +49,8 @@ class LeastSquares(Tuner):
         step_tolerance: a fit has converged when its step is shorter than this share of the cube.
         restart: whether to start again elsewhere when the target has not been reproduced.
         reproduced: the target is reproduced when the loss is below this share of the observation's root mean square.
+        ahead: recommend a step before it is simulated where all samples are fitted and the last step did what the model
+            promised; otherwise the lowest loss seen.
     """
 
     horizons: tuple[float, ...] = (0.0625, 0.09, 0.125, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)
@@ -61,25 +63,26 @@ class LeastSquares(Tuner):
     step_tolerance: float = 1e-10
     restart: bool = True
     reproduced: float = 1e-10
+    ahead: bool = False
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
         """Fit from the start, then from other points until the target is reproduced."""
-        run = _Run(task, self.reproduced)
-        point = task.start
-        while True:
-            yield from self._fit(run, point)
-            if run.finished:
-                return "the simulation reproduces the target"
+        run = Run(task, self.reproduced)
+        yield from self.fit_from(run, task.start)
+        while not run.finished:
             if not self.restart:
                 return "the fit reached a minimum"
-            point = run.untried(rng)
+            yield from self.fit_from(run, run.untried(rng))
+        return "the simulation reproduces the target"
 
-    def _fit(self, run: _Run, point: Array) -> Simulates[None]:
-        """One fit from `point` over all horizons."""
+    def fit_from(self, run: Run, point: Array) -> Simulates[None]:
+        """One fit from `point`, of which nothing is known."""
         (residual,) = yield from run.simulate(point[None])
-        if np.isnan(residual).any():
-            return
-        model = yield from self._differentiate(run, point, residual, self.difference)
+        if not np.isnan(residual).any():
+            yield from self.fit_model(run, (yield from self._differentiate(run, point, residual, self.difference)))
+
+    def fit_model(self, run: Run, model: Model) -> Simulates[None]:
+        """One fit over all horizons, beginning with a model."""
         for share in self.horizons:
             chosen = run.samples(share)
             if share >= 1.0 or model.sensitive(chosen):
@@ -87,7 +90,7 @@ class LeastSquares(Tuner):
             if run.finished:
                 return
 
-    def _differentiate(self, run: _Run, point: Array, residual: Array, longest: float) -> Simulates[_Model]:
+    def _differentiate(self, run: Run, point: Array, residual: Array, longest: float) -> Simulates[Model]:
         """One-sided differences, inward at the upper border; to the other side where a simulation failed."""
         h = min(max(longest, self.smallest_difference), self.difference)
         steps = np.where(point + h > 1.0, -h, h)
@@ -96,9 +99,9 @@ class LeastSquares(Tuner):
         if failed.any():  # and where both sides fail, the column stays zero
             steps[failed] *= -1.0
             moved[failed] = yield from run.simulate(point + np.diag(steps)[failed])
-        return _Model(point, residual, np.nan_to_num((moved - residual) / steps[:, None]).T)
+        return Model(point, residual, np.nan_to_num((moved - residual) / steps[:, None]).T)
 
-    def _descend(self, run: _Run, model: _Model, chosen: Mask) -> Simulates[_Model]:
+    def _descend(self, run: Run, model: Model, chosen: Mask) -> Simulates[Model]:
         """Levenberg-Marquardt on the chosen samples until they are fitted, or it is stuck."""
         worthwhile = 1e-8 if chosen.all() else 0.1  # of the sum of squares; early horizons need not be polished
         damping, stalled, failed = _Damping(self.damping), 0, 0
@@ -107,13 +110,15 @@ class LeastSquares(Tuner):
             step, promised = model.step(chosen, damping.mu)
             if np.abs(step).max() < self.step_tolerance or promised <= worthwhile * before:
                 break
-            (residual,) = yield from run.simulate((model.point + step)[None])
+            hopeful = model.point + step if self.ahead and model.trusted and chosen.all() else None
+            (residual,) = yield from run.simulate((model.point + step)[None], hopeful)
             after = float(residual[chosen] @ residual[chosen])  # NaN where the simulation failed
             better = after < before
             if np.isfinite(after):
                 model.update(step, residual)
             if better:
                 model.point, model.residual = model.point + step, residual
+            model.trusted = before - after > 0.5 * promised
             damping.adapt((before - after) / promised)
             failed = 0 if better else failed + 1
             stalled = 0 if after < (1.0 - self.progress) * before else stalled + 1
@@ -142,12 +147,16 @@ class _Damping:
 
 
 @dataclass
-class _Model:
-    """The residual near a point: r(θ + s) ≈ residual + jacobian s; arrays (dim,), (samples,), (samples, dim)."""
+class Model:
+    """The residual near a point: r(θ + s) ≈ residual + jacobian s; arrays (dim,), (samples,), (samples, dim).
+
+    `trusted` where the last step did at least half of what was promised.
+    """
 
     point: Array
     residual: Array
     jacobian: Array
+    trusted: bool = False
 
     def error(self, chosen: Mask) -> float:
         """Sum of squares of the chosen samples."""
@@ -178,24 +187,34 @@ class _Model:
 
 
 @dataclass
-class _Run:
+class Run:
     """What one run has simulated."""
 
     task: Task
     reproduced: float
     tried: list[Array] = field(default_factory=list)
+    residuals: list[Array] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
     finished: bool = False
 
     def __post_init__(self) -> None:
         observed = np.nan_to_num(self.task.observed) / self.task.scale
         self.enough = self.reproduced * float(np.sqrt(np.mean(observed**2)))
 
-    def simulate(self, points: Array) -> Simulates[Array]:
+    def simulate(self, points: Array, recommend: Array | None = None) -> Simulates[Array]:
         """Residuals (n, samples) of the points; rows of NaN where the simulation failed."""
-        seen = yield np.clip(points, 0.0, 1.0)
-        self.tried.extend(seen.proposals)
-        self.finished = self.finished or bool((seen.losses <= self.enough).any())
-        return np.where(np.isfinite(seen.losses)[:, None], self.task.residuals(seen.observations), np.nan)
+        points = np.clip(points, 0.0, 1.0)
+        return self.seen((yield points if recommend is None else Ask(points, recommend)))
+
+    def seen(self, evaluation: Evaluation) -> Array:
+        """Note what was simulated; its residuals."""
+        proposals, observations, losses = evaluation
+        residuals = np.where(np.isfinite(losses)[:, None], self.task.residuals(observations), np.nan)
+        self.tried.extend(proposals)
+        self.residuals.extend(residuals)
+        self.losses.extend(losses.tolist())
+        self.finished = self.finished or bool((losses <= self.enough).any())
+        return residuals
 
     def samples(self, share: float) -> Mask:
         """Which residuals belong to the first `share` of their run."""

@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from methods.base import Array, Practice, Task
+from methods.base import Array, Practice, Task, Tuner
 from methods.pair_inputs import Inputs, raw_inputs, roughness, weighed_inputs
-from methods.pair_network import Design, estimate, shapes, train
+from methods.pair_network import Design, Watched, estimate, shapes, train
 
 
-class Options(Protocol):
-    """The options of a tuner that bear on its network's inputs."""
+@dataclass(frozen=True)
+class Reading:
+    """What networks read of an observation, and the noise that they prepare for.
 
-    published: bool
-    points: int
-    inputs: int
-    strictness: float
-    noise: float
+    Attributes:
+        points: points to which each run is resampled; L in Algorithm 1.
+        inputs: inputs kept of those an observation offers.
+        strictness: see `methods.pair_inputs.weighed_inputs`.
+        noise: sensor noise that a second network is trained with, 1 sigma, in units of each channel's standard
+            deviation in training; 0 for no second network.
+        raw: the resampled series in SI units as they are, as published; `inputs` and `strictness` say nothing then.
+    """
+
+    points: int = 400
+    inputs: int = 400
+    strictness: float = 1000.0
+    noise: float = 0.01
+    raw: bool = False
 
 
 class Rehearsal(NamedTuple):
@@ -34,6 +46,23 @@ class Rehearsal(NamedTuple):
     parameters: Array
     observations: Array
     lengths: tuple[int, ...]
+
+    def spoilt(self, noise: Array, rng: np.random.Generator) -> Rehearsal:
+        """The same with white noise of standard deviations (C,) added."""
+        return self._replace(observations=self.observations + noise * rng.standard_normal(self.observations.shape))
+
+
+@dataclass(frozen=True)
+class Look:
+    """Looks on while one network is trained.
+
+    Attributes:
+        held_out: simulations that measure only.
+        epoch: told of each pass: its number from 1, how many there are, training and held-out loss.
+    """
+
+    held_out: Rehearsal
+    epoch: Callable[[int, int, float, float], None]
 
 
 def rehearse(simulator: Practice, rng: np.random.Generator, budget: int, scenarios: int, each: int) -> Rehearsal:
@@ -73,16 +102,23 @@ class Fitted:
     weights: dict[str, Array]
 
     @classmethod
-    def train(cls, design: Design, data: Rehearsal, rng: np.random.Generator, options: Options, alone: bool) -> Fitted:
+    def train(
+        cls, design: Design, data: Rehearsal, rng: np.random.Generator, reading: Reading, alone: bool, look: Look | None
+    ) -> Fitted:
         """Choose the inputs and train the network on them; `alone` as in `pair_network.train`."""
         parameters, observations, lengths = data
         flat = observations.reshape(-1, *observations.shape[2:])
-        if options.published:
-            rows = raw_inputs(flat, lengths, options.points)
+        if reading.raw:
+            rows = raw_inputs(flat, lengths, reading.points)
         else:
-            rows = weighed_inputs(parameters, observations, lengths, options.points, options.inputs, options.strictness)
-        seen = rows(flat, lengths).reshape(*parameters.shape[:2], -1)
-        return cls(design, rows, train(seen, parameters, design, rng, alone))
+            rows = weighed_inputs(parameters, observations, lengths, reading.points, reading.inputs, reading.strictness)
+
+        def pairs(some: Rehearsal) -> tuple[Array, Array]:
+            every = some.observations.reshape(-1, *some.observations.shape[2:])
+            return rows(every, lengths).reshape(*some.parameters.shape[:2], -1), some.parameters
+
+        seen = None if look is None else Watched(*pairs(look.held_out), look.epoch)
+        return cls(design, rows, train(*pairs(data), design, rng, alone, seen))
 
     def difference(self, proposed: Array, target: Array) -> Array:
         """h(proposed, target) of input rows; see `pair_network.estimate`."""
@@ -98,7 +134,7 @@ class Fitted:
         }
 
     @classmethod
-    def restored(cls, state: dict[str, Array], design: Design, points: int, plain: bool) -> Fitted:
+    def restored(cls, state: dict[str, Array], design: Design, reading: Reading) -> Fitted:
         """The inverse of `state`.
 
         Raises:
@@ -115,9 +151,8 @@ class Fitted:
             if arrays[name].shape != shape or not size or not np.isfinite(arrays[name]).all():
                 raise ValueError(f"array {name}: expected finite numbers of shape {shape}, found {arrays[name].shape}")
         weights = {name: arrays[name] for name in shapes(size, design.width, 1)}
-        return cls(
-            design, Inputs(points, plain, *(arrays[f"inputs.{n}"] for n in ("chosen", "centre", "gain"))), weights
-        )
+        scaling = (arrays[f"inputs.{name}"] for name in ("chosen", "centre", "gain"))
+        return cls(design, Inputs(reading.points, reading.raw, *scaling), weights)
 
 
 @dataclass(frozen=True)
@@ -139,22 +174,43 @@ class Prepared:
 
     @classmethod
     def train(
-        cls, design: Design, data: Rehearsal, rng: np.random.Generator, options: Options, alone: bool = False
+        cls,
+        design: Design,
+        data: Rehearsal,
+        rng: np.random.Generator,
+        reading: Reading,
+        alone: bool = False,
+        look: Callable[[str], Look] | None = None,
     ) -> Prepared:
-        """Train both networks on the same simulations; only one where published or where `options.noise` is 0."""
-        clean = Fitted.train(design, data, rng, options, alone)
+        """Train both networks on the same simulations; only one where `reading.noise` is 0."""
+        clean = Fitted.train(design, data, rng, reading, alone, look and look("clean"))
         flat = data.observations.reshape(-1, *data.observations.shape[2:])
         spread = flat.std(axis=(0, 1))
-        limit = 2.0 * roughness(flat, data.lengths).max(axis=0) + options.noise / 50.0 * spread
-        if options.published or not options.noise:
+        limit = 2.0 * roughness(flat, data.lengths).max(axis=0) + reading.noise / 50.0 * spread
+        if not reading.noise:
             return cls(clean, clean, limit)
-        spoilt = data.observations + options.noise * spread * rng.standard_normal(data.observations.shape)
-        return cls(clean, Fitted.train(design, data._replace(observations=spoilt), rng, options, alone), limit)
+        spoilt = data.spoilt(reading.noise * spread, rng)
+        seen = look and look("noisy")
+        if seen:
+            seen = replace(seen, held_out=seen.held_out.spoilt(reading.noise * spread, np.random.default_rng(0)))
+        return cls(clean, Fitted.train(design, spoilt, rng, reading, alone, seen), limit)
 
     def suited(self, task: Task) -> Fitted:
         """The network for a target, chosen by the target's roughness."""
         rough = roughness(task.observed[None], task.lengths)[0]
         return self.noisy if (rough > self.limit).any() else self.clean
+
+    def estimator(self, task: Task) -> Callable[[Array], Array]:
+        """From one simulation (1, T, C) to h(simulation, target), (dim,); NaN where the simulation failed."""
+        network, missing = self.suited(task), np.isnan(task.observed)
+        target = network.rows(task.observed[None], task.lengths, missing)[0]
+
+        def difference(observations: Array) -> Array:
+            if not np.isfinite(observations).all():  # nothing was seen
+                return np.full(task.dim, np.nan)
+            return network.difference(network.rows(observations, task.lengths, missing)[0], target)
+
+        return difference
 
     def state(self) -> dict[str, Array]:
         """Everything as plain arrays."""
@@ -164,7 +220,7 @@ class Prepared:
         return arrays | {"limit": self.limit}
 
     @classmethod
-    def restored(cls, state: dict[str, Array], design: Design, options: Options) -> Prepared:
+    def restored(cls, state: dict[str, Array], design: Design, reading: Reading) -> Prepared:
         """The inverse of `state`.
 
         Raises:
@@ -179,9 +235,72 @@ class Prepared:
         limit = np.array(parts["limit"].get("", np.nan), dtype=np.float64)
         if limit.ndim != 1 or not np.isfinite(limit).all():
             raise ValueError(f"array limit: expected finite numbers of shape (channels,), found shape {limit.shape}")
-        two = bool(options.noise) and not options.published
+        two = bool(reading.noise)
         if two != bool(parts["noisy"]):
             raise ValueError(f"expected {'two networks' if two else 'one network'}, found another number of them")
-        clean = Fitted.restored(parts["clean"], design, options.points, options.published)
-        noisy = Fitted.restored(parts["noisy"], design, options.points, options.published) if two else clean
+        clean = Fitted.restored(parts["clean"], design, reading)
+        noisy = Fitted.restored(parts["noisy"], design, reading) if two else clean
         return cls(clean, noisy, limit)
+
+
+class PairTuner(Tuner):
+    """What the tuners on TuneNet's network share; subclasses say how it is built and what it reads, and tune."""
+
+    requires: ClassVar[tuple[str, ...]] = ("torch",)
+    stochastic: ClassVar[bool] = False
+    learned: ClassVar[bool] = True
+    alone: ClassVar[bool] = False
+    """As in `pair_network.train`."""
+
+    _fitted: Prepared | None = None
+
+    def design(self) -> Design:
+        """How the network is built and trained."""
+        raise NotImplementedError
+
+    def reading(self) -> Reading:
+        """What it reads."""
+        raise NotImplementedError
+
+    def layout(self, dim: int) -> tuple[int, int]:
+        """Training scenarios, at most as many as the budget allows, and simulations in each."""
+        raise NotImplementedError
+
+    def fit(self, simulator: Practice, rng: np.random.Generator, budget: int) -> None:
+        """Train on at most `budget` simulations of the training range.
+
+        Raises:
+            ValueError: a budget of less than two scenarios.
+        """
+        scenarios, each = self.layout(simulator.dim)
+        data = rehearse(simulator, rng, budget, scenarios, each)
+        look = None
+        if (watch := self.watch) is not None:
+            apart = rehearse(watch.ground, np.random.default_rng(0), watch.ground.budget, scenarios, max(each, 2))
+
+            def look(stage: str) -> Look:
+                return Look(apart, partial(watch.epoch, stage))
+
+        self._fitted = Prepared.train(self.design(), data, rng, self.reading(), self.alone, look)
+
+    def state(self) -> dict[str, Array]:
+        """The network's weights and what it reads, by name; empty before `fit`."""
+        return {} if self._fitted is None else self._fitted.state()
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Take back what `state` gave.
+
+        Raises:
+            ValueError: arrays of other names or shapes.
+        """
+        self._fitted = Prepared.restored(state, self.design(), self.reading())
+
+    def fitted(self) -> Prepared:
+        """What was trained.
+
+        Raises:
+            RuntimeError: nothing was.
+        """
+        if self._fitted is None:
+            raise RuntimeError(f"{self.name} has not been trained; call fit or restore first")
+        return self._fitted

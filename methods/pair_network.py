@@ -6,9 +6,11 @@ Source: arXiv 1907.11200, section III and Eq. 1; layer sizes and training from t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -104,10 +106,23 @@ def estimate(weights: dict[str, Array], design: Design, proposed: Array, target:
     return joined(proposed, target)
 
 
+class Watched(NamedTuple):
+    """Held-out data, and who is told of the losses: epoch from 1, number of epochs, training and held-out loss."""
+
+    rows: Array
+    parameters: Array
+    epoch: Callable[[int, int, float, float], None]
+
+
 def train(
-    rows: Array, parameters: Array, design: Design, rng: np.random.Generator, alone: bool = False
+    rows: Array,
+    parameters: Array,
+    design: Design,
+    rng: np.random.Generator,
+    alone: bool = False,
+    watched: Watched | None = None,
 ) -> dict[str, Array]:
-    """Fit the weights by Eq. 1; the same generator gives the same weights bit for bit.
+    """Fit the weights by Eq. 1; the same generator gives the same weights bit for bit on the same device.
 
     Args:
         rows: (scenarios, m, D) input rows.
@@ -115,26 +130,46 @@ def train(
         design: how the network is built and trained.
         rng: seeds the initial weights and the order; no global random state is touched.
         alone: learn parameters from the target alone, the proposed input being zero (the direct regressor).
+        watched: told of the losses, without the penalty on the weights; the weights do not depend on it.
 
     Returns:
         Weights as in `shapes`.
     """
     import torch
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # sums in a fixed order, and the machine's other cores left to other runs
-    try:
+    with reproducible(device := "cuda" if torch.cuda.is_available() else "cpu"), torch.enable_grad():
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        weights = _initial(rows.shape[-1], parameters.shape[-1], design, generator)
-        loss = _loss(torch.as_tensor(rows, dtype=torch.float32), parameters, design, weights, alone)
-        with torch.enable_grad():
-            _descend(loss, list(weights.values()), len(rows), design, generator)
-        return {name: w.detach().numpy().astype(np.float64) for name, w in weights.items()}
+        weights = _initial(rows.shape[-1], parameters.shape[-1], design, generator, device)
+        loss = _loss(design, weights, alone)
+        _descend(loss, list(weights.values()), _data(rows, parameters, device), design, generator, watched)
+        return {name: w.detach().cpu().numpy().astype(np.float64) for name, w in weights.items()}
+
+
+@contextmanager
+def reproducible(device: str) -> Iterator[None]:
+    """Sums in a fixed order; on the CPU the machine's other cores are left to other runs."""
+    import torch
+
+    threads, deterministic = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    torch.set_num_threads(1)
+    if device == "cuda":
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS's condition for a fixed order
+        torch.use_deterministic_algorithms(True)
+    try:
+        yield
     finally:
         torch.set_num_threads(threads)
+        torch.use_deterministic_algorithms(deterministic)
 
 
-def _initial(inputs: int, dim: int, design: Design, generator: torch.Generator) -> dict[str, Any]:
+def _data(rows: Array, parameters: Array, device: str) -> tuple[Any, Any]:
+    import torch
+
+    x, y = (torch.as_tensor(array, dtype=torch.float32, device=device) for array in (rows, parameters))
+    return x, y
+
+
+def _initial(inputs: int, dim: int, design: Design, generator: torch.Generator, device: str) -> dict[str, Any]:
     """Weights uniform in +- gain / sqrt(inputs); biases too (published), or zero."""
     import torch
 
@@ -143,19 +178,14 @@ def _initial(inputs: int, dim: int, design: Design, generator: torch.Generator) 
     for name, shape in shapes(inputs, design.width, dim).items():
         fan_in = shape[0] if name.endswith("weight") else fan_in
         limit = (1.0 if not design.adam else 1.7 if name.endswith("weight") else 0.0) / fan_in**0.5
-        weights[name] = ((torch.rand(shape, generator=generator) * 2 - 1) * limit).requires_grad_()
+        weights[name] = ((torch.rand(shape, generator=generator) * 2 - 1) * limit).to(device).requires_grad_()
     return weights
 
 
-def _loss(rows: Any, parameters: Array, design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any], Any]:
-    """The objective of Eq. 1 over the scenarios of one batch."""
+def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any], Any]:
+    """The data term of Eq. 1 of rows (n, m, D) and parameters (n, m, dim)."""
     import torch
     from torch.nn.functional import softplus
-
-    truth = torch.as_tensor(parameters, dtype=torch.float32)
-    each = rows.shape[1]
-    # antisymmetric: half of the ordered pairs will do, the other half are mirror images
-    one, other = torch.triu_indices(each, each, offset=1)
 
     def unit(x: Any) -> Any:
         return softplus(x) - _LOG_2 if design.smooth else torch.relu(x)
@@ -168,40 +198,53 @@ def _loss(rows: Any, parameters: Array, design: Design, w: dict[str, Any], alone
         out = unit(both @ w["joined.weight"] + w["joined.bias"]) @ w["output.weight"] + w["output.bias"]
         return torch.tanh(out) if design.bounded else out
 
-    def objective(batch: Any) -> Any:
-        x, y = rows[batch], truth[batch]
+    def objective(x: Any, y: Any) -> Any:
         if alone:
             b = branch(x, "target")
             error = joined(unit(w["proposed.bias"]).expand_as(b), b) - y
-            data = (error**2).sum(dim=-1).mean()
-        else:
-            a, b = branch(x, "proposed"), branch(x, "target")
-            h = joined(a[:, one], b[:, other])
-            if design.antisymmetric:
-                h = (h - joined(a[:, other], b[:, one])) / 2.0
-            difference = y[:, other] - y[:, one]
-            squares = ((h - difference) ** 2).sum(dim=-1)
-            if design.relative:
-                squares = squares / ((difference**2).sum(dim=-1) + design.relative**2) / 30.0
-            data = squares.mean()
-        return data + design.weight_decay * sum((v**2).sum() for v in w.values())  # Eq. 1
+            return (error**2).sum(dim=-1).mean()
+        # antisymmetric: half of the ordered pairs will do, the other half are mirror images
+        one, other = torch.triu_indices(x.shape[1], x.shape[1], offset=1)
+        a, b = branch(x, "proposed"), branch(x, "target")
+        h = joined(a[:, one], b[:, other])
+        if design.antisymmetric:
+            h = (h - joined(a[:, other], b[:, one])) / 2.0
+        difference = y[:, other] - y[:, one]
+        squares = ((h - difference) ** 2).sum(dim=-1)
+        if design.relative:
+            squares = squares / ((difference**2).sum(dim=-1) + design.relative**2) / 30.0
+        return squares.mean()
 
     return objective
 
 
 def _descend(
-    loss: Callable[[Any], Any], weights: list[Any], scenarios: int, design: Design, generator: torch.Generator
+    loss: Callable[[Any, Any], Any],
+    weights: list[Any],
+    data: tuple[Any, Any],
+    design: Design,
+    generator: torch.Generator,
+    watched: Watched | None,
 ) -> None:
     import torch
 
+    x, y = data
+    held_out = watched and _data(watched.rows, watched.parameters, x.device)
     kind = torch.optim.Adam if design.adam else torch.optim.SGD
     optimiser: Any = kind(weights, lr=design.rate)
     for epoch in range(design.epochs):
         falling = 0.5 + 0.5 * np.cos(np.pi * epoch / design.epochs) if design.adam else 0.99**epoch
         for group in optimiser.param_groups:
             group["lr"] = design.rate * float(falling)
-        order = torch.randperm(scenarios, generator=generator)
-        for first in range(0, scenarios, design.batch):
+        order = torch.randperm(len(x), generator=generator)
+        losses = []
+        for first in range(0, len(x), design.batch):
+            batch = order[first : first + design.batch].to(x.device)
             optimiser.zero_grad()
-            loss(order[first : first + design.batch]).backward()
+            error = loss(x[batch], y[batch])
+            (error + design.weight_decay * sum((v**2).sum() for v in weights)).backward()  # Eq. 1
             optimiser.step()
+            losses.append(error.detach())
+        if watched and held_out:
+            with torch.no_grad():
+                watched.epoch(epoch + 1, design.epochs, float(torch.stack(losses).mean()), float(loss(*held_out)))

@@ -18,7 +18,7 @@ from methods.base import Array, Ask, BudgetExceededError, Evaluation, Steps, Tas
 
 _TIMES = np.linspace(0.0, 3.0, 40)
 _FIT_BUDGET = 240
-_NAME = re.compile(r"[a-z][a-z0-9_]*$")
+_NAME = re.compile(r"[a-z][a-z0-9_-]*$")
 
 
 def _observe(points: Array) -> Array:

@@ -7,7 +7,7 @@ from bench.drive import drive
 from methods.base import Array, BudgetExceededError, Task
 from methods.pair_inputs import resample, roughness, weighed_inputs
 from methods.pair_network import PUBLISHED, Design, estimate, train
-from methods.tunenet import TuneNet, _Search
+from methods.tunenet import Search, TuneNet, TuneNetPublished
 
 TRAINING = {1: np.array([[0.3], [0.7]]), 2: np.array([[0.3, 0.2], [0.7, 0.6]])}
 
@@ -160,7 +160,7 @@ def test_recommends_its_newest_guess(one):
 
 
 def test_published_network_has_the_published_size():
-    tuner = TuneNet(published=True)
+    tuner = TuneNetPublished()
     toy = Toy(runs=1)
     toy.observe = lambda points, scenario: swing(points, scenario[0], samples=400)[:, :, :1]
     toy.lengths = (400,)
@@ -178,7 +178,7 @@ def test_published_network_has_the_published_size():
 
 
 def test_published_is_clamped_at_zero_only_and_does_not_settle():
-    tuner = TuneNet(published=True, points=60)
+    tuner = TuneNetPublished(points=60)
     tuner.fit(Toy(), np.random.default_rng(0), 400)
     seen = tuner._fitted.clean.rows(Toy().observe(np.array([[0.5]]), [1.5]), (60,))[0]
     assert np.abs(tuner._fitted.clean.difference(seen, seen)).max() > 1e-6
@@ -287,7 +287,7 @@ def test_inputs_prefer_what_follows_the_parameters():
 def test_search_solves_a_linear_system_in_as_many_steps_as_it_must():
     matrix, root = np.array([[-0.6, 0.2], [0.1, -1.5]]), np.array([0.4, 0.7])
     task = Task(2, np.array([0.1, 0.9]), np.zeros((1, 1)), np.ones(1), TRAINING[2], 9, (1,))
-    search, guess = _Search(task), task.start
+    search, guess = Search(task), task.start
     distances = []
     for _ in range(6):
         guess = search.after(guess, matrix @ (guess - root))
@@ -297,7 +297,7 @@ def test_search_solves_a_linear_system_in_as_many_steps_as_it_must():
 
 
 def test_search_survives_a_failed_simulation():
-    search = _Search(Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 9, (1,)))
+    search = Search(Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 9, (1,)))
     assert search.after(np.zeros(1), np.array([np.nan])).tolist() == [0.25]
     assert search.after(np.full(1, 0.2), np.array([0.4])).tolist() == pytest.approx([0.6])
     assert search.after(np.full(1, 0.6), np.array([np.nan])).tolist() == pytest.approx([0.4])

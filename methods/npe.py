@@ -1,0 +1,184 @@
+"""Neural posterior estimation: a normalising flow learns p(parameters | observation) from simulations.
+
+Sources: G. Papamakarios, I. Murray, Fast ε-free inference of simulation models with Bayesian conditional density
+estimation, NeurIPS 2016, arXiv 1605.06376; D. Greenberg, M. Nonnenmacher, J. Macke, Automatic posterior transformation
+for likelihood-free inference, ICML 2019, arXiv 1905.07488; the flow: G. Papamakarios, T. Pavlakou, I. Murray, Masked
+autoregressive flow for density estimation, NeurIPS 2017, arXiv 1705.07057. Built and trained by the `sbi` package (JOSS
+5(52), 2020, doi:10.21105/joss.02505), which is an optional extra: pip install simgap[npe].
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from methods.base import Array, Ask, Practice, Steps, Task, Tuner
+from methods.pair_fit import rehearse
+from methods.pair_inputs import Inputs, weighed_inputs
+from methods.pair_network import reproducible
+
+_READ = ("chosen", "centre", "gain")
+
+
+@dataclass(eq=False)
+class NPE(Tuner):
+    """Recommends the mean of the learned posterior, simulates it, then draws from it and keeps the lowest loss.
+
+    It reads the same numbers of an observation as TuneNet does (`methods.pair_inputs`), of the target alone.
+
+    Attributes:
+        scenarios: training scenarios, at most as many as the budget allows.
+        each: simulations in each scenario, at least 2 (dim + 1).
+        points: points to which each run is resampled.
+        inputs: inputs kept of those an observation offers.
+        strictness: see `methods.pair_inputs.weighed_inputs`.
+        noise: sensor noise that every second training observation gets, 1 sigma, in units of each channel's standard
+            deviation in training.
+        hidden: units of each layer of the flow.
+        transforms: autoregressive layers of the flow.
+        epochs: passes over the training data at most; it stops when the held-out loss no longer falls.
+        draws: posterior samples behind the mean.
+    """
+
+    name: ClassVar[str] = "npe"
+    requires: ClassVar[tuple[str, ...]] = ("torch", "sbi")
+    learned: ClassVar[bool] = True
+
+    scenarios: int = 400
+    each: int = 4
+    points: int = 400
+    inputs: int = 100
+    strictness: float = 100.0
+    noise: float = 0.01
+    hidden: int = 50
+    transforms: int = 5
+    epochs: int = 300
+    draws: int = 1000
+    _flow: Any = field(default=None, init=False, repr=False)
+    _rows: Inputs | None = field(default=None, init=False, repr=False)
+
+    def fit(self, simulator: Practice, rng: np.random.Generator, budget: int) -> None:
+        """Train on at most `budget` simulations of the training range.
+
+        Raises:
+            ValueError: a budget of less than two scenarios.
+        """
+        data = rehearse(simulator, rng, budget, self.scenarios, max(self.each, 2 * (simulator.dim + 1)))
+        flat = data.observations.reshape(-1, *data.observations.shape[2:])
+        spoilt = flat + self.noise * flat.std(axis=(0, 1)) * rng.standard_normal(flat.shape)
+        self._rows = weighed_inputs(*data, self.points, self.inputs, self.strictness)
+        rows = np.concatenate([self._rows(seen, data.lengths) for seen in (flat, spoilt)])
+        theta = np.tile(data.parameters.reshape(len(flat), -1), (2, 1))
+        with _quietly(rng):
+            from sbi import inference
+
+            trainer = inference.NPE(density_estimator=self._builder(), tracker=_Silent(), show_progress_bars=False)
+            trainer.append_simulations(_tensor(theta), _tensor(rows))
+            self._flow = trainer.train(max_num_epochs=self.epochs, training_batch_size=min(100, len(rows) // 4))
+
+    def _builder(self) -> Callable[[Any, Any], Any]:
+        from sbi.neural_nets import posterior_nn
+
+        builder: Callable[[Any, Any], Any] = posterior_nn(
+            "maf", hidden_features=self.hidden, num_transforms=self.transforms
+        )
+        return builder
+
+    def state(self) -> dict[str, Array]:
+        """The flow's tensors and what it reads, by name; empty before `fit`."""
+        if self._rows is None:
+            return {}
+        tensors = {f"flow.{name}": np.array(t.numpy()) for name, t in self._flow.state_dict().items()}
+        return tensors | {f"inputs.{name}": getattr(self._rows, name) for name in _READ}
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Take back what `state` gave.
+
+        Raises:
+            ValueError: arrays of other names or shapes, or numbers that are not finite.
+        """
+        rest = dict(state)
+        try:
+            read = [np.array(rest.pop(f"inputs.{name}"), dtype=np.float64) for name in _READ]
+        except KeyError as missing:
+            raise ValueError(f"expected array {missing.args[0]}, found {sorted(state)[:4]}") from None
+        if any(r.ndim != 1 or r.shape != read[0].shape or not r.size for r in read):
+            raise ValueError(f"expected input arrays of one length, found shapes {[r.shape for r in read]}")
+        foreign = [name for name, a in rest.items() if not name.startswith("flow.") or not np.isfinite(a).all()]
+        if foreign:
+            raise ValueError(f"array {foreign[0]}: expected an array of the flow, of finite numbers")
+        self._flow = self._rebuilt({name.removeprefix("flow."): a for name, a in rest.items()}, read[0].size)
+        self._rows = Inputs(self.points, False, *read)
+
+    def _rebuilt(self, arrays: dict[str, Array], inputs: int) -> Any:
+        """A flow of the default build with these tensors; its number of parameters is what fits."""
+        import torch
+
+        sizes = {a.size for name, a in arrays.items() if name.endswith("_transforms.0._shift")}
+        dim = sizes.pop() if sizes else 0
+        if not 0 < dim < 1000:
+            raise ValueError("expected the arrays of a flow, found others")
+        rng = np.random.default_rng(0)
+        with _quietly(rng):
+            flow = self._builder()(*(_tensor(rng.standard_normal((4, size))) for size in (dim, inputs)))
+            try:
+                flow.load_state_dict({name: torch.from_numpy(np.array(a)) for name, a in arrays.items()})
+            except (RuntimeError, TypeError) as error:
+                raise ValueError(f"expected the arrays of a flow: {' '.join(str(error).split())[:200]}") from None
+        return flow
+
+    def tune(self, task: Task, rng: np.random.Generator) -> Steps:
+        """The posterior's mean, then draws."""
+        if self._rows is None:
+            raise RuntimeError("npe has not been trained; call fit or restore first")
+        row = self._rows(task.observed[None], task.lengths)
+        with _quietly(rng):
+            drawn = self._flow.sample((max(self.draws, task.budget),), condition=_tensor(row)).detach()[:, 0].numpy()
+        drawn = np.clip(np.nan_to_num(drawn.astype(np.float64), nan=0.5), 0.0, 1.0)
+        mean = drawn.mean(axis=0)
+        yield Ask(mean, recommend=mean)
+        for point in drawn:
+            yield point[None]
+        return "its draws are used up"
+
+
+def _tensor(array: Array) -> Any:
+    import torch
+
+    return torch.as_tensor(array, dtype=torch.float32)
+
+
+@contextmanager
+def _quietly(rng: np.random.Generator) -> Iterator[None]:
+    """Global generators seeded from `rng` inside and as they were outside; no gradients kept, no warnings."""
+    import torch
+
+    legacy = np.random.get_state()  # noqa: NPY002 - sbi may draw from it
+    with (
+        torch.random.fork_rng(devices=[]),
+        reproducible("cpu"),
+        warnings.catch_warnings(),
+        redirect_stdout(io.StringIO()),  # sbi prints
+    ):
+        warnings.simplefilter("ignore")
+        torch.manual_seed(int(rng.integers(2**62)))
+        np.random.seed(int(rng.integers(2**31)))  # noqa: NPY002
+        try:
+            yield
+        finally:
+            np.random.set_state(legacy)  # noqa: NPY002
+
+
+class _Silent:
+    """A tracker of training that keeps nothing; the package's own writes into the working folder."""
+
+    log_dir = None
+
+    def __getattr__(self, _: str) -> Callable[..., None]:
+        return lambda *_args, **_options: None

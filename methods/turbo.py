@@ -1,0 +1,145 @@
+"""TuRBO-1: Bayesian optimisation in one trust region, with Thompson sampling.
+
+Sources: D. Eriksson, M. Pearce, J. Gardner, R. Turner, M. Poloczek, Scalable global optimization via local Bayesian
+optimization, NeurIPS 2019, arXiv 1910.01739 (section 2; constants from its supplement); M. Balandat et al., BoTorch: a
+framework for efficient Monte-Carlo Bayesian optimization, NeurIPS 2020, arXiv 1910.06403. Gaussian process and sampling
+are the `botorch` package's, which is an optional extra: pip install simgap[turbo].
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from methods.base import Array, Steps, Task, Tuner
+from methods.pair_network import reproducible
+
+
+@dataclass(eq=False)
+class TuRBO(Tuner):
+    """A box around the best point that grows with successes and shrinks with failures; recommends the lowest loss.
+
+    Where the box has shrunk below its smallest length, it starts again elsewhere with new initial points.
+
+    Attributes:
+        initial: points before the first model, per parameter, the start included; at least 2 in all.
+        candidates: points among which a Thompson sample is compared.
+        length: first side of the trust region, unit cube.
+        longest: its largest side.
+        shortest: below this side it starts again.
+        successes: improvements in succession after which the side is doubled; it is halved after as many failures in
+            succession as there are parameters, at least 4.
+    """
+
+    name: ClassVar[str] = "turbo"
+    requires: ClassVar[tuple[str, ...]] = ("torch", "botorch")
+
+    initial: int = 2
+    candidates: int = 1000
+    length: float = 0.8
+    longest: float = 1.6
+    shortest: float = 0.5**7
+    successes: int = 3
+
+    def tune(self, task: Task, rng: np.random.Generator) -> Steps:
+        """Initial points, then one Thompson sample at a time; again from new points when the region has collapsed."""
+        first: Array | None = task.start
+        while True:
+            points = list(_spread(rng, max(2, self.initial * task.dim), task.dim))
+            if first is not None:
+                points[0], first = first, None
+            losses = []
+            for point in points:
+                losses.append(float((yield point).losses[0]))
+            yield from self._region(task.dim, rng, np.array(points), np.array(losses))
+
+    def _region(self, dim: int, rng: np.random.Generator, points: Array, losses: Array) -> Steps:
+        """One trust region, until it has collapsed."""
+        length, succeeded, failed = self.length, 0, 0
+        while length >= self.shortest:
+            point = self._sampled(points, losses, length, rng)
+            loss = float((yield point).losses[0])
+            better = loss < 0.999 * losses.min()
+            succeeded, failed = (succeeded + 1, 0) if better else (0, failed + 1)
+            if succeeded == self.successes:
+                length, succeeded = min(2.0 * length, self.longest), 0
+            elif failed == max(4, dim):
+                length, failed = length / 2.0, 0
+            points, losses = np.vstack([points, point]), np.append(losses, loss)
+        return None
+
+    def _sampled(self, points: Array, losses: Array, length: float, rng: np.random.Generator) -> Array:
+        """The best of a Thompson sample of the process over candidates in the trust region."""
+        import torch
+
+        finite = np.isfinite(losses)
+        if not finite.any():
+            anywhere: Array = rng.uniform(size=(points.shape[1],))
+            return anywhere
+        values = np.where(finite, losses, losses[finite].max())
+        scale = float(values.std()) or 1.0
+        with _quietly(rng):
+            from botorch.generation import MaxPosteriorSampling
+
+            model = _process(points, -(values - values.mean()) / scale)
+            sides = np.asarray(model.covar_module.base_kernel.lengthscale.detach().numpy()).ravel()
+            sides = length * sides / np.exp(np.log(sides).mean())
+            candidates = self._candidates(points[values.argmin()], sides, rng)
+            with torch.no_grad():
+                chosen = MaxPosteriorSampling(model=model, replacement=False)(torch.from_numpy(candidates))
+            best: Array = np.clip(chosen.numpy()[0].astype(np.float64), 0.0, 1.0)
+        return best
+
+    def _candidates(self, centre: Array, sides: Array, rng: np.random.Generator) -> Array:
+        """Points in the box around `centre`; in many dimensions each differs from it in about 20 of them."""
+        low, high = np.clip(centre - sides / 2.0, 0.0, 1.0), np.clip(centre + sides / 2.0, 0.0, 1.0)
+        spread = low + (high - low) * _spread(rng, self.candidates, len(centre))
+        moved = rng.uniform(size=spread.shape) <= min(20.0 / len(centre), 1.0)
+        moved[~moved.any(axis=1), rng.integers(len(centre))] = True
+        return np.where(moved, spread, centre)
+
+
+def _spread(rng: np.random.Generator, n: int, dim: int) -> Array:
+    """Scrambled Sobol points (n, dim)."""
+    from scipy.stats import qmc
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # n need not be a power of two
+        points: Array = qmc.Sobol(dim, seed=rng).random(n)
+    return points
+
+
+def _process(points: Array, values: Array) -> Any:
+    """A Gaussian process with a scaled Matérn-5/2 kernel, fitted by its marginal likelihood."""
+    import torch
+    from botorch.exceptions import ModelFittingError
+    from botorch.fit import fit_gpytorch_mll
+    from botorch.models import SingleTaskGP
+    from gpytorch.constraints import Interval
+    from gpytorch.kernels import MaternKernel, ScaleKernel
+    from gpytorch.likelihoods import GaussianLikelihood
+    from gpytorch.mlls import ExactMarginalLogLikelihood
+
+    kernel = MaternKernel(nu=2.5, ard_num_dims=points.shape[1], lengthscale_constraint=Interval(0.005, 4.0))
+    likelihood = GaussianLikelihood(noise_constraint=Interval(1e-8, 1e-3))
+    x, y = torch.from_numpy(points), torch.from_numpy(values)[:, None]
+    model = SingleTaskGP(x, y, covar_module=ScaleKernel(kernel), likelihood=likelihood, outcome_transform=None)
+    with suppress(ModelFittingError):  # the kernel as it stands serves as well
+        fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
+    return model.eval()
+
+
+@contextmanager
+def _quietly(rng: np.random.Generator) -> Iterator[None]:
+    """Torch's global generator seeded from `rng` inside and as it was outside; no warnings."""
+    import torch
+
+    with torch.random.fork_rng(devices=[]), reproducible("cpu"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.manual_seed(int(rng.integers(2**62)))
+        yield

@@ -1,0 +1,50 @@
+"""Who is ahead of a tuner, at which number of simulations: ``python -m tests.benchmarks.behind FOLDER [TUNER]``.
+
+Reads a comparison's folder; paired tests over its targets after 1, 2, 3, 5, ... simulations (`bench.paired`: Wilcoxon
+on the logarithms of errors, Holm's correction over all pairs). Writes behind.csv there and prints it as a table.
+"""
+
+import argparse
+from pathlib import Path
+
+import pandas as pd
+
+from bench.curves import Rows, primary
+from bench.paired import pairs
+from bench.stats import checkpoints
+from bench.store import configuration, read
+
+
+def against(folder, tuner):
+    """One row a rival, range and number of simulations: median error of `tuner` over the rival's, and Holm's p."""
+    stored = read(folder)
+    parts = []
+    for k in checkpoints(configuration(folder).experiment.budget)[1:]:
+        found = pairs(Rows(stored.runs, stored.statuses, k).curves(primary(stored.runs)))
+        found = found[(found["a"] == tuner) | (found["b"] == tuner)].copy()
+        mirrored = found["b"] == tuner
+        found.loc[mirrored, "error_ratio"] = 1.0 / found.loc[mirrored, "error_ratio"]
+        found.loc[mirrored, "effect"] *= -1.0
+        found["rival"] = found["a"].where(mirrored, found["b"])
+        found["behind"] = (found["p_holm"] < 0.05) & (found["effect"] < 0.0)
+        found["ahead"] = (found["p_holm"] < 0.05) & (found["effect"] > 0.0)
+        parts.append(found.assign(simulations=k))
+    columns = ["range", "rival", "simulations", "targets", "error_ratio", "effect", "p_holm", "ahead", "behind"]
+    return pd.concat(parts)[columns].sort_values(["range", "rival", "simulations"])
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("tuner", nargs="?", default="hybrid")
+    options = parser.parse_args()
+    table = against(options.folder, options.tuner)
+    table.to_csv(options.folder / "behind.csv", index=False, float_format="%.3g")
+    words = table["error_ratio"].map("{:.2g}".format) + table["ahead"].map({True: " +", False: ""})
+    table["shown"] = words + table["behind"].map({True: " BEHIND", False: ""})
+    print(f"median error of {options.tuner} over the rival's; + significantly ahead, BEHIND significantly behind")
+    print(table.pivot(index=["range", "rival"], columns="simulations", values="shown").to_string())
+
+
+if __name__ == "__main__":
+    main()

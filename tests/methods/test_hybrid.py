@@ -1,0 +1,124 @@
+import numpy as np
+import pytest
+
+from bench.drive import drive
+from methods.base import Evaluation, Task
+from methods.hybrid import Hybrid, _complement
+from methods.least_squares import LeastSquares, Run
+from methods.tunenet import TuneNet
+from tests.methods.test_tunenet import TRAINING, Toy, run
+
+
+def trained(toy, **options):
+    tuner = Hybrid(**{"scenarios": 40, "points": 60, "epochs": 100, **options})
+    tuner.fit(toy, np.random.default_rng(0), toy.budget)
+    return tuner
+
+
+@pytest.fixture(scope="module")
+def two():
+    return trained(Toy(2, runs=3), scenarios=80)
+
+
+def errors(tuner, toy, budget=12, seeds=12, **kwargs):
+    rows = []
+    for seed in range(seeds):
+        trace, truth = run(tuner, toy, seed, budget=budget, **kwargs)
+        row = np.abs(trace.recommendations - truth).mean(axis=1)
+        rows.append(np.append(row, np.full(budget + 1 - len(row), row[-1])))
+    return np.mean(rows, axis=0)
+
+
+def test_starts_as_the_network_and_ends_as_least_squares(two):
+    toy = Toy(2, runs=3)
+    error, searched = errors(two, toy), errors(LeastSquares(), toy)
+    assert error[1] < 0.03 < searched[1] / 2
+    assert error[3] < 2e-3 < searched[3]
+    assert error[12] < 1e-9
+
+
+def test_finishes_where_the_network_is_wrong():
+    """A network of one epoch on two scenarios, outside its training range."""
+    poor = trained(Toy(2, budget=16), scenarios=2, epochs=1)
+    alone = TuneNet(points=60)
+    alone.restore(poor.state())
+    assert errors(alone, Toy(2), budget=30, wide=True)[30] > 1e-3
+    assert errors(poor, Toy(2), budget=30, wide=True)[30] < 1e-9
+
+
+def test_noise_is_averaged_as_least_squares_does(two):
+    noise = np.random.default_rng(5)
+
+    def spoil(observed):
+        observed += 0.02 * noise.standard_normal(observed.shape)
+
+    ours = errors(two, Toy(2, runs=3), budget=20, spoil=spoil)[20]
+    noise = np.random.default_rng(5)
+    theirs = errors(LeastSquares(), Toy(2, runs=3), budget=40, spoil=spoil)[40]
+    assert ours == pytest.approx(theirs, rel=0.1)
+    assert ours < 5e-3
+
+
+def seen_so_far(points, matrix, offset=0.0):
+    """A run whose residuals are linear in the points."""
+    task = Task(2, np.zeros(2), np.zeros((4, 1)), np.ones(1), TRAINING[2], 9, (4,))
+    run = Run(task, 0.0)
+    residuals = points @ matrix.T + offset
+    for point, residual in zip(points, residuals, strict=True):
+        run.tried.append(point)
+        run.residuals.append(residual)
+        run.losses.append(float(np.sqrt(np.mean(residual**2))))
+    return run
+
+
+def modelled(run, matrix):
+    """The model, and the points that had to be simulated for it."""
+    steps, asked = Hybrid()._model(run, LeastSquares()), []
+    try:
+        points = next(steps)
+        while True:
+            asked += list(points)
+            residuals = points @ matrix.T
+            seen = Evaluation(points, residuals[:, :, None], np.sqrt((residuals**2).mean(axis=1)))
+            points = steps.send(seen)
+    except StopIteration as stop:
+        return stop.value, asked
+
+
+MATRIX = np.array([[1.0, 2.0], [0.0, -1.0], [3.0, 0.5], [1.0, 1.0]])
+
+
+def test_model_takes_secants_for_differences():
+    points = np.array([[0.4, 0.4], [0.41, 0.4], [0.41, 0.45], [0.9, 0.9]])
+    model, asked = modelled(seen_so_far(points, MATRIX), MATRIX)
+    assert not asked
+    assert np.allclose(model.jacobian, MATRIX)
+    assert model.point.tolist() == [0.4, 0.4]
+
+
+def test_model_simulates_only_the_directions_that_are_missing():
+    points = np.array([[0.4, 0.4], [0.43, 0.44], [0.9, 0.9]])  # the third is not near
+    model, asked = modelled(seen_so_far(points, MATRIX), MATRIX)
+    assert len(asked) == 1
+    assert (asked[0] - points[0]) @ (points[1] - points[0]) == pytest.approx(0.0, abs=1e-12)
+    assert np.allclose(model.jacobian, MATRIX)
+    rounding = np.array([[0.4, 0.4], [0.4 + 1e-9, 0.4]])
+    _, asked = modelled(seen_so_far(rounding, MATRIX), MATRIX)
+    assert len(asked) == 2
+
+
+def test_complement_is_orthonormal():
+    basis = [np.array([0.6, 0.8, 0.0])]
+    directions = _complement(basis, 3)
+    assert directions.shape == (2, 3)
+    assert np.allclose(directions @ directions.T, np.eye(2))
+    assert np.allclose(directions @ basis[0], 0.0)
+
+
+def test_everything_fails_and_it_still_uses_its_budget(two):
+    toy = Toy(2, runs=3)
+    toy.observe = lambda points, scenario: np.full((len(points), 180, 2), np.nan)
+    task = Task(2, np.full(2, 0.5), np.zeros((180, 2)), np.ones(2), TRAINING[2], 9, (60, 60, 60))
+    trace = drive(two, task, lambda p: (toy.observe(p, None), np.full(len(p), np.inf)), np.random.default_rng(0))
+    assert trace.status == "done"
+    assert len(trace.losses) == 9
