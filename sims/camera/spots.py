@@ -23,7 +23,9 @@ _LEAST_LEVEL = 12.0
 _AGREE = 0.6
 _MOST_SPOTS = 6
 _TINY = 2.5
-_ROUNDS = 2
+_ROUNDS = 3
+_FINE = 0.25
+_RIM = 5
 _SHADE = (0.25, 0.97)
 
 
@@ -64,6 +66,7 @@ class Finder:
         self.background, self.sigma, self.shadows = background, sigma, shadows
         self.level = max(_LEAST_LEVEL, 6 * sigma)
         self._plain = background.astype(np.float32)
+        self._grey = opencv().cvtColor(background, opencv().COLOR_RGB2GRAY)
         self._square = np.maximum((self._plain * self._plain).sum(axis=2), 1.0)
 
     def spots(self, picture: Image) -> list[Spot]:
@@ -71,6 +74,7 @@ class Finder:
         cv2 = opencv()
         apart = cv2.absdiff(picture, self.background)
         difference = cv2.max(cv2.max(apart[..., 0], apart[..., 1]), apart[..., 2])
+        brightness = cv2.absdiff(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), self._grey)
         mask = (difference > self.level).astype(np.uint8)
         if not mask.any():
             return []
@@ -83,24 +87,27 @@ class Finder:
             shade = np.zeros(mask.shape, bool)
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         large = sorted(((len(c), i) for i, c in enumerate(contours) if len(c) > 3), reverse=True)[:_MOST_SPOTS]
-        found = [self._spot(contours[i], difference, shade) for _, i in large]
+        found = [self._spot(contours[i], (brightness, difference), shade) for _, i in large]
         return [spot for spot in found if spot is not None]
 
     def _shadow(self, picture: Image, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Where the picture is the background times one factor below 1, in all colours alike."""
+        """Where the picture is the background times one factor, in all colours alike: shadow, or shadow gone."""
         result = np.zeros(mask.shape, bool)
         rows, columns = np.nonzero(mask)
         there = picture[rows, columns].astype(np.float32)
         plain = self._plain[rows, columns]
         factor = (there * plain).sum(axis=1) / self._square[rows, columns]
         rest = np.abs(there - factor[:, None] * plain).max(axis=1)
-        result[rows, columns] = (factor > _SHADE[0]) & (factor < _SHADE[1]) & (rest < max(6.0, 3 * self.sigma))
+        even = np.minimum(factor, 1 / np.maximum(factor, 1e-3))
+        result[rows, columns] = (even > _SHADE[0]) & (even < _SHADE[1]) & (rest < max(6.0, 3 * self.sigma))
         return result
 
-    def _spot(self, contour: Any, difference: NDArray[np.uint8], shade: NDArray[np.bool_]) -> Spot | None:
+    def _spot(
+        self, contour: Any, differences: tuple[NDArray[np.uint8], ...], shade: NDArray[np.bool_]
+    ) -> Spot | None:
         cv2 = opencv()
         left, top, width, height = cv2.boundingRect(contour)
-        if width * height < _LEAST_AREA or max(width, height) > 0.9 * min(difference.shape):
+        if width * height < _LEAST_AREA or max(width, height) > 0.9 * min(shade.shape):
             return None
         filled = np.zeros((height + 2, width + 2), np.uint8)
         cv2.drawContours(filled, [contour], -1, 1, -1, offset=(1 - left, 1 - top))
@@ -114,21 +121,23 @@ class Finder:
         reach = int(2 * max(radius, 0.5 * max(width, height))) + 4
         u0, v0 = max(0, int(u) - reach), max(0, int(v) - reach)
         place = np.s_[v0 : int(v) + reach + 1, u0 : int(u) + reach + 1]
-        window = difference[place].astype(np.float32)
-        hidden = shade[place].copy()
-        cv2.drawContours(own := hidden.astype(np.uint8), [contour], -1, 0, -1, offset=(-u0, -v0))
-        window[own > 0] = 0
+        windows = np.stack([each[place] for each in differences]).astype(np.float32)
+        # the edge itself, half ball and half background, may pass for shadow
+        hidden = shade[place].astype(np.uint8)
+        cv2.drawContours(hidden, [contour], -1, 0, -1, offset=(-u0, -v0))
+        cv2.drawContours(hidden, [contour], -1, 0, _RIM, offset=(-u0, -v0))
+        windows[:, hidden > 0] = 0
         if radius < _TINY:
-            return self._tiny(window, u - u0, v - v0, radius, u0, v0)
-        return self._circle(window, (u - u0, v - v0, radius), u0, v0)
+            return self._tiny(windows[1], u - u0, v - v0, radius, u0, v0)
+        return self._circle(windows, (u - u0, v - v0, radius), u0, v0)
 
     def _circle(
-        self, window: NDArray[np.float32], start: tuple[float, float, float], u0: int, v0: int
+        self, windows: NDArray[np.float32], start: tuple[float, float, float], u0: int, v0: int
     ) -> Spot | None:
         u, v, radius = start
         kept, rest = np.empty(0, bool), np.empty(0)
         for _ in range(_ROUNDS):
-            edges = self._edges(window, u, v, radius)
+            edges = self._edges(windows, u, v, radius)
             if edges is None:
                 return None
             fitted = _fit(edges, u, v, radius)
@@ -137,35 +146,37 @@ class Finder:
             (u, v, radius), rest = fitted
             kept = np.abs(rest) < max(0.7, 0.1 * radius)
         agree = float(kept.sum()) / _RAYS
-        height, width = window.shape
+        height, width = windows.shape[1:]
         if agree < _AGREE or not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
             return None
         scatter = float(np.sqrt(np.mean(rest[kept] ** 2)))
         return Spot(u + u0, v + v0, radius, agree, scatter)
 
-    def _edges(self, window: NDArray[np.float32], u: float, v: float, radius: float) -> Array | None:
-        """Points (n, 2) where the difference has fallen to half along rays from (u, v); None for too few."""
-        cv2 = opencv()
+    def _edges(self, windows: NDArray[np.float32], u: float, v: float, radius: float) -> Array | None:
+        """Points (n, 2) where the difference has fallen to half along rays from (u, v); None for too few.
+
+        What it falls from is taken just inside the edge, since a lit ball is not the same all over. Brightness counts
+        where it differs enough: video files keep colours at half the resolution.
+        """
+        steps = np.arange(max(0.0, 0.7 * radius - 2), 1.5 * radius + 2, _FINE, dtype=np.float32)
         cos, sin = _directions()
-        steps = np.arange(0.4 * radius, 1.9 * radius + 2, 0.25, dtype=np.float32)
         along_u, along_v = (u + cos * steps).astype(np.float32), (v + sin * steps).astype(np.float32)
-        values = cv2.remap(
-            window, along_u, along_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-1000.0
-        )
-        core = steps < 0.8 * radius
-        plateau = np.median(values[:, core], axis=1)
-        half = 0.5 * plateau[:, None]
+        profiles = [_along(window, along_u, along_v) for window in windows]
+        inner = (steps > min(0.5 * radius, radius - 3.5)) & (steps < max(0.7 * radius, radius - 1.3))
+        levels = [np.median(p[:, inner], axis=1) for p in profiles]
+        bright = (levels[0] > 1.5 * self.level) & (levels[0] > 0.7 * levels[1])
+        values = np.where(bright[:, None], *profiles)
+        half = 0.5 * np.where(bright, *levels)[:, None]
         below = (values[:, 1:] < half) & (values[:, :-1] >= half)
-        below[:, : max(0, int(core.sum()) - 2)] = False
-        has = below.any(axis=1) & (plateau > 0.8 * self.level)
+        below[:, : int(np.flatnonzero(inner)[0])] = False
         k = below.argmax(axis=1)
         lines = np.arange(_RAYS)
         a, b = values[lines, k], values[lines, k + 1]
-        has &= b > -500  # the picture ends there
+        has = below.any(axis=1) & (half[:, 0] > 0.4 * self.level) & (b > -500)  # far below: the picture ends there
         if has.sum() < 0.5 * _RAYS:
             return None
         share = (a - half[:, 0])[has] / np.maximum(a - b, 1e-6)[has]
-        out = steps[k[has]] + 0.25 * share
+        out = steps[k[has]] + _FINE * share
         return np.stack([u + cos[has, 0] * out, v + sin[has, 0] * out], axis=1).astype(np.float64)
 
     def _tiny(
@@ -184,6 +195,15 @@ class Finder:
             return None
         u, v = float((weights * columns).sum() / total), float((weights * rows).sum() / total)
         return Spot(u + u0, v + v0, float(np.sqrt(area / np.pi)), _AGREE, 0.2)
+
+
+def _along(window: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values of a window at places between its pixels; far below zero outside."""
+    cv2 = opencv()
+    result: NDArray[np.float32] = cv2.remap(
+        window, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-1000.0
+    )
+    return result
 
 
 @lru_cache(maxsize=1)

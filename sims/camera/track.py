@@ -96,16 +96,36 @@ def _shot(survey: background.Survey, notes: list[str]) -> tuple[int, int]:
 def _finder(pictures: list[Image]) -> Finder:
     """A finder with the better treatment of shadows, and a background that the ball has been taken out of."""
     plain = background.median(pictures)
-    for _ in range(2):
+    for _ in range(3):
         sigma = background.noise(pictures, plain)
         finders = [Finder(plain, sigma, shadows) for shadows in (True, False)]
         found = [[finder.spots(picture) for picture in pictures] for finder in finders]
         # a ball of the ground's own hue is itself taken for shadow; then shadow must be borne
         good = [sum(max((s.agree for s in spots), default=0.0) for spots in each) for each in found]
         best = 0 if good[0] >= 0.8 * good[1] else 1
-        balls = [[(s.u, s.v, s.radius) for s in spots] for spots in found[best]]
-        plain = background.without(pictures, balls, plain)
+        plain = background.without(pictures, _unghosted(found[best]), plain)
     return Finder(plain, sigma, best == 0)
+
+
+def _unghosted(found: list[list[Spot]]) -> list[list[tuple[float, float, float]]]:
+    """Where the ball hides the background in each picture.
+
+    A ball that rests for most of the film gets into the median. Then each picture shows, beside the ball, something as
+    round that never moves: the hole where it will rest. There those pictures tell the background and the others do not.
+    """
+    balls = [[(s.u, s.v, s.radius) for s in spots] for spots in found]
+    for ghost in [ball for there in balls for ball in there]:
+        at = [next((b for b in there if _same(b, ghost)), None) for there in balls]
+        beside = [any(not _same(b, ghost) and 0.5 < b[2] / ghost[2] < 2 for b in there) for there in balls]
+        both = sum(b and a is not None for a, b in zip(at, beside, strict=True))
+        if both >= 4 and both >= 0.7 * sum(a is not None for a in at):
+            balls = [[b for b in there if not _same(b, ghost)] for there in balls]
+            return [[*there, ghost] if a is None else there for a, there in zip(at, balls, strict=True)]
+    return balls
+
+
+def _same(a: tuple[float, float, float], b: tuple[float, float, float]) -> bool:
+    return abs(a[0] - b[0]) + abs(a[1] - b[1]) < 0.3 * b[2] + 0.5 and 0.7 < a[2] / b[2] < 1.4
 
 
 def _others(path: Path, others: Sequence[Path], notes: list[str]) -> None:
@@ -151,7 +171,3 @@ def rough(values: Array) -> float:
     rest = windows - windows @ basis @ basis.T
     return float(np.sqrt(np.median((rest**2).sum(axis=1)) / (_WINDOW - 4)))
 
-
-def spots_of(frames: Iterable[Image], finder: Finder) -> list[list[Spot]]:
-    """The spots of each picture."""
-    return [finder.spots(picture) for picture in frames]
