@@ -37,9 +37,7 @@ def shown(cell: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
-def read_table(
-    path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str] = ()
-) -> list[TableRun]:
+def read_table(path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str] = ()) -> list[TableRun]:
     """The runs of a table in order of appearance. A channel's or extra cell may be empty; an input's may not.
 
     Raises:

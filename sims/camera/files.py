@@ -41,7 +41,9 @@ def read_filmed(path: Path) -> Filmed:
         InputError: anything malformed, in one line.
     """
     meta = read_toml(path)
-    camera = _numbers(path, "camera", meta, ("azimuth", "distance", "height", "field_of_view"), {"target": 3, "size": 2})
+    camera = _numbers(
+        path, "camera", meta, ("azimuth", "distance", "height", "field_of_view"), {"target": 3, "size": 2}
+    )
     ball = _numbers(path, "ball", meta, ("radius", "x", "y"), {})
     if ball["radius"] <= 0:
         raise InputError(f"{path}: ball.radius: expected more than 0 m, found {ball['radius']:g}")
@@ -63,7 +65,9 @@ def _numbers(path: Path, section: str, meta: dict[str, Any], single: tuple[str, 
     for name in (*single, *rows):
         found, length = table.get(name), rows.get(name, 0)
         cells = found if length and isinstance(found, list) else [found]
-        if len(cells) != max(1, length) or not all(isinstance(c, int | float) and not isinstance(c, bool) for c in cells):
+        if len(cells) != max(1, length) or not all(
+            isinstance(c, int | float) and not isinstance(c, bool) for c in cells
+        ):
             raise InputError(f"{path}: {section}.{name}: expected {length or 'a'} number{'s' * bool(length)}")
         values[name] = tuple(map(float, cells)) if length else float(cells[0])
     return values

@@ -99,9 +99,7 @@ class Stage:
         light = self.look.light
         stretch, travel = 1 / light[2], position[2] / light[2]
         foot = position - travel * light
-        corners = foot + self.radius * stretch * 1.1 * np.array(
-            [(a, b, 0.0) for a in (-1, 1) for b in (-1, 1)]
-        )
+        corners = foot + self.radius * stretch * 1.1 * np.array([(a, b, 0.0) for a in (-1, 1) for b in (-1, 1)])
         window = _window(self.camera.project(corners), self.camera.size)
         if window is None:
             return

@@ -102,9 +102,7 @@ class Finder:
         result[rows, columns] = (even > _SHADE[0]) & (even < _SHADE[1]) & (rest < max(6.0, 3 * self.sigma))
         return result
 
-    def _spot(
-        self, contour: Any, differences: tuple[NDArray[np.uint8], ...], shade: NDArray[np.bool_]
-    ) -> Spot | None:
+    def _spot(self, contour: Any, differences: tuple[NDArray[np.uint8], ...], shade: NDArray[np.bool_]) -> Spot | None:
         cv2 = opencv()
         left, top, width, height = cv2.boundingRect(contour)
         if width * height < _LEAST_AREA or max(width, height) > 0.9 * min(shade.shape):
@@ -131,9 +129,7 @@ class Finder:
             return self._tiny(windows[1], u - u0, v - v0, radius, u0, v0)
         return self._circle(windows, (u - u0, v - v0, radius), u0, v0)
 
-    def _circle(
-        self, windows: NDArray[np.float32], start: tuple[float, float, float], u0: int, v0: int
-    ) -> Spot | None:
+    def _circle(self, windows: NDArray[np.float32], start: tuple[float, float, float], u0: int, v0: int) -> Spot | None:
         u, v, radius = start
         kept, rest = np.empty(0, bool), np.empty(0)
         for _ in range(_ROUNDS):
@@ -179,9 +175,7 @@ class Finder:
         out = steps[k[has]] + _FINE * share
         return np.stack([u + cos[has, 0] * out, v + sin[has, 0] * out], axis=1).astype(np.float64)
 
-    def _tiny(
-        self, window: NDArray[np.float32], u: float, v: float, radius: float, u0: int, v0: int
-    ) -> Spot | None:
+    def _tiny(self, window: NDArray[np.float32], u: float, v: float, radius: float, u0: int, v0: int) -> Spot | None:
         """A ball of a few pixels: the middle of the difference, and a circle of its sum."""
         rows, columns = np.mgrid[: window.shape[0], : window.shape[1]]
         near = np.hypot(columns - u, rows - v) <= radius + 2.5

@@ -16,6 +16,7 @@ from sims.camera.spots import Finder, Spot
 
 _LEAST_FRAMES = 5
 _WINDOW = 9
+_FEW = 14
 
 
 @dataclass(frozen=True)
@@ -73,12 +74,21 @@ def track(frames: Iterable[tuple[float, Image]]) -> Track:
     if len(path.frames) < _LEAST_FRAMES or path.travel < path.radius:
         raise InputError(_nothing(end - first, len(path.frames)))
     _others(path, others, notes)
-    return _made(survey.times[first:end], path, survey.size, notes, finder, dict(zip(numbers, pictures, strict=True)))
+    return _made(
+        survey.times[first:end],
+        path,
+        survey.size,
+        notes,
+        finder,
+        {n - first: p for n, p in zip(numbers, pictures, strict=True)},
+    )
 
 
 def _nothing(frames: int, some: int) -> str:
     seen = f"something round in {some} of {frames} frames, but nothing" if some else "nothing"
-    return f"no ball found: {seen} that moves and stays round; film with a fixed camera and a ball unlike its background"
+    return (
+        f"no ball found: {seen} that moves and stays round; film with a fixed camera and a ball unlike its background"
+    )
 
 
 def _shot(survey: background.Survey, notes: list[str]) -> tuple[int, int]:
@@ -96,15 +106,15 @@ def _shot(survey: background.Survey, notes: list[str]) -> tuple[int, int]:
 def _finder(pictures: list[Image]) -> Finder:
     """A finder with the better treatment of shadows, and a background that the ball has been taken out of."""
     plain = background.median(pictures)
-    for _ in range(3):
+    few = pictures[:: max(1, len(pictures) // _FEW)]
+    for _ in range(2):
         sigma = background.noise(pictures, plain)
         finders = [Finder(plain, sigma, shadows) for shadows in (True, False)]
-        found = [[finder.spots(picture) for picture in pictures] for finder in finders]
         # a ball of the ground's own hue is itself taken for shadow; then shadow must be borne
-        good = [sum(max((s.agree for s in spots), default=0.0) for spots in each) for each in found]
-        best = 0 if good[0] >= 0.8 * good[1] else 1
-        plain = background.without(pictures, _unghosted(found[best]), plain)
-    return Finder(plain, sigma, best == 0)
+        good = [sum(max((s.agree for s in finder.spots(p)), default=0.0) for p in few) for finder in finders]
+        best = finders[0 if good[0] >= 0.8 * good[1] else 1]
+        plain = background.without(pictures, _unghosted([best.spots(p) for p in pictures]), plain)
+    return Finder(plain, sigma, best.shadows)
 
 
 def _unghosted(found: list[list[Spot]]) -> list[list[tuple[float, float, float]]]:
@@ -170,4 +180,3 @@ def rough(values: Array) -> float:
     basis = np.linalg.qr(np.vander(np.linspace(-1, 1, _WINDOW), 4))[0]
     rest = windows - windows @ basis @ basis.T
     return float(np.sqrt(np.median((rest**2).sum(axis=1)) / (_WINDOW - 4)))
-

@@ -74,9 +74,7 @@ def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None
                 if stream.height % 2 or stream.width % 2:
                     raise InputError(f"{path}: expected an even number of pixels, found {picture.shape[:2]}")
             # one converter on one thread: PyAV's own starts as many threads as there are cores for every frame
-            frame = converter.reformat(
-                av.VideoFrame.from_ndarray(picture, format="rgb24"), format="yuv420p", threads=1
-            )
+            frame = converter.reformat(av.VideoFrame.from_ndarray(picture, format="rgb24"), format="yuv420p", threads=1)
             frame.pts, frame.time_base = tick, Fraction(1, _TICKS)
             file.mux(stream.encode(frame))
         file.mux(stream.encode(None))
