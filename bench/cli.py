@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from bench import __version__
 from bench.ahead import add_train
 from bench.gap.commands import add_explain, add_score
+from bench.vision.commands import add_film, add_track
 
 if TYPE_CHECKING:
     from bench.experiment import Experiment
@@ -99,6 +100,9 @@ def _parser() -> argparse.ArgumentParser:
 
     add_explain(commands.add_parser("explain", help="show what a simulation gets wrong on a recording, and why"))
     add_score(commands.add_parser("score", help="error of an extended simulator on another recording"))
+
+    add_film(commands.add_parser("film", help="render a recorded ball as a video"))
+    add_track(commands.add_parser("track", help="track a ball in a video; write a recording"))
 
     listing = commands.add_parser("list", help="list tuners, simulators, systems, effects or experiments")
     listing.add_argument("what", choices=("tuners", "simulators", "systems", "effects", "experiments"))

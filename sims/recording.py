@@ -8,7 +8,7 @@ line: file, row, column, what was expected, what was found.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +43,7 @@ class Run:
         constants: constants that this run states for itself.
         initial: known initial state.
         held_out: for measuring only, never for fitting.
+        extra: columns that no channel or input of the system is, each (T,), in the units they are written in.
     """
 
     name: str
@@ -52,11 +53,15 @@ class Run:
     constants: Mapping[str, float]
     initial: Mapping[str, float]
     held_out: bool
+    extra: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording: the system it is of, its constants, each channel's noise where stated (1 sigma), its runs."""
+    """A recording: the system it is of, its constants, each channel's noise where stated (1 sigma), its runs.
+
+    `extra` has the units of the columns that belong to no channel or input, such as pixels of a tracked film.
+    """
 
     path: Path
     system: str
@@ -64,6 +69,7 @@ class Recording:
     constants: Mapping[str, float]
     noise: Mapping[str, float]
     runs: tuple[Run, ...]
+    extra: Mapping[str, str] = field(default_factory=dict)
 
     def training(self) -> tuple[Run, ...]:
         """Runs for fitting."""
@@ -88,11 +94,11 @@ def read_recording(path: str | Path, declared: Declared, whole: bool = False) ->
     table = Path(path)
     description = description_of(table)
     about = read_description(description, declared)
-    parts = read_table(table, list(about.channels), list(about.inputs))
+    parts = read_table(table, list(about.channels), list(about.inputs), list(about.extra))
     check_names(description, about.runs, [part.name for part in parts])
     runs = [_run(table, part, about) for part in parts]
     kept = tuple(runs) if whole else _split(description, runs)
-    return Recording(table, about.system, about.title, about.constants, about.noise, kept)
+    return Recording(table, about.system, about.title, about.constants, about.noise, kept, about.extra)
 
 
 _UNMARKED = RunMarks({}, {}, None)
@@ -103,7 +109,8 @@ def _run(table: Path, part: TableRun, about: Description) -> Run:
     channels, inputs = (
         {n: _converted(table, part, n, s) for n, s in scales.items()} for scales in (about.channels, about.inputs)
     )
-    return Run(part.name, part.times, channels, inputs, marks.constants, marks.initial, bool(marks.held_out))
+    extra = {name: part.columns[name] for name in about.extra}
+    return Run(part.name, part.times, channels, inputs, marks.constants, marks.initial, bool(marks.held_out), extra)
 
 
 def _converted(table: Path, part: TableRun, name: str, scale: Scale) -> Array:
@@ -142,6 +149,7 @@ def _halves(path: Path, run: Run) -> tuple[Run, ...]:
 
 
 def _slice(run: Run, part: slice, held_out: bool) -> Run:
-    channels, inputs = ({k: v[part] for k, v in signals.items()} for signals in (run.channels, run.inputs))
+    signals = run.channels, run.inputs, run.extra
+    channels, inputs, extra = ({k: v[part] for k, v in each.items()} for each in signals)
     initial = run.initial if part.start is None else {}
-    return Run(run.name, run.times[part], channels, inputs, run.constants, initial, held_out)
+    return Run(run.name, run.times[part], channels, inputs, run.constants, initial, held_out, extra)

@@ -44,6 +44,7 @@ class Description:
         noise: each channel's noise where stated, 1 sigma, SI units.
         constants: known numbers, SI units.
         runs: by name, only those the description mentions.
+        extra: units of columns that belong to no channel or input, as written.
     """
 
     system: str
@@ -53,6 +54,7 @@ class Description:
     noise: Mapping[str, float]
     constants: Mapping[str, float]
     runs: Mapping[str, RunMarks]
+    extra: Mapping[str, str]
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -108,7 +110,7 @@ def read_description(path: Path, declared: Declared) -> Description:
         InputError: anything malformed, in one line.
     """
     meta = read_toml(path)
-    _known(path, "", meta, ("system", "title", "channels", "inputs", "constants", "runs"))
+    _known(path, "", meta, ("system", "title", "channels", "inputs", "constants", "runs", "extra"))
     title = meta.get("title", path.stem)
     if not isinstance(title, str):
         raise InputError(f"{path}: title: expected text, found {shown(title)}")
@@ -121,7 +123,8 @@ def read_description(path: Path, declared: Declared) -> Description:
     _positive(path, "constants", constants, declared)
     runs = {name: _run(path, name, own, declared) for name, own in _section(path, meta, "runs").items()}
     of_channels, of_inputs = ({n: s for n, (s, _) in columns.items()} for columns in (channels, inputs))
-    return Description(_system(path, meta), title, of_channels, of_inputs, noise, constants, runs)
+    extra = _extra(path, meta, ["run", "t", *(c.name for c in (*declared.channels, *declared.inputs))])
+    return Description(_system(path, meta), title, of_channels, of_inputs, noise, constants, runs, extra)
 
 
 def check_names(path: Path, marked: Iterable[str], there: Iterable[str]) -> None:
@@ -163,6 +166,20 @@ def _columns(
             result[name] = scale(unit, units[name]), entry
         except InputError as error:
             raise InputError(f"{path}: {kind} {name}: {error}") from None
+    return result
+
+
+def _extra(path: Path, meta: dict[str, Any], taken: Collection[str]) -> dict[str, str]:
+    """Units of the columns that are no channel or input; `taken` are names that they cannot have."""
+    result = {}
+    for name, entry in _section(path, meta, "extra").items():
+        if name in taken:
+            raise InputError(f"{path}: extra.{name}: is a column of its own right; declare it as channel or input")
+        unit = entry.get("unit") if isinstance(entry, dict) else None
+        if not isinstance(unit, str):
+            raise InputError(f'{path}: extra {name}: expected a table with unit = "TEXT", found {shown(entry)}')
+        _known(path, f"extra.{name}", entry, ("unit",))
+        result[name] = unit
     return result
 
 

@@ -37,8 +37,8 @@ def shown(cell: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
-def read_table(path: Path, channels: Sequence[str], inputs: Sequence[str]) -> list[TableRun]:
-    """The runs of a table in order of appearance. A channel's cell may be empty; an input's may not.
+def read_table(path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str] = ()) -> list[TableRun]:
+    """The runs of a table in order of appearance. A channel's or extra cell may be empty; an input's may not.
 
     Raises:
         InputError: anything malformed, in one line.
@@ -46,7 +46,7 @@ def read_table(path: Path, channels: Sequence[str], inputs: Sequence[str]) -> li
     if not path.is_file():
         raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
     try:
-        return _Table(path, channels, inputs).read()
+        return _Table(path, channels, inputs, extra).read()
     except UnicodeDecodeError:
         raise _not_text(path) from None
     except OSError as error:
@@ -66,9 +66,10 @@ def _not_text(path: Path) -> InputError:
 
 
 class _Table:
-    def __init__(self, path: Path, channels: Sequence[str], inputs: Sequence[str]) -> None:
+    def __init__(self, path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str]) -> None:
         self.path = path
-        self.wanted = ["run", "t", *inputs, *channels]
+        self.wanted = ["run", "t", *inputs, *channels, *extra]
+        self.gaps = {*channels, *extra}
         self.channels, self.inputs = channels, inputs
 
     def read(self) -> list[TableRun]:
@@ -76,7 +77,7 @@ class _Table:
         header = self._header(next(records, []))
         found = None
         if self.path.stat().st_size >= WORTHWHILE:
-            found = read_fast(self.path, header, self.wanted[1:], self.channels)
+            found = read_fast(self.path, header, self.wanted[1:], self.gaps)
         names, columns = found or self._cells(header, records)
         if not names:
             raise InputError(f"{self.path}: expected rows of data, found none")
@@ -149,7 +150,7 @@ class _Table:
         if "_" in joined or not joined.isascii():  # float() takes 1_000 and the digits of other scripts
             suspects = range(len(cells))
         for i in suspects:
-            if cells[i].strip() or name not in self.channels:
+            if cells[i].strip() or name not in self.gaps:
                 self._check(name, cells[i], first + i)
         return values
 

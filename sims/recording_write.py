@@ -103,18 +103,25 @@ def _table(runs: Sequence[Run], digits: int) -> str:
     inputs, channels = list(runs[0].inputs), list(runs[0].channels)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["run", "t", *inputs, *channels])
+    extra = list(runs[0].extra)
+    writer.writerow(["run", "t", *inputs, *channels, *extra])
     seen: set[str] = set()
     for run in runs:
         if run.name in seen:
             raise InputError(f"two runs are called {run.name!r}; expected different names")
         seen.add(run.name)
-        for names, there, kind in ((inputs, run.inputs, "input"), (channels, run.channels, "channel")):
+        for names, there, kind in _signals(run, inputs, channels, extra):
             if set(names) != set(there):
                 raise unknown(f"{kind} of run {run.name}", ", ".join(set(names) ^ set(there)), names or ["none"])
-        columns = [run.times, *(run.inputs[n] for n in inputs), *(run.channels[n] for n in channels)]
+        columns = [run.times, *(there[n] for names, there, _ in _signals(run, inputs, channels, extra) for n in names)]
         writer.writerows(zip([run.name] * len(run.times), *(_cells(c, digits) for c in columns), strict=True))
     return text.getvalue()
+
+
+def _signals(
+    run: Run, inputs: list[str], channels: list[str], extra: list[str]
+) -> tuple[tuple[list[str], Mapping[str, Array], str], ...]:
+    return (inputs, run.inputs, "input"), (channels, run.channels, "channel"), (extra, run.extra, "extra column")
 
 
 def _cells(values: Array, digits: int) -> list[str]:
@@ -131,6 +138,8 @@ def _description(recording: Recording, declared: Declared) -> str:
     document["channels"] = {n: {"unit": units[n], **_stated(recording.noise, n)} for n in first.channels}
     if first.inputs:
         document["inputs"] = {n: {"unit": units[n]} for n in first.inputs}
+    if first.extra:
+        document["extra"] = {n: {"unit": recording.extra.get(n, "1")} for n in first.extra}
     if recording.constants:
         document["constants"] = dict(recording.constants)
     runs = {run.name: _marks(run) for run in recording.runs}

@@ -1,0 +1,1 @@
+"""From a film to a recording: the commands `simgap film` and `simgap track`."""

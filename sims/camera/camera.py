@@ -1,0 +1,162 @@
+"""A pinhole camera: where a point of the world, or a ball, appears in the picture.
+
+Pixels are (u, v): u to the right, v down, (0, 0) the centre of the upper left pixel, as OpenCV counts them. World
+coordinates are metres, z up. Pixels are square and the lens does not distort.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sims.base import Array, InputError, frozen
+
+_REFINEMENTS = 4
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera that stands `distance` from the vertical through its target and looks at it.
+
+    Attributes:
+        azimuth: rad, where it stands around that vertical, from x towards y.
+        distance: m, from that vertical.
+        height: m, above the ground.
+        target: m, the point it looks at, which appears in the middle of the picture.
+        field_of_view: degrees, from the lower to the upper edge of the picture.
+        size: pixels, width and height.
+    """
+
+    azimuth: float
+    distance: float
+    height: float
+    target: tuple[float, float, float] = (0.0, 0.0, 2.0)
+    field_of_view: float = 40.0
+    size: tuple[int, int] = (100, 100)
+
+    def __post_init__(self) -> None:
+        numbers = [self.azimuth, self.distance, self.height, self.field_of_view, *self.target]
+        if not np.isfinite(numbers).all():
+            raise InputError(f"camera: expected finite numbers, found {numbers}")
+        if self.distance <= 0:
+            raise InputError(f"camera: distance: expected more than 0 m, found {self.distance:g}")
+        if not 0 < self.field_of_view < 180:
+            raise InputError(f"camera: field_of_view: expected 0 to 180 degrees, found {self.field_of_view:g}")
+        if len(self.size) != 2 or min(self.size) < 2:
+            raise InputError(f"camera: size: expected two numbers of pixels, found {self.size}")
+
+    @classmethod
+    def published(cls, rng: np.random.Generator, pixels: int = 100) -> Camera:
+        """A camera drawn as for the published visual tuner.
+
+        Azimuth U[0, 2 pi], distance U[5, 10] m, height U[5, 8] m, aimed at (0, 0, 2), field of view 40 degrees,
+        100 x 100 px (Allevato et al., TuneNet, arXiv 1907.11200, released code).
+
+        Args:
+            rng: what is drawn comes from here.
+            pixels: width and height of the picture.
+        """
+        azimuth, distance, height = rng.uniform((0.0, 5.0, 5.0), (2 * math.pi, 10.0, 8.0)).tolist()
+        return cls(azimuth, distance, height, size=(pixels, pixels))
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera with other pixels; the field of view from lower to upper edge stays."""
+        return replace(self, size=(width, height))
+
+    @cached_property
+    def position(self) -> Array:
+        """Where it stands (3,), m."""
+        x, y, _ = self.target
+        return frozen(
+            [x + self.distance * math.cos(self.azimuth), y + self.distance * math.sin(self.azimuth), self.height]
+        )
+
+    @cached_property
+    def focal(self) -> float:
+        """Focal length in pixels."""
+        return 0.5 * self.size[1] / math.tan(math.radians(self.field_of_view) / 2)
+
+    @cached_property
+    def middle(self) -> Array:
+        """The pixel (2,) of the optical axis."""
+        return frozen([(self.size[0] - 1) / 2, (self.size[1] - 1) / 2])
+
+    @cached_property
+    def axes(self) -> Array:
+        """Rows: the picture's right, its down, and the viewing direction, as unit vectors of the world (3, 3)."""
+        forward = np.asarray(self.target) - self.position
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        right /= np.linalg.norm(right)
+        return frozen([right, np.cross(forward, right), forward])
+
+    def seen(self, points: ArrayLike) -> Array:
+        """World points (..., 3) in the camera's frame (..., 3), m: right, down, depth."""
+        result: Array = (np.asarray(points, dtype=np.float64) - self.position) @ self.axes.T
+        return result
+
+    def depth(self, points: ArrayLike) -> Array:
+        """Distance (...) of world points (..., 3) from the camera along its axis, m; negative behind it."""
+        result: Array = self.seen(points)[..., 2]
+        return result
+
+    def project(self, points: ArrayLike) -> Array:
+        """Pixels (..., 2) where world points (..., 3) appear, inside the picture or not; NaN behind the camera."""
+        seen = self.seen(points)
+        depth = np.where(seen[..., 2:] > 0, seen[..., 2:], np.nan)
+        result: Array = self.middle + self.focal * seen[..., :2] / depth
+        return result
+
+    def outline(self, points: ArrayLike, radius: float) -> tuple[Array, Array]:
+        """The ellipse as which a sphere appears: its centre (..., 2) and semi-axes (..., 2), the longer first, px.
+
+        The longer axis points to the middle of the picture, and the centre lies a little further out than the
+        projection of the sphere's own centre. With t the angle between optical axis and sphere, and p the angle that
+        the sphere fills, sin p = radius / distance, its ends lie at tan(t - p) and tan(t + p).
+
+        Args:
+            points: centres (..., 3), m; NaN comes back for one that is not wholly before the camera.
+            radius: of the sphere, m.
+        """
+        seen = self.seen(points)
+        far = np.linalg.norm(seen, axis=-1)
+        aside = np.hypot(seen[..., 0], seen[..., 1])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            half = np.arcsin(radius / far)
+            tilt = np.arctan2(aside, seen[..., 2])
+            tilt = np.where(tilt + half < math.pi / 2, tilt, np.nan)
+            near_end, far_end = np.tan(tilt - half), np.tan(tilt + half)
+            away = (near_end + far_end) / 2
+            # the cone (x . c)^2 = cos(p)^2 |x|^2 cut by the picture plane, at its middle
+            across = ((away * np.sin(tilt) + np.cos(tilt)) / np.cos(half)) ** 2 - away**2 - 1
+            direction = seen[..., :2] / np.where(aside > 0, aside, 1.0)[..., None]
+        centre = self.middle + self.focal * away[..., None] * direction
+        return centre, self.focal * np.stack([(far_end - near_end) / 2, np.sqrt(across)], axis=-1)
+
+    def apparent_radius(self, points: ArrayLike, radius: float) -> Array:
+        """Radius (...) in pixels of the circle that covers as much of the picture as the sphere does."""
+        axes = self.outline(points, radius)[1]
+        result: Array = np.sqrt(axes[..., 0] * axes[..., 1])
+        return result
+
+    def heights(self, centres: ArrayLike, x: float, y: float, radius: float) -> Array:
+        """Heights (...) at which a ball on the vertical through (x, y) has its outline nearest to `centres` (..., 2).
+
+        A point on that vertical is linear in z, so both its picture equations are; the small offset between outline and
+        projected centre is taken off in a few rounds.
+        """
+        pixels = np.asarray(centres, dtype=np.float64)
+        base, up = self.seen((x, y, 0.0)), self.axes[:, 2]
+        shift: Array = np.zeros_like(pixels)
+        z: Array = np.full(pixels.shape[:-1], np.nan)
+        for _ in range(_REFINEMENTS):
+            ratio = (pixels - shift - self.middle) / self.focal
+            constant, slope = base[:2] - ratio * base[2], up[:2] - ratio * up[2]
+            z = -(constant * slope).sum(axis=-1) / (slope * slope).sum(axis=-1)
+            points = np.stack([np.full_like(z, x), np.full_like(z, y), z], axis=-1)
+            shift = self.outline(points, radius)[0] - self.project(points)
+        return z

@@ -1,0 +1,69 @@
+"""What a filmed scene looks like: light, colours, noise and compression, drawn by seed."""
+
+from __future__ import annotations
+
+import colorsys
+from dataclasses import dataclass
+
+import numpy as np
+
+from sims.base import Array, frozen
+
+_CONTRAST = 0.25
+"""Least difference between ball and ground in some colour, of 1; a ball like its ground cannot be seen by anyone."""
+_WAVES = 6
+
+
+@dataclass(frozen=True)
+class Look:
+    """The look of a scene; colours are red, green, blue from 0 to 1.
+
+    Attributes:
+        light: unit vector (3,) towards the light.
+        ball: colour of the ball.
+        ground: colour of the ground.
+        sky: colour above the horizon.
+        waves: the ground's pattern, rows of (wave vector x, y in rad/m, phase, amplitude as a share of brightness).
+        shadow: share of the light that the ball's shadow takes away.
+        noise: of the camera, 1 sigma in grey levels of 255.
+        crf: compression, the encoder's constant rate factor: 0 loses nothing, above 30 it is coarse.
+    """
+
+    light: Array
+    ball: tuple[float, float, float]
+    ground: tuple[float, float, float]
+    sky: tuple[float, float, float]
+    waves: Array
+    shadow: float = 0.4
+    noise: float = 1.0
+    crf: int = 20
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> Look:
+        """A look by chance: light 30 to 80 degrees above the ground, any colours that can be told apart."""
+        azimuth, above = rng.uniform(0, 2 * np.pi), rng.uniform(np.pi / 6, np.pi / 2.25)
+        flat = np.cos(above)
+        light = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(above)]
+        ground = _colour(rng, saturation=(0.0, 0.4), value=(0.3, 0.85))
+        ball = _colour(rng, saturation=(0.0, 1.0), value=(0.15, 1.0))
+        while np.max(np.abs(np.subtract(ball, ground))) < _CONTRAST:
+            ball = _colour(rng, saturation=(0.0, 1.0), value=(0.15, 1.0))
+        sky = _colour(rng, saturation=(0.0, 0.3), value=(0.7, 1.0))
+        bearing, length = rng.uniform(0, 2 * np.pi, _WAVES), rng.uniform(0.5, 6.0, _WAVES)
+        phase, amplitude = rng.uniform(0, 2 * np.pi, _WAVES), rng.uniform(0.0, 0.04, _WAVES)
+        waves = np.stack([length * np.cos(bearing), length * np.sin(bearing), phase, amplitude], axis=1)
+        shadow, noise = rng.uniform(0.2, 0.6), rng.uniform(0.5, 2.5)
+        return cls(frozen(light), ball, ground, sky, frozen(waves), shadow, noise, int(rng.integers(16, 27)))
+
+    def pattern(self, x: Array, y: Array) -> Array:
+        """Brightness of the ground at (x, y), 1 on average, of the arguments' shape."""
+        bright = np.ones_like(x)
+        for kx, ky, phase, amplitude in self.waves:
+            bright += amplitude * np.sin(kx * x + ky * y + phase)
+        return bright
+
+
+def _colour(
+    rng: np.random.Generator, saturation: tuple[float, float], value: tuple[float, float]
+) -> tuple[float, float, float]:
+    return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(*value))

@@ -1,0 +1,231 @@
+"""Round things that differ from the background in one picture, measured to a fraction of a pixel.
+
+What differs is divided into connected spots. A circle is fitted to each spot's edge, found along rays from its middle
+where the difference has fallen to half of what it is inside: there half a pixel's area is the ball's, whatever its
+colour. Rays that meet something else (a shadow, the edge of the picture, a patch of the ball's colour) lie off the circle
+and are left out; a spot for which too few agree is no ball.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.base import Array, InputError
+from sims.camera.render import Image
+
+_RAYS = 48
+_LEAST_AREA = 6
+_LEAST_LEVEL = 12.0
+_AGREE = 0.6
+_MOST_SPOTS = 6
+_TINY = 2.5
+_ROUNDS = 3
+_FINE = 0.25
+_RIM = 5
+_SHADE = (0.25, 0.97)
+
+
+class Spot(NamedTuple):
+    """A ball-like thing: middle and radius of its outline in pixels, the share of rays that agree, their scatter."""
+
+    u: float
+    v: float
+    radius: float
+    agree: float
+    scatter: float
+
+
+def opencv() -> Any:
+    """The module ``cv2``.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import cv2
+    except ImportError:
+        raise InputError('videos need PyAV and OpenCV: pip install "simgap[vision]"') from None
+    return cv2
+
+
+class Finder:
+    """Finds spots in pictures of one scene.
+
+    Args:
+        background: the scene without the ball.
+        sigma: noise, 1 sigma in grey levels.
+        shadows: whether what is merely darker than the background is taken for shadow; wrong for a ball of the
+            ground's own hue.
+    """
+
+    def __init__(self, background: Image, sigma: float, shadows: bool) -> None:
+        self.background, self.sigma, self.shadows = background, sigma, shadows
+        self.level = max(_LEAST_LEVEL, 6 * sigma)
+        self._plain = background.astype(np.float32)
+        self._grey = opencv().cvtColor(background, opencv().COLOR_RGB2GRAY)
+        self._square = np.maximum((self._plain * self._plain).sum(axis=2), 1.0)
+
+    def spots(self, picture: Image) -> list[Spot]:
+        """What looks like a ball, the largest first."""
+        cv2 = opencv()
+        apart = cv2.absdiff(picture, self.background)
+        difference = cv2.max(cv2.max(apart[..., 0], apart[..., 1]), apart[..., 2])
+        brightness = cv2.absdiff(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), self._grey)
+        mask = (difference > self.level).astype(np.uint8)
+        if not mask.any():
+            return []
+        if self.shadows:
+            shade = self._shadow(picture, mask)
+            mask[shade] = 0
+            # single pixels that shadow and noise leave
+            mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+        else:
+            shade = np.zeros(mask.shape, bool)
+        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        large = sorted(((len(c), i) for i, c in enumerate(contours) if len(c) > 3), reverse=True)[:_MOST_SPOTS]
+        found = [self._spot(contours[i], (brightness, difference), shade) for _, i in large]
+        return [spot for spot in found if spot is not None]
+
+    def _shadow(self, picture: Image, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Where the picture is the background times one factor, in all colours alike: shadow, or shadow gone."""
+        result = np.zeros(mask.shape, bool)
+        rows, columns = np.nonzero(mask)
+        there = picture[rows, columns].astype(np.float32)
+        plain = self._plain[rows, columns]
+        factor = (there * plain).sum(axis=1) / self._square[rows, columns]
+        rest = np.abs(there - factor[:, None] * plain).max(axis=1)
+        even = np.minimum(factor, 1 / np.maximum(factor, 1e-3))
+        result[rows, columns] = (even > _SHADE[0]) & (even < _SHADE[1]) & (rest < max(6.0, 3 * self.sigma))
+        return result
+
+    def _spot(self, contour: Any, differences: tuple[NDArray[np.uint8], ...], shade: NDArray[np.bool_]) -> Spot | None:
+        cv2 = opencv()
+        left, top, width, height = cv2.boundingRect(contour)
+        if width * height < _LEAST_AREA or max(width, height) > 0.9 * min(shade.shape):
+            return None
+        filled = np.zeros((height + 2, width + 2), np.uint8)
+        cv2.drawContours(filled, [contour], -1, 1, -1, offset=(1 - left, 1 - top))
+        if int(filled.sum()) < _LEAST_AREA:
+            return None
+        inside = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
+        row, column = np.unravel_index(int(inside.argmax()), inside.shape)
+        radius = max(float(inside[row, column]), 1.0)
+        u, v = left + float(column) - 1, top + float(row) - 1
+        # a window around it, where shadow counts as background unless the spot encloses it
+        reach = int(2 * max(radius, 0.5 * max(width, height))) + 4
+        u0, v0 = max(0, int(u) - reach), max(0, int(v) - reach)
+        place = np.s_[v0 : int(v) + reach + 1, u0 : int(u) + reach + 1]
+        windows = np.stack([each[place] for each in differences]).astype(np.float32)
+        # the edge itself, half ball and half background, may pass for shadow
+        hidden = shade[place].astype(np.uint8)
+        cv2.drawContours(hidden, [contour], -1, 0, -1, offset=(-u0, -v0))
+        cv2.drawContours(hidden, [contour], -1, 0, _RIM, offset=(-u0, -v0))
+        windows[:, hidden > 0] = 0
+        if radius < _TINY:
+            return self._tiny(windows[1], u - u0, v - v0, radius, u0, v0)
+        return self._circle(windows, (u - u0, v - v0, radius), u0, v0)
+
+    def _circle(self, windows: NDArray[np.float32], start: tuple[float, float, float], u0: int, v0: int) -> Spot | None:
+        u, v, radius = start
+        kept, rest = np.empty(0, bool), np.empty(0)
+        for _ in range(_ROUNDS):
+            edges = self._edges(windows, u, v, radius)
+            if edges is None:
+                return None
+            fitted = _fit(edges, u, v, radius)
+            if fitted is None:
+                return None
+            (u, v, radius), rest = fitted
+            kept = np.abs(rest) < max(0.7, 0.1 * radius)
+        agree = float(kept.sum()) / _RAYS
+        height, width = windows.shape[1:]
+        if agree < _AGREE or not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+            return None
+        scatter = float(np.sqrt(np.mean(rest[kept] ** 2)))
+        return Spot(u + u0, v + v0, radius, agree, scatter)
+
+    def _edges(self, windows: NDArray[np.float32], u: float, v: float, radius: float) -> Array | None:
+        """Points (n, 2) where the difference has fallen to half along rays from (u, v); None for too few.
+
+        What it falls from is taken just inside the edge, since a lit ball is not the same all over. Brightness counts
+        where it differs enough: video files keep colours at half the resolution.
+        """
+        steps = np.arange(max(0.0, 0.7 * radius - 2), 1.5 * radius + 2, _FINE, dtype=np.float32)
+        cos, sin = _directions()
+        along_u, along_v = (u + cos * steps).astype(np.float32), (v + sin * steps).astype(np.float32)
+        profiles = [_along(window, along_u, along_v) for window in windows]
+        inner = (steps > min(0.5 * radius, radius - 3.5)) & (steps < max(0.7 * radius, radius - 1.3))
+        levels = [np.median(p[:, inner], axis=1) for p in profiles]
+        bright = (levels[0] > 1.5 * self.level) & (levels[0] > 0.7 * levels[1])
+        values = np.where(bright[:, None], *profiles)
+        half = 0.5 * np.where(bright, *levels)[:, None]
+        below = (values[:, 1:] < half) & (values[:, :-1] >= half)
+        below[:, : int(np.flatnonzero(inner)[0])] = False
+        k = below.argmax(axis=1)
+        lines = np.arange(_RAYS)
+        a, b = values[lines, k], values[lines, k + 1]
+        has = below.any(axis=1) & (half[:, 0] > 0.4 * self.level) & (b > -500)  # far below: the picture ends there
+        if has.sum() < 0.5 * _RAYS:
+            return None
+        share = (a - half[:, 0])[has] / np.maximum(a - b, 1e-6)[has]
+        out = steps[k[has]] + _FINE * share
+        return np.stack([u + cos[has, 0] * out, v + sin[has, 0] * out], axis=1).astype(np.float64)
+
+    def _tiny(self, window: NDArray[np.float32], u: float, v: float, radius: float, u0: int, v0: int) -> Spot | None:
+        """A ball of a few pixels: the middle of the difference, and a circle of its sum."""
+        rows, columns = np.mgrid[: window.shape[0], : window.shape[1]]
+        near = np.hypot(columns - u, rows - v) <= radius + 2.5
+        weights = np.where(near & (window > 0.4 * self.level), window, 0.0)
+        total = float(weights.sum())
+        peak = float(np.percentile(window[near], 90))
+        if total <= 0 or peak < self.level:
+            return None
+        area = total / max(peak, 1.0)
+        if not _LEAST_AREA / 2 <= area:
+            return None
+        u, v = float((weights * columns).sum() / total), float((weights * rows).sum() / total)
+        return Spot(u + u0, v + v0, float(np.sqrt(area / np.pi)), _AGREE, 0.2)
+
+
+def _along(window: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values of a window at places between its pixels; far below zero outside."""
+    cv2 = opencv()
+    result: NDArray[np.float32] = cv2.remap(
+        window, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-1000.0
+    )
+    return result
+
+
+@lru_cache(maxsize=1)
+def _directions() -> tuple[Array, Array]:
+    angles = np.linspace(0, 2 * np.pi, _RAYS, endpoint=False)[:, None]
+    return np.cos(angles), np.sin(angles)
+
+
+def _fit(points: Array, u: float, v: float, radius: float) -> tuple[tuple[float, float, float], Array] | None:
+    """The circle nearest to most of the points, by Gauss-Newton with Tukey's weights; and each ray's distance to it."""
+    rest = np.empty(0)
+    for turn in range(8):
+        away = points - (u, v)
+        far = np.hypot(away[:, 0], away[:, 1])
+        if turn == 0:
+            radius = float(np.median(far))
+        rest = far - radius
+        width = 4.7 * max(1.4826 * float(np.median(np.abs(rest))), 0.15)
+        weights = np.clip(1 - (rest / width) ** 2, 0, None) ** 2
+        basis = np.concatenate([away / np.maximum(far, 1e-9)[:, None], np.ones((len(far), 1))], axis=1)
+        normal = basis.T @ (weights[:, None] * basis)
+        if np.linalg.det(normal) < 1e-6:
+            return None
+        du, dv, dr = np.linalg.solve(normal, basis.T @ (weights * rest)).tolist()
+        u, v, radius = u + du, v + dv, radius + dr
+        if abs(du) + abs(dv) + abs(dr) < 1e-4:
+            break
+    if not 0.5 < radius < 1e4:
+        return None
+    away = points - (u, v)
+    return (u, v, radius), np.hypot(away[:, 0], away[:, 1]) - radius

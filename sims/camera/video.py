@@ -1,0 +1,181 @@
+"""Ordinary video files, written and read with their true time stamps.
+
+PyAV brings its own codecs and gives every frame's time as the file states it, also where frames come unevenly.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims.base import Array, InputError
+from sims.camera.render import Image
+from sims.recording_write import refuse_existing
+
+_TICKS = 90_000
+"""Time stamps a second in files written here; common for video, and a whole number for the usual rates."""
+_DEFAULT_RATE = 30.0
+
+
+def _av() -> Any:
+    try:
+        import av
+    except ImportError:
+        raise InputError('videos need PyAV and OpenCV: pip install "simgap[vision]"') from None
+    return av
+
+
+def write_video(path: Path, frames: Iterable[Image], times: Array, crf: int = 18) -> None:
+    """Write frames as H.264 in an .mp4 file, whole or not at all.
+
+    Args:
+        path: a new file, its name ends in .mp4.
+        frames: pictures (height, width, 3) of one size, both even.
+        times: (n,) seconds, increasing, one a frame; rounded to 1/90000 s.
+        crf: constant rate factor, 0 (lossless) to 51.
+
+    Raises:
+        InputError: the file exists or cannot be written, or the frames have no size that can be encoded.
+    """
+    if path.suffix != ".mp4":
+        raise InputError(f"{path}: expected a name that ends in .mp4")
+    refuse_existing([path])
+    draft = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
+    try:
+        _encode(draft, frames, times, crf)
+        refuse_existing([path])
+        draft.rename(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None:
+    av = _av()
+    ticks = np.rint((times - times[0]) * _TICKS).astype(int)
+    rate = Fraction(len(times) - 1, 1) / Fraction(max(1, int(ticks[-1])), _TICKS) if len(times) > 1 else Fraction(30)
+    # the index stands first, so that a file cut short can still be read up to the cut
+    with av.open(str(path), "w", options={"movflags": "faststart"}) as file:
+        stream = file.add_stream("libx264", rate=rate.limit_denominator(1000))
+        stream.pix_fmt = "yuv420p"
+        stream.thread_count = 1
+        stream.options = {"crf": str(crf), "preset": "veryfast", "bf": "0"}
+        stream.codec_context.time_base = Fraction(1, _TICKS)
+        converter = av.video.reformatter.VideoReformatter()
+        for tick, picture in zip(ticks.tolist(), frames, strict=True):
+            if not stream.codec_context.is_open:
+                stream.height, stream.width = picture.shape[:2]
+                if stream.height % 2 or stream.width % 2:
+                    raise InputError(f"{path}: expected an even number of pixels, found {picture.shape[:2]}")
+            # one converter on one thread: PyAV's own starts as many threads as there are cores for every frame
+            frame = converter.reformat(av.VideoFrame.from_ndarray(picture, format="rgb24"), format="yuv420p", threads=1)
+            frame.pts, frame.time_base = tick, Fraction(1, _TICKS)
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode(None))
+
+
+class Video:
+    """A video file, read frame by frame, as often as one likes.
+
+    Args:
+        path: any file that FFmpeg reads.
+        fps: frames a second, instead of the file's own time stamps.
+
+    Attributes:
+        notes: what was wrong with the file but did not keep it from being read, in sentences; complete after a pass.
+
+    Raises:
+        InputError: no such file, or nothing in it is video.
+    """
+
+    def __init__(self, path: Path, fps: float | None = None) -> None:
+        if not path.is_file():
+            raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+        if fps is not None and not (np.isfinite(fps) and fps > 0):
+            raise InputError(f"--fps {fps:g}: expected more than 0")
+        self.path, self.fps = path, fps
+        self.notes: list[str] = []
+        with self._open():
+            pass
+
+    def __iter__(self) -> Iterator[tuple[float, Image]]:
+        """Time in seconds and picture of each frame that can be read; times increase."""
+        self.notes = []
+        last, count, dropped, broken, stated = -np.inf, 0, 0, False, 0
+        with self._open() as file:
+            stated = file.streams.video[0].frames
+            for seconds, picture in self._decoded(file):
+                if picture is None:
+                    broken = True
+                    break
+                time = count / self.fps if self.fps else seconds
+                count += 1
+                if time <= last:
+                    dropped += 1
+                    continue
+                last = time
+                yield time, picture
+        self._judge(count, stated, broken, dropped)
+
+    def _open(self) -> Any:
+        av = _av()
+        try:
+            file = av.open(str(self.path))
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be read ({error.strerror})") from None
+        except ValueError:
+            raise InputError(f"{self.path}: {_why_not(self.path)}") from None
+        if not file.streams.video:
+            if not len(file.streams):
+                raise InputError(f"{self.path}: {_why_not(self.path)}")
+            file.close()
+            raise InputError(f"{self.path}: expected a video, found a file without moving pictures")
+        return file
+
+    def _decoded(self, file: Any) -> Iterator[tuple[float, Image | None]]:
+        """Each frame's time and picture; a last pair without picture where the file breaks off."""
+        av = _av()
+        stream = file.streams.video[0]
+        stream.thread_count = 1
+        rate = float(stream.average_rate or _DEFAULT_RATE)
+        number, converter = 0, av.video.reformatter.VideoReformatter()
+        try:
+            for frame in file.decode(stream):
+                seconds = frame.time if frame.time is not None else number / rate
+                yield seconds, _upright(converter.reformat(frame, format="rgb24", threads=1), frame.rotation)
+                number += 1
+        except av.FFmpegError:
+            yield np.nan, None
+
+    def _judge(self, count: int, stated: int, broken: bool, dropped: int) -> None:
+        if not count:
+            raise InputError(f"{self.path}: no frame of it can be read; the file is damaged or breaks off too early")
+        if broken or count < stated:
+            of = f" of {stated}" if stated > count else ""
+            self.notes.append(f"the file is truncated or damaged: {count}{of} frames could be read")
+        if dropped:
+            self.notes.append(f"{dropped} frames whose time stamps do not increase were left out")
+
+
+def _upright(frame: Any, degrees: float) -> Image:
+    picture: Image = frame.to_ndarray()
+    turns = round(degrees / 90) % 4  # telephones store how they were held
+    return np.ascontiguousarray(np.rot90(picture, turns)) if turns else picture
+
+
+def _why_not(path: Path) -> str:
+    """Why a file that no reader knows is none, from how it begins."""
+    with path.open("rb") as file:
+        start = file.read(64)
+    if not start:
+        return "expected a video, found an empty file"
+    if start[4:8] == b"ftyp":
+        return "breaks off before its index, so no frame can be found; copy the whole file again"
+    text = all(32 <= byte < 127 or byte in b"\t\r\n" for byte in start)
+    return f"expected a video, found {'a text file' if text else 'something else'}"
