@@ -230,7 +230,7 @@ def path_figure(table):
         ax.grid(alpha=0.3)
     axes[0].set_yticks(range(len(names)), names)
     axes[0].invert_yaxis()
-    axes[0].legend(loc="lower left")
+    axes[0].legend(loc="upper left")
     figure.suptitle(f"From the published TuneNet, one change added after another ({SEEDS} trainings each)", fontsize=11)
     return figure
 
