@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sims.base import Array, InputError
 from sims.camera.render import Image
 
-MOST = 41
+MOST = 25
 """Frames of which the background is the median."""
 _PIXELS = 5_000
 _CUT = 0.5

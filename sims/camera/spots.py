@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from sims.base import Array, InputError
 from sims.camera.render import Image
 
-_RAYS = 48
+_RAYS = 36
 _LEAST_AREA = 6
 _LEAST_LEVEL = 12.0
 _AGREE = 0.6
-_MOST_SPOTS = 6
+_MOST_SPOTS = 4
 _TINY = 2.5
 _ROUNDS = 3
 _FINE = 0.25

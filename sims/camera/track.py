@@ -17,7 +17,8 @@ from sims.camera.spots import Finder, Spot
 
 _LEAST_FRAMES = 5
 _WINDOW = 9
-_FEW = 14
+_FEW = 8
+_MISFIT = 0.2
 
 
 @dataclass(frozen=True)
@@ -155,10 +156,12 @@ def _made(
     times: Array, path: Path, size: tuple[int, int], notes: list[str], finder: Finder, pictures: dict[int, Image]
 ) -> Track:
     columns = np.full((3, len(times)), np.nan)
-    for frame, spot in zip(path.frames, _steadied(path.spots), strict=True):
+    steady, misfits = _steadied(path.spots)
+    for frame, spot in zip(path.frames, steady, strict=True):
         columns[:, frame] = spot.u, spot.v, spot.radius
+    columns[:, [f for f, wrong in zip(path.frames, misfits, strict=True) if wrong]] = np.nan
     u, v, radius = columns
-    gone = len(times) - len(path.frames)
+    gone = int(np.isnan(u).sum())
     if gone:
         notes.append(f"{gone} of {len(times)} frames show no ball that could be measured; their cells are empty")
     noise = max(rough(u), rough(v)) if len(times) > _WINDOW else float(np.median([s.scatter for s in path.spots]))
@@ -166,10 +169,13 @@ def _made(
     return Track(times, u, v, radius, noise, size, tuple(notes), finder.background, pictures)
 
 
-def _steadied(spots: list[Spot]) -> list[Spot]:
-    """Middles fitted again with radii that change evenly along the path, as perspective has it on a straight line."""
+def _steadied(spots: list[Spot]) -> tuple[list[Spot], list[bool]]:
+    """Middles fitted again with radii that change evenly along the path, as perspective has it on a straight line.
+
+    The second list says whose own radius is too far from that: something else than the ball was measured there.
+    """
     if len(spots) < _WINDOW:
-        return spots
+        return spots, [False] * len(spots)
     places = np.array([(1.0, s.u, s.v) for s in spots])
     centre, spread = places.mean(axis=0), np.maximum(np.ptp(places, axis=0), 1.0)
     axes = np.linalg.svd((places - centre)[:, 1:], full_matrices=False)[2]
@@ -182,7 +188,9 @@ def _steadied(spots: list[Spot]) -> list[Spot]:
         line = np.linalg.lstsq(basis * weights[:, None], radius * weights, rcond=None)[0]
         rest = np.abs(radius - basis @ line)
         weights = 1 / (1 + (rest / max(float(np.median(rest)), 0.02)) ** 2)
-    return [s.with_radius(max(float(r), 0.5)) for s, r in zip(spots, basis @ line, strict=True)]
+    fitted = np.maximum(basis @ line, 0.5)
+    wrong = np.abs(radius - fitted) > np.maximum(_MISFIT * fitted, 1.0)
+    return [s.with_radius(float(r)) for s, r in zip(spots, fitted, strict=True)], wrong.tolist()
 
 
 def rough(values: Array) -> float:

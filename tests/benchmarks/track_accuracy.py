@@ -77,7 +77,8 @@ def main():
     table = pd.DataFrame(
         {
             "by": by, "bin": interval, "drops": part.seed.nunique(), "frames": int(part.error.notna().sum()),
-            "rms_px": rms(part.error), "median_px": float(part.error.median()), "p95_px": float(part.error.quantile(0.95)),
+            "rms_px": rms(part.error), "median_px": float(part.error.median()),
+            "p95_px": float(part.error.quantile(0.95)),
             "missed_of_whole_balls": float(part.error[part.whole].isna().mean()),
         }
         for by, interval, part in rows
