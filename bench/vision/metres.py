@@ -1,8 +1,8 @@
 """Heights in metres from a tracked ball.
 
 With the camera known they follow exactly. Without it: along the straight line of a vertical fall the inverse depth, and
-so the ball's radius r in pixels, is linear in the place s on the picture, and height is a projective function of s. Both
-together leave one unknown factor S:
+so the ball's radius r in pixels, is linear in the place s on the picture, and height is a projective function of s.
+Both together leave one unknown factor S:
 
     z = radius + S (s_ground - s) / r(s)
 
@@ -13,6 +13,7 @@ the ball, so S is larger; then the fall itself tells it, since the second deriva
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -124,7 +125,7 @@ def _arcs(times: Array, q: Array) -> list[_Arc]:
     lowest = [i for i in range(1, len(seen) - 1) if q[seen[i - 1]] < q[seen[i]] >= q[seen[i + 1]]]
     edges = [0, *lowest, len(seen) - 1]
     arcs = []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         inside = seen[a + (a > 0) : b - (b < len(seen) - 1) + 1]
         if len(inside) < _ARC or np.ptp(q[inside]) < 0.3:
             continue
@@ -148,13 +149,29 @@ def _factor(arcs: list[_Arc]) -> float | None:
 def _ground(track: Track, q: Array, arcs: list[_Arc]) -> float:
     """`q` where the ball touches the ground: where flights meet, or where it lies."""
     meets = []
-    for before, after in zip(arcs[:-1], arcs[1:], strict=True):
+    for before, after in pairwise(arcs):
         roots = np.roots(before.curve - after.curve)
         real = [r.real for r in roots if abs(r.imag) < 1e-9 and before.end - 0.1 < r.real < after.begin + 0.1]
         meets += [float(np.polyval(before.curve, r)) for r in real[:1]]
     if meets:
         return float(np.median(meets))
     return float(np.nanpercentile(q, 99.5)) if len(track.seen) else 0.0
+
+
+def scatter(times: Array, z: Array) -> float:
+    """1 sigma of what a cubic leaves of each flight, m: also errors that last for several samples; NaN without flight.
+
+    A cubic has room for gravity and a drag. White noise estimated from neighbouring samples alone would pass over the
+    errors that a slowly changing outline makes.
+    """
+    squares, freedom = 0.0, 0
+    for arc in _arcs(times, -z):
+        inside = (times >= arc.begin) & (times <= arc.end) & np.isfinite(z)
+        t = times[inside] - arc.begin
+        if len(t) > _ARC:
+            squares += float(np.sum((z[inside] - np.polyval(np.polyfit(t, z[inside], 3), t)) ** 2))
+            freedom += len(t) - 4
+    return float(np.sqrt(squares / freedom)) if freedom else float("nan")
 
 
 def released(track: Track) -> int:

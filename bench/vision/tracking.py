@@ -58,8 +58,9 @@ def write(video: Path, out: Path, diameter: float | None, fps: float | None, sca
     if first > seen.seen[0]:
         notes.append(f"the ball is held until {seen.times[first]:.2f} s; what is before that is left out")
     part = slice(first, last + 1)
-    noise = rough(heights.z[part])
-    if not (np.isfinite(noise) and noise > 0):
+    z = heights.z[part]
+    noise = float(np.nanmax([rough(z), metres.scatter(seen.times[part], z), 0.0]))
+    if not noise > 0:
         noise = seen.noise * heights.radius / float(np.nanmedian(seen.radius))
     write_recording(out, _recording(seen, heights, noise, part, video), BallSystem, digits=_DIGITS)
     draw(seen, heights, part, f"{video.name}: {heights.how}", pictures)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from sims.base import Array, InputError
 from sims.camera.render import Image
 
-MOST = 41
+MOST = 25
 """Frames of which the background is the median."""
 _PIXELS = 5_000
 _CUT = 0.5
@@ -37,7 +38,7 @@ class Survey:
     def shots(self) -> list[tuple[int, int]]:
         """First and behind the last frame between cuts."""
         edges = [0, *self.cuts, len(self.times)]
-        return [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+        return [(a, b) for a, b in pairwise(edges) if b > a]
 
 
 def survey(frames: Iterable[tuple[float, Image]]) -> Survey:

@@ -63,7 +63,8 @@ def _numbers(path: Path, section: str, meta: dict[str, Any], single: tuple[str, 
             raise unknown(f"entry in [{section}] of {path}", name, [*single, *rows])
     values: dict[str, Any] = {}
     for name in (*single, *rows):
-        found, length = table.get(name), rows.get(name, 0)
+        found: Any = table.get(name)
+        length = rows.get(name, 0)
         cells = found if length and isinstance(found, list) else [found]
         if len(cells) != max(1, length) or not all(
             isinstance(c, int | float) and not isinstance(c, bool) for c in cells

@@ -77,7 +77,7 @@ def linked(pictures: Sequence[Sequence[Spot]]) -> list[Path]:
             live[i].frames.append(frame)
             live[i].spots.append(spots[k])
         live += [Path([frame], [s]) for k, s in enumerate(spots) if k not in taken]
-    return sorted((p for p in done + live if len(p.frames) >= _LEAST), key=lambda p: -p.weight)
+    return sorted((p for p in done + live if len(p.frames) >= _LEAST), key=lambda p: -p.weight * (p.travel > p.radius))
 
 
 def joined(paths: Sequence[Path]) -> tuple[Path, list[Path]]:

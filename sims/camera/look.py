@@ -9,7 +9,7 @@ import numpy as np
 
 from sims.base import Array, frozen
 
-_CONTRAST = 0.25
+_CONTRAST = 0.3
 """Least difference between ball and ground in some colour, of 1; a ball like its ground cannot be seen by anyone."""
 _WAVES = 6
 
@@ -53,7 +53,7 @@ class Look:
         phase, amplitude = rng.uniform(0, 2 * np.pi, _WAVES), rng.uniform(0.0, 0.04, _WAVES)
         waves = np.stack([length * np.cos(bearing), length * np.sin(bearing), phase, amplitude], axis=1)
         shadow, noise = rng.uniform(0.2, 0.6), rng.uniform(0.5, 2.5)
-        return cls(frozen(light), ball, ground, sky, frozen(waves), shadow, noise, int(rng.integers(16, 27)))
+        return cls(frozen(light), ball, ground, sky, frozen(waves), shadow, noise, int(rng.integers(14, 24)))
 
     def pattern(self, x: Array, y: Array) -> Array:
         """Brightness of the ground at (x, y), 1 on average, of the arguments' shape."""

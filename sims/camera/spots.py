@@ -2,8 +2,8 @@
 
 What differs is divided into connected spots. A circle is fitted to each spot's edge, found along rays from its middle
 where the difference has fallen to half of what it is inside: there half a pixel's area is the ball's, whatever its
-colour. Rays that meet something else (a shadow, the edge of the picture, a patch of the ball's colour) lie off the circle
-and are left out; a spot for which too few agree is no ball.
+colour. Rays that meet something else (a shadow, the picture's edge, a patch of like colour) lie off the circle and are
+left out; a spot for which too few agree is no ball.
 """
 
 from __future__ import annotations
@@ -17,26 +17,56 @@ from numpy.typing import NDArray
 from sims.base import Array, InputError
 from sims.camera.render import Image
 
-_RAYS = 48
+_RAYS = 36
 _LEAST_AREA = 6
 _LEAST_LEVEL = 12.0
 _AGREE = 0.6
-_MOST_SPOTS = 6
+_MOST_SPOTS = 4
 _TINY = 2.5
 _ROUNDS = 3
 _FINE = 0.25
+_LOOSE = 0.5
 _RIM = 5
 _SHADE = (0.25, 0.97)
 
 
 class Spot(NamedTuple):
-    """A ball-like thing: middle and radius of its outline in pixels, the share of rays that agree, their scatter."""
+    """A ball-like thing: middle and radius of its outline in pixels, the share of rays that agree, their scatter.
+
+    `edges` (n, 2) are the points of its edge to which the circle was fitted; none for a ball of a few pixels.
+    """
 
     u: float
     v: float
     radius: float
     agree: float
     scatter: float
+    edges: Array = np.empty((0, 2))
+
+    def with_radius(self, radius: float) -> Spot:
+        """The same, its middle fitted again to the edge with the radius known from other pictures.
+
+        Where shade hides a part of the edge, the middle and a free radius give way together.
+        """
+        if len(self.edges) < 0.4 * _RAYS:
+            return self
+        u, v = self.u, self.v
+        for _ in range(12):
+            away = self.edges - (u, v)
+            far = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
+            rest = far - radius
+            weights = 1 / (1 + (rest / _LOOSE) ** 2) ** 2
+            basis = away / far[:, None]
+            normal = basis.T @ (weights[:, None] * basis)
+            if np.linalg.det(normal) < 1e-6:
+                return self
+            du, dv = np.linalg.solve(normal, basis.T @ (weights * rest)).tolist()
+            u, v = u + du, v + dv
+            if abs(du) + abs(dv) < 1e-3:
+                break
+        if np.hypot(u - self.u, v - self.v) > 0.5 * radius:
+            return self
+        return self._replace(u=u, v=v)
 
 
 def opencv() -> Any:
@@ -131,7 +161,7 @@ class Finder:
 
     def _circle(self, windows: NDArray[np.float32], start: tuple[float, float, float], u0: int, v0: int) -> Spot | None:
         u, v, radius = start
-        kept, rest = np.empty(0, bool), np.empty(0)
+        kept, rest, edges = np.empty(0, bool), np.empty(0), None
         for _ in range(_ROUNDS):
             edges = self._edges(windows, u, v, radius)
             if edges is None:
@@ -143,10 +173,10 @@ class Finder:
             kept = np.abs(rest) < max(0.7, 0.1 * radius)
         agree = float(kept.sum()) / _RAYS
         height, width = windows.shape[1:]
-        if agree < _AGREE or not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+        if edges is None or agree < _AGREE or not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
             return None
         scatter = float(np.sqrt(np.mean(rest[kept] ** 2)))
-        return Spot(u + u0, v + v0, radius, agree, scatter)
+        return Spot(u + u0, v + v0, radius, agree, scatter, edges + np.array([u0, v0]))
 
     def _edges(self, windows: NDArray[np.float32], u: float, v: float, radius: float) -> Array | None:
         """Points (n, 2) where the difference has fallen to half along rays from (u, v); None for too few.
@@ -185,7 +215,7 @@ class Finder:
         if total <= 0 or peak < self.level:
             return None
         area = total / max(peak, 1.0)
-        if not _LEAST_AREA / 2 <= area:
+        if area < _LEAST_AREA / 2:
             return None
         u, v = float((weights * columns).sum() / total), float((weights * rows).sum() / total)
         return Spot(u + u0, v + v0, float(np.sqrt(area / np.pi)), _AGREE, 0.2)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from sims.base import Array, InputError
 from sims.camera import background
@@ -16,7 +17,8 @@ from sims.camera.spots import Finder, Spot
 
 _LEAST_FRAMES = 5
 _WINDOW = 9
-_FEW = 14
+_FEW = 8
+_MISFIT = 0.2
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Track:
     pictures: dict[int, Image] = field(repr=False)
 
     @property
-    def seen(self) -> Array:
+    def seen(self) -> NDArray[np.intp]:
         """Numbers of the frames that show the ball."""
         return np.flatnonzero(np.isfinite(self.u))
 
@@ -154,15 +156,41 @@ def _made(
     times: Array, path: Path, size: tuple[int, int], notes: list[str], finder: Finder, pictures: dict[int, Image]
 ) -> Track:
     columns = np.full((3, len(times)), np.nan)
-    for frame, spot in zip(path.frames, path.spots, strict=True):
+    steady, misfits = _steadied(path.spots)
+    for frame, spot in zip(path.frames, steady, strict=True):
         columns[:, frame] = spot.u, spot.v, spot.radius
+    columns[:, [f for f, wrong in zip(path.frames, misfits, strict=True) if wrong]] = np.nan
     u, v, radius = columns
-    gone = len(times) - len(path.frames)
+    gone = int(np.isnan(u).sum())
     if gone:
         notes.append(f"{gone} of {len(times)} frames show no ball that could be measured; their cells are empty")
     noise = max(rough(u), rough(v)) if len(times) > _WINDOW else float(np.median([s.scatter for s in path.spots]))
     noise = noise if np.isfinite(noise) and noise > 0 else float(np.median([s.scatter for s in path.spots]))
     return Track(times, u, v, radius, noise, size, tuple(notes), finder.background, pictures)
+
+
+def _steadied(spots: list[Spot]) -> tuple[list[Spot], list[bool]]:
+    """Middles fitted again with radii that change evenly along the path, as perspective has it on a straight line.
+
+    The second list says whose own radius is too far from that: something else than the ball was measured there.
+    """
+    if len(spots) < _WINDOW:
+        return spots, [False] * len(spots)
+    places = np.array([(1.0, s.u, s.v) for s in spots])
+    centre, spread = places.mean(axis=0), np.maximum(np.ptp(places, axis=0), 1.0)
+    axes = np.linalg.svd((places - centre)[:, 1:], full_matrices=False)[2]
+    along = (places - centre)[:, 1:] @ axes[0] / spread[1:].max()
+    basis = np.stack([np.ones_like(along), along], axis=1)
+    radius = np.array([s.radius for s in spots])
+    weights = np.ones_like(radius)
+    line = np.zeros(2)
+    for _ in range(10):
+        line = np.linalg.lstsq(basis * weights[:, None], radius * weights, rcond=None)[0]
+        rest = np.abs(radius - basis @ line)
+        weights = 1 / (1 + (rest / max(float(np.median(rest)), 0.02)) ** 2)
+    fitted = np.maximum(basis @ line, 0.5)
+    wrong = np.abs(radius - fitted) > np.maximum(_MISFIT * fitted, 1.0)
+    return [s.with_radius(float(r)) for s, r in zip(spots, fitted, strict=True)], wrong.tolist()
 
 
 def rough(values: Array) -> float:

@@ -317,3 +317,29 @@ def test_real_balls(recordings):
         recording = read_recording(path, Ball)
         assert [run.held_out for run in recording.runs] == [False, True]
         assert 40 < recording.runs[0].channels["z"][0] < 50
+
+
+def test_extra_columns_are_kept_with_their_units_and_gaps(tmp_path):
+    csv = CSV.replace("run,t,x,u", "run,t,x,u,v_px").replace("1\n", "1,7.5\n", 1)
+    lines = csv.splitlines()
+    rows = [line if line.count(",") == 4 else f"{line}," for line in lines]
+    path = written(tmp_path, csv="\n".join(rows) + "\n", toml=TOML + '[extra.v_px]\nunit = "px"\n')
+    recording = read_recording(path, Cart)
+    assert recording.extra == {"v_px": "px"}
+    np.testing.assert_array_equal(recording.runs[0].extra["v_px"], [7.5, np.nan, np.nan])
+    write_recording(tmp_path / "again.csv", recording, Cart)
+    again = read_recording(tmp_path / "again.csv", Cart)
+    np.testing.assert_array_equal(again.runs[0].extra["v_px"], [7.5, np.nan, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("toml", "message"),
+    [
+        ('[extra.x]\nunit = "px"\n', "declare it as channel or input"),
+        ("[extra.v_px]\n", "expected a table with unit"),
+        ('[extra.v_px]\nunit = "px"\n', "expected column 'v_px'"),
+    ],
+)
+def test_extra_columns_that_cannot_be(tmp_path, toml, message):
+    with pytest.raises(InputError, match=message):
+        read_recording(written(tmp_path, toml=TOML + toml), Cart)
