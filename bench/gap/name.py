@@ -206,7 +206,8 @@ class _Judge:
                     rivals.append((behind, added.pop()))
         ordered = [n for _, n in sorted(rivals, key=lambda rival: (not _in_range(search, rival[1]), rival))]
         alternatives = tuple(n for n in ordered if n != effect)
-        return Cause(effect, alternatives, float(np.clip(p_value, 0.0, 1.0)), float(gain), ordered[0])
+        first = effect if self.left.structure else ordered[0]  # alike is not as likely, where structure is left
+        return Cause(effect, alternatives, float(np.clip(p_value, 0.0, 1.0)), float(gain), first)
 
     def _behind(self, model: Model, other: Model) -> float:
         """How far another model is behind, in twice the log likelihood; negative if it is ahead.

@@ -28,7 +28,10 @@ class Bias(Force):
 
 
 class Ripple(Force):
-    """A force that repeats with position, as a motor's cogging: sine and cosine of 2 pi x / period."""
+    """A force that repeats with position, as a motor's cogging: sine and cosine of 2 pi x / period.
+
+    At least twice a turn: what repeats once a turn is gravity, scaled and tilted.
+    """
 
     name = "force.ripple"
     says = "a force comes and goes with position, as the cogging of a motor"
@@ -37,7 +40,7 @@ class Ripple(Force):
     coefficients = (
         Coefficient("sine", ("m/s^2", "N", "N*m"), ((-2, 2), (-2, 2), (-0.2, 0.2))),
         Coefficient("cosine", ("m/s^2", "N", "N*m"), ((-2, 2), (-2, 2), (-0.2, 0.2))),
-        Coefficient("period", ("m", "m", "rad"), ((0.01, 1), (0.01, 1), (0.05, 6.2832))),
+        Coefficient("period", ("m", "m", "rad"), ((0.01, 1), (0.01, 1), (0.05, 3.1416))),
     )
 
     def force(self, c: Array, moment: Moment) -> Array:
