@@ -47,7 +47,7 @@ class HeldOut:
         """Simulate with each parameter vector (P,), initial states estimated run by run.
 
         Least squares may end in another minimum for one model than for its neighbour, and luck would then decide
-        between them: every model is fitted again from the states of the one that came nearest, and the better fit counts.
+        between them: every model is fitted again from the states of the nearest one, and the better fit counts.
         """
         fits = self._fitted([Start((), theta, self.world.guess) for theta in thetas], STAGES)
         nearest = min(fits, key=lambda fit: fit.cost)
