@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -168,8 +168,11 @@ def _chosen(options: argparse.Namespace) -> Experiment:
 
 
 def _compare(options: argparse.Namespace) -> int:
+    from bench.bars import Bars
     from bench.compare import begin, make, only_resume, resume
     from bench.report import finish
+    from bench.shot.study import begin as begin_shot
+    from bench.shot.study import is_shot
 
     pool = None
     if options.cluster:
@@ -179,11 +182,16 @@ def _compare(options: argparse.Namespace) -> int:
     if options.resume:
         only_resume(options)
         folder = options.resume
+        if is_shot(folder):
+            return _shoot(folder, options)
         plugins, results = resume(folder, options.plugin)
     else:
         plugins = options.plugin
-        folder, results = begin(_chosen(options), plugins, options.out, options.jobs)
-    with _Bars() as bars:
+        experiment = _chosen(options)
+        if experiment.shot:
+            return _shoot(begin_shot(experiment, plugins, options.out, options.jobs), options)
+        folder, results = begin(experiment, plugins, options.out, options.jobs)
+    with Bars() as bars:
         complete = make(folder, results, plugins, options.jobs, bars.start, pool)
     failed = finish(folder, results.problem, print)
     if not complete:
@@ -195,35 +203,19 @@ def _compare(options: argparse.Namespace) -> int:
     return 1 if failed and not options.allow_failures else 0
 
 
+def _shoot(folder: Path, options: argparse.Namespace) -> int:
+    """A bounce shot: begun or resumed in its folder."""
+    from bench.bars import Bars
+    from bench.shot.study import make
+
+    with Bars() as bars:
+        return make(folder, options.plugin, options.jobs, bars.start, print)
+
+
 def _status(options: argparse.Namespace) -> int:
     from bench.compare import status
 
     return 0 if status(options.run, options.runs, print) else 1
-
-
-class _Bars:
-    """Progress bars on stderr, one after another; tqdm estimates the time left."""
-
-    def __enter__(self) -> _Bars:
-        self._close: Callable[[], None] = lambda: None
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
-
-    def start(self, title: str, total: int) -> Callable[[], None]:
-        """Begin a bar of `total` steps; returns what advances it."""
-        from tqdm import tqdm
-
-        self._close()
-        pause = 0.5 if sys.stderr.isatty() else 30.0  # a log wants few lines
-        bar = tqdm(total=total, desc=title, unit="run", file=sys.stderr, dynamic_ncols=True, mininterval=pause)
-        self._close = bar.close
-
-        def step() -> None:
-            bar.update()
-
-        return step
 
 
 def _check(options: argparse.Namespace) -> int:

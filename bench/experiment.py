@@ -73,6 +73,7 @@ class Experiment:
         inputs: input signals by name, as `simgap simulate` writes them, e.g. ``sine:2:0.5`` (`bench.signals`).
         sampling: sample times of simulated targets.
         recording: the measured data, for range real.
+        shot: where the experiment is a bounce shot, its scene (`bench.shot.settings`); targets are then shots a ball.
         tuners: the entries.
     """
 
@@ -99,6 +100,7 @@ class Experiment:
     inputs: Mapping[str, str] = field(default_factory=dict)
     sampling: Sampling = field(default_factory=Sampling)
     recording: Source | None = None
+    shot: Mapping[str, Any] = field(default_factory=dict)
     tuners: tuple[Entry, ...] = ()
 
     def __post_init__(self) -> None:
@@ -199,6 +201,7 @@ _TYPES: dict[str, type | tuple[type, ...]] = {
     "inputs": dict,
     "sampling": dict,
     "recording": dict,
+    "shot": dict,
 }
 
 
