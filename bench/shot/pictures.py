@@ -95,8 +95,8 @@ def _success(experiment: Experiment, lines: pd.DataFrame) -> Figure:
     right.spines[:].set_visible(False)
     _legend(figure, [m for m in _GROUPS if m in {group_of(x) for x in methods}])
     shots = int(lines.loc[lines["ball"] != ALL, "shots"].max())
-    figure.suptitle(f"{experiment.title or experiment.name} ({shots} shots of each ball)", fontsize=11)
-    figure.supxlabel("Bars and ranges: 95 % intervals (Wilson), one recorded drop for every shot.", fontsize=7.5)
+    told = f"shots of each ball: {shots}, each with a ball and a recorded drop of its own"
+    figure.suptitle(f"{experiment.title or experiment.name}\n{told}; bars and ranges: 95 % (Wilson)", fontsize=10)
     return figure
 
 
@@ -126,23 +126,23 @@ def _off(settings: Settings, rows: pd.DataFrame) -> Figure:
     radius = 100 * settings.hoop_radius
     left.axvspan(-radius, radius, color="#000000", alpha=0.08, linewidth=0)
     left.axvline(0, color="#444444", linewidth=0.8)
-    left.set_xlabel("where the shot met the hoop's plane, from its centre [cm]\n(grey: the hoop; right of it: too far)")
+    left.set_xlabel(
+        "where shots met the hoop's plane, from its centre [cm]\ngrey: the hoop; beyond 6 of its radii not shown"
+    )
     left.set_xlim(-6 * radius, 6 * radius)
     right.set_xlabel("mean distance between planned and flown path [cm]")
     right.set_xscale("log")
+    right.set_xticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
+    right.minorticks_off()
     left.set_yticks(range(len(methods)), [label_of(m) for m in methods])
     left.invert_yaxis()
     for axis in (left, right):
         axis.grid(visible=True, axis="x", which="both", linewidth=0.3, alpha=0.5)
         axis.spines[["top", "right"]].set_visible(False)
     _legend(figure, [m for m in _GROUPS if m in {group_of(x) for x in methods}])
-    figure.suptitle(
-        f"How far off: {rows['shot'].nunique()} shots of {rows['ball'].nunique()} balls a method", fontsize=11
-    )
-    caption = (
-        "Box: quartiles and median; whiskers: 5 % and 95 %; dots: the shots outside. The panel ends at 6 hoop radii."
-    )
-    figure.supxlabel(caption, fontsize=7.5)
+    shots, balls = rows["shot"].nunique(), rows["ball"].nunique()
+    told = "box: quartiles and median, whiskers: 5 % and 95 %, dots: shots outside"
+    figure.suptitle(f"How far off: {shots} shots of {balls} kinds of ball by every method\n{told}", fontsize=10)
     return figure
 
 

@@ -57,13 +57,25 @@ def make(folder: Path, plugins: Sequence[str], jobs: int, bar: Progress, say: Sa
     skipped = check(experiment)
     experiment = experiment.with_tuners([e.label for e in experiment.tuners if e.label not in skipped])
     settings = settings_of(experiment)
-    dealt = deals(experiment, settings)
+    missing = [one for one in deals(experiment, settings) if not _path(folder, one).exists()]
+    if missing:
+        _unchanged(folder, plugins)
     try:
-        _shoot(folder, experiment, settings, [d for d in dealt if not _path(folder, d).exists()], plugins, jobs, bar)
+        _shoot(folder, experiment, settings, missing, plugins, jobs, bar)
     except KeyboardInterrupt:
         say(f"simgap: interrupted; to finish: simgap compare --resume {folder}")
         return 130
     return finish(folder, experiment, settings, skipped, say)
+
+
+def _unchanged(folder: Path, plugins: Sequence[str]) -> None:
+    """Refuse to mix shots of two configurations."""
+    from bench.compare import refuse_changes
+    from bench.identity import fingerprint
+
+    held = configuration(folder)
+    everything = held.plugins + sorted({str(Path(p).resolve()) for p in plugins} - set(held.plugins))
+    refuse_changes(folder, held.fingerprint, fingerprint(held.experiment, everything))
 
 
 def _shoot(
