@@ -40,7 +40,7 @@ def draw(
 
     matplotlib.use("Agg")
     made = [save(folder, "success", _success(experiment, lines)), save(folder, "off", _off(settings, rows))]
-    found = _examples(dealt, kept, rows)
+    found = examples(dealt, kept, rows)
     if found:
         made.append(save(folder, "shots", _shots(settings, found, kept)))
     return made
@@ -94,7 +94,8 @@ def _success(experiment: Experiment, lines: pd.DataFrame) -> Figure:
     right.tick_params(length=0)
     right.spines[:].set_visible(False)
     _legend(figure, [m for m in _GROUPS if m in {group_of(x) for x in methods}])
-    shots = int(lines.loc[lines["ball"] != ALL, "shots"].max())
+    counts = sorted(set(lines.loc[lines["ball"] != ALL, "shots"].tolist()))
+    shots = "–".join(str(n) for n in (counts if len(counts) == 1 else (counts[0], counts[-1])))
     told = f"shots of each ball: {shots}, each with a ball and a recorded drop of its own"
     figure.suptitle(f"{experiment.title or experiment.name}\n{told}; bars and ranges: 95 % (Wilson)", fontsize=10)
     return figure
@@ -157,7 +158,7 @@ def _box(axis: Axes, values: Array, place: int, colour: str) -> None:
     )  # fmt: skip
 
 
-def _examples(dealt: Sequence[Deal], kept: Mapping[str, Any], rows: pd.DataFrame) -> list[tuple[Deal, list[str]]]:
+def examples(dealt: Sequence[Deal], kept: Mapping[str, Any], rows: pd.DataFrame) -> list[tuple[Deal, list[str]]]:
     """Two shots that a method without an extended simulator missed or nearly missed, and the methods to show."""
     by = {one.name: one for one in dealt}
     tuned = [m for m in rows["method"].unique() if group_of(m) == "tuned"]
@@ -181,7 +182,7 @@ def _shots(settings: Settings, found: list[tuple[Deal, list[str]]], kept: Mappin
         throws = {method: throw(dealt, settings, models[method]) for method in shown}
         top = max(float(np.nanmax(t.flown[:, 2])) for t in throws.values()) + 0.1
         for column, method in enumerate(shown):
-            _shot(axes[row, column], dealt, label_of(method), models[method], throws[method], top)
+            shot_panel(axes[row, column], dealt, label_of(method), models[method], throws[method], top)
         axes[row, 0].set_ylabel(f"{dealt.name}\nheight [m]")
     for axis in axes[-1]:
         axis.set_xlabel("distance [m]")
@@ -192,7 +193,8 @@ def _shots(settings: Settings, found: list[tuple[Deal, list[str]]], kept: Mappin
     return figure
 
 
-def _shot(axis: Axes, dealt: Deal, method: str, model: Model, made: Throw, top: float) -> None:
+def shot_panel(axis: Axes, dealt: Deal, method: str, model: Model, made: Throw, top: float) -> None:
+    """Incline, hoop, planned and flown path of one shot; the flown path is the last line."""
     scene, reach = dealt.scene, dealt.scene.hoop_x + 4 * dealt.scene.hoop_radius
     slope = np.array([-0.25, min(0.55 * scene.hoop_x, 0.45)])
     axis.fill_between(slope, -slope * np.tan(scene.angle), -0.35, color="#BBBBBB", linewidth=0)
@@ -202,7 +204,7 @@ def _shot(axis: Axes, dealt: Deal, method: str, model: Model, made: Throw, top: 
         (made.planned, {"color": "#0072B2", "linestyle": (0, (4, 2))}, "planned"),
         (made.flown, {"color": "#D55E00", "linestyle": "-"}, "flown"),
     ):
-        shown = path[: _end(path, scene.hoop_z - 0.12)]
+        shown = path[: end_of(path, scene.hoop_z - 0.12)]
         axis.plot(shown[:, 0], shown[:, 2], linewidth=1.7, label=name, **style)
     result = "hit" if made.hit else "miss"
     axis.set_title(f"{method}: {result}, {100 * made.off:+.0f} cm\nrestitution {model.restitution:.2f}", fontsize=9)
@@ -210,7 +212,7 @@ def _shot(axis: Axes, dealt: Deal, method: str, model: Model, made: Throw, top: 
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _end(path: Array, height: float) -> int:
+def end_of(path: Array, height: float) -> int:
     """Index of the sample at which a path is below a height after its bounce."""
     z = path[:, 2]
     risen = np.concatenate([[False], np.logical_or.accumulate(z[1:] > z[:-1])])

@@ -9,8 +9,9 @@ import pandas as pd
 
 from bench.experiment import Experiment
 from bench.journal import FOLDER, replace_text
+from bench.shot.animation import animate
 from bench.shot.deal import deals
-from bench.shot.pictures import draw
+from bench.shot.pictures import draw, examples
 from bench.shot.settings import Settings
 from bench.shot.study import read
 from bench.shot.table import FAILED, table, text
@@ -31,6 +32,7 @@ def finish(
     replace_text(folder / "shots.csv", rows.to_csv(index=False, float_format="%.6g"))
     replace_text(folder / "status.csv", _statuses(rows, skipped).to_csv(index=False, float_format="%.6g"))
     figures = draw(folder, experiment, settings, dealt, kept, rows, lines)
+    figures += [animate(folder, settings, example, kept) for example in examples(dealt, kept, rows)[:1]]
     journal = folder / FOLDER
     if journal.is_dir() and not any(journal.iterdir()):
         journal.rmdir()

@@ -62,7 +62,9 @@ def make(folder: Path, plugins: Sequence[str], jobs: int, bar: Progress, say: Sa
         _unchanged(folder, plugins)
     try:
         _shoot(folder, experiment, settings, missing, plugins, jobs, bar)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:  # the balls take turns, so what there is tells of all of them
+        if any((folder / SHOTS).glob("*.json")):
+            finish(folder, experiment, settings, skipped, say)
         say(f"simgap: interrupted; to finish: simgap compare --resume {folder}")
         return 130
     return finish(folder, experiment, settings, skipped, say)

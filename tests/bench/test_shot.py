@@ -160,6 +160,7 @@ tuners = { least_squares = {} }
     for figure in ("success", "off", "shots"):
         assert (out / "figures" / f"{figure}.png").stat().st_size > 10_000
         assert (out / "figures" / f"{figure}.pdf").exists()
+    assert (out / "figures" / "shot.gif").stat().st_size > 10_000
     kept = (out / "shots" / "golf-000.json").read_text()
     assert {row["method"] for row in json.loads(kept)["rows"]} == set(lines.index.unique("method"))
     before = (out / "table.csv").read_text()
