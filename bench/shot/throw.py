@@ -63,7 +63,7 @@ def throw(dealt: Deal, settings: Settings, model: Model) -> Throw:
 
 
 def _through(path: Array, height: float) -> int:
-    """Index of the sample after which a path comes down through a height for the last time; its end if never."""
+    """Index of the sample after which a path comes down through a height after its bounce; its end if never."""
     z = path[:, 2]
     risen = np.logical_or.accumulate(z[1:] > z[:-1])
     down = np.flatnonzero(risen & (z[:-1] > height) & (z[1:] <= height))

@@ -82,7 +82,7 @@ def models(experiment: Experiment, settings: Settings, known: Known) -> list[dic
     if explained.status == "done":
         again = [_tuned(experiment, e, known, recording, acting, e.label + AFTER) for e in experiment.tuners]
         made += [replace(model, effects=explained.effects) for model in again]
-    radius = recording.constants["radius"]
+    radius = _constants(recording)["radius"]
     return [asdict(_planned(model, settings, known.scene, radius)) for model in made]
 
 
@@ -114,14 +114,19 @@ def _tuned(
 def _side(recording: Recording, experiment: Experiment) -> Side:
     """The recorded run as the experiment's simulator sees it."""
     (run,) = recording.runs
-    simulator = BallSimulator(observe=["z"])
-    scenario = scenario_of(run, simulator, recording.constants)
-    shift = experiment.constants["radius"] - recording.constants["radius"]
-    moved = Scenario(
-        scenario.times, {**scenario.initial, "z": scenario.initial["z"] + shift}, {},
-        {**scenario.constants, "radius": experiment.constants["radius"]},
-    )  # fmt: skip
-    return Side((moved,), run.channels["z"][:, None] + shift)
+    scenario = scenario_of(run, BallSimulator(observe=["z"]), recording.constants)
+    radius = experiment.constants["radius"]
+    shift = radius - _constants(recording)["radius"]
+    z = run.channels["z"] + shift
+    seen = run.channels["z"][np.isfinite(run.channels["z"])]
+    initial = {**scenario.initial, "z": scenario.initial.get("z", float(seen[0])) + shift}
+    moved = Scenario(scenario.times, initial, {}, {**scenario.constants, "radius": radius})
+    return Side((moved,), z[:, None])
+
+
+def _constants(recording: Recording) -> dict[str, float]:
+    """Of the recorded run, the system's where the recording states none."""
+    return {**BallSimulator().constant_values, **recording.constants, **recording.runs[0].constants}
 
 
 def _explained(recording: Path) -> tuple[Model, Effects]:
@@ -185,6 +190,8 @@ def planned_in(model: Model, settings: Settings, scene: Scene, radius: float) ->
 
 
 def _planned(model: Model, settings: Settings, scene: Scene, radius: float) -> Model:
+    if model.status == "crashed":
+        return model
     made = planned_in(model, settings, scene, radius)
     if not made.found and model.status in ("done", "converged"):
         return replace(model, status="no plan", reason="the model reaches the hoop's plane from no height")

@@ -109,6 +109,7 @@ def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp
     assert untuned.off > 0.5
     assert tuned.hit
     assert tuned.prediction_error < 0.04 < untuned.prediction_error
+    assert math.isnan(made["explain"].height)
     perfect = replace(made["least_squares"], height=math.nan)
     assert not throw(dealt, settings, perfect).hit
 
