@@ -145,6 +145,10 @@ def status(folder: Path, every: bool, say: Say) -> bool:
         InputError: it is not the folder of a comparison, or it is damaged.
     """
     held = configuration(folder)
+    if held.experiment.shot:
+        from bench.shot.study import status as status_of_shots
+
+        return status_of_shots(folder, say)
     planned, ends = _ends(folder)
     missing = len(planned) - len(ends)
     say(f"{held.experiment.name}: {len(ends)} of {len(planned)} runs finished" + (", complete" if not missing else ""))

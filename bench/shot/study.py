@@ -46,6 +46,18 @@ def is_shot(folder: Path) -> bool:
     return bool(configuration(folder).experiment.shot)
 
 
+def status(folder: Path, say: Say) -> bool:
+    """Say how many shots a folder holds; returns whether that is all."""
+    experiment = configuration(folder).experiment
+    dealt = deals(experiment, settings_of(experiment))
+    made = sum(_path(folder, one).exists() for one in dealt)
+    complete = made == len(dealt)
+    say(f"{experiment.name}: {made} of {len(dealt)} shots made" + (", complete" if complete else ""))
+    if not complete:
+        say(f"to finish it: simgap compare --resume {folder}")
+    return complete
+
+
 def make(folder: Path, plugins: Sequence[str], jobs: int, bar: Progress, say: Say) -> int:
     """Make what is missing in the folder, write table and figures; returns the exit code."""
     from bench.shot.report import finish

@@ -168,6 +168,8 @@ tuners = { least_squares = {} }
     assert cli.main(["compare", "--resume", str(out)]) == 0
     assert (out / "shots" / "golf-000.json").read_text() == kept
     assert (out / "table.csv").read_text() == before
+    assert cli.main(["status", str(out)]) == 0
+    assert "1 of 1 shots made, complete" in capsys.readouterr().out
     (out / "shots" / "golf-000.json").write_text("{")
     assert cli.main(["compare", "--resume", str(out)]) == 2
     assert "damaged; delete it" in capsys.readouterr().err
