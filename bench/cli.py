@@ -181,6 +181,8 @@ def _compare(options: argparse.Namespace) -> int:
     from bench.bars import Bars
     from bench.compare import begin, make, only_resume, resume
     from bench.report import finish
+    from bench.shot.study import begin as begin_shot
+    from bench.shot.study import is_shot
 
     pool = None
     if options.cluster:
@@ -190,10 +192,15 @@ def _compare(options: argparse.Namespace) -> int:
     if options.resume:
         only_resume(options)
         folder = options.resume
+        if is_shot(folder):
+            return _shoot(folder, options)
         plugins, results = resume(folder, options.plugin)
     else:
         plugins = options.plugin
-        folder, results = begin(_chosen(options), plugins, options.out, options.jobs)
+        experiment = _chosen(options)
+        if experiment.shot:
+            return _shoot(begin_shot(experiment, plugins, options.out, options.jobs), options)
+        folder, results = begin(experiment, plugins, options.out, options.jobs)
     with Bars() as bars:
         complete = make(folder, results, plugins, options.jobs, bars.start, pool)
     failed = finish(folder, results.problem, print)
@@ -204,6 +211,15 @@ def _compare(options: argparse.Namespace) -> int:
         print(f"simgap: to finish: simgap compare --resume {folder}", file=sys.stderr)
         return INTERRUPTED if results.interrupted else 1
     return 1 if failed and not options.allow_failures else 0
+
+
+def _shoot(folder: Path, options: argparse.Namespace) -> int:
+    """A bounce shot: begun or resumed in its folder."""
+    from bench.bars import Bars
+    from bench.shot.study import make
+
+    with Bars() as bars:
+        return make(folder, options.plugin, options.jobs, bars.start, print)
 
 
 def _status(options: argparse.Namespace) -> int:

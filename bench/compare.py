@@ -49,7 +49,7 @@ def resume(folder: Path, plugins: Sequence[str]) -> tuple[list[str], Results]:
     given = {str(Path(p).resolve()) for p in plugins}
     everything = held.plugins + sorted(given - set(held.plugins))
     load_plugins(everything)
-    _unchanged(folder, held.fingerprint, fingerprint(held.experiment, everything))
+    refuse_changes(folder, held.fingerprint, fingerprint(held.experiment, everything))
     results = prepare(held.experiment)
     _attach(folder, results)
     return everything, results
@@ -67,8 +67,12 @@ def only_resume(options: object) -> None:
         raise InputError(f"--resume takes the configuration of its folder as it is; leave out {', '.join(given)}")
 
 
-def _unchanged(folder: Path, before: dict[str, str], now: dict[str, str]) -> None:
-    """Refuse to mix runs of two configurations."""
+def refuse_changes(folder: Path, before: dict[str, str], now: dict[str, str]) -> None:
+    """Refuse to mix runs of two configurations.
+
+    Raises:
+        InputError: something changed since the folder was begun.
+    """
     if not before:
         raise InputError(f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison")
     changed = [what for what in now if before.get(what) != now[what]]
@@ -151,6 +155,10 @@ def status(folder: Path, every: bool, say: Say) -> bool:
         InputError: it is not the folder of a comparison, or it is damaged.
     """
     held = configuration(folder)
+    if held.experiment.shot:
+        from bench.shot.study import status as status_of_shots
+
+        return status_of_shots(folder, say)
     planned, ends = _ends(folder)
     missing = len(planned) - len(ends)
     say(f"{held.experiment.name}: {len(ends)} of {len(planned)} runs finished" + (", complete" if not missing else ""))

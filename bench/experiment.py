@@ -86,6 +86,7 @@ class Experiment:
         identifiability: whether to find what the data of each simulated target identify, where there are several
             parameters (`bench.identifiability`): two simulations a parameter and target, beside all budgets.
         recording: the measured data, for range real.
+        shot: where the experiment is a bounce shot, its scene (`bench.shot.settings`); targets are then shots a ball.
         tuners: the entries.
     """
 
@@ -114,6 +115,7 @@ class Experiment:
     held_out: HeldOut | None = None
     identifiability: bool = True
     recording: Source | None = None
+    shot: Mapping[str, Any] = field(default_factory=dict)
     tuners: tuple[Entry, ...] = ()
 
     def __post_init__(self) -> None:
@@ -218,6 +220,7 @@ _TYPES: dict[str, type | tuple[type, ...]] = {
     "held_out": dict,
     "identifiability": bool,
     "recording": dict,
+    "shot": dict,
 }
 
 

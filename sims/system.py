@@ -168,6 +168,14 @@ class System(ABC):
         """(L, 1) restitution at an impact."""
         raise NotImplementedError
 
+    def friction(self, constants: Mapping[str, Array]) -> Array | None:  # noqa: ARG002
+        """(L, 1) friction coefficient of the ground itself, without effects; None for none."""
+        return None
+
+    def grip(self, constants: Mapping[str, Array]) -> Array | None:  # noqa: ARG002
+        """(L, 1) largest share of tangential speed that an impact takes, less than 1 where the body spins up."""
+        return None
+
 
 @dataclass(frozen=True)
 class Coefficient:

@@ -2,8 +2,8 @@
 
 The last coordinate strikes the ground at its `floor`; the others run along it. Restitution is the system's, changed by
 the contact effects in their order. The ground takes tangential speed mu (1 + e) |vn|, never more than there is (R. M.
-Brach, J. Appl. Mech. 56(1), 133, 1989, doi:10.1115/1.3176033). A ball that rests on the ground has no impacts and is
-not slowed by it.
+Brach, J. Appl. Mech. 56(1), 133, 1989, doi:10.1115/1.3176033), or less where the system says at which share of it a
+body that spins up grips. A ball that rests on the ground has no impacts and is not slowed by it.
 
 Bounces of a ball with e < 1 die out in finite time after infinitely many. They are taken as over once a flight would
 last less than `SHORTEST`, or after `PATIENCE` flights below `SHORT` in a row; what the bounces left out would have
@@ -45,6 +45,8 @@ class Ground:
     def __init__(self, lanes: Lanes) -> None:
         self.floor = lanes.system.floor(lanes.constants)
         self._restitution = lanes.system.restitution(lanes.theta)
+        self._friction = lanes.system.friction(lanes.constants)
+        self._grip = lanes.system.grip(lanes.constants)
         self._effects = [(effect, c) for effect, c in lanes.effects if isinstance(effect, Contact) and c.any()]
         self._shorts = np.zeros(len(lanes.x), dtype=np.intp)
 
@@ -57,7 +59,8 @@ class Ground:
             a: (n, D) acceleration of free motion there.
         """
         speed = np.abs(v[:, -1:])
-        e, mu = self._restitution[lanes], np.zeros_like(speed)
+        e = self._restitution[lanes]
+        mu = np.zeros_like(speed) if self._friction is None else self._friction[lanes]
         for effect, c in self._effects:
             own = c[:, lanes]
             on = (own != 0).any(axis=0)
@@ -72,7 +75,8 @@ class Ground:
             up = np.where(rests, 0.0, up)
         if mu.any():
             along = _size(v[:, :-1])
-            kept = np.where(mu > 0, np.maximum(1.0 - lost / np.where(along > 0, along, 1.0), 0.0), 1.0)
+            least = 0.0 if self._grip is None else 1.0 - self._grip[lanes]
+            kept = np.where(mu > 0, np.maximum(1.0 - lost / np.where(along > 0, along, 1.0), least), 1.0)
             return Outcome(np.concatenate([v[:, :-1] * kept, up], axis=1), rests[:, 0])
         return Outcome(np.concatenate([v[:, :-1], up], axis=1), rests[:, 0])
 

@@ -1,0 +1,75 @@
+"""Draws what each shot is made with, the same for every method, and records the ball's drop.
+
+The recorded drop is what a camera would give: heights of the centre at the sampling rate, with a tracker's noise. It is
+a recording like any other, so that one tracked from a video takes its place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bench.experiment import Experiment
+from bench.seeds import rng_for
+from bench.shot.settings import Settings
+from sims.ball.simulator import Ball as BallSimulator
+from sims.recording import Recording, Run
+from sims.recording_write import write_recording
+from sims.shot.balls import Ball, ball_named
+from sims.shot.scene import Scene
+from sims.shot.world import GRAVITY, Ground, fly
+
+
+@dataclass(frozen=True)
+class Deal:
+    """One ball and one shot.
+
+    Attributes:
+        name: e.g. ``tennis-007``.
+        ball: the truth, which only the world knows.
+        scene: incline and hoop, which everybody knows.
+        release: error of the place of release, m: along x, and in height.
+    """
+
+    name: str
+    ball: Ball
+    scene: Scene
+    release: tuple[float, float]
+
+
+def deal(experiment: Experiment, settings: Settings, kind: str, index: int) -> Deal:
+    """Shot `index` of a kind of ball; it depends on the experiment's name, not on methods or numbers of shots."""
+    rng = rng_for(experiment.name, "shot", kind, index)
+    ball = ball_named(kind).one(rng)
+    angle, x, drop = (float(rng.uniform(*pair)) for pair in (settings.angle, settings.hoop_x, settings.hoop_drop))
+    dx, dz = (settings.release * rng.standard_normal(2)).tolist()
+    scene = Scene(angle, x, ball.radius / math.cos(angle) - drop, settings.hoop_radius)
+    return Deal(f"{kind}-{index:03d}", ball, scene, (dx, dz))
+
+
+def deals(experiment: Experiment, settings: Settings) -> list[Deal]:
+    """All shots of an experiment; the balls take turns, so that a part of the work is a part of each."""
+    return [deal(experiment, settings, kind, i) for i in range(experiment.targets) for kind in settings.balls]
+
+
+def record(experiment: Experiment, dealt: Deal, friction: float, path: Path) -> None:
+    """Record a drop of the ball on level ground; nothing is done where there is a recording already."""
+    if path.exists() and path.with_suffix(".toml").exists():
+        return
+    for left in (path, path.with_suffix(".toml")):
+        left.unlink(missing_ok=True)
+    rng = rng_for(experiment.name, "drop", dealt.name)
+    height = experiment.initial.get("z", 1.5)
+    clear = float(rng.uniform(*height)) if isinstance(height, tuple) else height
+    radius, sampling = dealt.ball.radius, experiment.sampling
+    times = np.arange(sampling.samples) / sampling.rate
+    z = fly(dealt.ball, Ground(0.0, friction), (0.0, 0.0, radius + clear), times)[:, 2]
+    noise = experiment.noise.get("z", 0.0)
+    seen = z + noise * rng.standard_normal(z.shape)
+    run = Run("1", times, {"z": np.round(seen, 5)}, {}, {}, {}, False)
+    known = {"radius": radius, "mass": dealt.ball.mass, "gravity": GRAVITY}
+    recording = Recording(path, "ball", f"a drop of {dealt.name}", known, {"z": noise}, (run,))
+    write_recording(path, recording, BallSimulator)

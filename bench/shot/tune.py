@@ -1,0 +1,198 @@
+"""From the recording of a drop to tuned models and planned shots. Nothing in here knows the ball that was dropped.
+
+The models are those of the tuners, in the simulator as it is and in the one that `explain` extended from the same
+recording, and `explain`'s own fit. Heights are shifted as if every ball had the radius of the experiment, so that a
+network trained once serves all.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from bench.experiment import Entry, Experiment
+from bench.measured import Side, scenario_of
+from bench.problem import SealedTarget
+from bench.shot.settings import Settings
+from bench.worker import Order, perform, problem_of
+from methods.base import Array
+from sims.ball.simulator import Ball as BallSimulator
+from sims.base import InputError, Scenario
+from sims.recording import Recording, read_recording
+from sims.shot.planner import Plan, plan
+from sims.shot.scene import Scene
+from sims.shot.simulator import BounceShot
+from sims.shot.system import ShotSystem
+
+NOMINAL, EXPLAINED = "nominal", "explain"
+AFTER = " + explain"
+Effects = Mapping[str, Sequence[float]]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A tuned simulator and the shot planned in it.
+
+    Attributes:
+        method: label.
+        restitution: tuned.
+        effects: coefficients of the effects it was extended with and that act on the shot.
+        simulations: used on this target.
+        seconds: taken.
+        status: as in status.csv; ``no plan`` where the model reaches the hoop from no height.
+        reason: in words.
+        height: planned drop height, m; NaN where there is none.
+        margin: to the rim, as planned, m.
+    """
+
+    method: str
+    restitution: float
+    effects: Effects
+    simulations: int
+    seconds: float
+    status: str
+    reason: str = ""
+    height: float = float("nan")
+    margin: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a method gets of a shot: the recording, the incline and hoop, trained weights by tuner."""
+
+    name: str
+    recording: Path
+    scene: Scene
+    weights: Mapping[str, Path]
+
+
+def models(experiment: Experiment, settings: Settings, known: Known) -> list[dict[str, Any]]:
+    """Every method's model and plan, as plain dictionaries."""
+    recording = read_recording(known.recording, BallSimulator, whole=True)
+    made = [Model(NOMINAL, _nominal(), {}, 0, 0.0, "done")]
+    made += [_tuned(experiment, entry, known, recording, {}, entry.label) for entry in experiment.tuners]
+    explained, acting = _explained(known.recording)
+    made.append(explained)
+    if explained.status == "done":
+        again = [_tuned(experiment, e, known, recording, acting, e.label + AFTER) for e in experiment.tuners]
+        made += [replace(model, effects=explained.effects) for model in again]
+    radius = _constants(recording)["radius"]
+    return [asdict(_planned(model, settings, known.scene, radius)) for model in made]
+
+
+def _nominal() -> float:
+    return BallSimulator.system.parameters[0].nominal
+
+
+def _tuned(
+    experiment: Experiment, entry: Entry, known: Known, recording: Recording, effects: Effects, label: str
+) -> Model:
+    """The model of a tuner, in the simulator with these effects."""
+    if effects:
+        fixed = {name: list(values) for name, values in effects.items()}
+        experiment = experiment.chosen(settings={**experiment.settings, "fixed": fixed})
+    try:
+        problem = problem_of(experiment)
+        start = problem.cube.inverse(np.array([p.nominal for p in problem.cube.parameters]))
+        side, nothing = _side(recording, experiment), Side((), np.empty((0, 1)))
+        target = SealedTarget(known.name, "real", start, side, nothing)
+        order = Order(label, entry, 0, target, entry.budget or experiment.budget, known.weights.get(entry.label))
+        outcome = perform(experiment, order)
+    except InputError as error:
+        return Model(label, _nominal(), {}, 0, 0.0, "crashed", str(error))
+    trace = outcome.trace
+    found = float(problem.cube.physical(trace.recommendations[-1])[0])
+    return Model(label, found, {}, len(trace.losses), outcome.seconds, trace.status, trace.reason)
+
+
+def _side(recording: Recording, experiment: Experiment) -> Side:
+    """The recorded run as the experiment's simulator sees it."""
+    (run,) = recording.runs
+    scenario = scenario_of(run, BallSimulator(observe=["z"]), recording.constants)
+    radius = experiment.constants["radius"]
+    shift = radius - _constants(recording)["radius"]
+    z = run.channels["z"] + shift
+    seen = run.channels["z"][np.isfinite(run.channels["z"])]
+    initial = {**scenario.initial, "z": scenario.initial.get("z", float(seen[0])) + shift}
+    moved = Scenario(scenario.times, initial, {}, {**scenario.constants, "radius": radius})
+    return Side((moved,), z[:, None])
+
+
+def _constants(recording: Recording) -> dict[str, float]:
+    """Of the recorded run, the system's where the recording states none."""
+    return {**BallSimulator().constant_values, **recording.constants, **recording.runs[0].constants}
+
+
+def _explained(recording: Path) -> tuple[Model, Effects]:
+    """The model of explain, with the effects that act on the shot, and all that it found."""
+    from bench.gap.explain import explain
+
+    started = perf_counter()
+    try:
+        found = explain(recording)
+    except Exception:  # a failure of one method is a row of the table
+        last = traceback.format_exc()
+        return Model(EXPLAINED, _nominal(), {}, 0, perf_counter() - started, "crashed", last), {}
+    acting = {
+        name: tuple(number.value for number in numbers.values()) for name, numbers in found.extended.effects.items()
+    }
+    carried = carry(acting, found.extended.constants.get("gravity", 9.81))
+    verdict = found.verdict
+    reason = f"{verdict['verdict']}: {', '.join(acting) or 'nothing'}"
+    restitution = found.extended.parameters["restitution"].value
+    seconds = perf_counter() - started
+    model = Model(EXPLAINED, restitution, carried, int(verdict["simulations"]), seconds, "done", reason)
+    return model, acting
+
+
+def carry(effects: Effects, gravity: float) -> dict[str, tuple[float, ...]]:
+    """The effects of a drop that act on a shot: what belongs to the ball and the air, not to the camera.
+
+    A constant force along the vertical is a change of gravity, and goes over as that.
+    """
+    from sims import effects as library
+
+    carried: dict[str, tuple[float, ...]] = {}
+    for name, values in effects.items():
+        kind = library.get(name)
+        if name == "force.bias":
+            carried["gravity.scale"] = (-values[0] / gravity,)
+        elif kind.hook in ("force", "contact") and kind.fits(ShotSystem):
+            carried[name] = tuple(values)
+    return carried
+
+
+def simulator_of(model: Model) -> BounceShot:
+    """The planning simulator of a model."""
+    return BounceShot(fixed={name: list(values) for name, values in model.effects.items()})
+
+
+def constants_of(settings: Settings, radius: float) -> dict[str, float]:
+    """What the planner takes for known of a ball."""
+    return {"radius": radius, "friction": settings.planned_friction, "inertia_ratio": settings.planned_inertia}
+
+
+def theta_of(model: Model) -> Array:
+    """The parameters of a model's planning simulator."""
+    return np.array([model.restitution])
+
+
+def planned_in(model: Model, settings: Settings, scene: Scene, radius: float) -> Plan:
+    """The shot planned in a model."""
+    known = constants_of(settings, radius)
+    return plan(simulator_of(model), theta_of(model), scene, known, settings.heights)
+
+
+def _planned(model: Model, settings: Settings, scene: Scene, radius: float) -> Model:
+    if model.status == "crashed":
+        return model
+    made = planned_in(model, settings, scene, radius)
+    if not made.found and model.status in ("done", "converged"):
+        return replace(model, status="no plan", reason="the model reaches the hoop's plane from no height")
+    return replace(model, height=made.height, margin=made.margin)

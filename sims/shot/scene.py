@@ -1,0 +1,62 @@
+"""Incline and hoop, and where a path goes through the hoop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from sims.base import Array, InputError
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is known of a shot. Heights count from the point of the incline below the release, where x = 0.
+
+    Attributes:
+        angle: of the incline, radians; it falls towards x.
+        hoop_x: centre of the hoop, a horizontal ring, m.
+        hoop_z: its height, m.
+        hoop_radius: m.
+    """
+
+    angle: float
+    hoop_x: float
+    hoop_z: float
+    hoop_radius: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.angle < math.pi / 2 and self.hoop_x > 0 and self.hoop_radius > 0):
+            raise InputError(f"expected an incline between 0 and a right angle and a hoop in front of it, found {self}")
+        if self.hoop_z <= -self.hoop_x * math.tan(self.angle):
+            raise InputError(f"expected a hoop above the incline, found {self}")
+
+    def touching(self, radius: float) -> float:
+        """Height of the centre of a ball that touches the incline at x = 0 or would, if let fall there, m."""
+        return radius / math.cos(self.angle)
+
+
+def crossings(path: Array, scene: Scene) -> Array:
+    """Where paths (n, T, 3) of centres x, y, z come down through the hoop's plane: (n, 2), NaN for never.
+
+    The first time after the bounce counts, which is where z first rises.
+    """
+    x, y, z = np.moveaxis(np.asarray(path, dtype=np.float64), -1, 0)
+    with np.errstate(invalid="ignore"):
+        risen = np.logical_or.accumulate(z[:, 1:] > z[:, :-1], axis=1)
+        down = risen & (z[:, :-1] > scene.hoop_z) & (z[:, 1:] <= scene.hoop_z)
+    first = np.argmax(down, axis=1)
+    rows = np.arange(len(z))
+    high, low = z[rows, first], z[rows, first + 1]
+    share = (high - scene.hoop_z) / np.where(down.any(axis=1), high - low, 1.0)
+    place = np.stack([c[rows, first] + share * (c[rows, first + 1] - c[rows, first]) for c in (x, y)], axis=1)
+    result: Array = np.where(down.any(axis=1)[:, None], place, np.nan)
+    return result
+
+
+def margins(path: Array, scene: Scene) -> Array:
+    """(n,) distance in m from where a path comes through the hoop's plane to its rim: > 0 inside; NaN for never."""
+    place = crossings(path, scene)
+    result: Array = scene.hoop_radius - np.hypot(place[:, 0] - scene.hoop_x, place[:, 1])
+    return result
