@@ -40,12 +40,14 @@ class Scene:
 def crossings(path: Array, scene: Scene) -> Array:
     """Where paths (n, T, 3) of centres x, y, z come down through the hoop's plane: (n, 2), NaN for never.
 
-    The first time after the bounce counts, which is where z first rises.
+    The flight after the first bounce counts: from where z first rises to where it rises again.
     """
     x, y, z = np.moveaxis(np.asarray(path, dtype=np.float64), -1, 0)
     with np.errstate(invalid="ignore"):
-        risen = np.logical_or.accumulate(z[:, 1:] > z[:, :-1], axis=1)
-        down = risen & (z[:, :-1] > scene.hoop_z) & (z[:, 1:] <= scene.hoop_z)
+        rises, falls = z[:, 1:] > z[:, :-1], z[:, 1:] < z[:, :-1]
+        risen = np.logical_or.accumulate(rises, axis=1)
+        again = np.logical_or.accumulate(np.logical_or.accumulate(risen & falls, axis=1) & rises, axis=1)
+        down = risen & ~again & (z[:, :-1] > scene.hoop_z) & (z[:, 1:] <= scene.hoop_z)
     first = np.argmax(down, axis=1)
     rows = np.arange(len(z))
     high, low = z[rows, first], z[rows, first + 1]

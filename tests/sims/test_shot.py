@@ -129,6 +129,8 @@ def test_where_a_path_comes_through_the_hoop_counts_after_its_bounce():
     falls = [(0, 0, 1), (0, 0, 0.2), (0.4, 0, 0.6), (0.8, 0.06, 0.7), (1.0, 0.12, 0.3)]
     low = [(0, 0, 1), (0, 0, 0.2), (0.4, 0, 0.45), (0.8, 0, 0.4), (1.0, 0, 0.3)]
     where = crossings(np.array([falls, low], dtype=float), scene)
+    twice = [(0, 0, 1), (0, 0, 0.2), (0.4, 0, 0.8), (0.6, 0, 0.55), (0.9, 0, 0.7), (1.0, 0, 0.3)]
+    assert np.isnan(crossings(np.array([twice], dtype=float), scene)).all()  # it struck something before the hoop
     np.testing.assert_allclose(where[0], [0.9, 0.09])
     assert np.isnan(where[1]).all()
     assert margins(np.array([falls], dtype=float), scene)[0] == pytest.approx(0.2 - math.hypot(0.1, 0.09))
