@@ -150,7 +150,8 @@ def train(experiment: Experiment, entry: Entry, seed: int, watch: Watch | None =
     problem = Problem(experiment)
     practice = problem.practice(experiment.training_budget)
     started = perf_counter()
-    tuner.fit(practice, rng_for(experiment.name, "fit", entry.tuner, seed), experiment.training_budget)
+    rng = rng_for(experiment.name, "fit", tuner.trains_as or entry.tuner, seed)
+    tuner.fit(practice, rng, experiment.training_budget)
     seconds = perf_counter() - started
     problem.close()
     about = {_COUNTS: np.array([practice.used, seconds]), _KEY: np.frombuffer(name.encode(), dtype=np.uint8)}

@@ -142,6 +142,8 @@ class Tuner:
         requires: importable packages without which this tuner is listed as skipped.
         stochastic: whether `tune` uses its generator; where not, one seed tells all.
         learned: whether `fit` must have been called before `tune`.
+        trains_as: another tuner that trains in the same way; its random stream is used, so that a comparison of the two
+            compares what they do with the same network.
         known_failures: conformance checks (by function name) that it fails on purpose, with the reason.
         watch: looks on during `fit`, where the tuner tells it of its progress.
     """
@@ -150,6 +152,7 @@ class Tuner:
     requires: ClassVar[tuple[str, ...]] = ()
     stochastic: ClassVar[bool] = True
     learned: ClassVar[bool] = False
+    trains_as: ClassVar[str] = ""
     known_failures: ClassVar[Mapping[str, str]] = {}
     watch: Watch | None = None
 

@@ -38,6 +38,7 @@ class Hybrid(TuneNet):
 
     name: ClassVar[str] = "hybrid"
     stochastic: ClassVar[bool] = True
+    trains_as: ClassVar[str] = "tunenet"
 
     pays: float = 0.5
     patience: int = 2

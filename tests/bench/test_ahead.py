@@ -59,6 +59,16 @@ def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
     assert "trained earlier with 56 simulations" in capsys.readouterr().out
 
 
+def test_hybrid_starts_from_the_same_network_as_tunenet(experiment):
+    settings = load(str(experiment))
+    one, two = (dict(np.load(train(settings, Entry("x", name, TUNER["options"]), 1).path)) for name in
+                ("tunenet", "hybrid"))  # fmt: skip
+    arrays = [name for name in one if "." in name]
+    assert len(arrays) > 6
+    for name in arrays:
+        np.testing.assert_array_equal(one[name], two[name])
+
+
 def test_looking_on_changes_nothing(experiment):
     """Weights are the same whether somebody looks on, as `simgap train` does, or not, as `simgap compare`."""
     from bench.ahead import _Told

@@ -19,8 +19,9 @@ def against(folder, tuner):
     """One row a rival, range and number of simulations: median error of `tuner` over the rival's, and Holm's p."""
     stored = read(folder)
     parts = []
+    metric, runs, _ = primary(stored.runs)
     for k in checkpoints(configuration(folder).experiment.budget)[1:]:
-        found = pairs(Rows(stored.runs, stored.statuses, k).curves(primary(stored.runs)))
+        found = pairs(Rows(runs, stored.statuses, k).curves(metric))
         found = found[(found["a"] == tuner) | (found["b"] == tuner)].copy()
         mirrored = found["b"] == tuner
         found.loc[mirrored, "error_ratio"] = 1.0 / found.loc[mirrored, "error_ratio"]
