@@ -8,7 +8,7 @@ PLUGINS = Path(__file__).parent / "plugins"
 
 if (
     signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-):  # begun in the background: children that are interrupted would not be
+):  # as in the background; children inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
