@@ -6,9 +6,7 @@ import pytest
 
 PLUGINS = Path(__file__).parent / "plugins"
 
-if (
-    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-):  # as in the background; children inherit it
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background; children inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
