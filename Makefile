@@ -33,7 +33,7 @@ explain: $(STAMP)
 	$(BIN)/simgap score results/example/explained/extended.toml results/example/swing.csv
 
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -44,8 +44,7 @@ class Wind(Force):
     name = "wind"
     says = "moving air drags along what is in it"
     source = "G. K. Batchelor, An Introduction to Fluid Dynamics (1967), doi:10.1017/CBO9780511800955"
-    needs = "push"
-    contains = ("drag.quadratic",)
+    needs, contains = "push", ("drag.quadratic",)
     coefficients = (
         Coefficient("drag", ("1/m", "N*s^2/m^2", None), ((0, 0.3), (0, 5), (0, 0))),
         Coefficient("x", ("m/s", "m/s", None), ((-10, 10), (-10, 10), (0, 0))),

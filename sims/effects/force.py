@@ -27,11 +27,9 @@ class Bias(Force):
         return moment.along_primary(c[0])
 
 
+# Twice a turn at least: what repeats once a turn is gravity, scaled and tilted.
 class Ripple(Force):
-    """A force that repeats with position, as a motor's cogging: sine and cosine of 2 pi x / period.
-
-    At least twice a turn: what repeats once a turn is gravity, scaled and tilted.
-    """
+    """A force that repeats with position, as a motor's cogging: sine and cosine of 2 pi x / period."""
 
     name = "force.ripple"
     says = "a force comes and goes with position, as the cogging of a motor"

@@ -35,8 +35,7 @@ class Stribeck(Friction):
     name = "friction.stribeck"
     says = "friction is greatest at rest and falls as motion picks up"
     source = _SURVEY
-    needs = "guide"
-    contains = ("friction.coulomb",)
+    needs, contains = "guide", ("friction.coulomb",)
     coefficients = (
         Coefficient("coulomb", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),
         Coefficient("extra", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),
