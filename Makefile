@@ -1,4 +1,4 @@
-# make compare   a small comparison, from a bare machine to the figure
+# make compare   a small comparison, from a bare machine to the figure (TARGETS=5 SEEDS=1 is shorter)
 # make explain   a small diagnosis: makes a recording with a hidden cause, finds it, writes the report
 # make test      the tests
 # make check     lint, types and import rules
@@ -22,8 +22,11 @@ $(STAMP): requirements.lock pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch $@
 
+TARGETS ?= 10
+SEEDS ?= 2
+
 compare: $(STAMP)
-	$(BIN)/simgap compare ball-drop --targets 10 --seeds 2 --budget 50
+	$(BIN)/simgap compare ball-drop --targets $(TARGETS) --seeds $(SEEDS) --budget 50
 
 explain: $(STAMP)
 	rm -rf results/example
