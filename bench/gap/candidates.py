@@ -21,7 +21,7 @@ from sims.simulated import effect_parameters
 
 SMALL = 1e-4
 """Share of a plausible range at which a direction is first taken."""
-LEVELS = (0.15, 0.35, 0.6, 0.85)
+LEVELS = (0.15, 0.35, 0.6, 0.85, 0.95, 0.99)
 """Shares of the largest input at which limits, dead bands and plays are tried besides."""
 NOTHING = 1e-11
 """Share of the largest observation below which a change is rounding."""

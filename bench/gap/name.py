@@ -116,19 +116,23 @@ def unfixed(search: Search, base: Model) -> tuple[str, ...]:
 
 
 def settled(search: Search, model: Model) -> Model:
-    """The best model after it and its rivals of the same size were fitted once more, to the end.
+    """The best model after it and its rivals of the same size, all that are promising, were fitted to the end.
 
     By generalised least squares where what is left is noise; by ordinary ones where structure is left, which is none
     and would pull the fit away from the data.
     """
+    search.extend([search.without(model, name) for name in model.names], len(search.world.library))
     size, names = len(model.names), set(model.names)
+    around = list(neighbours(search.world, model.fit))
+    if around:  # what repeats has minima by the dozen
+        search.from_pieces(size)
     near = [m for m in search.models.values() if len(m.names) == size and _is_near(search, m, model)]
     parts = [m for m in search.models.values() if len(m.names) == size - 1 and set(m.names) < names]
     noise, noisy = None, not remains(search, model).structure
     if noisy:
         noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), np.maximum(model.likelihood.phi, 0.0))
     rivals = [m for m in near if noisy and abs(model.merit - m.merit) < NEAR] or [model]
-    search.refit([*(m.fit.start() for m in (*near, *parts)), *neighbours(search.world, model.fit)], noise)
+    search.refit([*(m.fit.start() for m in (*near, *parts)), *around], noise)
     return max((search.models[frozenset(m.names)] for m in rivals), key=lambda m: m.merit)
 
 

@@ -17,6 +17,7 @@ from bench.gap.candidates import Directions, directions
 from bench.gap.colour import forgets, surrogates
 from bench.gap.fit import Start
 from bench.gap.models import Model, Models, Names
+from bench.gap.pieces import pieces, whole
 from bench.gap.score import Group, Scores, score, tail
 from bench.gap.world import coefficient_bounds
 from methods.base import Array
@@ -43,8 +44,12 @@ FAR = 0.5
 """Excess over the noise above which the search looks further ahead."""
 HOPELESS = 0.5
 """Share of the base model's excess that two effects leave where a third is not worth a try."""
+IDLE = 0.85
+"""The same, of the excess that the best single effect leaves: what is left is then nothing that the library knows."""
 CLEARLY = 0.5
 """Share of the excess over the noise to which other effects must bring a model to take the place of fewer."""
+SKETCHED, TRANSFERRED = 2, 5
+"""Models of at most so many effects are sought over short pieces; so many of the best are fitted to the whole runs."""
 BEAM, NEAREST = 3, 2
 RIVAL = 0.5
 """A model goes on in the beam if it has at least this share of the best one's gain."""
@@ -59,6 +64,7 @@ class Search(Models):
     scanned: dict[frozenset[str], tuple[Directions, Scores]] = field(default_factory=dict)
     tests: dict[frozenset[str], float] = field(default_factory=dict)
     _lessened: set[frozenset[str]] = field(default_factory=set)
+    _sketch: Search | None = None
 
     def replaced(self, key: frozenset[str]) -> None:
         """What was scored about the model before holds no longer."""
@@ -252,9 +258,15 @@ class Search(Models):
                 best = larger
             elif self.excess(best) < FAR or self._quiet(best):
                 break
-            if size > 1 and self.excess(larger) > HOPELESS * self.excess(self.models[frozenset()]):
+            if size > 1 and self._hopeless(larger):
                 break
         return best
+
+    def _hopeless(self, larger: Model) -> bool:
+        """Whether a model of several effects is so far from the data that one more is not worth a try."""
+        singles = [self.excess(m) for m in self.models.values() if len(m.names) == 1]
+        before = self.excess(self.models[frozenset()])
+        return self.excess(larger) > min(HOPELESS * before, IDLE * min(singles, default=np.inf))
 
     def _grown(self, size: int) -> Model | None:
         """The best model of so many effects: from the best smaller one, then from its rivals, or with patience."""
@@ -263,11 +275,28 @@ class Search(Models):
         first = self.best(size)
         if first is not None and self.plain(first, ALPHA):
             return first
+        self.from_pieces(size)
+        first = self.best(size)
+        if first is not None and self.plain(first, ALPHA):
+            return first
         if size == 1:
             self.extend(beam, NOMINATED, patient=True)
         else:
             self.extend(beam[1:], NOMINATED)
         return self.best(size)
+
+    def from_pieces(self, size: int) -> None:
+        """Refit the models of so many effects that explain short pieces of the runs best."""
+        if size > SKETCHED or (cut := pieces(self.world)) is None:
+            return
+        if self._sketch is None:
+            base = self.models[frozenset()].fit
+            self._sketch = Search(cut, self.noise, self.frozen, self.rng, self.stated)
+            self._sketch.refit([Start((), base.theta, cut.guess)])
+        sketch = self._sketch
+        sketch.extend(sketch._beam(size - 1), NOMINATED)
+        found = sorted((m for m in sketch.models.values() if len(m.names) == size), key=lambda m: -m.merit)
+        self.refit([whole(self.world, m.fit) for m in found[:TRANSFERRED]])
 
     def _conservative(self, best: Model, larger: Model) -> Model:
         """The larger model, unless it puts other effects in place of the best one's and is hardly nearer to the noise.

@@ -54,7 +54,8 @@ class Track:
 class World:
     """Some runs of a recording, and one simulator that has every effect at hand, off unless its coefficients say so.
 
-    A vector theta (P,) holds the system's own parameters, constants set free, then all coefficients.
+    A vector theta (P,) holds the system's own parameters, constants set free, then all coefficients. `longest` is the
+    duration of the longest run in seconds, `travel` the largest range of the primary coordinate in one run.
 
     Args:
         kind: the simulator's class.
@@ -79,6 +80,7 @@ class World:
         candidates: Sequence[str] | None = None,
     ) -> None:
         self.kind, self.recording, self.engine = kind, recording, engine
+        self.runs, self.extra = tuple(runs), tuple(extra)
         usable = library.library(kind.system)
         names = list(usable) if candidates is None else list(candidates)
         self.library = names
@@ -105,6 +107,7 @@ class World:
             row[: len(track.observed)] = track.observed
         self.known: Mask = np.array([t.known for t in self.tracks])
         self.guess: Array = np.array([t.guess for t in self.tracks])
+        self.longest, self.travel = self._longest(), self._travel()
         self.simulations = 0
         self._parts: dict[float, list[Scenario]] = {}
         self._shifting, self._filtering = self._delaying()
@@ -114,13 +117,11 @@ class World:
         """Names of the recorded channels, in the order of observations."""
         return [c.name for c in self.simulator.channels]
 
-    @property
-    def longest(self) -> float:
+    def _longest(self) -> float:
         """Seconds that the longest run takes."""
         return max(float(t.scenario.times[-1] - t.scenario.times[0]) for t in self.tracks) or 1.0
 
-    @property
-    def travel(self) -> float:
+    def _travel(self) -> float:
         """The range of the primary coordinate in the run where it is largest; 0 where it is not recorded."""
         system = self.simulator.system
         name = system.coordinates[system.primary]
