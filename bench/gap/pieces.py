@@ -9,6 +9,7 @@ decides nothing.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def _cut(run: Run) -> list[Run]:
     seen = np.isfinite(np.stack(list(run.channels.values()))).any(axis=0)
     count = int(np.clip(seen.sum() // LEAST, 1, PIECES))
     edges = np.linspace(0, run.times.size, count + 1).astype(int)
-    parts = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    parts = [slice(a, b) for a, b in pairwise(edges)]
     if any(seen[part].sum() < LEAST // 2 for part in parts):
         return [run]
     return [
