@@ -13,8 +13,9 @@ from itertools import product
 
 import numpy as np
 
+from bench.gap.bounds import CYCLES
 from bench.gap.fit import Fit, Start
-from bench.gap.world import CYCLES, Mask, World
+from bench.gap.world import Mask, World
 from methods.base import Array
 from sims.base import Parameter
 from sims.simulated import effect_parameters

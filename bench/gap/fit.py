@@ -14,8 +14,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from bench.gap.bounds import coefficient_bounds
 from bench.gap.colour import Noise, whitened
-from bench.gap.world import Indices, Mask, World, coefficient_bounds
+from bench.gap.world import Indices, Mask, World
 from methods.base import Array
 
 RESPONSE = 0.1

@@ -121,8 +121,11 @@ def settled(search: Search, model: Model) -> Model:
     By generalised least squares where what is left is noise; by ordinary ones where structure is left, which is none
     and would pull the fit away from the data.
     """
+    size, known = len(model.names), set(search.models)
     search.extend([search.without(model, name) for name in model.names], len(search.world.library))
-    size, names = len(model.names), set(model.names)
+    asked = [m for key, m in search.models.items() if key not in known and len(key) == size]
+    model = max([model, *asked], key=lambda m: m.merit)
+    names = set(model.names)
     around = list(neighbours(search.world, model.fit))
     if around:  # what repeats has minima by the dozen
         search.from_pieces(size)

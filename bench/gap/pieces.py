@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from bench.gap.fit import Fit, Start
-from bench.gap.world import World
+from bench.gap.world import Mask, World
 from sims.recording import Run
 
 PIECES, LEAST = 4, 20
@@ -33,7 +33,7 @@ def pieces(world: World) -> World | None:
 
 
 def _cut(run: Run) -> list[Run]:
-    seen = np.isfinite(np.stack(list(run.channels.values()))).any(axis=0)
+    seen: Mask = np.any(np.isfinite(np.stack(list(run.channels.values()))), axis=0)
     count = int(np.clip(seen.sum() // LEAST, 1, PIECES))
     edges = np.linspace(0, run.times.size, count + 1).astype(int)
     parts = [slice(a, b) for a, b in pairwise(edges)]

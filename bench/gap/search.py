@@ -7,19 +7,18 @@ of its effects (A. Miller, Subset Selection in Regression, 2nd ed., 2002, doi:10
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from bench.gap.base import HORIZONS
 from bench.gap.candidates import Directions, directions
 from bench.gap.colour import forgets, surrogates
 from bench.gap.fit import Start
-from bench.gap.models import Model, Models, Names
+from bench.gap.models import Model, Models
+from bench.gap.nominate import nominated
 from bench.gap.pieces import pieces, whole
-from bench.gap.score import Group, Scores, score, tail
-from bench.gap.world import coefficient_bounds
+from bench.gap.score import Scores, score, tail
 from methods.base import Array
 
 SURROGATES = 120
@@ -34,11 +33,6 @@ LOUD, FORGOT = 1.3, 0.01
 estimated floor, where the chance that it is first-order noise is above the second."""
 MOST_EFFECTS = 3
 NOMINATED = 7
-WHITE = 3
-"""So many of the best by sum of squares alone are refitted besides: far from the data, noise that remembers explains
-almost anything."""
-PROMISING = 0.25
-"""Candidates are refitted that promise at least this share of the best one's score."""
 MOVES = 2
 FAR = 0.5
 """Excess over the noise above which the search looks further ahead."""
@@ -94,76 +88,14 @@ class Search(Models):
             self.chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         return scores
 
-    def starts(self, model: Model, scores: Scores, most: int, patient: bool) -> list[Start]:
-        """Where to begin with the most promising candidates, at what scores say and at less; with all in patience."""
-        found = self.scanned[frozenset(model.names)][0]
-        promise = scores.score - scores.chance
-        order = np.argsort(-promise, kind="stable")
-        chosen = [i for i in order if patient or promise[i] >= PROMISING * promise[order[0]]]
-        if not patient:
-            near = [i for i in np.argsort(-scores.white, kind="stable")[:WHITE] if i not in chosen[:most]]
-            chosen = chosen[:most] + near
-        result = []
-        for i in chosen:
-            for peak, (group, scored) in enumerate(scores.peaks[i]):
-                for c in self._sizes(found, group, scored, scores.effects[i]):
-                    result.append((peak, self._with(model, scores.effects[i], c)))
-        return self._nearest(result, HORIZONS[0][0] if patient else 1.0)
-
-    def _with(self, model: Model, name: str, c: Array) -> Start:
-        """The model with one more effect, which takes the place of those that it contains."""
-        theta, held = model.fit.theta.copy(), self.world.effects[name].contains
-        theta[self.world.slots[name]] = c
-        for part in set(held) & set(model.names):
-            theta[self.world.slots[part]] = 0.0
-        return Start((*(n for n in model.names if n not in held), name), theta, model.fit.states)
-
-    def _sizes(self, found: Directions, group: Group, scored: Array, name: str) -> Iterator[Array]:
-        """Coefficients to begin with: as scored, less, and at shares of the plausible range where one scales it."""
-        bounds = coefficient_bounds(self.world, name)
-        first = found.probes[group.columns[0]]
-        if first.fixed:
-            yield first.c
-            return
-        for share in (1.0, 0.25):
-            c = first.c.copy()
-            for column, size in zip(group.columns, scored, strict=True):
-                place = found.probes[column].place
-                c[place] = share * float(np.clip(size, *bounds[place]))
-            yield c
-        if len(group.columns) == 1:
-            reach = self.world.parameters[self.world.slots[name].start + first.place].bounds[1]
-            for share in (0.2, 0.7, 1.5, *((-0.2, -0.7, -1.5) if first.signed else ())):
-                c = first.c.copy()
-                c[first.place] = share * reach
-                yield c
-
-    def _nearest(self, numbered: Sequence[tuple[int, Start]], share: float) -> list[Start]:
-        """Of starts of one number and the same effects the one nearest to the data over the first share of the runs."""
-        if not numbered:
-            return []
-        starts = [start for _, start in numbered]
-        world, runs = self.world, len(self.world.tracks)
-        theta = np.repeat([s.theta for s in starts], runs, axis=0)
-        states = np.concatenate([s.states for s in starts])
-        seen = world.simulate(theta, np.tile(np.arange(runs), len(starts)), states, share)
-        seen = seen.reshape(len(starts), runs, *seen.shape[1:])
-        counted = world.counted(share)
-        best: dict[tuple[int, Names], tuple[float, Start]] = {}
-        for (number, start), part in zip(numbered, seen, strict=True):
-            left = np.where(counted, world.observed - part, 0.0) / self.noise.sigma
-            cost = float(np.square(left).sum())
-            if cost < best.get((number, start.effects), (np.inf,))[0]:
-                best[number, start.effects] = cost, start
-        return [start for _, start in best.values()]
-
     def extend(self, beam: Iterable[Model], most: int, patient: bool = False) -> None:
         """Refit the most promising extensions of some models; those that are known already only with patience."""
         starts = []
         for model in beam:
             key = frozenset(model.names)
             scores = self.scanned[key][1] if key in self.scanned else self.scan(model)
-            found = self.starts(self.models[key], scores, most, patient)
+            start = self.models[key]
+            found = nominated(self.world, self.noise, start, self.scanned[key][0], scores, most, patient)
             starts += [s for s in found if patient or frozenset(s.effects) not in self.models]
         if starts:
             self.refit(starts, patient=patient)

@@ -13,8 +13,8 @@ from methods.base import Array
 from sims import effects as library
 from sims.base import InputError, Parameter, Scenario, unknown
 from sims.recording import Recording, Run
-from sims.simulated import Simulated, effect_parameters
-from sims.system import Effect, Friction, Input, Sensor
+from sims.simulated import Simulated
+from sims.system import Effect, Input, Sensor
 
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
@@ -287,25 +287,3 @@ def beginning(times: Array, values: Array) -> tuple[float, float]:
 
 
 _FIRST = 8
-
-
-def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
-    """The range in which a fit may move each coefficient of an effect.
-
-    A plausible range orders causes; it does not overrule the data: what may have either sign may be twenty times
-    larger. What is zero or positive by its meaning stays so, and what shapes an effect stays in its range.
-    """
-    bounds = []
-    for parameter in effect_parameters(world.effects[name], world.simulator.system, world.channels):
-        low, high = parameter.bounds
-        if parameter.unit == "Hz":
-            low = min(max(low, CYCLES / world.longest), high / 2.0)
-        beyond = DRY if isinstance(world.effects[name], Friction) else BEYOND
-        bounds.append((low, high) if low > 0 else (0.0 if low == 0 else beyond * low, beyond * high))
-    return bounds
-
-
-BEYOND, DRY = 20.0, 4.0
-"""The second for dry friction: what is stronger only sticks."""
-CYCLES = 1.0
-"""What comes and goes must do so about once in the longest run, else any slow change would be called periodic."""

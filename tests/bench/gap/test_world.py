@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.gap.world import BEYOND, DRY, FREED, beginning, coefficient_bounds, first_of
+from bench.gap.bounds import BEYOND, DRY, coefficient_bounds
+from bench.gap.world import FREED, beginning, first_of
 from sims.ball.simulator import Ball
 from sims.base import InputError, Scenario
 from sims.pendulum.simulator import Pendulum
