@@ -77,7 +77,8 @@ class Experiment:
         settings: the simulator's own settings, e.g. its time step.
         world: settings of the simulator that makes the targets, where it is another: another engine, effects with
             fixed coefficients. Empty: the same simulator. Its parameters are the first of the tuned ones.
-        constants: constants other than the simulator's defaults.
+        constants: constants other than the simulator's defaults: a number, or [low, high] for uniform between in each
+            scenario, known to whoever simulates it.
         parameters: changes to parameters' nominal, bounds, training range.
         initial: initial state: a number, or [low, high] for uniform between.
         inputs: input signals by name, as `simgap simulate` writes them, e.g. ``sine:2:0.5`` (`bench.signals`).
@@ -107,7 +108,7 @@ class Experiment:
     noise: Mapping[str, float] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     world: Mapping[str, Any] = field(default_factory=dict)
-    constants: Mapping[str, float] = field(default_factory=dict)
+    constants: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     initial: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
     inputs: Mapping[str, str] = field(default_factory=dict)
@@ -137,6 +138,11 @@ class Experiment:
         document = {k: v for k, v in asdict(self).items() if k not in ("name", "tuners") and v is not None}
         document["tuners"] = {e.label: _without_none(e) for e in self.tuners}
         return document
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """The constants that are the same in every scenario."""
+        return {name: value for name, value in self.constants.items() if not isinstance(value, tuple)}
 
     def chosen(self, **changes: Any) -> Experiment:
         """This experiment with the given fields replaced where they are not None."""
@@ -230,11 +236,11 @@ def _field(path: Path, key: str, value: Any) -> Any:
     checked(path, key, value, _TYPES[key])
     if key in ("observe", "ranges"):
         return tuple(checked(path, key, v, str) for v in value)
-    if key in ("noise", "constants"):
+    if key == "noise":
         return {k: float(checked(path, f"{key}.{k}", v, (int, float))) for k, v in value.items()}
     if key == "parameters":
         return {k: dict(_parameter(path, k, v)) for k, v in value.items()}
-    if key == "initial":
+    if key in ("initial", "constants"):
         return _initial(path, key, value)
     if key == "inputs":
         return _inputs(path, key, value)

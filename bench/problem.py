@@ -75,7 +75,7 @@ class Problem:
     def _simulator(self, kind: type[Simulator], observe: Sequence[str], settings: Mapping[str, Any]) -> Simulator:
         experiment = self.experiment
         try:
-            return kind(constants=experiment.constants, observe=observe, **settings)
+            return kind(constants=experiment.fixed, observe=observe, **settings)
         except TypeError as error:
             raise InputError(f"experiment {experiment.name}: simulator {experiment.simulator}: {error}") from None
 
@@ -110,7 +110,9 @@ class Problem:
         sampling = self.experiment.sampling
         start = {k: rng.uniform(*v) if isinstance(v, tuple) else v for k, v in initial.items()}
         times = np.arange(sampling.samples) / sampling.rate
-        return Scenario(times, start, {name: signal(text, times, rng) for name, text in inputs.items()})
+        signals = {name: signal(text, times, rng) for name, text in inputs.items()}
+        drawn = {k: rng.uniform(*v) for k, v in self.experiment.constants.items() if isinstance(v, tuple)}
+        return Scenario(times, start, signals, drawn)
 
     def _held_out(self, theta: Array, names: tuple[str, str, int]) -> Side:
         """Unseen scenarios, and what the target's world does in them, without sensor noise: what is to be predicted.

@@ -115,7 +115,7 @@ def _side(recording: Recording, experiment: Experiment) -> Side:
     """The recorded run as the experiment's simulator sees it."""
     (run,) = recording.runs
     scenario = scenario_of(run, BallSimulator(observe=["z"]), recording.constants)
-    radius = experiment.constants["radius"]
+    radius = experiment.fixed["radius"]
     shift = radius - _constants(recording)["radius"]
     z = run.channels["z"] + shift
     seen = run.channels["z"][np.isfinite(run.channels["z"])]

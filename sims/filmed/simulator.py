@@ -1,0 +1,129 @@
+"""The ball before a camera: heights, and where a tracker sees the ball in the picture."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims.ball.simulator import Ball
+from sims.ball.system import BallSystem
+from sims.base import Array, Channel, Constant, InputError, Scenario, Simulator
+from sims.camera.camera import Camera
+
+FILMS = ("projected", "tracked")
+
+
+class FilmedBall(Simulator):
+    """A ball that falls and bounces on level ground, and its place in the picture of a fixed camera.
+
+    The camera looks at (0, 0, 2) m with a field of view of 40 degrees, as the published visual tuner's does (Allevato
+    et al., TuneNet, arXiv 1907.11200, released code). `v` is the pixel row of the middle of the ball's outline, from
+    the top; it may lie outside the picture.
+
+    Args:
+        constants: values for `constants` other than their defaults.
+        observe: channels to return, in order (default: both).
+        film: "projected" computes `v` through the camera. "tracked" renders a film of each run, its light, colours and
+            compression drawn from the run's own numbers, and lets the tracker find the ball: `v` is missing where it is
+            not seen, and `z`, which no film shows, throughout.
+        settings: those of simulator ball.
+
+    Raises:
+        InputError: an unknown name or setting, or a film to be tracked without the packages for it.
+    """
+
+    name = "ball-filmed"
+    says = "a bouncing ball before a fixed camera"
+    parameters = BallSystem.parameters
+    channels = (
+        Channel("z", "m", says="height of the centre above the ground"),
+        Channel("v", "px", says="pixel row of the middle of the ball's outline, down from the top"),
+    )
+    constants = (
+        *BallSystem.constants,
+        Constant("camera_azimuth", "rad", 0.0, "where the camera stands around the vertical"),
+        Constant("camera_distance", "m", 7.5, "of the camera from the vertical", positive=True),
+        Constant("camera_height", "m", 6.5, "of the camera above the ground"),
+        Constant("pixels", "px", 100.0, "width and height of the picture", positive=True),
+    )
+    states = BallSystem.states
+
+    def __init__(
+        self,
+        constants: Mapping[str, float] | None = None,
+        observe: Sequence[str] | None = None,
+        *,
+        film: str = "projected",
+        **settings: Any,
+    ) -> None:
+        super().__init__(constants, observe)
+        if film not in FILMS:
+            raise InputError(f"simulator {self.name}: expected film to be one of {', '.join(FILMS)}, found {film!r}")
+        if film == "tracked" and not all(map(importlib.util.find_spec, ("av", "cv2"))):
+            raise InputError('films need PyAV and OpenCV: pip install "simgap[vision]"')
+        self._tracked = film == "tracked"
+        self._ball = Ball(self._of_ball(self.constant_values), ["x", "y", "z"], **settings)
+
+    def simulate(self, theta: Array, scenario: Scenario) -> Array:
+        """Simulate each row of `theta` (n, 1); returns (n, T, C). See `Simulator.simulate`."""
+        constants = self.run_constants(scenario)
+        self.run_inputs(scenario)
+        fall = Scenario(scenario.times, scenario.initial, {}, self._of_ball(constants))
+        places = self._ball.simulate(theta, fall)
+        camera, radius = _camera(constants), constants["radius"]
+        if self._tracked:
+            rows = np.array([_tracked(camera, radius, way, scenario.times) for way in places]).reshape(places.shape[:2])
+            seen = np.stack([np.full_like(rows, np.nan), rows], axis=2)
+        else:
+            seen = np.stack([places[..., 2], camera.outline(places, radius)[0][..., 1]], axis=2)
+        result: Array = seen[:, :, self.columns]
+        return result
+
+    def close(self) -> None:
+        """Give back what the engine holds."""
+        self._ball.close()
+
+    @staticmethod
+    def _of_ball(constants: Mapping[str, float]) -> dict[str, float]:
+        return {c.name: constants[c.name] for c in BallSystem.constants}
+
+
+def _camera(constants: Mapping[str, float]) -> Camera:
+    size = round(constants["pixels"])
+    place = (constants["camera_azimuth"], constants["camera_distance"], constants["camera_height"])
+    return Camera(*place, size=(size, size))
+
+
+def _tracked(camera: Camera, radius: float, places: Array, times: Array) -> Array:
+    """Pixel rows (T,) that the tracker finds in a film of the ball at `places` (T, 3); NaN where it finds none."""
+    from sims.camera.look import Look
+    from sims.camera.render import Stage
+    from sims.camera.track import track
+    from sims.camera.video import Video, write_video
+
+    rows: Array = np.full(times.size, np.nan)
+    if not np.isfinite(places).all():
+        return rows
+    numbers = [camera.azimuth, camera.distance, camera.height, *camera.size, radius, *places.ravel()]
+    digest = hashlib.sha256(np.array(numbers).tobytes()).digest()
+    rng = np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
+    look = Look.drawn(rng)
+    stage = Stage(camera, look, radius, rng)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "film.mp4"
+            write_video(path, stage.film(places), times, look.crf)
+            found = track(Video(path))
+    except InputError:  # no ball to be seen: nothing was measured
+        return rows
+    finally:
+        stage.close()
+    at = np.rint(np.interp(found.times, times - times[0], np.arange(times.size))).astype(int)
+    rows[at] = found.v
+    return rows
