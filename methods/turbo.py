@@ -84,7 +84,7 @@ class TuRBO(Tuner):
         values = np.where(finite, losses, losses[finite].max())
         scale = float(values.std()) or 1.0
         with _quietly(rng):
-            from botorch.generation import MaxPosteriorSampling
+            from botorch.generation.sampling import MaxPosteriorSampling
 
             model = _process(points, -(values - values.mean()) / scale)
             sides = np.asarray(model.covar_module.base_kernel.lengthscale.detach().numpy()).ravel()
@@ -117,7 +117,7 @@ def _spread(rng: np.random.Generator, n: int, dim: int) -> Array:
 def _process(points: Array, values: Array) -> Any:
     """A Gaussian process with a scaled Matérn-5/2 kernel, fitted by its marginal likelihood."""
     import torch
-    from botorch.exceptions import ModelFittingError
+    from botorch.exceptions.errors import ModelFittingError
     from botorch.fit import fit_gpytorch_mll
     from botorch.models import SingleTaskGP
     from gpytorch.constraints import Interval
