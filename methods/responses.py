@@ -50,7 +50,8 @@ def _response(series: Array, inputs: Array) -> Array:
         windows = sliding_window_view(signal, len(s), axis=1)[:, :: max(1, half // 4)]
         return np.asarray(windows @ kernel, dtype=np.float64)
 
-    told = np.broadcast_to(inputs, (len(series), *inputs.shape))
+    held = (inputs + np.concatenate([inputs[:1], inputs[:-1]])) / 2.0  # an input is held until the next sample
+    told = np.broadcast_to(held, (len(series), *inputs.shape))
     beside = np.concatenate([np.ones_like(told[..., :1]), series, series**3, _sense(series), told], axis=2)
     regressors = np.concatenate([integral(beside, bump), -integral(series, slope)], axis=2)
     return _fitted(regressors, integral(series, bend)).reshape(len(series), -1)

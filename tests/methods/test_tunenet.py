@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from bench.drive import drive
-from methods.base import Array, BudgetExceededError, Task
+from methods.base import NOTHING, Array, BudgetExceededError, Task
 from methods.pair_inputs import resample, roughness, weighed_inputs
 from methods.pair_network import PUBLISHED, Design, estimate, train
+from methods.rehearsal import Rehearsal
 from methods.tunenet import Search, TuneNet, TuneNetPublished
 
 TRAINING = {1: np.array([[0.3], [0.7]]), 2: np.array([[0.3, 0.2], [0.7, 0.6]])}
@@ -28,12 +29,17 @@ class Toy:
         self.dim, self.budget, self.used, self.runs = dim, budget, 0, runs
         self.training, self.scale, self.lengths = TRAINING[dim], np.ones(2), (60,) * runs
         self.calls: list[int] = []
+        self.scene = self.known(self.scenario(np.random.default_rng(0)))
 
     def sample(self, rng, n):
         return rng.uniform(*self.training, size=(n, self.dim))
 
     def scenario(self, rng):
         return rng.uniform(1.0, 2.0, size=self.runs)
+
+    def known(self, scenario):
+        """What a tuner is told of a scenario."""
+        return NOTHING
 
     def observe(self, points, scenario):
         return np.concatenate([swing(points, amplitude) for amplitude in scenario], axis=1)
@@ -45,7 +51,9 @@ class Toy:
         self.used += len(points)
         if self.used > self.budget:
             raise BudgetExceededError
-        return self.observe(points, self.scenario(rng))
+        scenario = self.scenario(rng)
+        self.scene = self.known(scenario)
+        return self.observe(points, scenario)
 
 
 def run(tuner, toy, seed, wide=False, budget=10, spoil=None):
@@ -56,7 +64,7 @@ def run(tuner, toy, seed, wide=False, budget=10, spoil=None):
     observed = toy.observe(truth[None], scenario)[0]
     if spoil is not None:
         spoil(observed)
-    task = Task(toy.dim, start, observed, toy.scale, toy.training, budget, toy.lengths)
+    task = Task(toy.dim, start, observed, toy.scale, toy.training, budget, toy.lengths, toy.known(scenario))
 
     def evaluate(points):
         seen = toy.observe(points, scenario)
@@ -278,7 +286,8 @@ def test_inputs_prefer_what_follows_the_parameters():
     circumstance = np.broadcast_to(rng.uniform(size=(20, 1, 1)), (20, 8, 1))
     observations = np.stack([parameters, jumping, circumstance], axis=-1)  # one channel each, a single sample
     observations = np.repeat(observations, 2, axis=2)
-    inputs = weighed_inputs(parameters, observations, (2,), 2, most=3 * 6, strictness=1000.0)
+    data = Rehearsal(parameters, observations, (2,), (NOTHING,) * 20)
+    inputs = weighed_inputs(data, 2, most=3 * 6, strictness=1000.0)
     gain = {int(number): gain for number, gain in zip(inputs.chosen, inputs.gain, strict=True)}
     assert gain[0] * np.std(parameters) > 1e3 * gain[6] * np.std(jumping)
     assert gain[12] * np.std(circumstance) > 1e3 * gain[6] * np.std(jumping)
