@@ -9,17 +9,14 @@ autoregressive flow for density estimation, NeurIPS 2017, arXiv 1705.07057. Buil
 
 from __future__ import annotations
 
-import io
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 
 from methods.base import Array, Ask, Practice, Steps, Task, Tuner
-from methods.pair_network import reproducible
+from methods.quiet import Silent, quietly
 from methods.reader import Reader, Reading
 from methods.rehearsal import rehearse
 
@@ -74,10 +71,10 @@ class NPE(Tuner):
         self._read = read = Reader.learned(data, self._reading())
         rows = np.concatenate([read.table(some).reshape(-1, read.size) for some in (data, spoilt)])
         theta = np.tile(data.parameters.reshape(-1, simulator.dim), (2, 1))
-        with _quietly(rng):
+        with quietly(rng):
             from sbi import inference
 
-            trainer = inference.NPE(density_estimator=self._builder(), tracker=_Silent(), show_progress_bars=False)
+            trainer = inference.NPE(density_estimator=self._builder(), tracker=Silent(), show_progress_bars=False)
             trainer.append_simulations(_tensor(theta), _tensor(rows))
             self._flow = trainer.train(max_num_epochs=self.epochs, training_batch_size=min(100, len(rows) // 4))
 
@@ -122,7 +119,7 @@ class NPE(Tuner):
         if not 0 < dim < 1000:
             raise ValueError("expected the arrays of a flow, found others")
         rng = np.random.default_rng(0)
-        with _quietly(rng):
+        with quietly(rng):
             flow = self._builder()(*(_tensor(rng.standard_normal((4, size))) for size in (dim, inputs)))
             try:
                 flow.load_state_dict({name: torch.from_numpy(np.array(a)) for name, a in arrays.items()})
@@ -135,7 +132,7 @@ class NPE(Tuner):
         if self._read is None:
             raise RuntimeError("npe has not been trained; call fit or restore first")
         row = self._read(task.observed[None], task.lengths, task.scene)
-        with _quietly(rng):
+        with quietly(rng):
             drawn = self._flow.sample((max(self.draws, task.budget),), condition=_tensor(row)).detach()[:, 0].numpy()
         drawn = np.clip(np.nan_to_num(drawn.astype(np.float64), nan=0.5), 0.0, 1.0)
         mean = drawn.mean(axis=0)
@@ -149,33 +146,3 @@ def _tensor(array: Array) -> Any:
     import torch
 
     return torch.as_tensor(array, dtype=torch.float32)
-
-
-@contextmanager
-def _quietly(rng: np.random.Generator) -> Iterator[None]:
-    """Global generators seeded from `rng` inside and as they were outside; no gradients kept, no warnings."""
-    import torch
-
-    legacy = np.random.get_state()  # noqa: NPY002 - sbi may draw from it
-    with (
-        torch.random.fork_rng(devices=[]),
-        reproducible("cpu"),
-        warnings.catch_warnings(),
-        redirect_stdout(io.StringIO()),  # sbi prints
-    ):
-        warnings.simplefilter("ignore")
-        torch.manual_seed(int(rng.integers(2**62)))
-        np.random.seed(int(rng.integers(2**31)))  # noqa: NPY002
-        try:
-            yield
-        finally:
-            np.random.set_state(legacy)  # noqa: NPY002
-
-
-class _Silent:
-    """A tracker of training that keeps nothing; the package's own writes into the working folder."""
-
-    log_dir = None
-
-    def __getattr__(self, _: str) -> Callable[..., None]:
-        return lambda *_args, **_options: None
