@@ -116,9 +116,11 @@ class Inputs:
         Raises:
             ValueError: the observation yields fewer numbers than the network was trained on.
         """
+        if not self.chosen.size:
+            return np.empty((len(observations), 0))
         rows = _rows(observations, lengths, self.points, self.plain)
         chosen = self.chosen.astype(np.intp)
-        if chosen.size and chosen.max() >= rows.shape[1]:
+        if chosen.max() >= rows.shape[1]:
             raise ValueError(
                 f"the network reads number {chosen.max()} of an observation, this one gives {rows.shape[1]}; "
                 "train on observations of the same runs and channels"
