@@ -18,7 +18,7 @@ from bench.measured import Side, measured
 from bench.registry import simulators
 from bench.seeds import rng_for
 from bench.signals import signal
-from methods.base import Array, BudgetExceededError
+from methods.base import Array, BudgetExceededError, Scene
 from sims.base import InputError, Scenario, Simulator, UnitCube, adjusted, unknown
 
 
@@ -114,6 +114,13 @@ class Problem:
         drawn = {k: rng.uniform(*v) for k, v in self.experiment.constants.items() if isinstance(v, tuple)}
         return Scenario(times, start, signals, drawn)
 
+    def scene(self, scenarios: Sequence[Scenario]) -> Scene:
+        """What tuners are told; an initial value that a channel shows is the observation's first sample."""
+        shown = {c.name for c in self.channels}
+        initial = [v for s in scenarios for k, v in sorted(s.initial.items()) if k not in shown]
+        inputs = [np.array([v for _, v in sorted(s.inputs.items())]).reshape(-1, s.times.size).T for s in scenarios]
+        return Scene(np.array(initial, dtype=np.float64), np.concatenate(inputs))
+
     def _held_out(self, theta: Array, names: tuple[str, str, int]) -> Side:
         """Unseen scenarios, and what the target's world does in them, without sensor noise: what is to be predicted.
 
@@ -186,14 +193,16 @@ class Practice:
         self.scale = problem.scale
         self.used = 0
         self.budget = budget
-        self.lengths = tuple(s.times.size for s in problem.scenarios(np.random.default_rng(0)))
+        scenarios = problem.scenarios(np.random.default_rng(0))
+        self.lengths = tuple(s.times.size for s in scenarios)
+        self.scene = problem.scene(scenarios)
 
     def sample(self, rng: np.random.Generator, n: int) -> Array:
         """(n, dim) parameters drawn uniformly from the training range, unit cube."""
         return rng.uniform(self.training[0], self.training[1], size=(n, self.dim))
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
-        """Observations (n, T, C) of `points` (n, dim), all in one scenario drawn by `rng`."""
+        """Observations (n, T, C) of `points` (n, dim), all in one scenario drawn by `rng`; told by `scene`."""
         points = np.asarray(points, dtype=np.float64)
         slack = 1e-9
         if not ((points >= self.training[0] - slack) & (points <= self.training[1] + slack)).all():
@@ -201,4 +210,6 @@ class Practice:
         if self.used + len(points) > self.budget:
             raise BudgetExceededError(f"{self.used + len(points)} training simulations asked, {self.budget} allowed")
         self.used += len(points)
-        return self._problem.simulate(points, self._problem.scenarios(rng))
+        scenarios = self._problem.scenarios(rng)
+        self.scene = self._problem.scene(scenarios)
+        return self._problem.simulate(points, scenarios)

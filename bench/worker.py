@@ -83,6 +83,7 @@ def perform(experiment: Experiment, order: Order) -> Outcome:
         training=problem.cube.training,
         budget=order.budget,
         lengths=tuple(s.times.size for s in target.fitting.scenarios),
+        scene=problem.scene(target.fitting.scenarios),
     )
     rng = rng_for(experiment.name, order.entry.tuner, target.name, order.seed)
     before = problem.simulated

@@ -51,6 +51,22 @@ Steps = Generator["Array | Ask", Evaluation, "str | None"]
 """A tuner's run. Its return value, if any, is the reason for which it stopped by itself."""
 
 
+class Scene(NamedTuple):
+    """What the experimenter knows of a target's scenario beside its observation.
+
+    Attributes:
+        initial: (K,) initial values that no channel begins with, run by run in the order of their names, SI units.
+        inputs: (T, U) input signals in the order of their names, SI units; the runs follow one another along T.
+    """
+
+    initial: Array
+    inputs: Array
+
+
+NOTHING = Scene(np.empty(0), np.empty((0, 0)))
+"""Nothing is known, or nothing worth telling."""
+
+
 @dataclass(frozen=True)
 class Task:
     """Everything a tuner gets of one target; nothing here leads to its true parameters.
@@ -64,6 +80,7 @@ class Task:
         training: (2, dim) lower and upper corner of the training range, unit cube.
         budget: number of simulations the tuner may use.
         lengths: number of samples of each run; they add up to T.
+        scene: what is known of the scenario beside the observation.
     """
 
     dim: int
@@ -73,6 +90,7 @@ class Task:
     training: Array
     budget: int
     lengths: tuple[int, ...]
+    scene: Scene = NOTHING
 
     def residuals(self, observations: Array) -> Array:
         """Scaled differences simulated - observed, (n, T * C); zero where the target's sample is missing."""
@@ -88,6 +106,7 @@ class Practice(Protocol):
         training: (2, dim) corners of the training range, unit cube.
         scale: (C,) as in `Task`.
         lengths: as in `Task`.
+        scene: as in `Task`, of the scenario in which `simulate` was last called; of any before that.
         used: simulations made so far.
         budget: simulations allowed.
     """
@@ -96,6 +115,7 @@ class Practice(Protocol):
     training: Array
     scale: Array
     lengths: tuple[int, ...]
+    scene: Scene
     used: int
     budget: int
 

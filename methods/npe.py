@@ -9,21 +9,16 @@ autoregressive flow for density estimation, NeurIPS 2017, arXiv 1705.07057. Buil
 
 from __future__ import annotations
 
-import io
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 
 from methods.base import Array, Ask, Practice, Steps, Task, Tuner
-from methods.pair_fit import rehearse
-from methods.pair_inputs import Inputs, weighed_inputs
-from methods.pair_network import reproducible
-
-_READ = ("chosen", "centre", "gain")
+from methods.quiet import Silent, quietly
+from methods.reader import Reader, Reading
+from methods.rehearsal import rehearse
 
 
 @dataclass(eq=False)
@@ -44,6 +39,7 @@ class NPE(Tuner):
         transforms: autoregressive layers of the flow.
         epochs: passes over the training data at most; it stops when the held-out loss no longer falls.
         draws: posterior samples behind the mean.
+        told: as in `methods.tunenet.TuneNet`.
     """
 
     name: ClassVar[str] = "npe"
@@ -60,8 +56,9 @@ class NPE(Tuner):
     transforms: int = 5
     epochs: int = 300
     draws: int = 1000
+    told: bool = True
     _flow: Any = field(default=None, init=False, repr=False)
-    _rows: Inputs | None = field(default=None, init=False, repr=False)
+    _read: Reader | None = field(default=None, init=False, repr=False)
 
     def fit(self, simulator: Practice, rng: np.random.Generator, budget: int) -> None:
         """Train on at most `budget` simulations of the training range.
@@ -70,17 +67,19 @@ class NPE(Tuner):
             ValueError: a budget of less than two scenarios.
         """
         data = rehearse(simulator, rng, budget, self.scenarios, max(self.each, 2 * (simulator.dim + 1)))
-        flat = data.observations.reshape(-1, *data.observations.shape[2:])
-        spoilt = flat + self.noise * flat.std(axis=(0, 1)) * rng.standard_normal(flat.shape)
-        self._rows = weighed_inputs(*data, self.points, self.inputs, self.strictness)
-        rows = np.concatenate([self._rows(seen, data.lengths) for seen in (flat, spoilt)])
-        theta = np.tile(data.parameters.reshape(len(flat), -1), (2, 1))
-        with _quietly(rng):
+        spoilt = data.spoilt(self.noise * data.flat.std(axis=(0, 1)), rng)
+        self._read = read = Reader.learned(data, self._reading())
+        rows = np.concatenate([read.table(some).reshape(-1, read.size) for some in (data, spoilt)])
+        theta = np.tile(data.parameters.reshape(-1, simulator.dim), (2, 1))
+        with quietly(rng):
             from sbi import inference
 
-            trainer = inference.NPE(density_estimator=self._builder(), tracker=_Silent(), show_progress_bars=False)
+            trainer = inference.NPE(density_estimator=self._builder(), tracker=Silent(), show_progress_bars=False)
             trainer.append_simulations(_tensor(theta), _tensor(rows))
             self._flow = trainer.train(max_num_epochs=self.epochs, training_batch_size=min(100, len(rows) // 4))
+
+    def _reading(self) -> Reading:
+        return Reading(self.points, self.inputs, self.strictness, told=self.told)
 
     def _builder(self) -> Callable[[Any, Any], Any]:
         from sbi.neural_nets import posterior_nn
@@ -92,10 +91,10 @@ class NPE(Tuner):
 
     def state(self) -> dict[str, Array]:
         """The flow's tensors and what it reads, by name; empty before `fit`."""
-        if self._rows is None:
+        if self._read is None:
             return {}
         tensors = {f"flow.{name}": np.array(t.numpy()) for name, t in self._flow.state_dict().items()}
-        return tensors | {f"inputs.{name}": getattr(self._rows, name) for name in _READ}
+        return tensors | self._read.state()
 
     def restore(self, state: dict[str, Array]) -> None:
         """Take back what `state` gave.
@@ -103,18 +102,13 @@ class NPE(Tuner):
         Raises:
             ValueError: arrays of other names or shapes, or numbers that are not finite.
         """
-        rest = dict(state)
-        try:
-            read = [np.array(rest.pop(f"inputs.{name}"), dtype=np.float64) for name in _READ]
-        except KeyError as missing:
-            raise ValueError(f"expected array {missing.args[0]}, found {sorted(state)[:4]}") from None
-        if any(r.ndim != 1 or r.shape != read[0].shape or not r.size for r in read):
-            raise ValueError(f"expected input arrays of one length, found shapes {[r.shape for r in read]}")
-        foreign = [name for name, a in rest.items() if not name.startswith("flow.") or not np.isfinite(a).all()]
-        if foreign:
-            raise ValueError(f"array {foreign[0]}: expected an array of the flow, of finite numbers")
-        self._flow = self._rebuilt({name.removeprefix("flow."): a for name, a in rest.items()}, read[0].size)
-        self._rows = Inputs(self.points, False, *read)
+        flow = {name: array for name, array in state.items() if name.startswith("flow.")}
+        read, foreign = Reader.restored({n: a for n, a in state.items() if n not in flow}, self._reading())
+        broken = [name for name, array in flow.items() if not np.isfinite(array).all()]
+        if foreign or broken:
+            raise ValueError(f"array {[*foreign, *broken][0]}: expected an array of the flow, of finite numbers")
+        self._flow = self._rebuilt({name.removeprefix("flow."): a for name, a in flow.items()}, read.size)
+        self._read = read
 
     def _rebuilt(self, arrays: dict[str, Array], inputs: int) -> Any:
         """A flow of the default build with these tensors; its number of parameters is what fits."""
@@ -125,7 +119,7 @@ class NPE(Tuner):
         if not 0 < dim < 1000:
             raise ValueError("expected the arrays of a flow, found others")
         rng = np.random.default_rng(0)
-        with _quietly(rng):
+        with quietly(rng):
             flow = self._builder()(*(_tensor(rng.standard_normal((4, size))) for size in (dim, inputs)))
             try:
                 flow.load_state_dict({name: torch.from_numpy(np.array(a)) for name, a in arrays.items()})
@@ -135,10 +129,10 @@ class NPE(Tuner):
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
         """The posterior's mean, then draws."""
-        if self._rows is None:
+        if self._read is None:
             raise RuntimeError("npe has not been trained; call fit or restore first")
-        row = self._rows(task.observed[None], task.lengths)
-        with _quietly(rng):
+        row = self._read(task.observed[None], task.lengths, task.scene)
+        with quietly(rng):
             drawn = self._flow.sample((max(self.draws, task.budget),), condition=_tensor(row)).detach()[:, 0].numpy()
         drawn = np.clip(np.nan_to_num(drawn.astype(np.float64), nan=0.5), 0.0, 1.0)
         mean = drawn.mean(axis=0)
@@ -152,33 +146,3 @@ def _tensor(array: Array) -> Any:
     import torch
 
     return torch.as_tensor(array, dtype=torch.float32)
-
-
-@contextmanager
-def _quietly(rng: np.random.Generator) -> Iterator[None]:
-    """Global generators seeded from `rng` inside and as they were outside; no gradients kept, no warnings."""
-    import torch
-
-    legacy = np.random.get_state()  # noqa: NPY002 - sbi may draw from it
-    with (
-        torch.random.fork_rng(devices=[]),
-        reproducible("cpu"),
-        warnings.catch_warnings(),
-        redirect_stdout(io.StringIO()),  # sbi prints
-    ):
-        warnings.simplefilter("ignore")
-        torch.manual_seed(int(rng.integers(2**62)))
-        np.random.seed(int(rng.integers(2**31)))  # noqa: NPY002
-        try:
-            yield
-        finally:
-            np.random.set_state(legacy)  # noqa: NPY002
-
-
-class _Silent:
-    """A tracker of training that keeps nothing; the package's own writes into the working folder."""
-
-    log_dir = None
-
-    def __getattr__(self, _: str) -> Callable[..., None]:
-        return lambda *_args, **_options: None

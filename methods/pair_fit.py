@@ -1,55 +1,19 @@
-"""Training data and the trained object that TuneNet and its regressor share."""
+"""The trained object that TuneNet and its regressor share."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
 from methods.base import Array, Practice, Task, Tuner
-from methods.pair_inputs import Inputs, raw_inputs, roughness, weighed_inputs
+from methods.pair_inputs import roughness
 from methods.pair_network import Design, Watched, estimate, shapes, train
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What networks read of an observation, and the noise that they prepare for.
-
-    Attributes:
-        points: points to which each run is resampled; L in Algorithm 1.
-        inputs: inputs kept of those an observation offers.
-        strictness: see `methods.pair_inputs.weighed_inputs`.
-        noise: sensor noise that a second network is trained with, 1 sigma, in units of each channel's standard
-            deviation in training; 0 for no second network.
-        raw: the resampled series in SI units as they are, as published; `inputs` and `strictness` say nothing then.
-    """
-
-    points: int = 400
-    inputs: int = 400
-    strictness: float = 1000.0
-    noise: float = 0.01
-    raw: bool = False
-
-
-class Rehearsal(NamedTuple):
-    """Training simulations: several in each scenario.
-
-    Attributes:
-        parameters: (scenarios, each, dim), unit cube.
-        observations: (scenarios, each, T, C), SI units.
-        lengths: samples of each run.
-    """
-
-    parameters: Array
-    observations: Array
-    lengths: tuple[int, ...]
-
-    def spoilt(self, noise: Array, rng: np.random.Generator) -> Rehearsal:
-        """The same with white noise of standard deviations (C,) added."""
-        return self._replace(observations=self.observations + noise * rng.standard_normal(self.observations.shape))
+from methods.reader import Reader, Reading
+from methods.rehearsal import Rehearsal, rehearse
 
 
 @dataclass(frozen=True)
@@ -65,40 +29,18 @@ class Look:
     epoch: Callable[[int, int, float, float], None]
 
 
-def rehearse(simulator: Practice, rng: np.random.Generator, budget: int, scenarios: int, each: int) -> Rehearsal:
-    """Simulate `each` uniformly drawn points in each of `scenarios` scenarios, fewer scenarios if the budget is small.
-
-    Raises:
-        ValueError: the budget does not last for two scenarios.
-    """
-    count = min(scenarios, budget // each)
-    if count < 2:
-        raise ValueError(f"{budget} training simulations are fewer than two scenarios of {each} need")
-    parameters, observations = [], []
-    for _ in range(count):
-        points = simulator.sample(rng, each)
-        seen = simulator.simulate(rng, points)
-        whole = np.isfinite(seen).all(axis=(1, 2))
-        if whole.all():
-            parameters.append(points)
-            observations.append(seen)
-    if len(parameters) < 2:
-        raise ValueError(f"of {count} training scenarios, {len(parameters)} could be simulated; at least 2 are needed")
-    return Rehearsal(np.array(parameters), np.array(observations), tuple(simulator.lengths))
-
-
 @dataclass(frozen=True)
 class Fitted:
     """A trained network together with what it reads.
 
     Attributes:
         design: how the network is built.
-        rows: observations to input rows.
+        read: observations and scenes to input rows.
         weights: the network's arrays by name.
     """
 
     design: Design
-    rows: Inputs
+    read: Reader
     weights: dict[str, Array]
 
     @classmethod
@@ -106,19 +48,11 @@ class Fitted:
         cls, design: Design, data: Rehearsal, rng: np.random.Generator, reading: Reading, alone: bool, look: Look | None
     ) -> Fitted:
         """Choose the inputs and train the network on them; `alone` as in `pair_network.train`."""
-        parameters, observations, lengths = data
-        flat = observations.reshape(-1, *observations.shape[2:])
-        if reading.raw:
-            rows = raw_inputs(flat, lengths, reading.points)
-        else:
-            rows = weighed_inputs(parameters, observations, lengths, reading.points, reading.inputs, reading.strictness)
-
-        def pairs(some: Rehearsal) -> tuple[Array, Array]:
-            every = some.observations.reshape(-1, *some.observations.shape[2:])
-            return rows(every, lengths).reshape(*some.parameters.shape[:2], -1), some.parameters
-
-        seen = None if look is None else Watched(*pairs(look.held_out), look.epoch)
-        return cls(design, rows, train(*pairs(data), design, rng, alone, seen))
+        read = Reader.learned(data, reading)
+        seen = None
+        if look is not None:
+            seen = Watched(read.table(look.held_out), look.held_out.parameters, look.epoch)
+        return cls(design, read, train(read.table(data), data.parameters, design, rng, alone, seen))
 
     def difference(self, proposed: Array, target: Array) -> Array:
         """h(proposed, target) of input rows; see `pair_network.estimate`."""
@@ -126,12 +60,7 @@ class Fitted:
 
     def state(self) -> dict[str, Array]:
         """Everything as plain arrays."""
-        return {
-            "inputs.chosen": self.rows.chosen,
-            "inputs.centre": self.rows.centre,
-            "inputs.gain": self.rows.gain,
-            **self.weights,
-        }
+        return self.read.state() | self.weights
 
     @classmethod
     def restored(cls, state: dict[str, Array], design: Design, reading: Reading) -> Fitted:
@@ -140,19 +69,14 @@ class Fitted:
         Raises:
             ValueError: arrays of other names or shapes, or numbers that are not finite.
         """
-        arrays = {name: np.array(array, dtype=np.float64) for name, array in state.items()}
-        expected: dict[str, tuple[int, ...]] = dict.fromkeys(("inputs.chosen", "inputs.centre", "inputs.gain"), ())
-        chosen, bias = arrays.get("inputs.chosen"), arrays.get("output.bias")
-        size = chosen.size if chosen is not None else 0
-        expected = dict.fromkeys(expected, (size,)) | shapes(size, design.width, bias.size if bias is not None else 0)
+        read, arrays = Reader.restored(state, reading)
+        expected = shapes(read.size, design.width, arrays.get("output.bias", np.empty(0)).size)
         if arrays.keys() != expected.keys():
             raise ValueError(f"expected arrays {sorted(expected)}, found {sorted(arrays)}")
         for name, shape in expected.items():
-            if arrays[name].shape != shape or not size or not np.isfinite(arrays[name]).all():
+            if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
                 raise ValueError(f"array {name}: expected finite numbers of shape {shape}, found {arrays[name].shape}")
-        weights = {name: arrays[name] for name in shapes(size, design.width, 1)}
-        scaling = (arrays[f"inputs.{name}"] for name in ("chosen", "centre", "gain"))
-        return cls(design, Inputs(reading.points, reading.raw, *scaling), weights)
+        return cls(design, read, {name: arrays[name] for name in expected})
 
 
 @dataclass(frozen=True)
@@ -184,9 +108,8 @@ class Prepared:
     ) -> Prepared:
         """Train both networks on the same simulations; only one where `reading.noise` is 0."""
         clean = Fitted.train(design, data, rng, reading, alone, look and look("clean"))
-        flat = data.observations.reshape(-1, *data.observations.shape[2:])
-        spread = flat.std(axis=(0, 1))
-        limit = 2.0 * roughness(flat, data.lengths).max(axis=0) + reading.noise / 50.0 * spread
+        spread = data.flat.std(axis=(0, 1))
+        limit = 2.0 * roughness(data.flat, data.lengths).max(axis=0) + reading.noise / 50.0 * spread
         if not reading.noise:
             return cls(clean, clean, limit)
         spoilt = data.spoilt(reading.noise * spread, rng)
@@ -203,12 +126,13 @@ class Prepared:
     def estimator(self, task: Task) -> Callable[[Array], Array]:
         """From one simulation (1, T, C) to h(simulation, target), (dim,); NaN where the simulation failed."""
         network, missing = self.suited(task), np.isnan(task.observed)
-        target = network.rows(task.observed[None], task.lengths, missing)[0]
+        target = network.read(task.observed[None], task.lengths, task.scene, missing)[0]
 
         def difference(observations: Array) -> Array:
             if not np.isfinite(observations).all():  # nothing was seen
                 return np.full(task.dim, np.nan)
-            return network.difference(network.rows(observations, task.lengths, missing)[0], target)
+            proposed = network.read(observations, task.lengths, task.scene, missing)[0]
+            return network.difference(proposed, target)
 
         return difference
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from methods.base import Array
+from methods.rehearsal import Rehearsal
 
 
 def resample(observations: Array, lengths: tuple[int, ...], points: int) -> Array:
@@ -105,20 +106,18 @@ class Inputs:
     centre: Array
     gain: Array
 
-    def __call__(self, observations: Array, lengths: tuple[int, ...], missing: Array | None = None) -> Array:
+    def __call__(self, observations: Array, lengths: tuple[int, ...]) -> Array:
         """Input rows (n, D) of observations (n, T, C).
 
         Args:
             observations: SI units; NaN where a sample is missing.
             lengths: samples of each run.
-            missing: (T, C) samples to be treated as missing as well: those of the target, so that a simulation of the
-                true parameters gives the target's own row.
 
         Raises:
             ValueError: the observation yields fewer numbers than the network was trained on.
         """
-        if missing is not None and missing.any():
-            observations = np.where(missing, np.nan, observations)
+        if not self.chosen.size:
+            return np.empty((len(observations), 0))
         rows = _rows(observations, lengths, self.points, self.plain)
         chosen = self.chosen.astype(np.intp)
         if chosen.max() >= rows.shape[1]:
@@ -141,9 +140,7 @@ def raw_inputs(observations: Array, lengths: tuple[int, ...], points: int) -> In
     return Inputs(points, True, np.arange(size, dtype=np.float64), np.zeros(size), np.ones(size))
 
 
-def weighed_inputs(
-    parameters: Array, observations: Array, lengths: tuple[int, ...], points: int, most: int, strictness: float
-) -> Inputs:
+def weighed_inputs(data: Rehearsal, points: int, most: int, strictness: float) -> Inputs:
     """Choose and scale inputs by how faithfully they follow the parameters.
 
     Within each scenario every candidate number is fitted as a linear function of the parameters. What the fit leaves
@@ -155,21 +152,17 @@ def weighed_inputs(
     (b / (b + strictness * w))^2, with b and w its standard deviations between and within scenarios.
 
     Args:
-        parameters: (scenarios, m, dim), unit cube.
-        observations: (scenarios, m, T, C).
-        lengths: samples of each run.
+        data: the training simulations.
         points: points to which each run is resampled.
-        most: number of inputs to keep, those of the largest weight.
+        most: number of inputs to keep, those of the largest weight; 0 for none.
         strictness: how heavily what is left over counts.
 
     Returns:
         The inputs; their mean square over the training data is 1.
     """
-    scenarios, each = parameters.shape[:2]
-    flat = observations.reshape(-1, *observations.shape[2:])
-    rows = _rows(flat, lengths, points, plain=False)
-    grouped = rows.reshape(scenarios, each, -1)
-    spread, explained, left = _followed(parameters, grouped)
+    rows = _rows(data.flat, data.lengths, points, plain=False)
+    grouped = rows.reshape(*data.parameters.shape[:2], -1)
+    spread, explained, left = _followed(data.parameters, grouped)
     deviation, between = rows.std(axis=0), grouped.mean(axis=1).std(axis=0)
     floor = 1e-9 * max(float(deviation.max()), 1e-300)
     faith = explained / (explained + strictness * left + floor)
@@ -178,13 +171,13 @@ def weighed_inputs(
     context = (between / (between + strictness * spread + floor)) ** 2
     kept = np.sort(np.argsort(-np.maximum(following, context), kind="stable")[:most])
     gain = np.maximum(_per(following[kept], spread[kept]), _per(context[kept], deviation[kept]))
-    size = np.sqrt(np.mean((gain * deviation[kept]) ** 2))
+    size = np.sqrt(np.mean((gain * deviation[kept]) ** 2)) if most else 1.0
     return Inputs(points, False, kept.astype(np.float64), rows[:, kept].mean(axis=0), gain / size if size > 0 else gain)
 
 
 def _per(weight: Array, deviation: Array) -> Array:
     """Weight per unit of deviation, bounded where there is hardly any."""
-    scaled: Array = weight / (deviation + 1e-3 * deviation.max() + 1e-300)
+    scaled: Array = weight / (deviation + 1e-3 * deviation.max(initial=0.0) + 1e-300)
     return scaled
 
 

@@ -8,8 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from methods.base import Ask, Steps, Task
-from methods.pair_fit import PairTuner, Reading
+from methods.pair_fit import PairTuner
 from methods.pair_network import PUBLISHED, Design
+from methods.reader import Reading
 
 
 @dataclass(eq=False)
@@ -29,6 +30,7 @@ class Regressor(PairTuner):
         epochs: passes over the training data.
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
+        told: read what is known of the scenario too, where scenarios differ in it (`methods.circumstances`).
     """
 
     name: ClassVar[str] = "regressor"
@@ -44,6 +46,7 @@ class Regressor(PairTuner):
     epochs: int = 100
     rate: float = 3e-3
     weight_decay: float = 1e-6
+    told: bool = True
 
     def design(self) -> Design:
         """How the network is built and trained."""
@@ -55,7 +58,7 @@ class Regressor(PairTuner):
         """What it reads."""
         if self.published:
             return Reading(self.points, noise=0.0, raw=True)
-        return Reading(self.points, self.inputs, self.strictness, self.noise)
+        return Reading(self.points, self.inputs, self.strictness, self.noise, told=self.told)
 
     def layout(self, dim: int) -> tuple[int, int]:
         """Training scenarios at most, and simulations in each."""
@@ -64,7 +67,7 @@ class Regressor(PairTuner):
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002 (the contract's signature)
         """One estimate from the target, simulated once."""
         network = self.fitted().suited(task)
-        target = network.rows(task.observed[None], task.lengths)[0]
+        target = network.read(task.observed[None], task.lengths, task.scene)[0]
         guess = np.clip(network.difference(np.zeros_like(target), target), 0.0, 1.0)
         yield Ask(guess, recommend=guess)
         return "it estimates once"

@@ -9,8 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from methods.base import Array, Ask, Steps, Task
-from methods.pair_fit import PairTuner, Reading
+from methods.pair_fit import PairTuner
 from methods.pair_network import PUBLISHED, Design
+from methods.reader import Reading
 
 
 @dataclass(eq=False)
@@ -35,6 +36,7 @@ class TuneNet(PairTuner):
         epochs: passes over the training data.
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
+        told: read what is known of the scenario too, where scenarios differ in it (`methods.circumstances`).
         broyden: solve h = 0; without it each step is that of Algorithm 1.
     """
 
@@ -49,6 +51,7 @@ class TuneNet(PairTuner):
     epochs: int = 300
     rate: float = 3e-3
     weight_decay: float = 1e-5
+    told: bool = True
     broyden: bool = True
 
     def design(self) -> Design:
@@ -57,7 +60,7 @@ class TuneNet(PairTuner):
 
     def reading(self) -> Reading:
         """What it reads."""
-        return Reading(self.points, self.inputs, self.strictness, self.noise)
+        return Reading(self.points, self.inputs, self.strictness, self.noise, told=self.told)
 
     def layout(self, dim: int) -> tuple[int, int]:
         """Training scenarios at most, and simulations in each."""

@@ -9,15 +9,14 @@ are the `botorch` package's, which is an optional extra: pip install simgap[turb
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from methods.base import Array, Steps, Task, Tuner
-from methods.pair_network import reproducible
+from methods.quiet import quietly
 
 
 @dataclass(eq=False)
@@ -83,8 +82,8 @@ class TuRBO(Tuner):
             return anywhere
         values = np.where(finite, losses, losses[finite].max())
         scale = float(values.std()) or 1.0
-        with _quietly(rng):
-            from botorch.generation import MaxPosteriorSampling
+        with quietly(rng):
+            from botorch.generation.sampling import MaxPosteriorSampling
 
             model = _process(points, -(values - values.mean()) / scale)
             sides = np.asarray(model.covar_module.base_kernel.lengthscale.detach().numpy()).ravel()
@@ -117,7 +116,7 @@ def _spread(rng: np.random.Generator, n: int, dim: int) -> Array:
 def _process(points: Array, values: Array) -> Any:
     """A Gaussian process with a scaled Matérn-5/2 kernel, fitted by its marginal likelihood."""
     import torch
-    from botorch.exceptions import ModelFittingError
+    from botorch.exceptions.errors import ModelFittingError
     from botorch.fit import fit_gpytorch_mll
     from botorch.models import SingleTaskGP
     from gpytorch.constraints import Interval
@@ -132,14 +131,3 @@ def _process(points: Array, values: Array) -> Any:
     with suppress(ModelFittingError):  # the kernel as it stands serves as well
         fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
     return model.eval()
-
-
-@contextmanager
-def _quietly(rng: np.random.Generator) -> Iterator[None]:
-    """Torch's global generator seeded from `rng` inside and as it was outside; no warnings."""
-    import torch
-
-    with torch.random.fork_rng(devices=[]), reproducible("cpu"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch.manual_seed(int(rng.integers(2**62)))
-        yield

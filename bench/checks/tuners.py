@@ -14,7 +14,7 @@ import numpy as np
 from bench.checks.base import CheckError, global_random_state_untouched, require, same_bits
 from bench.checks.processes import elsewhere
 from bench.drive import Trace, drive
-from methods.base import Array, Ask, BudgetExceededError, Evaluation, Steps, Task, Tuner
+from methods.base import NOTHING, Array, Ask, BudgetExceededError, Evaluation, Steps, Task, Tuner
 
 _TIMES = np.linspace(0.0, 3.0, 40)
 _FIT_BUDGET = 240
@@ -36,6 +36,7 @@ class _Practice:
     def __init__(self, dim: int) -> None:
         self.dim, self.scale = dim, np.ones(2)
         self.lengths: tuple[int, ...] = (_TIMES.size,)
+        self.scene = NOTHING
         self.training = np.array([[0.25] * dim, [0.75] * dim])
         self.used, self.budget = 0, _FIT_BUDGET
 

@@ -20,9 +20,11 @@ from bench.experiment import load
 from bench.figures import save
 from bench.problem import Problem
 from bench.seeds import rng_for
-from methods.base import Ask, Task
-from methods.pair_fit import Fitted, PairTuner, Prepared, Reading, rehearse
+from methods.base import NOTHING, Ask, Task
+from methods.pair_fit import Fitted, PairTuner, Prepared
 from methods.pair_network import PUBLISHED, Design
+from methods.reader import Reading
+from methods.rehearsal import rehearse
 from methods.tunenet import SETTLED, Search, TuneNet, TuneNetPublished
 
 AT = (1, 2, 3, 5, 10)
@@ -247,7 +249,7 @@ def differences_figure(study, kept):
     inside = ((points > low) & (points < high)).all(axis=1)
     for ax, (key, title) in zip(axes, names.items(), strict=True):
         network = kept[key].fitted().clean
-        pairs = [network.rows(seen[:, i], (seen.shape[2],)) for i in (0, 1)]
+        pairs = [network.read(seen[:, i], (seen.shape[2],), NOTHING) for i in (0, 1)]
         h, true = network.difference(*pairs)[:, 0], points[:, 1] - points[:, 0]
         ax.plot([-1, 1], [-1, 1], color="#999999", lw=1)
         ax.plot(true[~inside], h[~inside], "x", color="#D55E00", ms=4, label="one of them outside the training range")

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from bench.drive import drive
-from methods.base import Array, BudgetExceededError, Task
+from methods.base import NOTHING, Array, BudgetExceededError, Task
 from methods.pair_inputs import resample, roughness, weighed_inputs
 from methods.pair_network import PUBLISHED, Design, estimate, train
+from methods.rehearsal import Rehearsal
 from methods.tunenet import Search, TuneNet, TuneNetPublished
 
 TRAINING = {1: np.array([[0.3], [0.7]]), 2: np.array([[0.3, 0.2], [0.7, 0.6]])}
@@ -28,12 +29,17 @@ class Toy:
         self.dim, self.budget, self.used, self.runs = dim, budget, 0, runs
         self.training, self.scale, self.lengths = TRAINING[dim], np.ones(2), (60,) * runs
         self.calls: list[int] = []
+        self.scene = self.known(self.scenario(np.random.default_rng(0)))
 
     def sample(self, rng, n):
         return rng.uniform(*self.training, size=(n, self.dim))
 
     def scenario(self, rng):
         return rng.uniform(1.0, 2.0, size=self.runs)
+
+    def known(self, scenario):
+        """What a tuner is told of a scenario."""
+        return NOTHING
 
     def observe(self, points, scenario):
         return np.concatenate([swing(points, amplitude) for amplitude in scenario], axis=1)
@@ -45,7 +51,9 @@ class Toy:
         self.used += len(points)
         if self.used > self.budget:
             raise BudgetExceededError
-        return self.observe(points, self.scenario(rng))
+        scenario = self.scenario(rng)
+        self.scene = self.known(scenario)
+        return self.observe(points, scenario)
 
 
 def run(tuner, toy, seed, wide=False, budget=10, spoil=None):
@@ -56,7 +64,7 @@ def run(tuner, toy, seed, wide=False, budget=10, spoil=None):
     observed = toy.observe(truth[None], scenario)[0]
     if spoil is not None:
         spoil(observed)
-    task = Task(toy.dim, start, observed, toy.scale, toy.training, budget, toy.lengths)
+    task = Task(toy.dim, start, observed, toy.scale, toy.training, budget, toy.lengths, toy.known(scenario))
 
     def evaluate(points):
         seen = toy.observe(points, scenario)
@@ -148,7 +156,7 @@ def test_roughness_is_the_noise_and_sees_no_motion():
 
 def test_same_observation_means_no_difference(one):
     fitted = one._fitted.clean
-    seen = fitted.rows(Toy().simulate(np.random.default_rng(0), np.full((3, 1), 0.5)), (60,))
+    seen = fitted.read.seen(Toy().simulate(np.random.default_rng(0), np.full((3, 1), 0.5)), (60,))
     assert (fitted.difference(seen, seen) == 0.0).all()
     assert (fitted.difference(seen[0], seen[0] + 1.0) == -fitted.difference(seen[0] + 1.0, seen[0])).all()
 
@@ -174,13 +182,13 @@ def test_published_network_has_the_published_size():
     }
     assert sum(w.size for w in weights.values()) == 27_777
     assert toy.calls == [2] * 20
-    assert tuner._fitted.clean.rows(toy.observe(np.ones((1, 1)), [1.0]), (400,))[0, 0] == 1.0  # raw metres
+    assert tuner._fitted.clean.read.seen(toy.observe(np.ones((1, 1)), [1.0]), (400,))[0, 0] == 1.0  # raw metres
 
 
 def test_published_is_clamped_at_zero_only_and_does_not_settle():
     tuner = TuneNetPublished(points=60)
     tuner.fit(Toy(), np.random.default_rng(0), 400)
-    seen = tuner._fitted.clean.rows(Toy().observe(np.array([[0.5]]), [1.5]), (60,))[0]
+    seen = tuner._fitted.clean.read.seen(Toy().observe(np.array([[0.5]]), [1.5]), (60,))[0]
     assert np.abs(tuner._fitted.clean.difference(seen, seen)).max() > 1e-6
     steps = tuner.tune(Task(1, np.zeros(1), swing(np.ones((1, 1)), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)), None)
     next(steps)
@@ -239,7 +247,7 @@ def test_state_survives_a_round_trip_and_is_checked(one, tmp_path):
         with pytest.raises(ValueError, match="expected"):
             copy.restore(broken)
     with pytest.raises(ValueError, match="train on"):
-        one._fitted.clean.rows(np.zeros((1, 60, 1)), (60,))
+        one._fitted.clean.read.seen(np.zeros((1, 60, 1)), (60,))
     with pytest.raises(RuntimeError, match="not been trained"):
         next(TuneNet().tune(Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 1, (1,)), None))
 
@@ -278,7 +286,8 @@ def test_inputs_prefer_what_follows_the_parameters():
     circumstance = np.broadcast_to(rng.uniform(size=(20, 1, 1)), (20, 8, 1))
     observations = np.stack([parameters, jumping, circumstance], axis=-1)  # one channel each, a single sample
     observations = np.repeat(observations, 2, axis=2)
-    inputs = weighed_inputs(parameters, observations, (2,), 2, most=3 * 6, strictness=1000.0)
+    data = Rehearsal(parameters, observations, (2,), (NOTHING,) * 20)
+    inputs = weighed_inputs(data, 2, most=3 * 6, strictness=1000.0)
     gain = {int(number): gain for number, gain in zip(inputs.chosen, inputs.gain, strict=True)}
     assert gain[0] * np.std(parameters) > 1e3 * gain[6] * np.std(jumping)
     assert gain[12] * np.std(circumstance) > 1e3 * gain[6] * np.std(jumping)

@@ -1,0 +1,58 @@
+"""Training data of learned tuners: several simulations in each of many scenarios."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from methods.base import Array, Practice, Scene
+
+
+class Rehearsal(NamedTuple):
+    """Training simulations: several in each scenario.
+
+    Attributes:
+        parameters: (scenarios, each, dim), unit cube.
+        observations: (scenarios, each, T, C), SI units.
+        lengths: samples of each run.
+        scenes: what is known of each scenario.
+    """
+
+    parameters: Array
+    observations: Array
+    lengths: tuple[int, ...]
+    scenes: tuple[Scene, ...]
+
+    @property
+    def flat(self) -> Array:
+        """All observations (scenarios * each, T, C), one after another."""
+        return self.observations.reshape(-1, *self.observations.shape[2:])
+
+    def spoilt(self, noise: Array, rng: np.random.Generator) -> Rehearsal:
+        """The same with white noise of standard deviations (C,) added."""
+        return self._replace(observations=self.observations + noise * rng.standard_normal(self.observations.shape))
+
+
+def rehearse(simulator: Practice, rng: np.random.Generator, budget: int, scenarios: int, each: int) -> Rehearsal:
+    """Simulate `each` uniformly drawn points in each of `scenarios` scenarios, fewer scenarios if the budget is small.
+
+    Raises:
+        ValueError: the budget does not last for two scenarios.
+    """
+    count = min(scenarios, budget // each)
+    if count < 2:
+        raise ValueError(f"{budget} training simulations are fewer than two scenarios of {each} need")
+    parameters, observations, scenes = [], [], []
+    for _ in range(count):
+        points = simulator.sample(rng, each)
+        seen = simulator.simulate(rng, points)
+        whole = np.isfinite(seen).all(axis=(1, 2))
+        if whole.all():
+            parameters.append(points)
+            observations.append(seen)
+            scenes.append(simulator.scene)
+    if len(parameters) < 2:
+        raise ValueError(f"of {count} training scenarios, {len(parameters)} could be simulated; at least 2 are needed")
+    lengths = tuple(simulator.lengths)
+    return Rehearsal(np.array(parameters), np.array(observations), lengths, tuple(scenes))
