@@ -117,7 +117,8 @@ class Problem:
     def scene(self, scenarios: Sequence[Scenario]) -> Scene:
         """What tuners are told; an initial value that a channel shows is the observation's first sample."""
         shown = {c.name for c in self.channels}
-        initial = [v for s in scenarios for k, v in sorted(s.initial.items()) if k not in shown]
+        known = [{**{k: v for k, v in s.initial.items() if k not in shown}, **s.constants} for s in scenarios]
+        initial = [v for numbers in known for _, v in sorted(numbers.items())]
         inputs = [np.array([v for _, v in sorted(s.inputs.items())]).reshape(-1, s.times.size).T for s in scenarios]
         return Scene(np.array(initial, dtype=np.float64), np.concatenate(inputs))
 

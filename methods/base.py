@@ -55,7 +55,8 @@ class Scene(NamedTuple):
     """What the experimenter knows of a target's scenario beside its observation.
 
     Attributes:
-        initial: (K,) initial values that no channel begins with, run by run in the order of their names, SI units.
+        initial: (K,) initial values that no channel begins with, and constants of the run, run by run in the order of
+            their names, SI units.
         inputs: (T, U) input signals in the order of their names, SI units; the runs follow one another along T.
     """
 

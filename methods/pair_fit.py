@@ -11,7 +11,7 @@ import numpy as np
 
 from methods.base import Array, Practice, Task, Tuner
 from methods.pair_inputs import roughness
-from methods.pair_network import Design, Watched, estimate, shapes, train
+from methods.pair_network import Design, Sides, Watched, estimate, shapes, train
 from methods.reader import Reader, Reading
 from methods.rehearsal import Rehearsal, rehearse
 
@@ -35,13 +35,15 @@ class Fitted:
 
     Attributes:
         design: how the network is built.
-        read: observations and scenes to input rows.
+        read: observations and scenes to input rows, on the target's side.
         weights: the network's arrays by name.
+        proposed: the same on the proposed side; the same object where both sides read the same.
     """
 
     design: Design
     read: Reader
     weights: dict[str, Array]
+    proposed: Reader
 
     @classmethod
     def train(
@@ -49,10 +51,12 @@ class Fitted:
     ) -> Fitted:
         """Choose the inputs and train the network on them; `alone` as in `pair_network.train`."""
         read = Reader.learned(data, reading)
+        proposed = Reader.learned(data.pure, reading.proposed) if reading.proposed else read
         seen = None
         if look is not None:
-            seen = Watched(read.table(look.held_out), look.held_out.parameters, look.epoch)
-        return cls(design, read, train(read.table(data), data.parameters, design, rng, alone, seen))
+            seen = Watched(_sides(proposed, read, look.held_out), look.held_out.parameters, look.epoch)
+        weights = train(_sides(proposed, read, data), data.parameters, design, rng, alone, seen)
+        return cls(design, read, weights, proposed)
 
     def difference(self, proposed: Array, target: Array) -> Array:
         """h(proposed, target) of input rows; see `pair_network.estimate`."""
@@ -60,7 +64,8 @@ class Fitted:
 
     def state(self) -> dict[str, Array]:
         """Everything as plain arrays."""
-        return self.read.state() | self.weights
+        own = {} if self.proposed is self.read else {f"own-{k}": v for k, v in self.proposed.state().items()}
+        return own | self.read.state() | self.weights
 
     @classmethod
     def restored(cls, state: dict[str, Array], design: Design, reading: Reading) -> Fitted:
@@ -69,14 +74,24 @@ class Fitted:
         Raises:
             ValueError: arrays of other names or shapes, or numbers that are not finite.
         """
-        read, arrays = Reader.restored(state, reading)
-        expected = shapes(read.size, design.width, arrays.get("output.bias", np.empty(0)).size)
+        own = {name[4:]: array for name, array in state.items() if name.startswith("own-")}
+        common = {name: array for name, array in state.items() if not name.startswith("own-")}
+        read, arrays = Reader.restored(common, reading)
+        proposed = Reader.restored(own, reading.proposed)[0] if reading.proposed else read
+        dim = arrays.get("output.bias", np.empty(0)).size
+        expected = shapes((proposed.size, read.size), design.width, dim)
         if arrays.keys() != expected.keys():
             raise ValueError(f"expected arrays {sorted(expected)}, found {sorted(arrays)}")
         for name, shape in expected.items():
             if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
                 raise ValueError(f"array {name}: expected finite numbers of shape {shape}, found {arrays[name].shape}")
-        return cls(design, read, {name: arrays[name] for name in expected})
+        return cls(design, read, {name: arrays[name] for name in expected}, proposed)
+
+
+def _sides(proposed: Reader, target: Reader, data: Rehearsal) -> Sides:
+    """Input rows of both sides; a side of its own sees simulations, which no sensor spoils."""
+    seen = target.table(data)
+    return Sides(seen if proposed is target else proposed.table(data.pure), seen)
 
 
 @dataclass(frozen=True)
@@ -131,7 +146,8 @@ class Prepared:
         def difference(observations: Array) -> Array:
             if not np.isfinite(observations).all():  # nothing was seen
                 return np.full(task.dim, np.nan)
-            proposed = network.read(observations, task.lengths, task.scene, missing)[0]
+            hidden = missing if network.proposed is network.read else None
+            proposed = network.proposed(observations, task.lengths, task.scene, hidden)[0]
             return network.difference(proposed, target)
 
         return difference

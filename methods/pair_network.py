@@ -67,9 +67,9 @@ PUBLISHED = Design(
 )
 
 
-def shapes(inputs: int, width: int, dim: int) -> dict[str, tuple[int, ...]]:
-    """Shape of every weight array by name, in the order of the network."""
-    sizes = ((inputs, width), (inputs, width), (2 * width, width), (width, dim))
+def shapes(inputs: tuple[int, int], width: int, dim: int) -> dict[str, tuple[int, ...]]:
+    """Shape of every weight array by name, in the order of the network; inputs of the proposed and the target side."""
+    sizes = ((inputs[0], width), (inputs[1], width), (2 * width, width), (width, dim))
     named: dict[str, tuple[int, ...]] = {}
     for layer, (fan_in, fan_out) in zip(LAYERS, sizes, strict=True):
         named[f"{layer}.weight"], named[f"{layer}.bias"] = (fan_in, fan_out), (fan_out,)
@@ -83,7 +83,7 @@ def estimate(weights: dict[str, Array], design: Design, proposed: Array, target:
         weights: as in `shapes`.
         design: how the network is built.
         proposed: (n, D) input rows of the proposed simulations, or (D,).
-        target: (n, D) or (D,), likewise.
+        target: (n, E) or (E,), likewise; E is D where the network is antisymmetric.
 
     Returns:
         (n, dim) or (dim,), unit cube.
@@ -106,16 +106,28 @@ def estimate(weights: dict[str, Array], design: Design, proposed: Array, target:
     return joined(proposed, target)
 
 
+class Sides(NamedTuple):
+    """Input rows of simulations as either side of the network reads them.
+
+    Attributes:
+        proposed: (scenarios, m, D).
+        target: (scenarios, m, E); the same array where both sides read the same.
+    """
+
+    proposed: Array
+    target: Array
+
+
 class Watched(NamedTuple):
     """Held-out data, and who is told of the losses: epoch from 1, number of epochs, training and held-out loss."""
 
-    rows: Array
+    rows: Sides
     parameters: Array
     epoch: Callable[[int, int, float, float], None]
 
 
 def train(
-    rows: Array,
+    rows: Sides,
     parameters: Array,
     design: Design,
     rng: np.random.Generator,
@@ -125,7 +137,7 @@ def train(
     """Fit the weights by Eq. 1; the same generator gives the same weights bit for bit on the same device.
 
     Args:
-        rows: (scenarios, m, D) input rows.
+        rows: input rows of both sides.
         parameters: (scenarios, m, dim), unit cube.
         design: how the network is built and trained.
         rng: seeds the initial weights and the order; no global random state is touched.
@@ -139,7 +151,8 @@ def train(
 
     with reproducible(device := "cuda" if torch.cuda.is_available() else "cpu"), torch.enable_grad():
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        weights = _initial(rows.shape[-1], parameters.shape[-1], design, generator, device)
+        inputs = (rows.proposed.shape[-1], rows.target.shape[-1])
+        weights = _initial(inputs, parameters.shape[-1], design, generator, device)
         loss = _loss(design, weights, alone)
         _descend(loss, list(weights.values()), _data(rows, parameters, device), design, generator, watched)
         return {name: w.detach().cpu().numpy().astype(np.float64) for name, w in weights.items()}
@@ -162,19 +175,22 @@ def reproducible(device: str) -> Iterator[None]:
         torch.use_deterministic_algorithms(deterministic)
 
 
-def _data(rows: Array, parameters: Array, device: str) -> tuple[Any, Any]:
+def _data(rows: Sides, parameters: Array, device: str) -> tuple[Any, Any, Any]:
     import torch
 
-    x, y = (torch.as_tensor(array, dtype=torch.float32, device=device) for array in (rows, parameters))
-    return x, y
+    x, y = (torch.as_tensor(array, dtype=torch.float32, device=device) for array in (rows.proposed, parameters))
+    same = rows.target is rows.proposed
+    return x, x if same else torch.as_tensor(rows.target, dtype=torch.float32, device=device), y
 
 
-def _initial(inputs: int, dim: int, design: Design, generator: torch.Generator, device: str) -> dict[str, Any]:
+def _initial(
+    inputs: tuple[int, int], dim: int, design: Design, generator: torch.Generator, device: str
+) -> dict[str, Any]:
     """Weights uniform in +- gain / sqrt(inputs); biases too (published), or zero."""
     import torch
 
     weights: dict[str, Any] = {}
-    fan_in = inputs
+    fan_in = 1
     for name, shape in shapes(inputs, design.width, dim).items():
         fan_in = shape[0] if name.endswith("weight") else fan_in
         limit = (1.0 if not design.adam else 1.7 if name.endswith("weight") else 0.0) / fan_in**0.5
@@ -182,8 +198,8 @@ def _initial(inputs: int, dim: int, design: Design, generator: torch.Generator, 
     return weights
 
 
-def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any], Any]:
-    """The data term of Eq. 1 of rows (n, m, D) and parameters (n, m, dim)."""
+def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any, Any], Any]:
+    """The data term of Eq. 1 of both sides' rows (n, m, D), (n, m, E) and parameters (n, m, dim)."""
     import torch
     from torch.nn.functional import softplus
 
@@ -198,14 +214,14 @@ def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any]
         out = unit(both @ w["joined.weight"] + w["joined.bias"]) @ w["output.weight"] + w["output.bias"]
         return torch.tanh(out) if design.bounded else out
 
-    def objective(x: Any, y: Any) -> Any:
+    def objective(x: Any, seen: Any, y: Any) -> Any:
         if alone:
-            b = branch(x, "target")
+            b = branch(seen, "target")
             error = joined(unit(w["proposed.bias"]).expand_as(b), b) - y
             return (error**2).sum(dim=-1).mean()
         # antisymmetric: half of the ordered pairs will do, the other half are mirror images
         one, other = torch.triu_indices(x.shape[1], x.shape[1], offset=1)
-        a, b = branch(x, "proposed"), branch(x, "target")
+        a, b = branch(x, "proposed"), branch(seen, "target")
         h = joined(a[:, one], b[:, other])
         if design.antisymmetric:
             h = (h - joined(a[:, other], b[:, one])) / 2.0
@@ -219,16 +235,16 @@ def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any]
 
 
 def _descend(
-    loss: Callable[[Any, Any], Any],
+    loss: Callable[[Any, Any, Any], Any],
     weights: list[Any],
-    data: tuple[Any, Any],
+    data: tuple[Any, Any, Any],
     design: Design,
     generator: torch.Generator,
     watched: Watched | None,
 ) -> None:
     import torch
 
-    x, y = data
+    x, seen, y = data
     held_out = watched and _data(watched.rows, watched.parameters, x.device)
     kind = torch.optim.Adam if design.adam else torch.optim.SGD
     optimiser: Any = kind(weights, lr=design.rate)
@@ -241,7 +257,7 @@ def _descend(
         for first in range(0, len(x), design.batch):
             batch = order[first : first + design.batch].to(x.device)
             optimiser.zero_grad()
-            error = loss(x[batch], y[batch])
+            error = loss(x[batch], seen[batch], y[batch])
             (error + design.weight_decay * sum((v**2).sum() for v in weights)).backward()  # Eq. 1
             optimiser.step()
             losses.append(error.detach())

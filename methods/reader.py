@@ -27,6 +27,8 @@ class Reading:
             deviation in training; 0 for no second network.
         raw: the resampled series in SI units as they are, as published; the other settings say nothing then.
         told: read what is known of a scenario too, where scenarios differ in it (`methods.circumstances`).
+        channels: the first and the last of the channels that are read, by number; None for all.
+        proposed: what the network's proposed side reads, where that is something else.
     """
 
     points: int = 400
@@ -35,6 +37,15 @@ class Reading:
     noise: float = 0.01
     raw: bool = False
     told: bool = True
+    channels: tuple[int, int] | None = None
+    proposed: Reading | None = None
+
+    def part(self, observations: Array) -> Array:
+        """The channels (..., c) that are read of observations (..., C); the last one if there are too few."""
+        if self.channels is None:
+            return observations
+        first, last = (min(c, observations.shape[-1] - 1) for c in self.channels)
+        return observations[..., first : last + 1]
 
 
 @dataclass(frozen=True)
@@ -42,21 +53,24 @@ class Reader:
     """A map to input rows, chosen and scaled by the training simulations.
 
     Attributes:
+        reading: how it was chosen.
         seen: observations to input rows.
         told: what is known of scenarios to further inputs; None where they were alike in training.
     """
 
+    reading: Reading
     seen: Inputs
     told: Circumstances | None = None
 
     @classmethod
     def learned(cls, data: Rehearsal, reading: Reading) -> Reader:
         """Choose what to read."""
+        data = data._replace(observations=reading.part(data.observations))
         if reading.raw:
-            return cls(raw_inputs(data.flat, data.lengths, reading.points))
+            return cls(reading, raw_inputs(data.flat, data.lengths, reading.points))
         told = Circumstances.learned(data.scenes, data.observations, data.lengths) if reading.told else None
         most = reading.inputs if told is None or not told.driven else 0
-        return cls(weighed_inputs(data, reading.points, most, reading.strictness), told)
+        return cls(reading, weighed_inputs(data, reading.points, most, reading.strictness), told)
 
     @property
     def size(self) -> int:
@@ -80,6 +94,7 @@ class Reader:
         """
         if missing is not None and missing.any():
             observations = np.where(missing, np.nan, observations)
+        observations = self.reading.part(observations)
         rows = self.seen(observations, lengths)
         if self.told is None:
             return rows
@@ -88,7 +103,7 @@ class Reader:
     def table(self, data: Rehearsal) -> Array:
         """Input rows (scenarios, each, D) of training simulations."""
         if self.told is None:
-            return self.seen(data.flat, data.lengths).reshape(*data.parameters.shape[:2], -1)
+            return self.seen(self.reading.part(data.flat), data.lengths).reshape(*data.parameters.shape[:2], -1)
         each = zip(data.observations, data.scenes, strict=True)
         return np.array([self(observations, data.lengths, scene) for observations, scene in each])
 
@@ -120,4 +135,4 @@ class Reader:
             raise ValueError("expected a network that reads something, found one without inputs")
         read = [rest.pop(name) for name in kept]
         told = Circumstances(read[3], read[4], int(read[5])) if read[3:] else None
-        return cls(Inputs(reading.points, reading.raw, read[0], read[1], read[2]), told), rest
+        return cls(reading, Inputs(reading.points, reading.raw, read[0], read[1], read[2]), told), rest

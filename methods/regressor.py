@@ -31,6 +31,7 @@ class Regressor(PairTuner):
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
         told: read what is known of the scenario too, where scenarios differ in it (`methods.circumstances`).
+        channels: first and last channel that is read, by number, where targets do not show the others; None for all.
     """
 
     name: ClassVar[str] = "regressor"
@@ -47,6 +48,7 @@ class Regressor(PairTuner):
     rate: float = 3e-3
     weight_decay: float = 1e-6
     told: bool = True
+    channels: tuple[int, int] | None = None
 
     def design(self) -> Design:
         """How the network is built and trained."""
@@ -58,7 +60,7 @@ class Regressor(PairTuner):
         """What it reads."""
         if self.published:
             return Reading(self.points, noise=0.0, raw=True)
-        return Reading(self.points, self.inputs, self.strictness, self.noise, told=self.told)
+        return Reading(self.points, self.inputs, self.strictness, self.noise, told=self.told, channels=self.channels)
 
     def layout(self, dim: int) -> tuple[int, int]:
         """Training scenarios at most, and simulations in each."""

@@ -17,12 +17,19 @@ class Rehearsal(NamedTuple):
         observations: (scenarios, each, T, C), SI units.
         lengths: samples of each run.
         scenes: what is known of each scenario.
+        unspoilt: the simulations before noise was added; None where none was.
     """
 
     parameters: Array
     observations: Array
     lengths: tuple[int, ...]
     scenes: tuple[Scene, ...]
+    unspoilt: Rehearsal | None = None
+
+    @property
+    def pure(self) -> Rehearsal:
+        """The simulations without noise."""
+        return self if self.unspoilt is None else self.unspoilt
 
     @property
     def flat(self) -> Array:
@@ -31,7 +38,8 @@ class Rehearsal(NamedTuple):
 
     def spoilt(self, noise: Array, rng: np.random.Generator) -> Rehearsal:
         """The same with white noise of standard deviations (C,) added."""
-        return self._replace(observations=self.observations + noise * rng.standard_normal(self.observations.shape))
+        noisy = self.observations + noise * rng.standard_normal(self.observations.shape)
+        return self._replace(observations=noisy, unspoilt=self.pure)
 
 
 def rehearse(simulator: Practice, rng: np.random.Generator, budget: int, scenarios: int, each: int) -> Rehearsal:

@@ -37,6 +37,7 @@ class TuneNet(PairTuner):
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
         told: read what is known of the scenario too, where scenarios differ in it (`methods.circumstances`).
+        channels: first and last channel that is read, by number, where targets do not show the others; None for all.
         broyden: solve h = 0; without it each step is that of Algorithm 1.
     """
 
@@ -52,6 +53,7 @@ class TuneNet(PairTuner):
     rate: float = 3e-3
     weight_decay: float = 1e-5
     told: bool = True
+    channels: tuple[int, int] | None = None
     broyden: bool = True
 
     def design(self) -> Design:
@@ -60,7 +62,7 @@ class TuneNet(PairTuner):
 
     def reading(self) -> Reading:
         """What it reads."""
-        return Reading(self.points, self.inputs, self.strictness, self.noise, told=self.told)
+        return Reading(self.points, self.inputs, self.strictness, self.noise, told=self.told, channels=self.channels)
 
     def layout(self, dim: int) -> tuple[int, int]:
         """Training scenarios at most, and simulations in each."""

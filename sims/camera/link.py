@@ -13,6 +13,7 @@ from sims.camera.spots import Spot
 _PATIENCE = 15
 _ALIKE = (0.65, 1.55)
 _LEAST = 3
+_CHANCE = 0.5
 
 
 @dataclass
@@ -56,8 +57,11 @@ class Path:
 
     @property
     def weight(self) -> float:
-        """How much speaks for it."""
-        return sum(s.agree for s in self.spots)
+        """How much speaks for it: edge, in pixels, that lies on circles beyond what chance lays there.
+
+        Counted in pictures alone, a remnant of shadow that is there all the time would outweigh a ball.
+        """
+        return sum((s.agree - _CHANCE) * s.radius for s in self.spots)
 
 
 def linked(pictures: Sequence[Sequence[Spot]]) -> list[Path]:

@@ -6,7 +6,7 @@ import pytest
 from bench.drive import drive
 from methods.base import NOTHING, Array, BudgetExceededError, Task
 from methods.pair_inputs import resample, roughness, weighed_inputs
-from methods.pair_network import PUBLISHED, Design, estimate, train
+from methods.pair_network import PUBLISHED, Design, Sides, estimate, train
 from methods.rehearsal import Rehearsal
 from methods.tunenet import Search, TuneNet, TuneNetPublished
 
@@ -254,7 +254,7 @@ def test_state_survives_a_round_trip_and_is_checked(one, tmp_path):
 
 def test_weight_decay_is_that_of_equation_1():
     """A step of gradient descent on data alike: w <- w - rate * 2 * lambda * w where the data have no say."""
-    rows, parameters = np.zeros((4, 2, 5)), np.full((4, 2, 1), 0.5)
+    rows, parameters = Sides(*[np.zeros((4, 2, 5))] * 2), np.full((4, 2, 1), 0.5)
     design = {"smooth": False, "antisymmetric": False, "adam": False, "rate": 0.1, "epochs": 1, "batch": 4}
     free, decayed = (
         train(rows, parameters, Design(**design, weight_decay=decay), np.random.default_rng(0)) for decay in (0.0, 0.5)

@@ -1,0 +1,65 @@
+"""TuneNet with another sensor on the target's side."""
+
+import numpy as np
+import pytest
+
+from methods.base import Scene, Task
+from methods.tunenet_vision import TuneNetVision
+from tests.methods.test_tunenet import Toy, errors, run
+
+
+class Filmed(Toy):
+    """The toy's oscillation, and another sensor that shows it magnified, shifted and upside down by chance."""
+
+    def scenario(self, rng):
+        return np.array([rng.uniform(1.0, 2.0), rng.uniform(0.5, 2.0), rng.uniform(-1.0, 1.0)])
+
+    def known(self, scenario):
+        return Scene(scenario[1:], np.empty((60, 0)))
+
+    def observe(self, points, scenario):
+        q = super().observe(points, scenario[:1])[:, :, 0]
+        return np.stack([q, 40.0 - 20.0 * scenario[1] * (q + scenario[2])], axis=2)
+
+
+def hide(observed):
+    observed[:, 0] = np.nan
+
+
+@pytest.fixture(scope="module")
+def tuner():
+    trained = TuneNetVision(scenarios=150, points=60, epochs=150)
+    trained.fit(Filmed(), np.random.default_rng(0), 10_000)
+    return trained
+
+
+def test_error_falls_although_the_target_is_seen_by_another_sensor_only(tuner):
+    fell = errors(tuner, Filmed(), spoil=hide)
+    assert fell[1] < 0.3 * fell[0]
+    assert fell[5] < 0.2 * fell[0]
+
+
+def test_sides_read_their_own_channels(tuner):
+    toy, rng = Filmed(), np.random.default_rng(1)
+    scenario = toy.scenario(rng)
+    target, proposed = (toy.observe(np.array([[value]]), scenario) for value in (0.6, 0.4))
+
+    def estimate(seen, shown):
+        task = Task(1, np.full(1, 0.4), seen[0], toy.scale, toy.training, 9, toy.lengths, toy.known(scenario))
+        return tuner.fitted().estimator(task)(shown)[0]
+
+    blind, deaf = target.copy(), proposed.copy()
+    blind[..., 0], deaf[..., 1] = 7.0, -7.0
+    assert estimate(target, proposed) == pytest.approx(0.2, abs=0.1)
+    assert estimate(blind, deaf) == estimate(target, proposed), "z of the target and v of the simulation say nothing"
+
+
+def test_state_survives_a_round_trip(tuner):
+    again = TuneNetVision(scenarios=150, points=60, epochs=150)
+    again.restore(tuner.state())
+    first, second = (run(t, Filmed(), 3, spoil=hide)[0].recommendations for t in (tuner, again))
+    assert first.tolist() == second.tolist()
+    for name in ("clean.own-inputs.gain", "noisy.own-inputs.centre", "clean.inputs.gain"):
+        lacking = {k: v for k, v in tuner.state().items() if k != name}
+        with pytest.raises(ValueError, match="inputs"):
+            TuneNetVision(scenarios=150, points=60).restore(lacking)
