@@ -159,7 +159,7 @@ def _box(axis: Axes, values: Array, place: int, colour: str) -> None:
 
 
 def examples(dealt: Sequence[Deal], kept: Mapping[str, Any], rows: pd.DataFrame) -> list[tuple[Deal, list[str]]]:
-    """Two shots that a method without an extended simulator missed or nearly missed, and the methods to show."""
+    """A shot as they usually go, one that the untuned simulator missed if it did, and the worst; the methods to show."""
     by = {one.name: one for one in dealt}
     tuned = [m for m in rows["method"].unique() if group_of(m) == "tuned"]
     if not tuned:
@@ -169,7 +169,10 @@ def examples(dealt: Sequence[Deal], kept: Mapping[str, Any], rows: pd.DataFrame)
     wide = rows.pivot(index="shot", columns="method", values="off")[shown].abs().dropna()
     if wide.empty:
         return []
-    typical = (wide[first] - wide[first].median()).abs().idxmin()
+    missed = rows[(rows["method"] == NOMINAL) & (rows["hit"].astype(float) == 0)]["shot"]
+    telling = wide[wide.index.isin(missed)]
+    telling = wide if telling.empty else telling
+    typical = (telling[first] - wide[first].median()).abs().idxmin()
     worst = wide[first].idxmax()
     return [(by[str(name)], shown) for name in dict.fromkeys((typical, worst)) if name in kept]
 
@@ -187,7 +190,7 @@ def _shots(settings: Settings, found: list[tuple[Deal, list[str]]], kept: Mappin
     for axis in axes[-1]:
         axis.set_xlabel("distance [m]")
     axes[0, 0].legend(loc="upper right", fontsize=8, frameon=False)
-    told = "Above a shot as they usually go, below the one that the tuned simulator got most wrong."
+    told = "Above a shot as they usually go (one that the untuned simulator missed, if it did), below the one that the tuned simulator got most wrong."
     figure.suptitle("Planned in the simulator, flown in the world", fontsize=11)
     figure.supxlabel(textwrap.fill(told, 140), fontsize=7.5)
     return figure
