@@ -159,7 +159,7 @@ def _box(axis: Axes, values: Array, place: int, colour: str) -> None:
 
 
 def examples(dealt: Sequence[Deal], kept: Mapping[str, Any], rows: pd.DataFrame) -> list[tuple[Deal, list[str]]]:
-    """A shot as they usually go, one that the untuned simulator missed if it did, and the worst; the methods to show."""
+    """A usual shot, if there is one that the untuned simulator missed, and the worst; and which methods to show."""
     by = {one.name: one for one in dealt}
     tuned = [m for m in rows["method"].unique() if group_of(m) == "tuned"]
     if not tuned:
@@ -190,7 +190,7 @@ def _shots(settings: Settings, found: list[tuple[Deal, list[str]]], kept: Mappin
     for axis in axes[-1]:
         axis.set_xlabel("distance [m]")
     axes[0, 0].legend(loc="upper right", fontsize=8, frameon=False)
-    told = "Above a shot as they usually go (one that the untuned simulator missed, if it did), below the one that the tuned simulator got most wrong."
+    told = "Above a usual shot, of those that the untuned simulator missed if there are any, below the one that the tuned simulator got most wrong."
     figure.suptitle("Planned in the simulator, flown in the world", fontsize=11)
     figure.supxlabel(textwrap.fill(told, 140), fontsize=7.5)
     return figure
