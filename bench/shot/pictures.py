@@ -190,7 +190,7 @@ def _shots(settings: Settings, found: list[tuple[Deal, list[str]]], kept: Mappin
     for axis in axes[-1]:
         axis.set_xlabel("distance [m]")
     axes[0, 0].legend(loc="upper right", fontsize=8, frameon=False)
-    told = "Above a usual shot, of those that the untuned simulator missed if there are any; below the worst of the tuned."
+    told = "Above a usual shot, of those that the untuned simulator missed if any; below the worst of the tuned."
     figure.suptitle("Planned in the simulator, flown in the world", fontsize=11)
     figure.supxlabel(textwrap.fill(told, 140), fontsize=7.5)
     return figure
