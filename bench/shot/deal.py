@@ -1,7 +1,7 @@
 """Draws what each shot is made with, the same for every method, and records the ball's drop.
 
-The recorded drop is what a camera would give: heights of the centre at the sampling rate, with a tracker's noise. It is
-a recording like any other, so that one tracked from a video takes its place.
+The recorded drop is filmed and tracked, or heights of the centre at the sampling rate with noise. Either is a recording
+like any other.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from bench.experiment import Experiment
 from bench.seeds import rng_for
+from bench.shot.filmed import filmed
 from bench.shot.settings import Settings
 from sims.ball.simulator import Ball as BallSimulator
 from sims.recording import Recording, Run
@@ -55,7 +56,7 @@ def deals(experiment: Experiment, settings: Settings) -> list[Deal]:
     return [deal(experiment, settings, kind, i) for i in range(experiment.targets) for kind in settings.balls]
 
 
-def record(experiment: Experiment, dealt: Deal, friction: float, path: Path) -> None:
+def record(experiment: Experiment, dealt: Deal, settings: Settings, path: Path) -> None:
     """Record a drop of the ball on level ground; nothing is done where there is a recording already."""
     if path.exists() and path.with_suffix(".toml").exists():
         return
@@ -66,7 +67,10 @@ def record(experiment: Experiment, dealt: Deal, friction: float, path: Path) -> 
     clear = float(rng.uniform(*height)) if isinstance(height, tuple) else height
     radius, sampling = dealt.ball.radius, experiment.sampling
     times = np.arange(sampling.samples) / sampling.rate
-    z = fly(dealt.ball, Ground(0.0, friction), (0.0, 0.0, radius + clear), times)[:, 2]
+    z = fly(dealt.ball, Ground(0.0, settings.friction), (0.0, 0.0, radius + clear), times)[:, 2]
+    if settings.filmed:
+        filmed(path, z, times, radius, round(settings.filmed), rng)
+        return
     noise = experiment.noise.get("z", 0.0)
     seen = z + noise * rng.standard_normal(z.shape)
     run = Run("1", times, {"z": np.round(seen, 5)}, {}, {}, {}, False)

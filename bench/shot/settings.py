@@ -27,6 +27,8 @@ class Settings:
         planned_friction: what the planner takes for the friction of ball and incline, all balls alike.
         planned_inertia: what it takes for their moment of inertia over mass x radius^2.
         friction: the world's.
+        filmed: height in pixels of the film from which the recorded drop is tracked (`bench.shot.filmed`);
+            0 for heights with the experiment's noise instead of a film.
     """
 
     balls: tuple[str, ...] = tuple(BALLS)
@@ -39,6 +41,7 @@ class Settings:
     planned_friction: float = 0.2
     planned_inertia: float = 0.4
     friction: float = 0.4
+    filmed: float = 0.0
 
 
 def settings_of(experiment: Experiment) -> Settings:

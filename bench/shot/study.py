@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -33,7 +34,8 @@ def begin(experiment: Experiment, plugins: Sequence[str], out: str | None, jobs:
     """
     from bench.identity import fingerprint
 
-    settings_of(experiment)
+    if settings_of(experiment).filmed and not all(map(importlib.util.find_spec, ("av", "cv2"))):
+        raise InputError('films need PyAV and OpenCV: pip install "simgap[vision]"; or set shot.filmed = 0')
     if experiment.simulator != "ball" or experiment.observe != ("z",):
         raise InputError(f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]')
     folder = free_folder(experiment, out)
@@ -105,7 +107,7 @@ def _shoot(
     calls = []
     for one in missing:
         path = folder / RECORDINGS / f"{one.name}.csv"
-        record(experiment, one, settings.friction, path)
+        record(experiment, one, settings, path)
         calls.append((tune.models, (experiment, settings, tune.Known(one.name, path, one.scene, weights))))
         step()
     step = bar("shooting", len(missing))

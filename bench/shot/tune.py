@@ -112,7 +112,7 @@ def _tuned(
 
 
 def _side(recording: Recording, experiment: Experiment) -> Side:
-    """The recorded run as the experiment's simulator sees it."""
+    """The recorded run as the experiment's simulator sees it: let go at rest at time 0, whenever it is seen first."""
     (run,) = recording.runs
     scenario = scenario_of(run, BallSimulator(observe=["z"]), recording.constants)
     radius = experiment.fixed["radius"]
@@ -120,6 +120,8 @@ def _side(recording: Recording, experiment: Experiment) -> Side:
     z = run.channels["z"] + shift
     seen = run.channels["z"][np.isfinite(run.channels["z"])]
     initial = {**scenario.initial, "z": scenario.initial.get("z", float(seen[0])) + shift}
+    fallen = scenario.constants.get("gravity", _constants(recording)["gravity"]) * float(run.times[0])
+    initial = {**initial, "vz": scenario.initial.get("vz", -fallen)}
     moved = Scenario(scenario.times, initial, {}, {**scenario.constants, "radius": radius})
     return Side((moved,), z[:, None])
 

@@ -14,6 +14,10 @@ _PATIENCE = 15
 _ALIKE = (0.65, 1.55)
 _LEAST = 3
 _CHANCE = 0.5
+_MEMORY = 20
+"""Pictures over which the colour of a path is averaged."""
+_TINGE, _SHARE = 25.0, 0.45
+"""Grey levels, and share of the contrast with the background, by which a thing's colour may vary."""
 
 
 @dataclass
@@ -22,6 +26,14 @@ class Path:
 
     frames: list[int] = field(default_factory=list)
     spots: list[Spot] = field(default_factory=list)
+    tone: Array = field(default_factory=lambda: np.zeros(3))
+
+    def add(self, frame: int, spot: Spot) -> None:
+        """Go on with a spot of one more picture."""
+        weight = 1.0 / min(len(self.spots) + 1, _MEMORY)
+        self.tone = (1.0 - weight) * self.tone + weight * np.array(spot.colour)
+        self.frames.append(frame)
+        self.spots.append(spot)
 
     def expected(self, frame: int) -> tuple[float, float, float]:
         """Where it should be if it goes on straight (u, v), and how far from there it may be: a bounce turns it."""
@@ -34,11 +46,25 @@ class Path:
         return last.u + du * wait, last.v + dv * wait, 2 * float(np.hypot(du, dv)) * wait + last.radius + 2
 
     def near(self, frame: int, spot: Spot) -> float:
-        """Distance of a spot from where this should be, as a share of what is allowed; above 1 it is another thing."""
+        """Distance of a spot from where this should be, as a share of what is allowed; infinite for another thing.
+
+        Where a ball meets its shadow and leaves it again, the shadow goes on as the ball went before; its colour tells.
+        """
         u, v, reach = self.expected(frame)
-        if not _ALIKE[0] < spot.radius / self.spots[-1].radius < _ALIKE[1]:
+        off = float(np.hypot(spot.u - u, spot.v - v)) / reach
+        if off > 1 or not _ALIKE[0] < spot.radius / self.spots[-1].radius < _ALIKE[1]:
             return np.inf
-        return float(np.hypot(spot.u - u, spot.v - v)) / reach
+        unlike = self.unlike(spot.colour, spot.contrast)
+        return off + unlike if unlike <= 1 else np.inf
+
+    def unlike(self, colour: Sequence[float], contrast: float) -> float:
+        """How far a colour is from this one's, as a share of what light and compression may do to it."""
+        return float(np.abs(self.tone - colour).max()) / max(_TINGE, _SHARE * contrast, _SHARE * self.contrast)
+
+    @property
+    def contrast(self) -> float:
+        """Of its last picture."""
+        return self.spots[-1].contrast
 
     @property
     def radius(self) -> float:
@@ -74,13 +100,15 @@ def linked(pictures: Sequence[Sequence[Spot]]) -> list[Path]:
         pairs = sorted((p.near(frame, s), i, k) for i, p in enumerate(live) for k, s in enumerate(spots))
         paths, taken = set(), set()
         for distance, i, k in pairs:
-            if distance > 1 or i in paths or k in taken:
+            if not np.isfinite(distance) or i in paths or k in taken:
                 continue
             paths.add(i)
             taken.add(k)
-            live[i].frames.append(frame)
-            live[i].spots.append(spots[k])
-        live += [Path([frame], [s]) for k, s in enumerate(spots) if k not in taken]
+            live[i].add(frame, spots[k])
+        for k, spot in enumerate(spots):
+            if k not in taken:
+                live.append(Path())
+                live[-1].add(frame, spot)
     return sorted((p for p in done + live if len(p.frames) >= _LEAST), key=lambda p: -p.weight * (p.travel > p.radius))
 
 
@@ -91,13 +119,14 @@ def joined(paths: Sequence[Path]) -> tuple[Path, list[Path]]:
     for path in paths[1:]:
         apart = not set(path.frames) & set(frames)
         alike = _ALIKE[0] < path.radius / main.radius < _ALIKE[1]
+        alike &= main.unlike(path.tone.tolist(), path.contrast) <= 1
         if apart and alike and _aside(main.places, path.places) < 3 * main.radius:
             frames += path.frames
             spots += path.spots
         else:
             others.append(path)
     order = np.argsort(frames).tolist()
-    return Path([frames[i] for i in order], [spots[i] for i in order]), others
+    return Path([frames[i] for i in order], [spots[i] for i in order], main.tone), others
 
 
 def _aside(line: Array, points: Array) -> float:

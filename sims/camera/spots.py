@@ -33,7 +33,8 @@ _SHADE = (0.25, 0.97)
 class Spot(NamedTuple):
     """A ball-like thing: middle and radius of its outline in pixels, the share of rays that agree, their scatter.
 
-    `edges` (n, 2) are the points of its edge to which the circle was fitted; none for a ball of a few pixels.
+    `edges` (n, 2) are the points of its edge to which the circle was fitted; none for a ball of a few pixels. `colour`
+    is that of its middle, `contrast` how far that is from the background there, in grey levels.
     """
 
     u: float
@@ -42,6 +43,8 @@ class Spot(NamedTuple):
     agree: float
     scatter: float
     edges: Array = np.empty((0, 2))
+    colour: tuple[float, ...] = (0.0, 0.0, 0.0)
+    contrast: float = 0.0
 
     def with_radius(self, radius: float) -> Spot:
         """The same, its middle fitted again to the edge with the radius known from other pictures.
@@ -118,7 +121,16 @@ class Finder:
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         large = sorted(((len(c), i) for i, c in enumerate(contours) if len(c) > 3), reverse=True)[:_MOST_SPOTS]
         found = [self._spot(contours[i], (brightness, difference), shade) for _, i in large]
-        return [spot for spot in found if spot is not None]
+        return [self._coloured(spot, picture) for spot in found if spot is not None]
+
+    def _coloured(self, spot: Spot, picture: Image) -> Spot:
+        """The spot with the colour of its middle."""
+        cv2, side = opencv(), 2 * max(1, int(0.4 * spot.radius)) + 1
+        here, behind = (
+            cv2.getRectSubPix(part, (side, side), (spot.u, spot.v)).reshape(-1, 3).mean(axis=0)
+            for part in (picture, self.background)
+        )
+        return spot._replace(colour=tuple(here.tolist()), contrast=float(np.abs(here - behind).max()))
 
     def _shadow(self, picture: Image, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Where the picture is the background times one factor, in all colours alike: shadow, or shadow gone."""

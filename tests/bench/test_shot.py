@@ -1,5 +1,6 @@
 """Bounce-shot studies: Wilson's interval, what goes over from a drop to a shot, who hits, and the command."""
 
+import importlib.util
 import json
 import math
 from dataclasses import fields, replace
@@ -20,6 +21,11 @@ from bench.shot.tune import Known, Model, carry, models
 from sims.ball.simulator import Ball
 from sims.base import InputError
 from sims.recording import read_recording
+from sims.shot.world import Ground, fly
+
+vision = pytest.mark.skipif(
+    not all(map(importlib.util.find_spec, ("av", "cv2"))), reason="PyAV and OpenCV are not installed: simgap[vision]"
+)
 
 
 @pytest.fixture(scope="module")
@@ -69,11 +75,31 @@ def test_deals_do_not_depend_on_methods_or_numbers(experiment):
     assert all(0.7 <= d.scene.hoop_x <= 1.1 and 0.30 <= d.scene.angle <= 0.40 for d in many)
 
 
-def test_recorded_drop_reads_as_any_recording_of_a_ball(experiment, tmp_path):
+@vision
+@pytest.mark.parametrize("kind", ["squash", "golf"])
+def test_a_filmed_drop_is_tracked_to_millimetres(experiment, tmp_path, kind):
+    """A squash ball meets its shadow at the bounce, which then goes on as the ball went before."""
     settings, path = settings_of(experiment), tmp_path / "drop.csv"
+    dealt = deal(experiment, settings, kind, 0)
+    record(experiment, dealt, settings, path)
+    recording = read_recording(path, Ball, whole=True)
+    run = recording.runs[0]
+    radius = recording.constants["radius"]
+    true = fly(dealt.ball, Ground(0.0, settings.friction), (0.0, 0.0, run.channels["z"][0]), run.times)[:, 2]
+    rms = float(np.sqrt(np.nanmean((run.channels["z"] - true) ** 2)))
+    assert np.isfinite(run.channels["z"]).mean() > 0.95
+    assert rms < 4e-3
+    assert radius == dealt.ball.radius
+    assert recording.noise["z"] < 4e-3
+    assert {path.with_suffix(end).is_file() for end in (".mp4", ".camera.toml", ".png")} == {True}
+
+
+def test_recorded_drop_reads_as_any_recording_of_a_ball(experiment, tmp_path):
+    settings, path = replace(settings_of(experiment), filmed=0.0), tmp_path / "drop.csv"
+    experiment = replace(experiment, noise={"z": 0.01})
     dealt = deal(experiment, settings, "tennis", 0)
-    record(experiment, dealt, settings.friction, path)
-    record(experiment, dealt, settings.friction, path)  # what is there stays
+    record(experiment, dealt, settings, path)
+    record(experiment, dealt, settings, path)  # what is there stays
     recording = read_recording(path, Ball, whole=True)
     z = recording.runs[0].channels["z"]
     assert len(z) == 150
@@ -98,7 +124,7 @@ def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp
     settings = settings_of(experiment)
     dealt = deal(experiment, settings, "rubber", 1)
     path = tmp_path / "drop.csv"
-    record(experiment, dealt, settings.friction, path)
+    record(experiment, dealt, settings, path)
     made = {row["method"]: Model(**row) for row in models(experiment, settings, Known("x", path, dealt.scene, {}))}
     assert list(made) == ["nominal", "least_squares", "explain"]
     assert made["nominal"].restitution == 0.5

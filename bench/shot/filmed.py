@@ -1,0 +1,50 @@
+"""A drop on film: what a camera that stands three metres away sees of it, and the recording that the tracker makes."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from bench.vision import tracking
+from methods.base import Array
+from sims.camera.camera import Camera
+from sims.camera.files import Filmed, beside, described
+from sims.camera.look import Look
+from sims.camera.render import Stage
+from sims.camera.video import write_video
+from sims.recording_write import publish
+
+DISTANCE, HEIGHT, AIM = (2.8, 3.4), (0.8, 1.4), 0.9
+"""Ranges of the camera's distance and height, and the height at which it looks, m: the whole drop is in the picture."""
+NARROW = 0.4
+"""Width of the picture over its height: what falls needs no more."""
+
+
+def filmed(path: Path, heights: Array, times: Array, radius: float, pixels: int, rng: np.random.Generator) -> None:
+    """Film a drop and write what the tracker sees of it: `path` (.csv), its description, film and camera beside it.
+
+    Args:
+        path: of the recording.
+        heights: (T,) of the ball's centre, m.
+        times: (T,) seconds.
+        radius: of the ball, m.
+        pixels: height of the picture, even.
+        rng: draws place, light, colours, noise and compression.
+
+    Raises:
+        InputError: the packages for films are missing, or the ball cannot be found in the film.
+    """
+    azimuth, distance, height = (float(rng.uniform(*pair)) for pair in ((0.0, 2.0 * math.pi), DISTANCE, HEIGHT))
+    size = (2 * round(NARROW * pixels / 2), pixels)
+    camera, look = Camera(azimuth, distance, height, (0.0, 0.0, AIM), size=size), Look.drawn(rng)
+    film = path.with_suffix(".mp4")
+    for left in (film, beside(film), *(path.with_suffix(end) for end in (".csv", ".toml", ".png", ".pdf"))):
+        left.unlink(missing_ok=True)
+    stage = Stage(camera, look, radius, rng)
+    places = np.stack([np.zeros_like(heights), np.zeros_like(heights), heights], axis=1)
+    write_video(film, stage.film(places), times, look.crf)
+    stage.close()
+    publish({beside(film): described(Filmed(camera, radius))})
+    tracking.write(film, path, None, None, "camera")
