@@ -201,7 +201,7 @@ class Finder:
         along_u, along_v = (u + cos * steps).astype(np.float32), (v + sin * steps).astype(np.float32)
         profiles = [_along(window, along_u, along_v) for window in windows]
         inner = (steps > min(0.5 * radius, radius - 3.5)) & (steps < max(0.7 * radius, radius - 1.3))
-        levels = [np.median(p[:, inner], axis=1) for p in profiles]
+        levels = [np.sort(p[:, inner], axis=1)[:, int(inner.sum()) // 2] for p in profiles]
         bright = (levels[0] > 1.5 * self.level) & (levels[0] > 0.7 * levels[1])
         values = np.where(bright[:, None], *profiles)
         half = 0.5 * np.where(bright, *levels)[:, None]
@@ -248,6 +248,13 @@ def _directions() -> tuple[Array, Array]:
     return np.cos(angles), np.sin(angles)
 
 
+def _middle(values: Array) -> float:
+    """The median; numpy's own takes ten times as long for a few numbers."""
+    k = len(values) // 2
+    sorted_there = np.partition(values, (k - 1, k))
+    return float(sorted_there[k]) if len(values) % 2 else float(0.5 * (sorted_there[k - 1] + sorted_there[k]))
+
+
 def _fit(points: Array, u: float, v: float, radius: float) -> tuple[tuple[float, float, float], Array] | None:
     """The circle nearest to most of the points, by Gauss-Newton with Tukey's weights; and each ray's distance to it."""
     rest = np.empty(0)
@@ -255,10 +262,10 @@ def _fit(points: Array, u: float, v: float, radius: float) -> tuple[tuple[float,
         away = points - (u, v)
         far = np.hypot(away[:, 0], away[:, 1])
         if turn == 0:
-            radius = float(np.median(far))
+            radius = _middle(far)
         rest = far - radius
-        width = 4.7 * max(1.4826 * float(np.median(np.abs(rest))), 0.15)
-        weights = np.clip(1 - (rest / width) ** 2, 0, None) ** 2
+        width = 4.7 * max(1.4826 * _middle(np.abs(rest)), 0.15)
+        weights = np.maximum(1 - (rest / width) ** 2, 0.0) ** 2
         basis = np.concatenate([away / np.maximum(far, 1e-9)[:, None], np.ones((len(far), 1))], axis=1)
         normal = basis.T @ (weights[:, None] * basis)
         if np.linalg.det(normal) < 1e-6:
