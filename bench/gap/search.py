@@ -184,7 +184,9 @@ class Search(Models):
             larger = self._grown(size)
             if larger is None:
                 break
-            if size > 1:
+            if size == 1:
+                larger = self._simpler(larger)
+            else:
                 larger = self._conservative(best, self.drop(self.swap(self.drop(larger))))
             if larger.merit > best.merit and self.missing(best, larger) <= ALPHA:
                 best = larger
@@ -229,6 +231,14 @@ class Search(Models):
         sketch.extend(sketch._beam(size - 1), NOMINATED)
         found = sorted((m for m in sketch.models.values() if len(m.names) == size), key=lambda m: -m.merit)
         self.refit([whole(self.world, m.fit) for m in found[:TRANSFERRED]])
+
+    def _simpler(self, single: Model) -> Model:
+        """The effect that the single one contains, where structure is left to which the rest of it may have bent."""
+        if self.plain(single, ALPHA):
+            return single
+        held = self.world.effects[single.names[0]].contains
+        there = [self.models[frozenset([name])] for name in held if frozenset([name]) in self.models]
+        return next((m for m in there if self.excess(single) > CLEARLY * self.excess(m)), single)
 
     def _conservative(self, best: Model, larger: Model) -> Model:
         """The larger model, unless it puts other effects in place of the best one's and is hardly nearer to the noise.
