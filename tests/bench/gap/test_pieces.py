@@ -8,6 +8,7 @@ import pytest
 from bench.gap import name, search
 from bench.gap.fit import Fitter, Start
 from bench.gap.pieces import PIECES, pieces, whole
+from sims.ball.simulator import Ball
 from sims.pendulum.simulator import Pendulum
 from tests.bench.gap.made import recorded, searched, white, with_runs, world
 
@@ -87,3 +88,8 @@ def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkey
     tried = {n for names in looking.models for n in names}
     assert {"drag.linear", "friction.coulomb", "friction.load"} <= tried
     assert found.names == ("drag.quadratic",)
+
+
+def test_what_bounces_is_left_whole():
+    falls = recorded(Ball(observe=["z"]), [0.6], [{"z": 2.0}, {"z": 3.0}], np.arange(200) * 0.02, noise=0.002)
+    assert pieces(world(falls)) is None
