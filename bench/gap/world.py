@@ -124,7 +124,7 @@ class World:
     def _travel(self) -> float:
         """The range of the primary coordinate in the run where it is largest; 0 where it is not recorded."""
         system = self.simulator.system
-        name = system.coordinates[system.primary]
+        name = system.coordinates[system.primary] if system.coordinates else ""
         if name not in self.channels:
             return 0.0
         values = self.observed[:, :, self.channels.index(name)]
