@@ -1,5 +1,7 @@
 """The batch engine against scipy, closed forms, and itself."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -9,6 +11,7 @@ from sims.ball.simulator import Ball
 from sims.base import InputError, Parameter, Scenario
 from sims.effects.friction import Coulomb
 from sims.engines.batch import engine
+from sims.engines.batch.clock import Clock
 from sims.pendulum.simulator import Pendulum
 from sims.servo.simulator import Servo
 from sims.slider.simulator import Slider
@@ -317,3 +320,23 @@ def test_an_effect_becomes_the_one_it_contains(simple, rich):
     np.testing.assert_allclose(
         other.simulate(theta, scenario), one.simulate(np.array([[1.0, 0.4]]), scenario), atol=1e-9
     )
+
+
+def test_a_lane_given_up_holds_nobody_up():
+    """Its clock has ended at once: one that an impact without speed had set back ran on for minutes."""
+    lanes = SimpleNamespace(steps=np.full((2, 3), 0.1), inputs={}, every=1, x=np.zeros((2, 1)))
+    clock, state = Clock(lanes), np.ones((3, 2))
+    clock.correct(np.array([0]), np.array([[-50.0]]))
+    assert clock.left[:, 0] == pytest.approx([50.1, 0.1])
+    clock.give_up(np.array([True, False]), np.full((3, 2), np.nan))
+    assert clock.left[0, 0] == 0.0
+    for _ in range(3):
+        assert not clock.over
+        clock.keep(state)
+        clock.spend(clock.left)
+        clock.finish(np.array([False, True]))
+    assert clock.over
+    clock.keep(state)
+    motion = clock.motion()
+    assert np.isnan(motion.x[0, -1]).all()
+    assert motion.x[1].tolist() == [[1.0]] * 4

@@ -58,10 +58,6 @@ class Clock:
         if lanes.size:
             self._kept[self._step[lanes] // self._every, lanes] = state[:, lanes].T
 
-    def keep_last(self, state: Array) -> None:
-        """Keep the state (3 D, L) as the one behind the last sample: nothing follows."""
-        self._kept[-1] = state.T
-
     def finish(self, ended: Mask | None = None) -> None:
         """Lanes `ended` (L,), or all, go on to their next step."""
         if ended is not None and self._common is not None and not ended.all():
@@ -86,6 +82,17 @@ class Clock:
         """Let h (L, 1) seconds pass, at most what is left."""
         self.t += h
         self.left = np.maximum(self.left - h, 0.0)
+
+    def give_up(self, lanes: Mask, state: Array) -> None:
+        """Lanes (L,) have made their last step; keep the state (3 D, L) as what is behind their last sample."""
+        if self._common is not None:
+            self._step[:] = self._common
+            self._common = None
+        self._step[lanes] = self._end
+        self._kept[-1, lanes] = state[:, lanes].T
+        self.left[lanes], self.t[lanes] = 0.0, 0.0
+        self._begins &= ~lanes
+        self.over = bool(self._step.min() == self._end)
 
     def correct(self, lanes: Indices, h: Array) -> None:
         """Move the clocks of some lanes (n,) by h (n, 1) seconds."""

@@ -94,14 +94,10 @@ class Stepping:
         if not late.any():
             return False
         self._rows[:, late] = np.nan
-        self._limit, self._try[late], self._goal[late] = (
-            np.where(late[:, None], self._longest, self._limit),
-            np.inf,
-            NOTHING,
-        )
-        if late.all():
-            self._clock.keep_last(self._rows)
-        return bool(late.all())
+        self._limit = np.where(late[:, None], self._longest, self._limit)
+        self._try[late], self._goal[late], self._taken[late] = np.inf, NOTHING, 0.0
+        self._clock.give_up(late, self._rows)
+        return bool(self._clock.over)
 
     def _stepped(self, h: Array, k1: Array) -> tuple[Array, Array, Array, Array]:
         """Position, velocity and (to third order) acceleration a step of h (L, 1) later; how the acceleration bent."""
@@ -245,6 +241,7 @@ class Stepping:
         rate = v[:, -1:]
         late = np.where(rate < 0, (floor - x[:, -1:]) / rate, 0.0)
         late *= 1.0 - 0.5 * late * a[:, -1:] / np.where(rate < 0, rate, 1.0)
+        late = self._rounding(i, late)
         x, v = x + late * (v + 0.5 * late * a), v + late * a
         self._clock.correct(i, late)
         x[:, -1:], v[:, -1:] = floor, np.minimum(v[:, -1:], 0.0)
@@ -253,11 +250,16 @@ class Stepping:
         if outcome.rests.any():
             self._dynamics.lay(i[outcome.rests])
 
+    def _rounding(self, i: Indices, seconds: Array) -> Array:
+        """Corrections (n, 1) of lanes i (n,), none longer than a step: of a lane all but at rest they mean nothing."""
+        bounded: Array = np.clip(np.nan_to_num(seconds), -self._longest[i], self._longest[i])
+        return bounded
+
     def _stop(self, i: Indices, a: Array) -> None:
         """Lanes i (n,) have lost their speed along their way but for rounding; a (n, D) before."""
         v, way = self._v[i], self._dynamics.way[i]
         slows = dot(a, way)
-        late = np.where(slows < 0, -dot(v, way) / slows, 0.0)
+        late = self._rounding(i, np.where(slows < 0, -dot(v, way) / slows, 0.0))
         self._x[i] += late * v
         self._clock.correct(i, late)
         v = v + late * a
