@@ -76,6 +76,6 @@ def test_unknown_name_is_one_line(capsys):
     assert main(["check", "cma_ess"]) == 2
     error = capsys.readouterr().err
     assert error.startswith(
-        "simgap: unknown tuner, simulator or effect 'cma_ess'; there are: arm, backlash, ball, bayes"
+        "simgap: unknown tuner, simulator or effect 'cma_ess'; there are: arm, backlash, ball, ball-filmed, bayes"
     )
     assert error.count("\n") == 1
