@@ -119,9 +119,9 @@ def _side(recording: Recording, experiment: Experiment) -> Side:
     shift = radius - _constants(recording)["radius"]
     z = run.channels["z"] + shift
     seen = run.channels["z"][np.isfinite(run.channels["z"])]
-    initial = {**scenario.initial, "z": scenario.initial.get("z", float(seen[0])) + shift}
     fallen = scenario.constants.get("gravity", _constants(recording)["gravity"]) * float(run.times[0])
-    initial = {**initial, "vz": scenario.initial.get("vz", -fallen)}
+    first = {"z": float(seen[0]), "vz": -fallen, **scenario.initial}
+    initial = {**first, "z": first["z"] + shift}
     moved = Scenario(scenario.times, initial, {}, {**scenario.constants, "radius": radius})
     return Side((moved,), z[:, None])
 

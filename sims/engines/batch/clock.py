@@ -60,9 +60,8 @@ class Clock:
 
     def finish(self, ended: Mask | None = None) -> None:
         """Lanes `ended` (L,), or all, go on to their next step."""
-        if ended is not None and self._common is not None and not ended.all():
-            self._step[:] = self._common
-            self._common = None
+        if ended is not None and not ended.all():
+            self._part()
         if self._common is not None:
             self._common += 1
             self.over = self._common == self._end
@@ -83,11 +82,15 @@ class Clock:
         self.t += h
         self.left = np.maximum(self.left - h, 0.0)
 
-    def give_up(self, lanes: Mask, state: Array) -> None:
-        """Lanes (L,) have made their last step; keep the state (3 D, L) as what is behind their last sample."""
+    def _part(self) -> None:
+        """From now on lanes are served one by one."""
         if self._common is not None:
             self._step[:] = self._common
             self._common = None
+
+    def give_up(self, lanes: Mask, state: Array) -> None:
+        """Lanes (L,) have made their last step; keep the state (3 D, L) as what is behind their last sample."""
+        self._part()
         self._step[lanes] = self._end
         self._kept[-1, lanes] = state[:, lanes].T
         self.left[lanes], self.t[lanes] = 0.0, 0.0
