@@ -17,7 +17,7 @@ from bench.seeds import rng_for
 from bench.shot.filmed import filmed
 from bench.shot.settings import Settings
 from sims.ball.simulator import Ball as BallSimulator
-from sims.recording import Recording, Run
+from sims.recording import Recording, Run, read_recording
 from sims.recording_write import write_recording
 from sims.shot.balls import Ball, ball_named
 from sims.shot.scene import Scene
@@ -54,6 +54,12 @@ def deal(experiment: Experiment, settings: Settings, kind: str, index: int) -> D
 def deals(experiment: Experiment, settings: Settings) -> list[Deal]:
     """All shots of an experiment; the balls take turns, so that a part of the work is a part of each."""
     return [deal(experiment, settings, kind, i) for i in range(experiment.targets) for kind in settings.balls]
+
+
+def in_view(path: Path, experiment: Experiment) -> float:
+    """The share of a drop's sample times at which its recording has a height."""
+    z = read_recording(path, BallSimulator, whole=True).runs[0].channels["z"]
+    return float(np.isfinite(z).sum() / experiment.sampling.samples)
 
 
 def record(experiment: Experiment, dealt: Deal, settings: Settings, path: Path) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from bench.experiment import Experiment
+from bench.registry import tuners
 from sims.base import InputError, unknown
 from sims.shot.balls import BALLS, ball_named
 
@@ -29,6 +30,8 @@ class Settings:
         friction: the world's.
         filmed: height in pixels of the film from which the recorded drop is tracked (`bench.shot.filmed`);
             0 for heights with the experiment's noise instead of a film.
+        rows: tuners that get the pixel rows of the film instead of heights in metres, and not the camera: those that
+            compare simulated heights with rows, such as tunenet-vision.
     """
 
     balls: tuple[str, ...] = tuple(BALLS)
@@ -42,6 +45,7 @@ class Settings:
     planned_inertia: float = 0.4
     friction: float = 0.4
     filmed: float = 0.0
+    rows: tuple[str, ...] = ()
 
 
 def settings_of(experiment: Experiment) -> Settings:
@@ -56,14 +60,22 @@ def settings_of(experiment: Experiment) -> Settings:
         if key not in names:
             raise unknown(f"entry of [shot] in experiment {experiment.name}", key, names)
         values[key] = _value(f"experiment {experiment.name}: shot.{key}", key, value)
-    return Settings(**values)
+    made = Settings(**values)
+    if made.rows and not made.filmed:
+        raise InputError(f"experiment {experiment.name}: shot.rows: only a film has pixel rows; set shot.filmed too")
+    for name in made.rows:
+        if name not in (known := [*(e.label for e in experiment.tuners), *tuners.names()]):
+            raise unknown(f"tuner in shot.rows of experiment {experiment.name}", name, known)
+    return made
 
 
 def _value(where: str, key: str, value: Any) -> Any:
-    if key == "balls":
-        if not isinstance(value, list | tuple) or not value or not all(isinstance(v, str) for v in value):
+    if key in ("balls", "rows"):
+        if not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
             raise InputError(f"{where}: expected a list of names, found {value!r}")
-        return tuple(ball_named(name).name for name in value)
+        if key == "balls" and not value:
+            raise InputError(f"{where}: expected at least one ball")
+        return tuple(ball_named(name).name if key == "balls" else name for name in value)
     if isinstance(getattr(Settings, key), tuple):
         if not isinstance(value, list | tuple) or len(value) != 2 or not all(_number(v) for v in value):
             raise InputError(f"{where}: expected [low, high], found {value!r}")

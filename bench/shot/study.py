@@ -12,10 +12,10 @@ from typing import Any
 
 from bench.experiment import Experiment
 from bench.journal import replace_text
-from bench.pools import LocalPool
+from bench.pools import Call, LocalPool
 from bench.runner import Progress, check
 from bench.shot import tune
-from bench.shot.deal import Deal, deals, record
+from bench.shot.deal import Deal, deals, in_view, record
 from bench.shot.settings import Settings, settings_of
 from bench.shot.throw import thrown
 from bench.store import Configuration, configuration, create, free_folder
@@ -100,27 +100,41 @@ def _shoot(
 ) -> None:  # fmt: skip
     if not missing:
         return
-    weights = _trained(experiment, bar)
+    weights = _trained(experiment, settings, bar)
     for name in (SHOTS, RECORDINGS):
         (folder / name).mkdir(exist_ok=True)
+    paths = [folder / RECORDINGS / f"{one.name}.csv" for one in missing]
+    drops: list[Call] = [(record, (experiment, one, settings, path)) for one, path in zip(missing, paths, strict=True)]
     step = bar("dropping", len(missing))
-    calls = []
-    for one in missing:
-        path = folder / RECORDINGS / f"{one.name}.csv"
-        record(experiment, one, settings, path)
-        calls.append((tune.models, (experiment, settings, tune.Known(one.name, path, one.scene, weights))))
-        step()
+    unseen: dict[int, BaseException] = {}
+    with LocalPool(jobs) as pool:  # these workers know the balls, and tune nothing
+        for place, fault in pool.results(drops, experiment.timeout):
+            if isinstance(fault, BaseException):
+                unseen[place] = fault
+            step()
+    seen = [place for place in range(len(missing)) if place not in unseen]
+    known = {place: tune.Known(missing[place].name, paths[place], missing[place].scene, weights) for place in seen}
     step = bar("shooting", len(missing))
+    for place, fault in unseen.items():
+        status = "no recording" if isinstance(fault, InputError) else "crashed"
+        _keep(folder, missing[place], settings, _failed(experiment, fault, status), 0.0)
+        step()
     with LocalPool(jobs) as pool:
         pool.load(plugins)
-        for place, made in pool.results(calls, experiment.timeout):
+        calls: list[Call] = [(tune.models, (experiment, settings, known[place])) for place in seen]
+        for at, made in pool.results(calls, experiment.timeout):
+            place = seen[at]
             models = _failed(experiment, made) if isinstance(made, BaseException) else made
-            kept = {"models": models, "rows": thrown(missing[place], settings, models)}
-            replace_text(_path(folder, missing[place]), json.dumps(_plain(kept), indent=1, allow_nan=False) + "\n")
+            _keep(folder, missing[place], settings, models, in_view(paths[place], experiment))
             step()
 
 
-def _trained(experiment: Experiment, bar: Progress) -> dict[str, Path]:
+def _keep(folder: Path, dealt: Deal, settings: Settings, models: list[dict[str, Any]], seen: float) -> None:
+    kept = {"models": models, "rows": [{**row, "seen": seen} for row in thrown(dealt, settings, models)]}
+    replace_text(_path(folder, dealt), json.dumps(_plain(kept), indent=1, allow_nan=False) + "\n")
+
+
+def _trained(experiment: Experiment, settings: Settings, bar: Progress) -> dict[str, Path]:
     from bench.registry import tuners
     from bench.training import train
 
@@ -128,14 +142,15 @@ def _trained(experiment: Experiment, bar: Progress) -> dict[str, Path]:
     step = bar("training", len(learned))
     weights = {}
     for entry in learned:
-        weights[entry.label] = train(experiment, entry, 0).path
+        weights[entry.label] = train(tune.tuned_in(experiment, settings, entry), entry, 0).path
         step()
     return weights
 
 
-def _failed(experiment: Experiment, error: BaseException) -> list[dict[str, Any]]:
-    """The models of a shot whose worker died or took too long: none has a plan."""
-    status = "timeout" if isinstance(error, TimeoutError) else "crashed"
+def _failed(experiment: Experiment, error: BaseException, status: str = "crashed") -> list[dict[str, Any]]:
+    """The models of a shot whose drop could not be recorded, or whose worker died or took too long: none has a plan."""
+    if isinstance(error, TimeoutError):
+        status = "timeout"
     nothing = partial(tune.Model, effects={}, simulations=0, seconds=math.nan, status=status, reason=str(error))
     labels = [e.label for e in experiment.tuners]
     methods = [tune.NOMINAL, *labels, tune.EXPLAINED, *(label + tune.AFTER for label in labels)]

@@ -11,7 +11,7 @@ COLUMNS = [
     "method", "ball", "shots", "hits", "rate", "low", "high", "off_median", "off_90", "prediction_error_median",
     "prediction_error_mean", "simulations", "seconds", "failures",
 ]  # fmt: skip
-FAILED = ("crashed", "timeout", "diverged", "no plan")
+FAILED = ("crashed", "timeout", "diverged", "no plan", "no recording")
 
 
 def wilson(hits: int, shots: int, z: float = 1.959963984540054) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 The models are those of the tuners, in the simulator as it is and in the one that `explain` extended from the same
 recording, and `explain`'s own fit. Heights are shifted as if every ball had the radius of the experiment, so that a
-network trained once serves all.
+network trained once serves all; tuners on vision get pixel rows instead (`bench.shot.rows`).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from bench.experiment import Entry, Experiment
 from bench.measured import Side, scenario_of
 from bench.problem import SealedTarget
+from bench.shot.rows import before_a_camera, rows_of
 from bench.shot.settings import Settings
 from bench.worker import Order, perform, problem_of
 from methods.base import Array
@@ -76,12 +77,12 @@ def models(experiment: Experiment, settings: Settings, known: Known) -> list[dic
     """Every method's model and plan, as plain dictionaries."""
     recording = read_recording(known.recording, BallSimulator, whole=True)
     made = [Model(NOMINAL, _nominal(), {}, 0, 0.0, "done")]
-    made += [_tuned(experiment, entry, known, recording, {}, entry.label) for entry in experiment.tuners]
+    made += [_tuned(experiment, settings, entry, known, recording, {}) for entry in experiment.tuners]
     explained, acting = _explained(known.recording)
     made.append(explained)
     if explained.status == "done":
-        again = [_tuned(experiment, e, known, recording, acting, e.label + AFTER) for e in experiment.tuners]
-        made += [replace(model, effects=explained.effects) for model in again]
+        again = [_tuned(experiment, settings, entry, known, recording, acting) for entry in experiment.tuners]
+        made += [replace(model, method=model.method + AFTER, effects=explained.effects) for model in again]
     radius = _constants(recording)["radius"]
     return [asdict(_planned(model, settings, known.scene, radius)) for model in made]
 
@@ -91,17 +92,20 @@ def _nominal() -> float:
 
 
 def _tuned(
-    experiment: Experiment, entry: Entry, known: Known, recording: Recording, effects: Effects, label: str
+    experiment: Experiment, settings: Settings, entry: Entry, known: Known, recording: Recording, effects: Effects
 ) -> Model:
     """The model of a tuner, in the simulator with these effects."""
+    label, radius = entry.label, _constants(recording)["radius"]
+    experiment = tuned_in(experiment, settings, entry)
     if effects:
         fixed = {name: list(values) for name, values in effects.items()}
         experiment = experiment.chosen(settings={**experiment.settings, "fixed": fixed})
     try:
         problem = problem_of(experiment)
         start = problem.cube.inverse(np.array([p.nominal for p in problem.cube.parameters]))
-        side, nothing = _side(recording, experiment), Side((), np.empty((0, 1)))
-        target = SealedTarget(known.name, "real", start, side, nothing)
+        seen = rows_of(recording, experiment, radius) if label in settings.rows else _side(recording, experiment)
+        nothing = Side((), np.empty((0, seen.observed.shape[1])))
+        target = SealedTarget(known.name, "real", start, seen, nothing)
         order = Order(label, entry, 0, target, entry.budget or experiment.budget, known.weights.get(entry.label))
         outcome = perform(experiment, order)
     except InputError as error:
@@ -109,6 +113,11 @@ def _tuned(
     trace = outcome.trace
     found = float(problem.cube.physical(trace.recommendations[-1])[0])
     return Model(label, found, {}, len(trace.losses), outcome.seconds, trace.status, trace.reason)
+
+
+def tuned_in(experiment: Experiment, settings: Settings, entry: Entry) -> Experiment:
+    """The experiment as a tuner gets it: heights, or simulated heights and pixel rows."""
+    return before_a_camera(experiment, settings) if entry.label in settings.rows else experiment
 
 
 def _side(recording: Recording, experiment: Experiment) -> Side:

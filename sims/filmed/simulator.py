@@ -22,9 +22,9 @@ FILMS = ("projected", "tracked")
 class FilmedBall(Simulator):
     """A ball that falls and bounces on level ground, and its place in the picture of a fixed camera.
 
-    The camera looks at (0, 0, 2) m with a field of view of 40 degrees, as the published visual tuner's does (Allevato
-    et al., TuneNet, arXiv 1907.11200, released code). `v` is the pixel row of the middle of the ball's outline, from
-    the top; it may lie outside the picture.
+    The camera has a field of view of 40 degrees and looks at (0, 0, 2) m where nothing else is said, as the published
+    visual tuner's does (Allevato et al., TuneNet, arXiv 1907.11200, released code). `v` is the pixel row of the middle
+    of the ball's outline, from the top; it may lie outside the picture.
 
     Args:
         constants: values for `constants` other than their defaults.
@@ -50,6 +50,7 @@ class FilmedBall(Simulator):
         Constant("camera_azimuth", "rad", 0.0, "where the camera stands around the vertical"),
         Constant("camera_distance", "m", 7.5, "of the camera from the vertical", positive=True),
         Constant("camera_height", "m", 6.5, "of the camera above the ground"),
+        Constant("camera_aim", "m", 2.0, "height of the point on the vertical at which the camera looks"),
         Constant("pixels", "px", 100.0, "width and height of the picture", positive=True),
     )
     states = BallSystem.states
@@ -97,7 +98,7 @@ class FilmedBall(Simulator):
 def _camera(constants: Mapping[str, float]) -> Camera:
     size = round(constants["pixels"])
     place = (constants["camera_azimuth"], constants["camera_distance"], constants["camera_height"])
-    return Camera(*place, size=(size, size))
+    return Camera(*place, target=(0.0, 0.0, constants["camera_aim"]), size=(size, size))
 
 
 def _tracked(camera: Camera, radius: float, places: Array, times: Array) -> Array:
