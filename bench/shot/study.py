@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -20,6 +19,7 @@ from bench.shot.settings import Settings, settings_of
 from bench.shot.throw import thrown
 from bench.store import Configuration, configuration, create, free_folder
 from sims.base import InputError
+from sims.camera import packages
 from sims.shot import world
 
 Say = Callable[[str], None]
@@ -34,8 +34,8 @@ def begin(experiment: Experiment, plugins: Sequence[str], out: str | None, jobs:
     """
     from bench.identity import fingerprint
 
-    if settings_of(experiment).filmed and not all(map(importlib.util.find_spec, ("av", "cv2"))):
-        raise InputError('films need PyAV and OpenCV: pip install "simgap[vision]"; or set shot.filmed = 0')
+    if settings_of(experiment).filmed:
+        packages.require("; or set shot.filmed = 0")
     if experiment.simulator != "ball" or experiment.observe != ("z",):
         raise InputError(f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]')
     folder = free_folder(experiment, out)

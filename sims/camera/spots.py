@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sims.base import Array, InputError
+from sims.base import Array
+from sims.camera.packages import imported
 from sims.camera.render import Image
 
 _RAYS = 36
@@ -24,6 +25,7 @@ _AGREE = 0.6
 _MOST_SPOTS = 4
 _TINY = 2.5
 _ROUNDS = 3
+_NEAR, _EXACT = 1e-2, 1e-4
 _FINE = 0.25
 _LOOSE = 0.5
 _RIM = 5
@@ -59,30 +61,17 @@ class Spot(NamedTuple):
             far = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
             rest = far - radius
             weights = 1 / (1 + (rest / _LOOSE) ** 2) ** 2
-            basis = away / far[:, None]
-            normal = basis.T @ (weights[:, None] * basis)
-            if np.linalg.det(normal) < 1e-6:
+            rows = np.stack([away[:, 0] / far, away[:, 1] / far, rest])
+            (a, b, p), (_, c, q), _ = ((rows * weights) @ rows.T).tolist()
+            if (area := a * c - b * b) < 1e-6:
                 return self
-            du, dv = np.linalg.solve(normal, basis.T @ (weights * rest)).tolist()
+            du, dv = (c * p - b * q) / area, (a * q - b * p) / area
             u, v = u + du, v + dv
             if abs(du) + abs(dv) < 1e-3:
                 break
         if np.hypot(u - self.u, v - self.v) > 0.5 * radius:
             return self
         return self._replace(u=u, v=v)
-
-
-def opencv() -> Any:
-    """The module ``cv2``.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        import cv2
-    except ImportError:
-        raise InputError('videos need PyAV and OpenCV: pip install "simgap[vision]"') from None
-    return cv2
 
 
 class Finder:
@@ -99,12 +88,13 @@ class Finder:
         self.background, self.sigma, self.shadows = background, sigma, shadows
         self.level = max(_LEAST_LEVEL, 6 * sigma)
         self._plain = background.astype(np.float32)
-        self._grey = opencv().cvtColor(background, opencv().COLOR_RGB2GRAY)
+        cv2 = imported("cv2")
+        self._grey = cv2.cvtColor(background, cv2.COLOR_RGB2GRAY)
         self._square = np.maximum((self._plain * self._plain).sum(axis=2), 1.0)
 
     def spots(self, picture: Image) -> list[Spot]:
         """What looks like a ball, the largest first."""
-        cv2 = opencv()
+        cv2 = imported("cv2")
         apart = cv2.absdiff(picture, self.background)
         difference = cv2.max(cv2.max(apart[..., 0], apart[..., 1]), apart[..., 2])
         brightness = cv2.absdiff(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), self._grey)
@@ -125,7 +115,7 @@ class Finder:
 
     def _coloured(self, spot: Spot, picture: Image) -> Spot:
         """The spot with the colour of its middle."""
-        cv2, side = opencv(), 2 * max(1, int(0.4 * spot.radius)) + 1
+        cv2, side = imported("cv2"), 2 * max(1, int(0.4 * spot.radius)) + 1
         here, behind = (
             cv2.getRectSubPix(part, (side, side), (spot.u, spot.v)).reshape(-1, 3).mean(axis=0)
             for part in (picture, self.background)
@@ -145,7 +135,7 @@ class Finder:
         return result
 
     def _spot(self, contour: Any, differences: tuple[NDArray[np.uint8], ...], shade: NDArray[np.bool_]) -> Spot | None:
-        cv2 = opencv()
+        cv2 = imported("cv2")
         left, top, width, height = cv2.boundingRect(contour)
         if width * height < _LEAST_AREA or max(width, height) > 0.9 * min(shade.shape):
             return None
@@ -174,11 +164,11 @@ class Finder:
     def _circle(self, windows: NDArray[np.float32], start: tuple[float, float, float], u0: int, v0: int) -> Spot | None:
         u, v, radius = start
         kept, rest, edges = np.empty(0, bool), np.empty(0), None
-        for _ in range(_ROUNDS):
+        for turn in range(_ROUNDS):
             edges = self._edges(windows, u, v, radius)
             if edges is None:
                 return None
-            fitted = _fit(edges, u, v, radius)
+            fitted = _fit(edges, u, v, _EXACT if turn == _ROUNDS - 1 else _NEAR)
             if fitted is None:
                 return None
             (u, v, radius), rest = fitted
@@ -235,7 +225,7 @@ class Finder:
 
 def _along(window: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
     """Values of a window at places between its pixels; far below zero outside."""
-    cv2 = opencv()
+    cv2 = imported("cv2")
     result: NDArray[np.float32] = cv2.remap(
         window, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-1000.0
     )
@@ -255,26 +245,42 @@ def _middle(values: Array) -> float:
     return float(sorted_there[k]) if len(values) % 2 else float(0.5 * (sorted_there[k - 1] + sorted_there[k]))
 
 
-def _fit(points: Array, u: float, v: float, radius: float) -> tuple[tuple[float, float, float], Array] | None:
-    """The circle nearest to most of the points, by Gauss-Newton with Tukey's weights; and each ray's distance to it."""
-    rest = np.empty(0)
-    for turn in range(8):
-        away = points - (u, v)
-        far = np.hypot(away[:, 0], away[:, 1])
-        if turn == 0:
+def _fit(points: Array, u: float, v: float, enough: float) -> tuple[tuple[float, float, float], Array] | None:
+    """The circle nearest to most of the points, by Gauss-Newton with Tukey's weights; and each ray's distance to it.
+
+    The normal equations are solved by hand: numpy's own solver spends its time on the call.
+
+    Args:
+        points: (n, 2).
+        u: where to begin.
+        v: where to begin.
+        enough: px, a step below this ends it.
+    """
+    x, y = points[:, 0], points[:, 1]
+    rows: Array = np.ones((4, len(points)))
+    radius = -1.0
+    for _ in range(8):
+        away_u, away_v = x - u, y - v
+        far = np.hypot(away_u, away_v)
+        if radius < 0:
             radius = _middle(far)
         rest = far - radius
         width = 4.7 * max(1.4826 * _middle(np.abs(rest)), 0.15)
         weights = np.maximum(1 - (rest / width) ** 2, 0.0) ** 2
-        basis = np.concatenate([away / np.maximum(far, 1e-9)[:, None], np.ones((len(far), 1))], axis=1)
-        normal = basis.T @ (weights[:, None] * basis)
-        if np.linalg.det(normal) < 1e-6:
+        np.maximum(far, 1e-9, out=far)
+        rows[0], rows[1], rows[3] = away_u / far, away_v / far, rest
+        (xx, xy, mx, p), (_, yy, my, q), (_, _, total, r), _ = ((rows * weights) @ rows.T).tolist()
+        if total <= 0:
             return None
-        du, dv, dr = np.linalg.solve(normal, basis.T @ (weights * rest)).tolist()
+        a, b, c = xx - mx * mx / total, xy - mx * my / total, yy - my * my / total
+        if total * (area := a * c - b * b) < 1e-6:
+            return None
+        p, q = p - mx * r / total, q - my * r / total
+        du, dv = (c * p - b * q) / area, (a * q - b * p) / area
+        dr = (r - mx * du - my * dv) / total
         u, v, radius = u + du, v + dv, radius + dr
-        if abs(du) + abs(dv) + abs(dr) < 1e-4:
+        if abs(du) + abs(dv) + abs(dr) < enough:
             break
     if not 0.5 < radius < 1e4:
         return None
-    away = points - (u, v)
-    return (u, v, radius), np.hypot(away[:, 0], away[:, 1]) - radius
+    return (u, v, radius), np.hypot(x - u, y - v) - radius

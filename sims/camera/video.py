@@ -14,20 +14,13 @@ from typing import Any
 import numpy as np
 
 from sims.base import Array, InputError
+from sims.camera.packages import imported
 from sims.camera.render import Image
 from sims.recording_write import refuse_existing
 
 _TICKS = 90_000
 """Time stamps a second in files written here; common for video, and a whole number for the usual rates."""
 _DEFAULT_RATE = 30.0
-
-
-def _av() -> Any:
-    try:
-        import av
-    except ImportError:
-        raise InputError('videos need PyAV and OpenCV: pip install "simgap[vision]"') from None
-    return av
 
 
 def write_video(path: Path, frames: Iterable[Image], times: Array, crf: int = 18) -> None:
@@ -57,7 +50,7 @@ def write_video(path: Path, frames: Iterable[Image], times: Array, crf: int = 18
 
 
 def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None:
-    av = _av()
+    av = imported("av")
     ticks = np.rint((times - times[0]) * _TICKS).astype(int)
     rate = Fraction(len(times) - 1, 1) / Fraction(max(1, int(ticks[-1])), _TICKS) if len(times) > 1 else Fraction(30)
     # the index stands first, so that a file cut short can still be read up to the cut
@@ -124,7 +117,7 @@ class Video:
         self._judge(count, stated, broken, dropped)
 
     def _open(self) -> Any:
-        av = _av()
+        av = imported("av")
         try:
             file = av.open(str(self.path))
         except OSError as error:
@@ -140,7 +133,7 @@ class Video:
 
     def _decoded(self, file: Any) -> Iterator[tuple[float, Image | None]]:
         """Each frame's time and picture; a last pair without picture where the file breaks off."""
-        av = _av()
+        av = imported("av")
         stream = file.streams.video[0]
         stream.thread_count = 1
         rate = float(stream.average_rate or _DEFAULT_RATE)

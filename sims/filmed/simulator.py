@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from sims.ball.simulator import Ball
 from sims.ball.system import BallSystem
 from sims.base import Array, Channel, Constant, InputError, Scenario, Simulator
+from sims.camera import packages
 from sims.camera.camera import Camera
 
 FILMS = ("projected", "tracked")
@@ -66,8 +66,8 @@ class FilmedBall(Simulator):
         super().__init__(constants, observe)
         if film not in FILMS:
             raise InputError(f"simulator {self.name}: expected film to be one of {', '.join(FILMS)}, found {film!r}")
-        if film == "tracked" and not all(map(importlib.util.find_spec, ("av", "cv2"))):
-            raise InputError('films need PyAV and OpenCV: pip install "simgap[vision]"')
+        if film == "tracked":
+            packages.require()
         self._tracked = film == "tracked"
         self._ball = Ball(self._of_ball(self.constant_values), ["x", "y", "z"], **settings)
 

@@ -14,10 +14,12 @@ from bench import cli
 from bench.experiment import load, names
 from bench.shot import study, tune
 from bench.shot.deal import deal, deals, record
+from bench.shot.rows import rows_of
 from bench.shot.settings import settings_of
 from bench.shot.table import ALL, table, wilson
 from bench.shot.throw import throw
 from bench.shot.tune import Known, Model, carry, models
+from bench.training import train
 from sims.ball.simulator import Ball
 from sims.base import InputError
 from sims.recording import read_recording
@@ -110,6 +112,65 @@ def test_recorded_drop_reads_as_any_recording_of_a_ball(experiment, tmp_path):
     assert np.polyfit(t, fall, 2)[0] == pytest.approx(-9.81 / 2, rel=0.06)
 
 
+@vision
+def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_camera_stood(tmp_path, monkeypatch):
+    monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path / "cache"))
+    experiment = load("bounce-shot").with_tuners(["tunenet-vision", "least_squares"])
+    experiment = experiment.chosen(training_budget=400)
+    settings, path = settings_of(experiment), tmp_path / "drop.csv"
+    assert settings.rows == ("tunenet-vision",)
+    watching, metres = (tune.tuned_in(experiment, settings, entry) for entry in experiment.tuners)
+    assert (watching.simulator, watching.observe, metres.simulator) == ("ball-filmed", ("z", "v"), "ball")
+    weights = {"tunenet-vision": train(watching, experiment.tuners[0], 0).path}
+    found = {}
+    for kind in ("golf", "squash"):
+        dealt = deal(experiment, settings, kind, 0)
+        record(experiment, dealt, settings, path)
+        seen = rows_of(read_recording(path, Ball, whole=True), watching, dealt.ball.radius)
+        assert not [name for s in seen.scenarios for name in s.constants if "camera" in name]
+        assert np.isnan(seen.observed[:, 0]).all()
+        # the ball lies on the ground at the end, lower in the picture than where it was let go
+        assert np.isfinite(seen.observed[:, 1]).mean() > 0.9
+        assert np.nanmax(seen.observed[:, 1]) - seen.observed[np.isfinite(seen.observed[:, 1])][0, 1] > 100
+        for left in ("drop.camera.toml", "drop.mp4"):
+            (tmp_path / left).unlink()
+        known = Known(dealt.name, path, dealt.scene, weights)
+        recording = read_recording(path, Ball, whole=True)
+        by_rows, by_metres = (
+            tune._tuned(experiment, settings, entry, known, recording, {}) for entry in experiment.tuners
+        )
+        assert by_rows.restitution == pytest.approx(by_metres.restitution, abs=0.06)
+        assert by_rows.simulations <= experiment.budget
+        found[kind] = by_rows.restitution
+        for left in ("drop.csv", "drop.toml", "drop.png", "drop.pdf"):
+            (tmp_path / left).unlink()
+    assert found["golf"] - found["squash"] > 0.2  # 0.86 and 0.54 by the tables
+
+
+@vision
+def test_a_drop_that_cannot_be_tracked_is_a_row_and_not_the_end(experiment, tmp_path, capsys):
+    """A film of 16 pixels' height shows a golf ball on a fifth of a pixel."""
+    text = """
+simulator = "ball"
+observe = ["z"]
+targets = 1
+budget = 2
+settings = { engine = "batch" }
+sampling = { rate = 60.0, samples = 60 }
+shot = { balls = ["golf"], filmed = 16 }
+tuners = { least_squares = {} }
+"""
+    (tmp_path / "small.toml").write_text(text)
+    out = tmp_path / "out"
+    assert cli.main(["compare", str(tmp_path / "small.toml"), "--jobs", "1", "--out", str(out)]) == 0
+    rows = pd.read_csv(out / "status.csv")
+    assert set(rows["status"]) == {"no recording"}
+    assert rows["reason"].str.contains("no ball found").all()
+    assert not pd.read_csv(out / "shots.csv")["hit"].any()
+    assert pd.read_csv(out / "shots.csv")["seen"].eq(0).all()
+    assert "no recording: least_squares in 1 shots" in capsys.readouterr().out
+
+
 def test_methods_get_the_recording_and_the_scene_and_not_the_ball():
     assert {f.name for f in fields(Known)} == {"name", "recording", "scene", "weights"}
 
@@ -147,6 +208,12 @@ def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp
         ({"balls": ["moon"]}, "unknown ball 'moon'"),
         ({"angle": 0.3}, r"shot.angle: expected \[low, high\], found 0.3"),
         ({"hoop_x": [2, 1]}, "expected 0 <= low <= high"),
+        (
+            {"rows": ["tunenet-visoin"], "filmed": 320},
+            "unknown tuner in shot.rows of experiment bounce-shot 'tunenet-v",
+        ),
+        ({"rows": ["tunenet-vision"], "filmed": 0}, "shot.rows: only a film has pixel rows"),
+        ({"balls": []}, "shot.balls: expected at least one ball"),
         ({"release": "small"}, "shot.release: expected a number of at least 0, found 'small'"),
     ],
 )

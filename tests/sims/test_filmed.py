@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sims.base import InputError, Scenario
-from sims.filmed import simulator as filmed
 from sims.filmed.simulator import FilmedBall
 
 TIMES = np.arange(60) / 60.0
@@ -65,6 +64,6 @@ def test_where_the_ball_is_out_of_the_picture_nothing_is_invented():
 def test_an_unknown_film_and_missing_packages_are_one_line(monkeypatch):
     with pytest.raises(InputError, match="projected, tracked, found 'seen'"):
         FilmedBall(film="seen")
-    monkeypatch.setattr(filmed.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"simgap\[vision\]"):
         FilmedBall(film="tracked")
