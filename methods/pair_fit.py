@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from methods.base import Array, Practice, Task, Tuner
+from methods.bridging import bridged
 from methods.pair_inputs import roughness
 from methods.pair_network import Design, Sides, Watched, estimate, shapes, train
 from methods.reader import Reader, Reading
@@ -102,7 +103,7 @@ class Prepared:
     even far outside the training range; with noise, what many samples say together.
 
     Attributes:
-        clean: trained on the simulations as they are.
+        clean: trained on the simulations as they are; the noisy one again where no target is as clean.
         noisy: trained on the same simulations with noise added; the clean one again where there is none.
         limit: (C,) roughness above which a target counts as noisy, SI units.
     """
@@ -121,17 +122,21 @@ class Prepared:
         alone: bool = False,
         look: Callable[[str], Look] | None = None,
     ) -> Prepared:
-        """Train both networks on the same simulations; only one where `reading.noise` is 0."""
-        clean = Fitted.train(design, data, rng, reading, alone, look and look("clean"))
+        """Train both networks on the same simulations; only one where `reading` prepares for one kind of target."""
         spread = data.flat.std(axis=(0, 1))
         limit = 2.0 * roughness(data.flat, data.lengths).max(axis=0) + reading.noise / 50.0 * spread
-        if not reading.noise:
-            return cls(clean, clean, limit)
-        spoilt = data.spoilt(reading.noise * spread, rng)
-        seen = look and look("noisy")
-        if seen:
-            seen = replace(seen, held_out=seen.held_out.spoilt(reading.noise * spread, np.random.default_rng(0)))
-        return cls(clean, Fitted.train(design, spoilt, rng, reading, alone, seen), limit)
+
+        def noisy() -> Fitted:
+            seen = look and look("noisy")
+            if seen:
+                seen = replace(seen, held_out=seen.held_out.spoilt(reading.noise * spread, np.random.default_rng(0)))
+            return Fitted.train(design, data.spoilt(reading.noise * spread, rng), rng, reading, alone, seen)
+
+        if reading.one_sensor and reading.noise:
+            network = noisy()
+            return cls(network, network, limit)
+        clean = Fitted.train(design, data, rng, reading, alone, look and look("clean"))
+        return cls(clean, noisy() if reading.noise else clean, limit)
 
     def suited(self, task: Task) -> Fitted:
         """The network for a target, chosen by the target's roughness."""
@@ -141,14 +146,17 @@ class Prepared:
     def estimator(self, task: Task) -> Callable[[Array], Array]:
         """From one simulation (1, T, C) to h(simulation, target), (dim,); NaN where the simulation failed."""
         network, missing = self.suited(task), np.isnan(task.observed)
+        alike = network.proposed is network.read
         target = network.read(task.observed[None], task.lengths, task.scene, missing)[0]
 
         def difference(observations: Array) -> Array:
             if not np.isfinite(observations).all():  # nothing was seen
                 return np.full(task.dim, np.nan)
-            hidden = missing if network.proposed is network.read else None
-            proposed = network.proposed(observations, task.lengths, task.scene, hidden)[0]
-            return network.difference(proposed, target)
+            proposed = network.proposed(observations, task.lengths, task.scene, missing if alike else None)[0]
+            if alike:
+                return network.difference(proposed, target)
+            whole = _bridged(task, observations[0], network)
+            return network.difference(proposed, network.read(whole[None], task.lengths, task.scene)[0])
 
         return difference
 
@@ -175,12 +183,25 @@ class Prepared:
         limit = np.array(parts["limit"].get("", np.nan), dtype=np.float64)
         if limit.ndim != 1 or not np.isfinite(limit).all():
             raise ValueError(f"array limit: expected finite numbers of shape (channels,), found shape {limit.shape}")
-        two = bool(reading.noise)
+        two = bool(reading.noise) and not reading.one_sensor
         if two != bool(parts["noisy"]):
             raise ValueError(f"expected {'two networks' if two else 'one network'}, found another number of them")
         clean = Fitted.restored(parts["clean"], design, reading)
         noisy = Fitted.restored(parts["noisy"], design, reading) if two else clean
         return cls(clean, noisy, limit)
+
+
+def _bridged(task: Task, shown: Array, network: Fitted) -> Array:
+    """The target (T, C) with its gaps bridged by a simulation (T, C), run by run, where one channel is compared."""
+    sensor = network.proposed.reading.part(shown)
+    whole = task.observed.copy()
+    if sensor.shape[-1] != 1:
+        return whole
+    ends = np.cumsum(task.lengths)
+    for first, end in zip(ends - task.lengths, ends, strict=True):
+        for channel in network.read.reading.part(whole[first:end]).T:
+            channel[:] = bridged(channel, sensor[first:end, 0])
+    return whole
 
 
 class PairTuner(Tuner):

@@ -19,13 +19,14 @@ class TuneNetVision(TuneNet):
 
     The proposed side reads the first channel of the simulation, as `z` of simulator ball-filmed; the target's side
     reads the other channels of the target, as the pixel row `v`, and nothing of what is known of the camera, as
-    published. Where there is one channel both sides read it. Inputs, training and the step are otherwise those of
-    `methods.tunenet.TuneNet`; h(o, o) = 0 cannot hold by construction, since no target is seen as a simulation is.
+    published. Gaps of the target are bridged by the proposed model (`methods.bridging`). Where there is one channel
+    both sides read it. Inputs, training and the step are otherwise those of `methods.tunenet.TuneNet`; h(o, o) = 0
+    cannot hold by construction, since no target is seen as a simulation is.
 
     Attributes:
         scenarios: training scenarios, each with a camera of its own, at most as many as the budget allows.
-        noise: of the tracker, 1 sigma, in units of the channel's standard deviation in training; used where the target
-            is rougher than the simulations.
+        noise: of the tracker, 1 sigma, in units of the channel's standard deviation in training. There is one network,
+            trained with it: a tracker's errors last for many samples, so that a smooth target is no clean one.
         told: read what is known of the scenario, such as where the camera stands.
         channels: first and last channel that the target's side reads, by number.
     """

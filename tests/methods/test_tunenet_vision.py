@@ -39,6 +39,28 @@ def test_error_falls_although_the_target_is_seen_by_another_sensor_only(tuner):
     assert fell[5] < 0.2 * fell[0]
 
 
+def test_there_is_one_network_which_is_prepared_for_the_sensor(tuner):
+    assert not [name for name in tuner.state() if name.startswith("noisy.")]
+    assert tuner.fitted().noisy is tuner.fitted().clean
+
+
+def test_gaps_are_bridged_by_the_proposed_model(tuner):
+    """The beginning is hidden. Held where it is seen first, it would be read as another motion."""
+    toy, rng = Filmed(), np.random.default_rng(2)
+    scenario = toy.scenario(rng)
+    target = toy.observe(np.array([[0.55]]), scenario)[0]
+    target[:, 0] = np.nan
+
+    def off(observed):
+        task = Task(1, np.full(1, 0.4), observed, toy.scale, toy.training, 9, toy.lengths, toy.known(scenario))
+        return abs(tuner.fitted().estimator(task)(toy.observe(np.array([[0.55]]), scenario))[0])
+
+    hidden, held = target.copy(), target.copy()
+    hidden[:20, 1], held[:20, 1] = np.nan, target[20, 1]
+    assert off(hidden) == pytest.approx(off(target), abs=1e-6)
+    assert off(held) > off(target) + 0.02
+
+
 def test_sides_read_their_own_channels(tuner):
     toy, rng = Filmed(), np.random.default_rng(1)
     scenario = toy.scenario(rng)
@@ -59,7 +81,7 @@ def test_state_survives_a_round_trip(tuner):
     again.restore(tuner.state())
     first, second = (run(t, Filmed(), 3, spoil=hide)[0].recommendations for t in (tuner, again))
     assert first.tolist() == second.tolist()
-    for name in ("clean.own-inputs.gain", "noisy.own-inputs.centre", "clean.inputs.gain"):
+    for name in ("clean.own-inputs.gain", "clean.own-inputs.centre", "clean.inputs.gain"):
         lacking = {k: v for k, v in tuner.state().items() if k != name}
         with pytest.raises(ValueError, match="inputs"):
             TuneNetVision(scenarios=150, points=60).restore(lacking)
