@@ -84,10 +84,22 @@ def median(pictures: list[Image]) -> Image:
     return result
 
 
-def without(pictures: list[Image], balls: list[list[tuple[float, float, float]]], before: Image) -> Image:
-    """The median without the pixels near each picture's balls (u, v, radius); `before` where none is left."""
+def without(
+    pictures: list[Image],
+    balls: list[list[tuple[float, float, float]]],
+    before: Image,
+    shaded: NDArray[np.bool_] | None = None,
+) -> Image:
+    """The median without what hides the background; `before` where none is left.
+
+    Args:
+        pictures: n of them, (height, width, 3).
+        balls: each picture's (u, v, radius).
+        before: the background as it was taken to be.
+        shaded: (n, height, width) where shadow is besides.
+    """
     rows, columns = np.mgrid[: before.shape[0], : before.shape[1]]
-    hidden = np.zeros((len(pictures), *rows.shape), bool)
+    hidden = np.zeros((len(pictures), *rows.shape), bool) if shaded is None else shaded.copy()
     for mask, there in zip(hidden, balls, strict=True):
         for u, v, radius in there:
             mask |= np.hypot(columns - u, rows - v) < 1.3 * radius + 3

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.base import Array
+from sims.camera import circle
 from sims.camera.packages import imported
 from sims.camera.render import Image
 
@@ -22,13 +23,15 @@ _RAYS = 36
 _LEAST_AREA = 6
 _LEAST_LEVEL = 12.0
 _AGREE = 0.6
+_GOOD = 0.85
 _MOST_SPOTS = 4
 _TINY = 2.5
 _ROUNDS = 3
-_NEAR, _EXACT = 1e-2, 1e-4
+_STILL = 0.02
 _FINE = 0.25
 _LOOSE = 0.5
 _RIM = 5
+_AROUND = 1.6
 _SHADE = (0.25, 0.97)
 
 
@@ -36,7 +39,8 @@ class Spot(NamedTuple):
     """A ball-like thing: middle and radius of its outline in pixels, the share of rays that agree, their scatter.
 
     `edges` (n, 2) are the points of its edge to which the circle was fitted; none for a ball of a few pixels. `colour`
-    is that of its middle, `contrast` how far that is from the background there, in grey levels.
+    is that of its middle, `contrast` how far that is from the background there, in grey levels. A `ghost` is a ball or
+    shadow in the background that the picture lacks.
     """
 
     u: float
@@ -47,6 +51,7 @@ class Spot(NamedTuple):
     edges: Array = np.empty((0, 2))
     colour: tuple[float, ...] = (0.0, 0.0, 0.0)
     contrast: float = 0.0
+    ghost: bool = False
 
     def with_radius(self, radius: float) -> Spot:
         """The same, its middle fitted again to the edge with the radius known from other pictures.
@@ -92,17 +97,16 @@ class Finder:
         self._grey = cv2.cvtColor(background, cv2.COLOR_RGB2GRAY)
         self._square = np.maximum((self._plain * self._plain).sum(axis=2), 1.0)
 
-    def spots(self, picture: Image) -> list[Spot]:
-        """What looks like a ball, the largest first."""
+    def spots(self, picture: Image, ghosts: bool = False) -> list[Spot]:
+        """What looks like a ball, the largest first; with the ghosts, if asked for."""
         cv2 = imported("cv2")
-        apart = cv2.absdiff(picture, self.background)
-        difference = cv2.max(cv2.max(apart[..., 0], apart[..., 1]), apart[..., 2])
+        difference = self._difference(picture)
         brightness = cv2.absdiff(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), self._grey)
         mask = (difference > self.level).astype(np.uint8)
         if not mask.any():
             return []
         if self.shadows:
-            shade = self._shadow(picture, mask)
+            shade = self._even(picture, mask) > 0
             mask[shade] = 0
             # single pixels that shadow and noise leave
             mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
@@ -111,27 +115,76 @@ class Finder:
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         large = sorted(((len(c), i) for i, c in enumerate(contours) if len(c) > 3), reverse=True)[:_MOST_SPOTS]
         found = [self._spot(contours[i], (brightness, difference), shade) for _, i in large]
-        return [self._coloured(spot, picture) for spot in found if spot is not None]
+        seen = [self._coloured(spot, picture) for spot in found if spot is not None]
+        return seen if ghosts else [spot for spot in seen if not spot.ghost]
 
     def _coloured(self, spot: Spot, picture: Image) -> Spot:
-        """The spot with the colour of its middle."""
+        """The spot with the colour of its middle, and whether it is the background that stands out against the rest."""
         cv2, side = imported("cv2"), 2 * max(1, int(0.4 * spot.radius)) + 1
         here, behind = (
             cv2.getRectSubPix(part, (side, side), (spot.u, spot.v)).reshape(-1, 3).mean(axis=0)
             for part in (picture, self.background)
         )
-        return spot._replace(colour=tuple(here.tolist()), contrast=float(np.abs(here - behind).max()))
+        cos, sin = _directions()
+        rows = (spot.v + _AROUND * spot.radius * sin[:, 0] + 0.5).astype(np.intp).clip(0, picture.shape[0] - 1)
+        columns = (spot.u + _AROUND * spot.radius * cos[:, 0] + 0.5).astype(np.intp).clip(0, picture.shape[1] - 1)
+        out, out_behind = (
+            np.partition(part[rows, columns], _RAYS // 2, axis=0)[_RAYS // 2].astype(np.float64)
+            for part in (picture, self.background)
+        )
+        contrast = float(np.abs(here - behind).max())
+        ghost = self._is_ghost((here, out), (behind, out_behind))
+        return spot._replace(colour=tuple(here.tolist()), contrast=contrast, ghost=ghost)
 
-    def _shadow(self, picture: Image, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Where the picture is the background times one factor, in all colours alike: shadow, or shadow gone."""
-        result = np.zeros(mask.shape, bool)
+    def unshaded(self, picture: Image) -> NDArray[np.bool_]:
+        """Where the picture lacks a shadow that the background has."""
+        cv2 = imported("cv2")
+        mask = (self._difference(picture) > self.level).astype(np.uint8)
+        lighter = (self._even(picture, mask) > 1).astype(np.uint8)
+        count, parts, sizes, _ = cv2.connectedComponentsWithStats(lighter)
+        gone = np.zeros(mask.shape, bool)
+        for part in range(1, count):
+            if sizes[part, cv2.CC_STAT_AREA] < _LEAST_AREA:
+                continue
+            inside = (parts == part).astype(np.uint8)
+            near = cv2.dilate(inside, np.ones((3, 3), np.uint8))
+            ring = (cv2.dilate(near, np.ones((5, 5), np.uint8)) > 0) & (near == 0) & (mask == 0)
+            if not ring.any():
+                continue
+            here, behind = (
+                (np.median(each[inside > 0], axis=0), np.median(each[ring], axis=0))
+                for each in (picture, self.background)
+            )
+            if self._is_ghost(here, behind):
+                gone |= inside > 0
+        return gone
+
+    def _is_ghost(self, here: tuple[Array, Array], behind: tuple[Array, Array]) -> bool:
+        """Whether a thing is in the background and not in the picture: colours (inside, around) of both."""
+        stands_out, stood_out = (float(np.abs(inside - around).max()) for inside, around in (here, behind))
+        return stood_out > stands_out + self.level / 2
+
+    def _difference(self, picture: Image) -> NDArray[np.uint8]:
+        """The largest difference over the colours."""
+        cv2 = imported("cv2")
+        apart = cv2.absdiff(picture, self.background)
+        result: NDArray[np.uint8] = cv2.max(cv2.max(apart[..., 0], apart[..., 1]), apart[..., 2])
+        return result
+
+    def _even(self, picture: Image, mask: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The factor by which the picture is the background where that is one in all colours, else 0.
+
+        Below 1 it is shadow, above 1 shadow gone.
+        """
+        result = np.zeros(mask.shape, np.float32)
         rows, columns = np.nonzero(mask)
         there = picture[rows, columns].astype(np.float32)
         plain = self._plain[rows, columns]
         factor = (there * plain).sum(axis=1) / self._square[rows, columns]
-        rest = np.abs(there - factor[:, None] * plain).max(axis=1)
+        rest = np.abs(there - factor[:, None] * plain).max(axis=1) / np.maximum(factor, 1)
         even = np.minimum(factor, 1 / np.maximum(factor, 1e-3))
-        result[rows, columns] = (even > _SHADE[0]) & (even < _SHADE[1]) & (rest < max(6.0, 3 * self.sigma))
+        shade = (even > _SHADE[0]) & (even < _SHADE[1]) & (rest < max(6.0, 3 * self.sigma))
+        result[rows, columns] = np.where(shade, factor, 0)
         return result
 
     def _spot(self, contour: Any, differences: tuple[NDArray[np.uint8], ...], shade: NDArray[np.bool_]) -> Spot | None:
@@ -164,15 +217,20 @@ class Finder:
     def _circle(self, windows: NDArray[np.float32], start: tuple[float, float, float], u0: int, v0: int) -> Spot | None:
         u, v, radius = start
         kept, rest, edges = np.empty(0, bool), np.empty(0), None
-        for turn in range(_ROUNDS):
+        for _ in range(_ROUNDS):
             edges = self._edges(windows, u, v, radius)
             if edges is None:
                 return None
-            fitted = _fit(edges, u, v, _EXACT if turn == _ROUNDS - 1 else _NEAR)
+            fitted = circle.fit(edges, (u, v, None))
+            if fitted is None or circle.agreeing(fitted).sum() < _GOOD * _RAYS:
+                fitted = circle.better(fitted, circle.fit(edges, circle.through_an_arc(edges)))
             if fitted is None:
                 return None
+            moved = max(abs(new - old) for new, old in zip(fitted[0], (u, v, radius), strict=True))
             (u, v, radius), rest = fitted
-            kept = np.abs(rest) < max(0.7, 0.1 * radius)
+            kept = circle.agreeing(fitted)
+            if moved < _STILL:
+                break
         agree = float(kept.sum()) / _RAYS
         height, width = windows.shape[1:]
         if edges is None or agree < _AGREE or not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
@@ -236,51 +294,3 @@ def _along(window: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.fl
 def _directions() -> tuple[Array, Array]:
     angles = np.linspace(0, 2 * np.pi, _RAYS, endpoint=False)[:, None]
     return np.cos(angles), np.sin(angles)
-
-
-def _middle(values: Array) -> float:
-    """The median; numpy's own takes ten times as long for a few numbers."""
-    k = len(values) // 2
-    sorted_there = np.partition(values, (k - 1, k))
-    return float(sorted_there[k]) if len(values) % 2 else float(0.5 * (sorted_there[k - 1] + sorted_there[k]))
-
-
-def _fit(points: Array, u: float, v: float, enough: float) -> tuple[tuple[float, float, float], Array] | None:
-    """The circle nearest to most of the points, by Gauss-Newton with Tukey's weights; and each ray's distance to it.
-
-    The normal equations are solved by hand: numpy's own solver spends its time on the call.
-
-    Args:
-        points: (n, 2).
-        u: where to begin.
-        v: where to begin.
-        enough: px, a step below this ends it.
-    """
-    x, y = points[:, 0], points[:, 1]
-    rows: Array = np.ones((4, len(points)))
-    radius = -1.0
-    for _ in range(8):
-        away_u, away_v = x - u, y - v
-        far = np.hypot(away_u, away_v)
-        if radius < 0:
-            radius = _middle(far)
-        rest = far - radius
-        width = 4.7 * max(1.4826 * _middle(np.abs(rest)), 0.15)
-        weights = np.maximum(1 - (rest / width) ** 2, 0.0) ** 2
-        np.maximum(far, 1e-9, out=far)
-        rows[0], rows[1], rows[3] = away_u / far, away_v / far, rest
-        (xx, xy, mx, p), (_, yy, my, q), (_, _, total, r), _ = ((rows * weights) @ rows.T).tolist()
-        if total <= 0:
-            return None
-        a, b, c = xx - mx * mx / total, xy - mx * my / total, yy - my * my / total
-        if total * (area := a * c - b * b) < 1e-6:
-            return None
-        p, q = p - mx * r / total, q - my * r / total
-        du, dv = (c * p - b * q) / area, (a * q - b * p) / area
-        dr = (r - mx * du - my * dv) / total
-        u, v, radius = u + du, v + dv, radius + dr
-        if abs(du) + abs(dv) + abs(dr) < enough:
-            break
-    if not 0.5 < radius < 1e4:
-        return None
-    return (u, v, radius), np.hypot(x - u, y - v) - radius

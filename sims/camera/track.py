@@ -18,6 +18,7 @@ from sims.camera.spots import Finder, Spot
 _LEAST_FRAMES = 5
 _WINDOW = 9
 _FEW = 8
+_FEWEST = 3
 _MISFIT = 0.2
 
 
@@ -115,25 +116,32 @@ def _finder(pictures: list[Image]) -> Finder:
         # a ball of the ground's own hue is itself taken for shadow; then shadow must be borne
         good = [sum(max((s.agree for s in finder.spots(p)), default=0.0) for p in few) for finder in finders]
         best = finders[0 if good[0] >= 0.8 * good[1] else 1]
-        plain = background.without(pictures, _unghosted([best.spots(p) for p in pictures]), plain)
+        hiding = _hiding([best.spots(p, ghosts=True) for p in pictures])
+        shaded = _shaded([best.unshaded(p) for p in pictures]) if best.shadows else None
+        plain = background.without(pictures, hiding, plain, shaded)
     return Finder(plain, sigma, best.shadows)
 
 
-def _unghosted(found: list[list[Spot]]) -> list[list[tuple[float, float, float]]]:
-    """Where the ball hides the background in each picture.
+def _hiding(found: list[list[Spot]]) -> list[list[tuple[float, float, float]]]:
+    """Where something hides the background in each picture.
 
-    A ball that rests for most of the film gets into the median. Then each picture shows, beside the ball, something as
-    round that never moves: the hole where it will rest. There those pictures tell the background and the others do not.
+    A ball that rests for most of the film, or its shadow, gets into the median. Pictures that lack it there show the
+    background, and the others do not.
     """
-    balls = [[(s.u, s.v, s.radius) for s in spots] for spots in found]
-    for ghost in [ball for there in balls for ball in there]:
-        at = [next((b for b in there if _same(b, ghost)), None) for there in balls]
-        beside = [any(not _same(b, ghost) and 0.5 < b[2] / ghost[2] < 2 for b in there) for there in balls]
-        both = sum(b and a is not None for a, b in zip(at, beside, strict=True))
-        if both >= 4 and both >= 0.7 * sum(a is not None for a in at):
-            balls = [[b for b in there if not _same(b, ghost)] for there in balls]
-            return [[*there, ghost] if a is None else there for a, there in zip(at, balls, strict=True)]
+    balls = [[(s.u, s.v, s.radius) for s in spots if not s.ghost] for spots in found]
+    ghosts = [[(s.u, s.v, s.radius) for s in spots if s.ghost] for spots in found]
+    for one in [ghost for there in ghosts for ghost in there]:
+        lacking = [any(_same(one, other) for other in there) for there in ghosts]
+        if sum(lacking) >= _FEWEST:
+            balls = [there if lacks else [*there, one] for there, lacks in zip(balls, lacking, strict=True)]
     return balls
+
+
+def _shaded(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """Where a shadow hides the background in each picture (n, height, width), seen by those in which it is gone."""
+    stack = np.stack(lit)
+    result: NDArray[np.bool_] = ~stack & (stack.sum(axis=0) >= _FEWEST)
+    return result
 
 
 def _same(a: tuple[float, float, float], b: tuple[float, float, float]) -> bool:
