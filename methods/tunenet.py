@@ -125,6 +125,8 @@ SETTLED = 1e-10
 
 _LONGEST = 2.0
 """Broyden's step against that of Algorithm 1, at most."""
+_REACH = 10.0
+"""The same of a step that halves an interval."""
 
 
 class Search:
@@ -171,12 +173,19 @@ class Search:
         return np.asarray(step * share, dtype=np.float64)
 
     def _bracketed(self, guess: Array, point: Array, residual: Array) -> Array:
-        """In one dimension, after a setback, keep between a point that was too low and one that was too high."""
+        """In one dimension, after a setback, keep between a point that was too low and one that was too high.
+
+        Halfway to the other end is far where that was one of the first points; what is nearly right already then needs
+        no such step, and where the estimates are rough it would be lost.
+        """
         if residual[0] > 0.0:
             self._low = max(self._low, point[0])
         elif residual[0] < 0.0:
             self._high = min(self._high, point[0])
         known = np.isfinite([self._low, self._high]).all() and self._low < self._high
         if self._setbacks and known and not self._low < guess[0] < self._high:
-            return np.array([(self._low + self._high) / 2.0])
+            far = _REACH * float(np.abs(self._residual).max()) if self._residual is not None else 1.0
+            halfway = np.array([(self._low + self._high) / 2.0])
+            inside: Array = np.clip(halfway, self.best - far, self.best + far)
+            return inside
         return guess
