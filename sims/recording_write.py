@@ -16,6 +16,8 @@ from sims.recording import Declared, Recording, Run
 from sims.recording_description import description_of
 
 _EXACT = 17
+Content = str | bytes
+"""Of a file; text is written as UTF-8."""
 
 
 def write_recording(
@@ -24,7 +26,7 @@ def write_recording(
     declared: Declared,
     *,
     digits: int = _EXACT,
-    beside: Mapping[Path, str] | None = None,
+    beside: Mapping[Path, Content] | None = None,
 ) -> None:
     """Write a recording such that `read_recording` gives the same back, in SI units.
 
@@ -43,11 +45,14 @@ def write_recording(
         raise InputError(f"{table}: expected a name that ends in .csv")
     if not recording.runs:
         raise InputError(f"{table}: expected at least one run, found none")
-    texts = {table: _table(recording.runs, digits), description_of(table): _description(recording, declared)}
+    texts: dict[Path, Content] = {
+        table: _table(recording.runs, digits),
+        description_of(table): _description(recording, declared),
+    }
     publish({**texts, **(beside or {})})
 
 
-def publish(files: Mapping[Path, str]) -> None:
+def publish(files: Mapping[Path, Content]) -> None:
     """Write all files or none; readers never see half of one.
 
     Raises:
@@ -60,8 +65,9 @@ def publish(files: Mapping[Path, str]) -> None:
         try:
             for path, draft in drafts.items():
                 undo.callback(draft.unlink, missing_ok=True)
-                with draft.open("x", encoding="utf-8", newline="") as file:
-                    file.write(files[path])
+                content = files[path]
+                with draft.open("xb") as file:
+                    file.write(content.encode() if isinstance(content, str) else content)
             for path, draft in drafts.items():
                 _place(draft, path)
                 made.append(path)

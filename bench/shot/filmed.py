@@ -14,7 +14,6 @@ from sims.camera.files import Filmed, beside, described
 from sims.camera.look import Look
 from sims.camera.render import Stage
 from sims.camera.video import write_video
-from sims.recording_write import publish
 
 DISTANCE, HEIGHT, AIM = (2.8, 3.4), (0.8, 1.4), 0.9
 """Ranges of the camera's distance and height, and the height at which it looks, m: the whole drop is in the picture."""
@@ -44,7 +43,6 @@ def filmed(path: Path, heights: Array, times: Array, radius: float, pixels: int,
         left.unlink(missing_ok=True)
     stage = Stage(camera, look, radius, rng)
     places = np.stack([np.zeros_like(heights), np.zeros_like(heights), heights], axis=1)
-    write_video(film, stage.film(places), times, look.crf)
+    write_video(film, stage.film(places), times, look.crf, {beside(film): described(Filmed(camera, radius))})
     stage.close()
-    publish({beside(film): described(Filmed(camera, radius))})
     tracking.write(film, path, None, None, "camera")

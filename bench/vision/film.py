@@ -15,7 +15,7 @@ from sims.camera.look import Look
 from sims.camera.render import Stage
 from sims.camera.video import write_video
 from sims.recording import read_recording, system_of
-from sims.recording_write import publish, refuse_existing
+from sims.recording_write import refuse_existing
 
 
 def write(recording: Path, out: Path, run: str | None, pixels: int, seed: int) -> tuple[int, float]:
@@ -44,8 +44,8 @@ def write(recording: Path, out: Path, run: str | None, pixels: int, seed: int) -
     rng = rng_for("film", seed)
     camera, look = Camera.published(rng, pixels), Look.drawn(rng)
     stage = Stage(camera, look, radius, rng)
-    write_video(out, stage.film(positions), chosen.times, look.crf)
-    publish({beside(out): described(Filmed(camera, radius, float(positions[0, 0]), float(positions[0, 1])))})
+    told = {beside(out): described(Filmed(camera, radius, float(positions[0, 0]), float(positions[0, 1])))}
+    write_video(out, stage.film(positions), chosen.times, look.crf, told)
     return len(positions), float(chosen.times[-1] - chosen.times[0])
 
 

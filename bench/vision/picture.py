@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+import io
 
 import numpy as np
 
 from bench.vision.metres import Heights
-from sims.base import InputError
 from sims.camera.render import Image
 from sims.camera.track import Track
 
@@ -16,12 +14,8 @@ _SEEN, _MISSING = "#0072B2", "#A03C00"
 _SHOWN = 6
 
 
-def draw(track: Track, heights: Heights, part: slice, title: str, paths: Sequence[Path]) -> None:
-    """Draw into `paths`, PNG and PDF.
-
-    Raises:
-        InputError: a file cannot be written.
-    """
+def drawn(track: Track, heights: Heights, part: slice, title: str) -> tuple[bytes, bytes]:
+    """The picture as PNG and PDF."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -50,13 +44,11 @@ def draw(track: Track, heights: Heights, part: slice, title: str, paths: Sequenc
     above.set_title("dotted: ball on the ground", fontsize=9)
     below.set_title("grey: recorded; marks at the foot: no ball seen", fontsize=9)
     figure.suptitle(f"{title}\n{int((~gone).sum())} of {len(t)} frames", parse_math=False, fontsize=10)
-    try:
-        figure.savefig(paths[0], dpi=140)
-        figure.savefig(paths[1], metadata={"CreationDate": None})
-    except OSError as error:
-        raise InputError(f"{paths[0]}: cannot be written ({error.strerror})") from None
-    finally:
-        plt.close(figure)
+    png, pdf = io.BytesIO(), io.BytesIO()
+    figure.savefig(png, format="png", dpi=140)
+    figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
+    plt.close(figure)
+    return png.getvalue(), pdf.getvalue()
 
 
 def _some(track: Track) -> list[int]:

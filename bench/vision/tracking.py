@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.vision import metres
-from bench.vision.picture import draw
+from bench.vision.picture import drawn
 from sims.ball.system import BallSystem
 from sims.base import InputError, frozen
 from sims.camera.files import beside, read_filmed
@@ -62,8 +62,8 @@ def write(video: Path, out: Path, diameter: float | None, fps: float | None, sca
     noise = float(np.nanmax([rough(z), metres.scatter(seen.times[part], z), 0.0]))
     if not noise > 0:
         noise = seen.noise * heights.radius / float(np.nanmedian(seen.radius))
-    write_recording(out, _recording(seen, heights, noise, part, video), BallSystem, digits=_DIGITS)
-    draw(seen, heights, part, f"{video.name}: {heights.how}", pictures)
+    shown = dict(zip(pictures, drawn(seen, heights, part, f"{video.name}: {heights.how}"), strict=True))
+    write_recording(out, _recording(seen, heights, noise, part, video), BallSystem, digits=_DIGITS, beside=shown)
     count = int(np.isfinite(heights.z[part]).sum())
     lines = (
         f"{out}: {count} of {part.stop - part.start} frames with the ball, z in metres {heights.how}",

@@ -6,7 +6,7 @@ PyAV brings its own codecs and gives every frame's time as the file states it, a
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,16 @@ import numpy as np
 from sims.base import Array, InputError
 from sims.camera.packages import imported
 from sims.camera.render import Image
-from sims.recording_write import refuse_existing
+from sims.recording_write import publish, refuse_existing
 
 _TICKS = 90_000
 """Time stamps a second in files written here; common for video, and a whole number for the usual rates."""
 _DEFAULT_RATE = 30.0
 
 
-def write_video(path: Path, frames: Iterable[Image], times: Array, crf: int = 18) -> None:
+def write_video(
+    path: Path, frames: Iterable[Image], times: Array, crf: int = 18, beside: Mapping[Path, str] | None = None
+) -> None:
     """Write frames as H.264 in an .mp4 file, whole or not at all.
 
     Args:
@@ -31,6 +33,7 @@ def write_video(path: Path, frames: Iterable[Image], times: Array, crf: int = 18
         frames: pictures (height, width, 3) of one size, both even.
         times: (n,) seconds, increasing, one a frame; rounded to 1/90000 s.
         crf: constant rate factor, 0 (lossless) to 51.
+        beside: texts of other new files that belong to it, written before it is to be seen.
 
     Raises:
         InputError: the file exists or cannot be written, or the frames have no size that can be encoded.
@@ -42,6 +45,7 @@ def write_video(path: Path, frames: Iterable[Image], times: Array, crf: int = 18
     try:
         _encode(draft, frames, times, crf)
         refuse_existing([path])
+        publish(beside or {})
         draft.rename(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 from time import process_time
 
@@ -23,18 +24,19 @@ from sims.camera.render import Stage
 from sims.camera.track import track
 from sims.camera.video import Video, write_video
 
-TIMES = np.arange(120) / 60
+RATE = 60.0
 BINS = {"range [m]": [5, 7, 8.5, 10, 13], "speed [px/frame]": [0, 0.5, 1, 2, 4]}
 
 
-def one(seed, folder):
-    """A row for each frame of the drop of this seed, and the seconds that reading and tracking took."""
+def one(seed, folder, count):
+    """A row for each of `count` frames of the drop of this seed, and the seconds that reading and tracking took."""
+    times = np.arange(count) / RATE
     rng = np.random.default_rng([7, seed])
     camera, look = Camera.published(rng), Look.drawn(rng)
     ball, z0 = Ball(observe=["z"], engine="batch"), rng.uniform(4, 5)
-    z = ball.simulate(np.array([[rng.uniform(0.3, 0.9)]]), Scenario(TIMES, {"z": z0}))[0, :, 0]
+    z = ball.simulate(np.array([[rng.uniform(0.3, 0.9)]]), Scenario(times, {"z": z0}))[0, :, 0]
     points = np.stack([0 * z, 0 * z, z], axis=1)
-    write_video(folder / f"{seed}.mp4", Stage(camera, look, 0.5, rng).film(points), TIMES, look.crf)
+    write_video(folder / f"{seed}.mp4", Stage(camera, look, 0.5, rng).film(points), times, look.crf)
     truth = camera.project(points)
     reach = camera.apparent_radius(points, 0.5)[:, None]
     whole = ((truth > reach) & (truth < 99 - reach)).all(axis=1)
@@ -60,11 +62,12 @@ def rms(values):
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--drops", type=int, default=24)
+    parser.add_argument("--frames", type=int, default=120, help="120 end while most balls bounce, 400 after all rest")
     parser.add_argument("--out", type=Path, default=Path("results/tracker"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        parts, drops = zip(*(one(seed, Path(folder)) for seed in range(options.drops)), strict=True)
+        parts, drops = zip(*(one(seed, Path(folder), options.frames) for seed in range(options.drops)), strict=True)
     frames = pd.concat(parts)
     by_drop = frames.groupby("seed")["error"].agg(rms=rms, worst="max").reset_index()
     by_drop["missed"] = frames[frames.whole].groupby("seed")["error"].apply(lambda e: float(e.isna().mean())).values
@@ -72,7 +75,8 @@ def main():
     by_drop.to_csv(options.out / "drops.csv", index=False, float_format="%.4g")
     rows = [("all", "", frames)]
     for name, edges in BINS.items():
-        groups = frames.groupby(pd.cut(frames[name], edges, include_lowest=True), observed=True)
+        labels = [f"{low:g} to {high:g}" for low, high in pairwise(edges)]
+        groups = frames.groupby(pd.cut(frames[name], edges, include_lowest=True, labels=labels), observed=True)
         rows += [(name, str(interval), part) for interval, part in groups]
     table = pd.DataFrame(
         {
@@ -84,12 +88,12 @@ def main():
         for by, interval, part in rows
     )  # fmt: skip
     table.to_csv(options.out / "table.csv", index=False, float_format="%.4g")
-    draw(table, by_drop, options.out)
+    draw(table, by_drop, options.out, options.frames)
     print(table.to_string(index=False))
     print(by_drop.drop(columns="notes").describe().to_string())
 
 
-def draw(table, drops, folder):
+def draw(table, drops, folder, count):
     import matplotlib
 
     matplotlib.use("Agg")
@@ -110,7 +114,8 @@ def draw(table, drops, folder):
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("distance from the true centre [px]")
     axes[0].legend(frameon=False, fontsize=8)
-    figure.suptitle("Tracked ball against the renderer's truth, 100 × 100 px, compressed; dashed: 0.5 px", fontsize=10)
+    told = f"films of {count} frames, 100 × 100 px, compressed; dashed: 0.5 px"
+    figure.suptitle(f"Tracked ball against the renderer's truth; {told}", fontsize=10)
     figure.savefig(folder / "accuracy.png", dpi=140)
     figure.savefig(folder / "accuracy.pdf", metadata={"CreationDate": None})
 

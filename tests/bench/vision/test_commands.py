@@ -7,7 +7,10 @@ pytest.importorskip("av")
 pytest.importorskip("cv2")
 
 from bench.cli import main
+from bench.vision import tracking
 from sims.ball.system import BallSystem
+from sims.base import InputError
+from sims.camera import video
 from sims.recording import read_recording
 
 
@@ -44,6 +47,25 @@ def test_without_the_camera_the_fall_gives_the_scale(drop, tmp_path, capsys):
     z = read_recording(out, BallSystem, whole=True).runs[0].channels["z"]
     assert np.nanmin(z) == pytest.approx(0.5, abs=0.15)
     assert np.nanmax(z) == pytest.approx(3.6, abs=0.4)
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_nothing_behind(drop, tmp_path, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("out of paint")
+
+    monkeypatch.setattr(tracking, "drawn", broken)
+    with pytest.raises(RuntimeError, match="out of paint"):
+        tracking.write(drop / "drop.mp4", tmp_path / "t.csv", None, None, None)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_and_its_camera_come_together_or_not_at_all(drop, tmp_path, monkeypatch):
+    def full(_):
+        raise InputError("disk full")
+
+    monkeypatch.setattr(video, "publish", full)
+    assert main(["film", str(drop / "drop.csv"), "--out", str(tmp_path / "film.mp4"), "--size", "32"]) == 2
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_cannot_be_tracked_is_one_line_and_nothing_is_written(tmp_path, capsys):
