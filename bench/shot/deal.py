@@ -23,6 +23,9 @@ from sims.shot.balls import Ball, ball_named
 from sims.shot.scene import Scene
 from sims.shot.world import GRAVITY, Ground, fly
 
+RECORDINGS = "recordings"
+"""The folder of recorded drops, in a study's."""
+
 
 @dataclass(frozen=True)
 class Deal:

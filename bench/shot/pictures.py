@@ -164,7 +164,7 @@ def examples(dealt: Sequence[Deal], kept: Mapping[str, Any], rows: pd.DataFrame)
     tuned = [m for m in rows["method"].unique() if group_of(m) == "tuned"]
     if not tuned:
         return []
-    first = "tunenet" if "tunenet" in tuned else tuned[0]
+    first = next((m for m in ("tunenet-vision", "tunenet") if m in tuned), tuned[0])
     shown = [m for m in (NOMINAL, first, EXPLAINED) if (rows["method"] == m).any()]
     wide = rows.pivot(index="shot", columns="method", values="off")[shown].abs().dropna()
     if wide.empty:

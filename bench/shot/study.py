@@ -14,7 +14,7 @@ from bench.journal import replace_text
 from bench.pools import Call, LocalPool
 from bench.runner import Progress, check
 from bench.shot import tune
-from bench.shot.deal import Deal, deals, in_view, record
+from bench.shot.deal import RECORDINGS, Deal, deals, in_view, record
 from bench.shot.settings import Settings, settings_of
 from bench.shot.throw import thrown
 from bench.store import Configuration, configuration, create, free_folder
@@ -23,7 +23,7 @@ from sims.camera import packages
 from sims.shot import world
 
 Say = Callable[[str], None]
-SHOTS, RECORDINGS = "shots", "recordings"
+SHOTS = "shots"
 
 
 def begin(experiment: Experiment, plugins: Sequence[str], out: str | None, jobs: int) -> Path:
