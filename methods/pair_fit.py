@@ -132,7 +132,7 @@ class Prepared:
                 seen = replace(seen, held_out=seen.held_out.spoilt(reading.noise * spread, np.random.default_rng(0)))
             return Fitted.train(design, data.spoilt(reading.noise * spread, rng), rng, reading, alone, seen)
 
-        if reading.one_sensor and reading.noise:
+        if reading.noise and not reading.clean:
             network = noisy()
             return cls(network, network, limit)
         clean = Fitted.train(design, data, rng, reading, alone, look and look("clean"))
@@ -183,7 +183,7 @@ class Prepared:
         limit = np.array(parts["limit"].get("", np.nan), dtype=np.float64)
         if limit.ndim != 1 or not np.isfinite(limit).all():
             raise ValueError(f"array limit: expected finite numbers of shape (channels,), found shape {limit.shape}")
-        two = bool(reading.noise) and not reading.one_sensor
+        two = bool(reading.noise) and reading.clean
         if two != bool(parts["noisy"]):
             raise ValueError(f"expected {'two networks' if two else 'one network'}, found another number of them")
         clean = Fitted.restored(parts["clean"], design, reading)

@@ -28,8 +28,8 @@ class Reading:
         raw: the resampled series in SI units as they are, as published; the other settings say nothing then.
         told: read what is known of a scenario too, where scenarios differ in it (`methods.circumstances`).
         channels: the first and the last of the channels that are read, by number; None for all.
-        proposed: what the network's proposed side reads, where that is something else: then targets come from another
-            sensor, and none is as clean as a simulation.
+        clean: whether targets may be as clean as simulations; else one network is trained, with the noise.
+        proposed: what the network's proposed side reads, where that is something else.
     """
 
     points: int = 400
@@ -39,12 +39,8 @@ class Reading:
     raw: bool = False
     told: bool = True
     channels: tuple[int, int] | None = None
+    clean: bool = True
     proposed: Reading | None = None
-
-    @property
-    def one_sensor(self) -> bool:
-        """Whether targets come from a sensor always."""
-        return self.proposed is not None
 
     def part(self, observations: Array) -> Array:
         """The channels (..., c) that are read of observations (..., C); the last one if there are too few."""

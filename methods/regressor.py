@@ -32,6 +32,7 @@ class Regressor(PairTuner):
         weight_decay: lambda in Eq. 1.
         told: read what is known of the scenario too, where scenarios differ in it (`methods.circumstances`).
         channels: first and last channel that is read, by number, where targets do not show the others; None for all.
+        clean: as in `methods.tunenet.TuneNet`.
     """
 
     name: ClassVar[str] = "regressor"
@@ -49,6 +50,7 @@ class Regressor(PairTuner):
     weight_decay: float = 1e-6
     told: bool = True
     channels: tuple[int, int] | None = None
+    clean: bool = True
 
     def design(self) -> Design:
         """How the network is built and trained."""
@@ -60,7 +62,10 @@ class Regressor(PairTuner):
         """What it reads."""
         if self.published:
             return Reading(self.points, noise=0.0, raw=True)
-        return Reading(self.points, self.inputs, self.strictness, self.noise, told=self.told, channels=self.channels)
+        return Reading(
+            self.points, self.inputs, self.strictness, self.noise,
+            told=self.told, channels=self.channels, clean=self.clean,
+        )  # fmt: skip
 
     def layout(self, dim: int) -> tuple[int, int]:
         """Training scenarios at most, and simulations in each."""

@@ -38,6 +38,8 @@ class TuneNet(PairTuner):
         weight_decay: lambda in Eq. 1.
         told: read what is known of the scenario too, where scenarios differ in it (`methods.circumstances`).
         channels: first and last channel that is read, by number, where targets do not show the others; None for all.
+        clean: whether targets may be as clean as simulations. False for a sensor whose errors last for many samples: a
+            smooth target is no clean one then, and there is one network, trained with `noise`.
         broyden: solve h = 0; without it each step is that of Algorithm 1.
     """
 
@@ -54,6 +56,7 @@ class TuneNet(PairTuner):
     weight_decay: float = 1e-5
     told: bool = True
     channels: tuple[int, int] | None = None
+    clean: bool = True
     broyden: bool = True
 
     def design(self) -> Design:
@@ -62,7 +65,10 @@ class TuneNet(PairTuner):
 
     def reading(self) -> Reading:
         """What it reads."""
-        return Reading(self.points, self.inputs, self.strictness, self.noise, told=self.told, channels=self.channels)
+        return Reading(
+            self.points, self.inputs, self.strictness, self.noise,
+            told=self.told, channels=self.channels, clean=self.clean,
+        )  # fmt: skip
 
     def layout(self, dim: int) -> tuple[int, int]:
         """Training scenarios at most, and simulations in each."""

@@ -25,8 +25,8 @@ class TuneNetVision(TuneNet):
 
     Attributes:
         scenarios: training scenarios, each with a camera of its own, at most as many as the budget allows.
-        noise: of the tracker, 1 sigma, in units of the channel's standard deviation in training. There is one network,
-            trained with it: a tracker's errors last for many samples, so that a smooth target is no clean one.
+        noise: of the tracker, 1 sigma, in units of the channel's standard deviation in training.
+        clean: as in TuneNet; a tracker's errors do last.
         told: read what is known of the scenario, such as where the camera stands.
         channels: first and last channel that the target's side reads, by number.
     """
@@ -38,6 +38,7 @@ class TuneNetVision(TuneNet):
     noise: float = 0.02
     told: bool = False
     channels: tuple[int, int] | None = (1, _LAST)
+    clean: bool = False
 
     def design(self) -> Design:
         """How the network is built and trained."""
