@@ -77,7 +77,9 @@ def _success(experiment: Experiment, lines: pd.DataFrame) -> Figure:
         rate, low, high = (100 * float(over.loc[method, c]) for c in ("rate", "low", "high"))
         left.plot([low, high], [place, place], color=colour, linewidth=2)
         left.plot(rate, place, marker=marker, color=colour, markersize=7)
-        left.annotate(f"{rate:.0f}", (rate, place), xytext=(0, 6), textcoords="offset points", ha="center", fontsize=8)
+        near = 0 < rate < 0.5 or 99.5 <= rate < 100  # not rounded to none or all
+        told = f"{rate:.{1 if near else 0}f}"
+        left.annotate(told, (rate, place), xytext=(0, 6), textcoords="offset points", ha="center", fontsize=8)
     left.set(xlim=(-2, 104), xlabel="shots through the hoop, all balls [%]")
     left.set_yticks(range(len(methods)), [label_of(m) for m in methods])
     left.invert_yaxis()
