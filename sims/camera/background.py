@@ -107,7 +107,16 @@ def without(
     values = np.where(hidden[:, ever, None], np.nan, np.stack(pictures)[:, ever].astype(np.float32))
     result = before.copy()
     if ever.any():
-        result[ever] = (np.nanmedian(values, axis=0) + 0.5).astype(np.uint8)
+        result[ever] = (_median_of_seen(values) + 0.5).astype(np.uint8)
+    return result
+
+
+def _median_of_seen(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The median over the first axis without NaN, of which not all are; numpy's own takes four times as long."""
+    ranked = np.sort(values, axis=0)  # NaN last
+    count = np.isfinite(values).sum(axis=0, keepdims=True)
+    low, high = (np.take_along_axis(ranked, place, axis=0)[0] for place in ((count - 1) // 2, count // 2))
+    result: NDArray[np.float32] = (low + high) / 2
     return result
 
 

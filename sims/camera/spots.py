@@ -249,7 +249,8 @@ class Finder:
         along_u, along_v = (u + cos * steps).astype(np.float32), (v + sin * steps).astype(np.float32)
         profiles = [_along(window, along_u, along_v) for window in windows]
         inner = (steps > min(0.5 * radius, radius - 3.5)) & (steps < max(0.7 * radius, radius - 1.3))
-        levels = [np.sort(p[:, inner], axis=1)[:, int(inner.sum()) // 2] for p in profiles]
+        half_way = int(inner.sum()) // 2
+        levels = [np.partition(p[:, inner], half_way, axis=1)[:, half_way] for p in profiles]
         bright = (levels[0] > 1.5 * self.level) & (levels[0] > 0.7 * levels[1])
         values = np.where(bright[:, None], *profiles)
         half = 0.5 * np.where(bright, *levels)[:, None]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +18,8 @@ from sims.camera.spots import Finder, Spot
 _LEAST_FRAMES = 5
 _WINDOW = 9
 _FEW = 8
+_HELD = 200_000_000
+"""Bytes of frames that are kept in memory."""
 _FEWEST = 3
 _MISFIT = 0.2
 
@@ -63,6 +65,7 @@ def track(frames: Iterable[tuple[float, Image]]) -> Track:
     Raises:
         InputError: there is no ball to be seen.
     """
+    frames = _Kept(frames)
     survey = background.survey(frames)
     notes: list[str] = []
     first, end = _shot(survey, notes)
@@ -87,6 +90,29 @@ def track(frames: Iterable[tuple[float, Image]]) -> Track:
     )
 
 
+class _Kept:
+    """Frames that are read once where they are few and small, and from their source each time where not."""
+
+    def __init__(self, source: Iterable[tuple[float, Image]]) -> None:
+        self._source = source
+        self._kept: list[tuple[float, Image]] | None = None
+
+    def __iter__(self) -> Iterator[tuple[float, Image]]:
+        if self._kept is not None:
+            yield from self._kept
+            return
+        kept, held = [], 0
+        for time, picture in self._source:
+            held += picture.nbytes
+            if held <= _HELD:
+                kept.append((time, picture))
+            else:
+                kept.clear()
+            yield time, picture
+        if held <= _HELD:
+            self._kept = kept
+
+
 def _nothing(frames: int, some: int) -> str:
     seen = f"something round in {some} of {frames} frames, but nothing" if some else "nothing"
     return (
@@ -109,14 +135,17 @@ def _shot(survey: background.Survey, notes: list[str]) -> tuple[int, int]:
 def _finder(pictures: list[Image]) -> Finder:
     """A finder with the better treatment of shadows, and a background that the ball has been taken out of."""
     plain = background.median(pictures)
-    few = pictures[:: max(1, len(pictures) // _FEW)]
+    every = max(1, len(pictures) // _FEW)
     for _ in range(2):
         sigma = background.noise(pictures, plain)
         finders = [Finder(plain, sigma, shadows) for shadows in (True, False)]
         # a ball of the ground's own hue is itself taken for shadow; then shadow must be borne
-        good = [sum(max((s.agree for s in finder.spots(p)), default=0.0) for p in few) for finder in finders]
-        best = finders[0 if good[0] >= 0.8 * good[1] else 1]
-        hiding = _hiding([best.spots(p, ghosts=True) for p in pictures])
+        tried = [[finder.spots(p, ghosts=True) for p in pictures[::every]] for finder in finders]
+        good = [sum(max((s.agree for s in spots if not s.ghost), default=0.0) for spots in each) for each in tried]
+        chosen = 0 if good[0] >= 0.8 * good[1] else 1
+        best, known = finders[chosen], tried[chosen]
+        found = [known[i // every] if i % every == 0 else best.spots(p, ghosts=True) for i, p in enumerate(pictures)]
+        hiding = _hiding(found)
         shaded = _shaded([best.unshaded(p) for p in pictures]) if best.shadows else None
         plain = background.without(pictures, hiding, plain, shaded)
     return Finder(plain, sigma, best.shadows)

@@ -9,6 +9,8 @@ pytest.importorskip("cv2")
 from dataclasses import replace
 
 from sims.base import InputError
+from sims.camera import background
+from sims.camera import track as tracking
 from sims.camera.camera import Camera
 from sims.camera.look import Look
 from sims.camera.render import Stage
@@ -98,6 +100,33 @@ def test_the_picture_is_where_the_camera_model_says():
     v, u = np.nonzero(apart)
     np.testing.assert_allclose([u.mean(), v.mean()], camera.outline(point, 0.5)[0], atol=0.35)
     np.testing.assert_allclose(np.sqrt(apart.sum() / np.pi), camera.apparent_radius(point, 0.5), rtol=0.06)
+
+
+def test_a_short_film_is_decoded_once_and_a_long_one_each_time_with_the_same_track(monkeypatch):
+    _, scene = stage(12)
+    frames = list(zip(TIMES, scene.film(upright(fall())), strict=True))
+
+    class Source:
+        passes = 0
+
+        def __iter__(self):
+            self.passes += 1
+            return iter(frames)
+
+    short, long = Source(), Source()
+    kept = tracking.track(short)
+    monkeypatch.setattr(tracking, "_HELD", 10_000)
+    again = tracking.track(long)
+    assert (short.passes, long.passes) == (1, 3)
+    np.testing.assert_array_equal(kept.u, again.u)
+
+
+def test_the_background_is_the_median_of_what_is_seen():
+    rng = np.random.default_rng(0)
+    values = rng.uniform(0, 255, (9, 50, 3)).astype(np.float32)
+    values[rng.uniform(size=(9, 50)) < 0.6] = np.nan
+    values[0] = 7.0  # each pixel is seen at least once
+    np.testing.assert_array_equal(background._median_of_seen(values), np.nanmedian(values, axis=0))
 
 
 def test_frames_without_the_ball_stay_missing():
