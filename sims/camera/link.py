@@ -18,6 +18,8 @@ _MEMORY = 20
 """Pictures over which the colour of a path is averaged."""
 _TINGE, _SHARE = 25.0, 0.45
 """Grey levels, and share of the contrast with the background, by which a thing's colour may vary."""
+_BLEEDS = 1.5
+"""Pixels over which video files, which keep colours at half the resolution, mix a ball's with the background's."""
 
 
 @dataclass
@@ -59,7 +61,8 @@ class Path:
 
     def unlike(self, colour: Sequence[float], contrast: float) -> float:
         """How far a colour is from this one's, as a share of what light and compression may do to it."""
-        return float(np.abs(self.tone - colour).max()) / max(_TINGE, _SHARE * contrast, _SHARE * self.contrast)
+        tinge = _TINGE * (1.0 + _BLEEDS / self.spots[-1].radius)
+        return float(np.abs(self.tone - colour).max()) / max(tinge, _SHARE * contrast, _SHARE * self.contrast)
 
     @property
     def contrast(self) -> float:
