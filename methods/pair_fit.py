@@ -147,16 +147,18 @@ class Prepared:
         """From one simulation (1, T, C) to h(simulation, target), (dim,); NaN where the simulation failed."""
         network, missing = self.suited(task), np.isnan(task.observed)
         alike = network.proposed is network.read
-        target = network.read(task.observed[None], task.lengths, task.scene, missing)[0]
+        hidden = missing if alike else None
+        known = network.read(task.observed[None], task.lengths, task.scene, hidden)[0] if alike else None
 
         def difference(observations: Array) -> Array:
             if not np.isfinite(observations).all():  # nothing was seen
                 return np.full(task.dim, np.nan)
-            proposed = network.proposed(observations, task.lengths, task.scene, missing if alike else None)[0]
-            if alike:
-                return network.difference(proposed, target)
-            whole = _bridged(task, observations[0], network)
-            return network.difference(proposed, network.read(whole[None], task.lengths, task.scene)[0])
+            proposed = network.proposed(observations, task.lengths, task.scene, hidden)[0]
+            target = known
+            if target is None:
+                whole = _bridged(task, observations[0], network)
+                target = network.read(whole[None], task.lengths, task.scene)[0]
+            return network.difference(proposed, target)
 
         return difference
 

@@ -70,12 +70,13 @@ def settings_of(experiment: Experiment) -> Settings:
 
 
 def _value(where: str, key: str, value: Any) -> Any:
-    if key in ("balls", "rows"):
-        if not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
-            raise InputError(f"{where}: expected a list of names, found {value!r}")
-        if key == "balls" and not value:
+    if key == "rows":
+        return _names(where, value)
+    if key == "balls":
+        balls = tuple(ball_named(name).name for name in _names(where, value))
+        if not balls:
             raise InputError(f"{where}: expected at least one ball")
-        return tuple(ball_named(name).name if key == "balls" else name for name in value)
+        return balls
     if isinstance(getattr(Settings, key), tuple):
         if not isinstance(value, list | tuple) or len(value) != 2 or not all(_number(v) for v in value):
             raise InputError(f"{where}: expected [low, high], found {value!r}")
@@ -86,6 +87,12 @@ def _value(where: str, key: str, value: Any) -> Any:
     if not _number(value) or value < 0:
         raise InputError(f"{where}: expected a number of at least 0, found {value!r}")
     return float(value)
+
+
+def _names(where: str, value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
+        raise InputError(f"{where}: expected a list of names, found {value!r}")
+    return tuple(value)
 
 
 def _number(value: Any) -> bool:

@@ -30,6 +30,14 @@ vision = pytest.mark.skipif(
 )
 
 
+SMALL = """
+simulator = "ball"
+observe = ["z"]
+targets = 1
+settings = { engine = "batch" }
+tuners = { least_squares = {} }"""
+
+
 @pytest.fixture(scope="module")
 def experiment():
     return load("bounce-shot").with_tuners(["least_squares"])
@@ -150,15 +158,10 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
 @vision
 def test_a_drop_that_cannot_be_tracked_is_a_row_and_not_the_end(experiment, tmp_path, capsys):
     """A film of 16 pixels' height shows a golf ball on a fifth of a pixel."""
-    text = """
-simulator = "ball"
-observe = ["z"]
-targets = 1
+    text = f"""{SMALL}
 budget = 2
-settings = { engine = "batch" }
-sampling = { rate = 60.0, samples = 60 }
-shot = { balls = ["golf"], filmed = 16 }
-tuners = { least_squares = {} }
+sampling = {{ rate = 60.0, samples = 60 }}
+shot = {{ balls = ["golf"], filmed = 16 }}
 """
     (tmp_path / "small.toml").write_text(text)
     out = tmp_path / "out"
@@ -230,18 +233,13 @@ def test_world_that_cannot_be_had_is_skipped_with_its_reason(experiment, tmp_pat
 
 def test_command_from_recorded_drop_to_table_and_again_from_what_is_kept(tmp_path, capsys):
     assert "bounce-shot" in names()
-    text = """
-simulator = "ball"
-observe = ["z"]
-targets = 1
+    text = f"""{SMALL}
 budget = 6
-settings = { engine = "batch" }
-constants = { gravity = 9.81, radius = 0.03 }
-noise = { z = 0.01 }
-initial = { z = [1.4, 1.8] }
-sampling = { rate = 60.0, samples = 100 }
-shot = { balls = ["golf"] }
-tuners = { least_squares = {} }
+constants = {{ gravity = 9.81, radius = 0.03 }}
+noise = {{ z = 0.01 }}
+initial = {{ z = [1.4, 1.8] }}
+sampling = {{ rate = 60.0, samples = 100 }}
+shot = {{ balls = ["golf"] }}
 """
     (tmp_path / "mine.toml").write_text(text)
     out = tmp_path / "out"
