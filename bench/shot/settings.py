@@ -63,8 +63,9 @@ def settings_of(experiment: Experiment) -> Settings:
     made = Settings(**values)
     if made.rows and not made.filmed:
         raise InputError(f"experiment {experiment.name}: shot.rows: only a film has pixel rows; set shot.filmed too")
+    known = sorted({*(e.label for e in experiment.tuners), *tuners.names()})
     for name in made.rows:
-        if name not in (known := [*(e.label for e in experiment.tuners), *tuners.names()]):
+        if name not in known:
             raise unknown(f"tuner in shot.rows of experiment {experiment.name}", name, known)
     return made
 
