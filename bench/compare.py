@@ -7,14 +7,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.journal import FOLDER, Journal, finished, read_plan, replace_text, write_plan
-from bench.store import Configuration, configuration, create, free_folder, write_results
+from bench.store.folder import Configuration, configuration, create, free_folder, write_results
+from bench.store.journal import FOLDER, Journal, finished, read_plan, replace_text, write_plan
 from sims.base import InputError
 
 if TYPE_CHECKING:
-    from bench.experiment import Experiment
-    from bench.pools import Pool
-    from bench.runner import Progress, Results
+    from bench.problem.experiment import Experiment
+    from bench.runs.pools import Pool
+    from bench.runs.runner import Progress, Results
 
 Say = Callable[[str], None]
 
@@ -25,8 +25,8 @@ def begin(experiment: Experiment, plugins: Sequence[str], out: str | None, jobs:
     Raises:
         InputError: a fault in the experiment, or the folder is not free.
     """
-    from bench.identity import fingerprint
-    from bench.runner import prepare
+    from bench.runs.identity import fingerprint
+    from bench.runs.runner import prepare
 
     folder = free_folder(experiment, out)
     results = prepare(experiment)
@@ -41,9 +41,9 @@ def resume(folder: Path, plugins: Sequence[str]) -> tuple[list[str], Results]:
     Raises:
         InputError: it is no such folder, it is damaged, or something that matters has changed since it was begun.
     """
-    from bench.identity import fingerprint
     from bench.registry import load_plugins
-    from bench.runner import prepare
+    from bench.runs.identity import fingerprint
+    from bench.runs.runner import prepare
 
     held = configuration(folder)
     given = {str(Path(p).resolve()) for p in plugins}
@@ -107,7 +107,7 @@ def _complete(folder: Path, ids: list[str]) -> dict[int, Any]:
     Raises:
         InputError: it holds other runs than those planned.
     """
-    from bench.store import read
+    from bench.store.folder import read
 
     stored = [str(name) for name in read(folder, ["run", "tuner", "k"]).statuses.query("status != 'skipped'")["run"]]
     if stored != ids:
@@ -121,7 +121,7 @@ def make(folder: Path, results: Results, plugins: Sequence[str], jobs: int, bar:
     Raises:
         InputError: workers cannot be had; what was finished is kept.
     """
-    from bench.runner import run
+    from bench.runs.runner import run
 
     journal = results.kept
     if not isinstance(journal, Journal):  # complete before we came
@@ -129,7 +129,7 @@ def make(folder: Path, results: Results, plugins: Sequence[str], jobs: int, bar:
     try:
         run(results, plugins, jobs, bar, pool)
     finally:
-        write_results(folder, journal, results.trainings, results.skipped_rows())
+        write_results(folder, journal, results.training_rows(), results.skipped_rows())
         _write_spectra(folder, results)
         complete = len(journal.statuses) == len(results.plan)
         if complete:
@@ -142,7 +142,7 @@ def make(folder: Path, results: Results, plugins: Sequence[str], jobs: int, bar:
 def _write_spectra(folder: Path, results: Results) -> None:
     """Write identifiability.csv, a row a target and direction, where there are several parameters."""
     if results.spectra:
-        from bench.figures_identifiability import spectra_table
+        from bench.analysis.spectra import spectra_table
 
         table = spectra_table(results.problem.experiment, results.spectra, results.problem.cube.parameters)
         replace_text(folder / "identifiability.csv", table.to_csv(index=False))
@@ -155,10 +155,6 @@ def status(folder: Path, every: bool, say: Say) -> bool:
         InputError: it is not the folder of a comparison, or it is damaged.
     """
     held = configuration(folder)
-    if held.experiment.shot:
-        from bench.shot.study import status as status_of_shots
-
-        return status_of_shots(folder, say)
     planned, ends = _ends(folder)
     missing = len(planned) - len(ends)
     say(f"{held.experiment.name}: {len(ends)} of {len(planned)} runs finished" + (", complete" if not missing else ""))
@@ -189,7 +185,7 @@ def _ends(folder: Path) -> tuple[list[str], dict[str, tuple[str, str]]]:
     if (folder / FOLDER).exists():
         planned = read_plan(folder) or []
         return planned, {s.run: (s.status, s.reason) for s in finished(folder).values()}
-    from bench.store import read
+    from bench.store.folder import read
 
     rows = read(folder, ["run", "tuner", "k"]).statuses
     rows = rows[rows["status"] != "skipped"]

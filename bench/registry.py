@@ -20,6 +20,7 @@ from typing import Any, Generic, TypeVar
 from methods.base import Tuner
 from sims import effects
 from sims.base import InputError, Simulator, unknown
+from sims.extended import load as load_extended
 from sims.system import Effect
 
 T = TypeVar("T", bound="Tuner | Simulator")
@@ -106,7 +107,7 @@ def load_plugins(paths: Iterable[str | Path]) -> None:
         if path in _loaded:
             continue
         if path.suffix == ".toml":
-            simulators.add(_extended(path), path)
+            simulators.add(load_extended(path, simulators.get), path)
             _loaded.add(path)
             continue
         module = _run(path)
@@ -123,12 +124,6 @@ def load_plugins(paths: Iterable[str | Path]) -> None:
             else:
                 effects.register(part)
         _loaded.add(path)
-
-
-def _extended(path: Path) -> type[Simulator]:
-    from bench.gap.extend import load
-
-    return load(path)
 
 
 _NAME = re.compile(r"[A-Za-z0-9][\w.+-]{0,60}$")

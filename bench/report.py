@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
-from bench.figures import draw
-from bench.figures_identifiability import identifiability_figures
-from bench.problem import Problem
-from bench.stats import FAILURES, summary, table
-from bench.store import read
-from bench.summary import NEEDED, summarise
+from bench.analysis.amortisation import EVEN_COLUMNS, Price, break_even_table, prices, winners
+from bench.analysis.curves import Curves, Rows, primary
+from bench.analysis.paired import pairs
+from bench.analysis.runtimes import ert_table, thresholds
+from bench.analysis.table import FAILURES, summary, table
+from bench.figures.errors import draw
+from bench.figures.identifiability import identifiability_figures
+from bench.figures.style import Styles
+from bench.problem.experiment import Experiment
+from bench.problem.problem import Problem
+from bench.store.folder import Stored, read
 
 
 def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
@@ -126,3 +132,76 @@ def first_line(reason: str) -> str:
     words = next((line for line in lines[frames[-1] + 1 :] if line[:1].strip()), lines[-1])
     file, number, function = _FRAME.findall(lines[frames[-1]])[0]
     return f"{words} ({Path(file).name}, line {number}, in {function})"
+
+
+WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
+
+
+NEEDED = (
+    "run", "experiment", "tuner", "target", "seed", "range", "k", "param_error", "param_abs_error", "stiff_error",
+    "sloppy_error", "obs_error", "heldout_error", "outside", "tuner_seconds", "simulator_seconds",
+)  # fmt: skip
+"""Columns of the runs that tables and figures use."""
+
+
+def summarise(folder: Path, stored: Stored) -> list[Path]:
+    """Write ert.csv, pairs.csv, break_even.csv, who_wins.csv and their figures; returns the figures' PNG files."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from bench.figures import runtimes as figures
+
+    experiment = stored.experiment
+    metric, runs, in_widths = primary(stored.runs)
+    rows = Rows(runs, stored.statuses, experiment.budget)
+    curves = rows.curves(metric)
+    spread, levels = thresholds(curves, in_widths)
+    ert_table(curves, levels, experiment.budget).to_csv(folder / "ert.csv", index=False)
+    pairs(curves).to_csv(folder / "pairs.csv", index=False)
+    held = {
+        level: _prices(rows, curves, level, experiment, stored.costs) for level in levels[:3]
+    }  # at every level as tables, at one as figures
+    evens = [
+        break_even_table(experiment.name, kind, level, table)
+        for level, kinds in held.items()
+        for kind, table in kinds.items()
+    ]
+    pd.concat([e for e in evens if len(e)] or [pd.DataFrame(columns=EVEN_COLUMNS)]).to_csv(
+        folder / "break_even.csv", index=False
+    )
+    won = [
+        (experiment.name, kind, level, *line)
+        for level, kinds in held.items()
+        for kind, table in kinds.items()
+        for line in winners(table, figures.SHARED)
+    ]
+    pd.DataFrame(won, columns=WINNER_COLUMNS).to_csv(folder / "who_wins.csv", index=False)
+    level = _telling(held)
+    style = Styles(experiment, runs, metric)
+    made = [figures.runtime_figure(folder, experiment, style, curves, spread)]
+    made.append(figures.cost_figure(folder, experiment, style, held[level], level))
+    if any(fit for fit, _ in stored.costs.values()):
+        made.append(figures.amortisation_figure(folder, experiment, style, held[level], level))
+    return made
+
+
+def _telling(held: Mapping[float, Mapping[str, Mapping[str, Price]]]) -> float:
+    """The tightest level that at least half of the tuners reach in some run, in every range; else the loosest."""
+    for level in sorted(held):
+        if all(2 * sum(np.isfinite(p.effort.ert()) for p in t.values()) >= len(t) for t in held[level].values()):
+            return level
+    return max(held)
+
+
+def _prices(
+    rows: Rows, curves: Curves, level: float, experiment: Experiment, fits: Mapping[str, tuple[float, float]]
+) -> dict[str, dict[str, Price]]:
+    tuner_seconds, simulator_seconds = rows.spent("tuner_seconds"), rows.spent("simulator_seconds")
+    result = {}
+    for kind in dict.fromkeys(curves.keys["range"]):
+        mask = (curves.keys["range"] == kind).to_numpy(dtype=bool)
+        part = curves.where(mask)
+        result[str(kind)] = prices(
+            part, level, experiment.budget, tuner_seconds[mask], simulator_seconds[mask], fits
+        )  # fmt: skip
+    return result

@@ -16,23 +16,23 @@ from typing import Any, ClassVar
 import numpy as np
 
 from methods.base import Array, Ask, Practice, Steps, Task, Tuner
-from methods.quiet import Silent, quietly
-from methods.reader import Reader, Reading
-from methods.rehearsal import rehearse
+from methods.learning.quiet import Silent, quietly
+from methods.learning.reader import Reader, Reading
+from methods.learning.rehearsal import rehearse
 
 
 @dataclass(eq=False)
 class NPE(Tuner):
     """Recommends the mean of the learned posterior, simulates it, then draws from it and keeps the lowest loss.
 
-    It reads the same numbers of an observation as TuneNet does (`methods.pair_inputs`), of the target alone.
+    It reads the same numbers of an observation as TuneNet does (`methods.learning.pair_inputs`), of the target alone.
 
     Attributes:
         scenarios: training scenarios, at most as many as the budget allows.
         each: simulations in each scenario, at least 2 (dim + 1).
         points: points to which each run is resampled.
         inputs: inputs kept of those an observation offers.
-        strictness: see `methods.pair_inputs.weighed_inputs`.
+        strictness: see `methods.learning.pair_inputs.weighed_inputs`.
         noise: sensor noise that every second training observation gets, 1 sigma, in units of each channel's standard
             deviation in training.
         hidden: units of each layer of the flow.

@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from methods.base import Ask, Steps, Task
-from methods.pair_fit import PairTuner
-from methods.pair_network import PUBLISHED, Design
-from methods.reader import Reading
+from methods.learning.pair_fit import PairTuner
+from methods.learning.pair_network import PUBLISHED, Design
+from methods.learning.reader import Reading
 
 
 @dataclass(eq=False)
@@ -25,12 +25,12 @@ class Regressor(PairTuner):
         each: simulations in each scenario, at least 2 (dim + 1).
         points: points to which each run is resampled.
         inputs: inputs kept of those an observation offers.
-        strictness: see `methods.pair_inputs.weighed_inputs`.
+        strictness: see `methods.learning.pair_inputs.weighed_inputs`.
         noise: as in `methods.tunenet.TuneNet`.
         epochs: passes over the training data.
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
-        told: read what is known of the scenario too, where scenarios differ in it (`methods.circumstances`).
+        told: read what is known of the scenario too, where scenarios differ in it (`methods.learning.circumstances`).
         channels: first and last channel that is read, by number, where targets do not show the others; None for all.
         clean: as in `methods.tunenet.TuneNet`.
     """

@@ -9,9 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from methods.base import Array, Ask, Steps, Task
-from methods.pair_fit import PairTuner
-from methods.pair_network import PUBLISHED, Design
-from methods.reader import Reading
+from methods.learning.pair_fit import PairTuner
+from methods.learning.pair_network import PUBLISHED, Design
+from methods.learning.reader import Reading
 
 
 @dataclass(eq=False)
@@ -20,8 +20,8 @@ class TuneNet(PairTuner):
 
     Algorithm 1 adds that estimate to the guess, simulates the new guess, and repeats; it recommends its newest guess.
 
-    The default differs from the published method in what the network sees (`methods.pair_inputs`), in its training
-    (`methods.pair_network.Design`), in h(o, o) = 0 by construction, and in the step: the estimates are read as the
+    The default differs from the published method in what the network sees (`methods.learning.pair_inputs`), in its training
+    (`methods.learning.pair_network.Design`), in h(o, o) = 0 by construction, and in the step: the estimates are read as the
     residuals of an equation h = 0, solved by Broyden's method (Math. Comp. 19, 1965; in one dimension the secant),
     which starts as Algorithm 1 does and converges where the network's scale is wrong, as outside its training range.
 
@@ -30,13 +30,13 @@ class TuneNet(PairTuner):
         each: simulations in each scenario, at least 2 (dim + 1); every two of them are a training pair.
         points: points to which each run is resampled; L in Algorithm 1.
         inputs: inputs kept of those an observation offers.
-        strictness: see `methods.pair_inputs.weighed_inputs`.
+        strictness: see `methods.learning.pair_inputs.weighed_inputs`.
         noise: sensor noise that a second network prepares for, 1 sigma, in units of each channel's standard deviation
             in training; used where the target is rougher than the simulations. 0 for no second network.
         epochs: passes over the training data.
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
-        told: read what is known of the scenario too, where scenarios differ in it (`methods.circumstances`).
+        told: read what is known of the scenario too, where scenarios differ in it (`methods.learning.circumstances`).
         channels: first and last channel that is read, by number, where targets do not show the others; None for all.
         clean: whether targets may be as clean as simulations. False for a sensor whose errors last for many samples: a
             smooth target is no clean one then, and there is one network, trained with `noise`.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from methods.pair_network import Design
-from methods.reader import Reading
+from methods.learning.pair_network import Design
+from methods.learning.reader import Reading
 from methods.tunenet import TuneNet
 
 _LAST = 1_000_000
@@ -19,7 +19,7 @@ class TuneNetVision(TuneNet):
 
     The proposed side reads the first channel of the simulation, as `z` of simulator ball-filmed; the target's side
     reads the other channels of the target, as the pixel row `v`, and nothing of what is known of the camera, as
-    published. Gaps of the target are bridged by the proposed model (`methods.bridging`). Where there is one channel
+    published. Gaps of the target are bridged by the proposed model (`methods.learning.bridging`). Where there is one channel
     both sides read it. Inputs, training and the step are otherwise those of `methods.tunenet.TuneNet`; h(o, o) = 0
     cannot hold by construction, since no target is seen as a simulation is.
 

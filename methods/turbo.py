@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from methods.base import Array, Steps, Task, Tuner
-from methods.quiet import quietly
+from methods.learning.quiet import quietly
 
 
 @dataclass(eq=False)

@@ -1,6 +1,6 @@
 """A small experiment on the test simulator."""
 
-from bench.experiment import parse
+from bench.problem.experiment import parse
 
 SPRING = {
     "simulator": "spring",

@@ -8,8 +8,8 @@ from typing import Any
 from bench.checks import EFFECT_CHECKS, SIMULATOR_CHECKS, TUNER_CHECKS, CheckError
 from bench.checks.processes import LIMIT
 from bench.checks.tuners import check_same_run_in_other_processes
-from bench.pools import LocalPool
 from bench.registry import simulators, tuners
+from bench.runs.pools import LocalPool
 from sims import effects
 from sims.base import InputError, unknown
 

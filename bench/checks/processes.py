@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
-from bench.pools import LocalPool
+from bench.runs.pools import LocalPool
 
 LIMIT = 120.0
 """Seconds that one call may take before it is killed."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.checks.base import CheckError, global_random_state_untouched, require, same_bits
 from bench.checks.processes import elsewhere
-from bench.drive import Trace, drive
+from bench.runs.drive import Trace, drive
 from methods.base import NOTHING, Array, Ask, BudgetExceededError, Evaluation, Steps, Task, Tuner
 
 _TIMES = np.linspace(0.0, 3.0, 40)

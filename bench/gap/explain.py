@@ -11,23 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap import extend, show
-from bench.gap.base import Base, fit_base
-from bench.gap.colour import Noise
-from bench.gap.extend import Extended, Number
-from bench.gap.floor import Floor, noise_floor
+from bench.gap.causes.name import Finding, name
+from bench.gap.causes.search import Search
+from bench.gap.causes.structure import CHANCE, Hat, Remains
 from bench.gap.measure import HeldOut
-from bench.gap.name import Finding, name
-from bench.gap.remains import CHANCE, Hat, Remains
-from bench.gap.search import Search
-from bench.gap.story import Shown, Story, Tuned
+from bench.gap.model.base_fit import Base, fit_base
+from bench.gap.model.floor import Floor, noise_floor
+from bench.gap.model.noise import Noise
+from bench.gap.model.world import World
+from bench.gap.report import show
+from bench.gap.report.story import Shown, Story, Tuned
 from bench.gap.verdict import Answer
-from bench.gap.world import World
-from bench.inspection import load
-from bench.seeds import rng_for
+from bench.problem.seeds import rng_for
+from bench.recordings.inspection import load
 from methods.base import Array
 from sims import effects as library
+from sims import extended as extend
 from sims.base import InputError
+from sims.extended import Extended, Number
 from sims.own import OwnSimulator
 from sims.simulated import Simulated
 
@@ -56,8 +57,8 @@ class Explanation:
 
     def write(self, folder: Path) -> list[Path]:
         """Write verdict.json, extended.toml, figures and report.html into a folder that exists."""
-        from bench.gap.pictures import draw
-        from bench.gap.report import write_report
+        from bench.gap.report.page import write_report
+        from bench.gap.report.pictures import draw
 
         paths = [folder / "verdict.json", folder / "extended.toml"]
         paths[0].write_text(json.dumps(self.verdict, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -152,7 +153,7 @@ class _Explainer:
         """Where a registered tuner would begin; None without one."""
         if self.tuner is None:
             return None
-        from bench.gap.begin import tuned
+        from bench.gap.model.tuner_start import tuned
 
         return tuned(self.tuner, self.fitting, self.noise, self.seed)
 

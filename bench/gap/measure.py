@@ -8,11 +8,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.gap.colour import Noise, likelihood, whitened
-from bench.gap.fit import RESPONSE, Fit, Fitter, Start, prior_of
-from bench.gap.models import Model, freedom
-from bench.gap.search import Search
-from bench.gap.world import Mask, World
+from bench.gap.causes.search import Search
+from bench.gap.model.fit import RESPONSE, Fit, Fitter, Start, prior_of
+from bench.gap.model.models import Model, freedom
+from bench.gap.model.noise import Noise, likelihood, whitened
+from bench.gap.model.world import Mask, World
 from methods.base import Array
 
 Z95 = 1.959964

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap.models import Model
-from bench.gap.search import Search
-from bench.gap.world import World
+from bench.gap.causes.search import Search
+from bench.gap.model.models import Model
+from bench.gap.model.world import World
 from methods.base import Array
 from sims.base import Scenario
 

@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap.extend import Number
-from bench.gap.floor import Floor
+from bench.gap.causes.name import Finding
+from bench.gap.causes.score_test import tail
+from bench.gap.causes.search import Search
 from bench.gap.measure import Gain, gain, intervals
-from bench.gap.models import Model
-from bench.gap.name import Finding
+from bench.gap.model.floor import Floor
+from bench.gap.model.models import Model
+from bench.gap.model.world import World
 from bench.gap.propose import next_experiment
-from bench.gap.score import tail
-from bench.gap.search import Search
-from bench.gap.world import World
 from methods.base import Array
-from sims.recording import Recording
+from sims.extended import Number
+from sims.recording.recording import Recording
 
 
 @dataclass(frozen=True)

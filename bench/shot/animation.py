@@ -18,7 +18,7 @@ from sims.ball.simulator import Ball
 from sims.base import InputError
 from sims.camera.render import Image
 from sims.camera.video import Video
-from sims.recording import read_recording
+from sims.recording.recording import read_recording
 
 _FRAMES_PER_SECOND = 12
 _SLOWER = 2.0

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.experiment import Experiment
-from bench.seeds import rng_for
+from bench.problem.experiment import Experiment
+from bench.problem.seeds import rng_for
 from bench.shot.filmed import filmed
 from bench.shot.settings import Settings
 from sims.ball.simulator import Ball as BallSimulator
-from sims.recording import Recording, Run, read_recording
-from sims.recording_write import write_recording
+from sims.recording.recording import Recording, Run, read_recording
+from sims.recording.write import write_recording
 from sims.shot.balls import Ball, ball_named
 from sims.shot.scene import Scene
 from sims.shot.world import GRAVITY, Ground, fly

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.vision import tracking
+from bench.recordings import tracking
 from methods.base import Array
 from sims.camera.camera import Camera
 from sims.camera.files import Filmed, beside, described

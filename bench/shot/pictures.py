@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from bench.experiment import Experiment
-from bench.figures import save
+from bench.figures.style import save
+from bench.problem.experiment import Experiment
 from bench.shot.deal import Deal
 from bench.shot.settings import Settings
 from bench.shot.table import ALL

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench.experiment import Experiment
-from bench.journal import FOLDER, replace_text
+from bench.problem.experiment import Experiment
 from bench.shot.animation import animate
 from bench.shot.deal import deals
 from bench.shot.pictures import draw, examples
 from bench.shot.settings import Settings
 from bench.shot.study import read
 from bench.shot.table import FAILED, table, text
-from bench.store import STATUS_COLUMNS
+from bench.store.journal import FOLDER, replace_text
+from bench.store.status import STATUS_COLUMNS
 
 
 def finish(

@@ -10,13 +10,13 @@ import math
 
 import numpy as np
 
-from bench.experiment import Experiment
-from bench.measured import Side
+from bench.problem.experiment import Experiment
+from bench.problem.recorded import Side
 from bench.shot.filmed import AIM, DISTANCE, HEIGHT
 from bench.shot.settings import Settings
 from methods.base import Array
 from sims.base import Scenario
-from sims.recording import Recording
+from sims.recording.recording import Recording
 from sims.shot.balls import ball_named
 
 ROW = "v"

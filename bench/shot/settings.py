@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from bench.experiment import Experiment
+from bench.problem.experiment import Experiment
 from bench.registry import tuners
 from sims.base import InputError, unknown
 from sims.shot.balls import BALLS, ball_named

@@ -9,15 +9,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bench.experiment import Experiment
-from bench.journal import replace_text
-from bench.pools import Call, LocalPool
-from bench.runner import Progress, check
+from bench.problem.experiment import Experiment
+from bench.runs.pools import Call, LocalPool
+from bench.runs.runner import Progress, check
 from bench.shot import tune
 from bench.shot.deal import RECORDINGS, Deal, deals, in_view, record
 from bench.shot.settings import Settings, settings_of
 from bench.shot.throw import thrown
-from bench.store import Configuration, configuration, create, free_folder
+from bench.store.folder import Configuration, configuration, create, free_folder
+from bench.store.journal import replace_text
 from sims.base import InputError
 from sims.camera import packages
 from sims.shot import world
@@ -32,7 +32,7 @@ def begin(experiment: Experiment, plugins: Sequence[str], out: str | None, jobs:
     Raises:
         InputError: a fault in it, or the folder is not free.
     """
-    from bench.identity import fingerprint
+    from bench.runs.identity import fingerprint
 
     if settings_of(experiment).filmed:
         packages.require("; or set shot.filmed = 0")
@@ -87,7 +87,7 @@ def make(folder: Path, plugins: Sequence[str], jobs: int, bar: Progress, say: Sa
 def _unchanged(folder: Path, plugins: Sequence[str]) -> None:
     """Refuse to mix shots of two configurations."""
     from bench.compare import refuse_changes
-    from bench.identity import fingerprint
+    from bench.runs.identity import fingerprint
 
     held = configuration(folder)
     everything = held.plugins + sorted({str(Path(p).resolve()) for p in plugins} - set(held.plugins))
@@ -136,7 +136,7 @@ def _keep(folder: Path, dealt: Deal, settings: Settings, models: list[dict[str, 
 
 def _trained(experiment: Experiment, settings: Settings, bar: Progress) -> dict[str, Path]:
     from bench.registry import tuners
-    from bench.training import train
+    from bench.runs.training import train
 
     learned = [entry for entry in experiment.tuners if tuners.get(entry.tuner).learned]
     step = bar("training", len(learned))

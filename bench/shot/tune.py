@@ -16,16 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from bench.experiment import Entry, Experiment
-from bench.measured import Side, scenario_of
-from bench.problem import SealedTarget
+from bench.problem.experiment import Entry, Experiment
+from bench.problem.problem import SealedTarget
+from bench.problem.recorded import Side, scenario_of
+from bench.runs.worker import Order, perform, problem_of
 from bench.shot.rows import before_a_camera, rows_of
 from bench.shot.settings import Settings
-from bench.worker import Order, perform, problem_of
 from methods.base import Array
 from sims.ball.simulator import Ball as BallSimulator
 from sims.base import InputError, Scenario
-from sims.recording import Recording, read_recording
+from sims.recording.recording import Recording, read_recording
 from sims.shot.planner import Plan, plan
 from sims.shot.scene import Scene
 from sims.shot.simulator import BounceShot

@@ -8,7 +8,7 @@ from typing import Any
 
 from sims.base import InputError, unknown
 from sims.camera.camera import Camera
-from sims.recording import read_toml
+from sims.recording.recording import read_toml
 
 
 @dataclass(frozen=True)

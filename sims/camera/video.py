@@ -16,7 +16,7 @@ import numpy as np
 from sims.base import Array, InputError
 from sims.camera.packages import imported
 from sims.camera.render import Image
-from sims.recording_write import publish, refuse_existing
+from sims.recording.write import publish, refuse_existing
 
 _TICKS = 90_000
 """Time stamps a second in files written here; common for video, and a whole number for the usual rates."""

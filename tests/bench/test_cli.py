@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 import tomli_w
 
+from bench.analysis.table import COLUMNS
 from bench.cli import main
-from bench.stats import COLUMNS
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING
 

@@ -12,7 +12,7 @@ import pytest
 import tomli_w
 
 from bench.cli import main
-from bench.journal import finished
+from bench.store.journal import finished
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING
 from tests.plugins.chaos import STATUSES
@@ -102,7 +102,7 @@ def test_what_changed_is_refused_by_name(finished_folder, tmp_path, capsys, monk
         assert "its configuration changed since it was begun" in error
         assert error.count("\n") == 1
     (folder / "experiment.toml").write_text(text)
-    monkeypatch.setattr("bench.identity.code", lambda: "0123456789")
+    monkeypatch.setattr("bench.runs.identity.code", lambda: "0123456789")
     assert main(["compare", "--resume", str(folder)]) == 2
     assert "its code changed since it was begun" in capsys.readouterr().err
     monkeypatch.undo()
@@ -117,7 +117,7 @@ def test_what_changed_is_refused_by_name(finished_folder, tmp_path, capsys, monk
 
 def test_run_ids_change_with_everything_that_matters_and_nothing_else():
     from bench.registry import load_plugins
-    from bench.runner import prepare
+    from bench.runs.runner import prepare
     from tests.experiments import spring_experiment
 
     load_plugins([SPRING_PLUGIN])
@@ -149,7 +149,7 @@ def test_every_chaos_tuner_has_its_status_and_the_others_do_not_change_by_a_bit(
     plugins = ["--plugin", SPRING_PLUGIN, "--plugin", CHAOS]
     hang_shorter = {**os.environ, "PYTHONPATH": os.getcwd()}
     code = (
-        "import sys, bench.pools, bench.cli; bench.pools.GRACE = -12.0\n"
+        "import sys, bench.runs.pools, bench.cli; bench.runs.pools.GRACE = -12.0\n"
         "if __name__ == '__main__':\n    sys.exit(bench.cli.main(sys.argv[1:]))\n"
     )
     (tmp_path / "go.py").write_text(code)

@@ -9,11 +9,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bench.compare import begin, make, resume, status
-from bench.experiment import load
-from bench.problem import Problem
+from bench.problem.experiment import load
+from bench.problem.problem import Problem
 from bench.registry import load_plugins
-from bench.runner import check
-from bench.store import configuration, read
+from bench.runs.runner import check
+from bench.store.folder import configuration, read
 from sims.base import InputError
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING, spring_experiment
@@ -153,7 +153,7 @@ def results(folder):
     done, results = begin(experiment, [SPRING_PLUGIN], str(folder / "done"), 1)
     make(done, results, [SPRING_PLUGIN], 1, lambda *_: lambda: None, None)
     half, results = begin(experiment, [SPRING_PLUGIN], str(folder / "half"), 1)
-    from bench.runner import run
+    from bench.runs.runner import run
 
     run(results, [SPRING_PLUGIN], 1)
     results.kept.close()

@@ -1,6 +1,6 @@
 """Who is ahead of a tuner, at which number of simulations: ``python -m tests.benchmarks.behind FOLDER [TUNER]``.
 
-Reads a comparison's folder; paired tests over its targets after 1, 2, 3, 5, ... simulations (`bench.paired`: Wilcoxon
+Reads a comparison's folder; paired tests over its targets after 1, 2, 3, 5, ... simulations (`bench.analysis.paired`: Wilcoxon
 on the logarithms of errors, Holm's correction over all pairs). Writes behind.csv there and prints it as a table.
 """
 
@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench.curves import Rows, primary
-from bench.paired import pairs
-from bench.stats import checkpoints
-from bench.store import configuration, read
+from bench.analysis.curves import Rows, primary
+from bench.analysis.paired import pairs
+from bench.analysis.table import checkpoints
+from bench.store.folder import configuration, read
 
 
 def against(folder, tuner):

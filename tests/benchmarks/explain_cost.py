@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from bench.gap import explain as explaining
-from bench.gap.world import World
-from bench.simulate import Wish, write
+from bench.gap.model.world import World
+from bench.recordings.simulate import Wish, write
 from sims import effects
 
 USUAL = Wish("slider", effects=["friction.coulomb=0.3"], noise=["0.005"], observe=["x"], engine="mujoco")

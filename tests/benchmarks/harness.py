@@ -14,13 +14,13 @@ from time import perf_counter
 
 import numpy as np
 
-from bench.drive import drive
-from bench.evaluate import Evaluator
-from bench.experiment import Entry
-from bench.problem import Problem
+from bench.problem.experiment import Entry
+from bench.problem.problem import Problem
 from bench.registry import load_plugins
-from bench.scores import rows
-from bench.worker import Order, Outcome
+from bench.runs.drive import drive
+from bench.runs.evaluate import Evaluator
+from bench.runs.rows import rows
+from bench.runs.worker import Order, Outcome
 from methods.base import Task, Tuner
 from tests.conftest import PLUGINS
 from tests.experiments import spring_experiment

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.identifiability import STIFF
+from bench.problem.identifiability import STIFF
 
 METRICS = {
     "param_error": "parameter error [training widths]",

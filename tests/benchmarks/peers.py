@@ -19,7 +19,7 @@ import textwrap
 from pathlib import Path
 from time import perf_counter
 
-from bench.pools import LocalPool
+from bench.runs.pools import LocalPool
 
 EVALUATIONS = 3000
 NEVERGRAD = """

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from bench.gap.explain import explain
-from bench.gap.scoring import scored
+from bench.gap.score_model import scored
 from sims.pendulum.simulator import Pendulum
-from sims.recording import Run, read_recording
-from sims.recording_write import write_recording
+from sims.recording.recording import Run, read_recording
+from sims.recording.write import write_recording
 
 DATA = Path(os.environ.get("SIMGAP_DATA", Path(__file__).parents[3] / "shared" / "data"))
 PUBLISHED = {

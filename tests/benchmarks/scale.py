@@ -16,16 +16,15 @@ from time import perf_counter
 import numpy as np
 
 from bench.compare import begin
-from bench.drive import Trace
-from bench.journal import Journal
-from bench.pools import LocalPool
 from bench.registry import load_plugins
-from bench.report import finish
-from bench.runner import prepare
-from bench.scores import rows, status_of
-from bench.store import read, write_results
-from bench.summary import NEEDED
-from bench.worker import Outcome
+from bench.report import NEEDED, finish
+from bench.runs.drive import Trace
+from bench.runs.pools import LocalPool
+from bench.runs.rows import rows, status_of
+from bench.runs.runner import prepare
+from bench.runs.worker import Outcome
+from bench.store.folder import read, write_results
+from bench.store.journal import Journal
 from tests.conftest import PLUGINS
 from tests.experiments import spring_experiment
 
@@ -68,7 +67,7 @@ def measure(targets, budget, figures):
         again = Journal(folder)
         reopened = perf_counter() - started
         started = perf_counter()
-        write_results(folder, again, {}, [])
+        write_results(folder, again, [], [])
         written = perf_counter() - started
         runs = len(results.plan)
         again.discard()

@@ -14,17 +14,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.drive import drive
-from bench.evaluate import Evaluator
-from bench.experiment import load
-from bench.figures import save
-from bench.problem import Problem
-from bench.seeds import rng_for
+from bench.figures.style import save
+from bench.problem.experiment import load
+from bench.problem.problem import Problem
+from bench.problem.seeds import rng_for
+from bench.runs.drive import drive
+from bench.runs.evaluate import Evaluator
 from methods.base import NOTHING, Ask, Task
-from methods.pair_fit import Fitted, PairTuner, Prepared
-from methods.pair_network import PUBLISHED, Design
-from methods.reader import Reading
-from methods.rehearsal import rehearse
+from methods.learning.pair_fit import Fitted, PairTuner, Prepared
+from methods.learning.pair_network import PUBLISHED, Design
+from methods.learning.reader import Reading
+from methods.learning.rehearsal import rehearse
 from methods.tunenet import SETTLED, Search, TuneNet, TuneNetPublished
 
 AT = (1, 2, 3, 5, 10)

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from sims import effects as library
-from sims.recording import Recording, Run
-from sims.recording_write import write_recording
+from sims.recording.recording import Recording, Run
+from sims.recording.write import write_recording
 from tests.exam import rivals, shapes, sizing
 from tests.exam.settings import setting as drawn_setting
 from tests.exam.worlds import FOREIGN, SIMULATORS, simulated, solved

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from sims.base import Scenario
-from sims.recording import read_recording
+from sims.recording.recording import read_recording
 from tests.exam import rivals, shapes, sizing
 from tests.exam.items import APART, EQUIVALENT, Item, coefficients, draw, held_out_of, realise, setting_of
 from tests.exam.questions import Question, quick, sheet

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bench.drive import Evaluate, Trace, drive
+from bench.runs.drive import Evaluate, Trace, drive
 from methods.base import Array, Task, Tuner
 
 Observe = Callable[[Array], Array]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from bench.drive import drive
+from bench.runs.drive import drive
 from methods.base import Array, Evaluation, Steps, Task, Tuner, from_callback
 from tests.methods.problems import smooth
 

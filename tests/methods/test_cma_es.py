@@ -2,7 +2,7 @@ import cma
 import numpy as np
 import pytest
 
-from bench.drive import drive
+from bench.runs.drive import drive
 from methods.base import Array, Evaluation
 from methods.cma_es import CMAES
 from tests.methods.problems import START, TRUTH, decays, errors, problem, run, smooth

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bench.drive import drive
+from bench.runs.drive import drive
 from methods.base import Evaluation, Task
 from methods.hybrid import Hybrid, _complement
 from methods.least_squares import LeastSquares, Run

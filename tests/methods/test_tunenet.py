@@ -3,11 +3,11 @@ import sys
 import numpy as np
 import pytest
 
-from bench.drive import drive
+from bench.runs.drive import drive
 from methods.base import NOTHING, Array, BudgetExceededError, Task
-from methods.pair_inputs import resample, roughness, weighed_inputs
-from methods.pair_network import PUBLISHED, Design, Sides, estimate, train
-from methods.rehearsal import Rehearsal
+from methods.learning.pair_inputs import resample, roughness, weighed_inputs
+from methods.learning.pair_network import PUBLISHED, Design, Sides, estimate, train
+from methods.learning.rehearsal import Rehearsal
 from methods.tunenet import Search, TuneNet, TuneNetPublished
 
 TRAINING = {1: np.array([[0.3], [0.7]]), 2: np.array([[0.3, 0.2], [0.7, 0.6]])}

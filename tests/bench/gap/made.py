@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.gap.base import fit_base
-from bench.gap.colour import Noise
-from bench.gap.fit import Fit
-from bench.gap.search import Search
-from bench.gap.world import World
+from bench.gap.causes.search import Search
+from bench.gap.model.base_fit import fit_base
+from bench.gap.model.fit import Fit
+from bench.gap.model.noise import Noise
+from bench.gap.model.world import World
+from bench.recordings.simulate import Wish, make
 from bench.registry import simulators
-from bench.simulate import Wish, make
 from sims.base import Scenario
-from sims.recording import Recording, Run
+from sims.recording.recording import Recording, Run
 
 
 def recording(system="pendulum", **wish):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.gap.story import Place, Profile, Shown, Side, Story, Tuned
+from bench.gap.report.story import Place, Profile, Shown, Side, Story, Tuned
 
 EVIL = "<script>alert(1)</script>"
 SIGMA = (0.01, 0.05)

@@ -8,10 +8,10 @@ import pytest
 
 from bench import registry
 from bench.gap.explain import explain
-from bench.gap.extend import load
+from bench.recordings.simulate import Wish, make, write
 from bench.registry import load_plugins, simulators
-from bench.simulate import Wish, make, write
 from sims.base import InputError, Scenario
+from sims.extended import load
 from sims.pendulum.simulator import Pendulum
 from tests.bench.gap import schema
 from tests.bench.gap.tables import swing, table
@@ -233,7 +233,9 @@ def test_an_extended_simulator_is_scored_and_explained_as_its_system(tmp_path):
     by_hand = Pendulum(found.extended.constants, engine="batch", effects=["drag.linear"])
     scenario = Scenario(TIMES, {"q": 0.7})
     np.testing.assert_array_equal(kind().simulate(theta, scenario), by_hand.simulate(theta, scenario))
-    np.testing.assert_array_equal(load(model)().simulate(theta, scenario), by_hand.simulate(theta, scenario))
+    np.testing.assert_array_equal(
+        load(model, simulators.get)().simulate(theta, scenario), by_hand.simulate(theta, scenario)
+    )
     made = make(Wish("pendulum_extended", noise=["q=0.003", "qd=0.02"], runs=3, seconds=1.5, rate=60)).recording
     columns = [(run.times, run.channels["q"], run.channels["qd"]) for run in made.runs]
     path = table(tmp_path, columns, system="pendulum_extended", noise=NOISE)

@@ -3,10 +3,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.gap.colour import Noise
-from bench.gap.fit import Fitter, Start
+from bench.gap.causes.search import Search
 from bench.gap.measure import HeldOut, central, covariance, gain, intervals
-from bench.gap.search import Search
+from bench.gap.model.fit import Fitter, Start
+from bench.gap.model.noise import Noise
 from sims.pendulum.simulator import Pendulum
 from sims.slider.simulator import Slider
 from tests.bench.gap.made import correlated, marked, recorded, recording, searched, white, world

@@ -4,7 +4,7 @@ did not make."""
 import pytest
 
 from bench.gap.explain import explain
-from bench.simulate import Wish, write
+from bench.recordings.simulate import Wish, write
 
 CASES = {
     "pendulum": ("drag.linear=6e-4", "mujoco", ("q",)),

@@ -3,10 +3,10 @@ import re
 import numpy as np
 import pytest
 
-from bench.gap.base import fit_base
-from bench.gap.fit import Fitter, Start
+from bench.gap.causes.search import Search
+from bench.gap.model.base_fit import fit_base
+from bench.gap.model.fit import Fitter, Start
 from bench.gap.propose import TELLING, next_experiment
-from bench.gap.search import Search
 from sims.base import Scenario
 from sims.pendulum.simulator import Pendulum
 from tests.bench.gap.made import marked, recording, white, world

@@ -1,0 +1,34 @@
+"""The table of what targets' data identify: identifiability.csv."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import pandas as pd
+
+from bench.problem.experiment import Experiment
+from bench.problem.identifiability import Spectrum
+from sims.base import Parameter
+
+COLUMNS = ["experiment", "target", "range", "direction", "eigenvalue", "sigma", "stiff"]
+
+
+def spectra_table(
+    experiment: Experiment, spectra: Mapping[str, Spectrum], parameters: Sequence[Parameter]
+) -> pd.DataFrame:
+    """A row a target and direction, the stiffest first: eigenvalue, 1 sigma, and the parameters' components."""
+    lines = [
+        [
+            experiment.name,
+            target,
+            target.split("-")[0],
+            i + 1,
+            found.values[i],
+            found.sigmas[i],
+            found.stiff[i],
+            *found.vectors[:, i],
+        ]
+        for target, found in spectra.items()
+        for i in range(len(found.values))
+    ]
+    return pd.DataFrame(lines, columns=[*COLUMNS, *(p.name for p in parameters)])

@@ -1,0 +1,119 @@
+"""Error against number of simulations: the table of a comparison.
+
+A run that ended early counts with its last recommendation. A target's value is the mean over its seeds; median and
+mean are over targets, and `low`..`high` is a 95 % percentile-bootstrap interval of the mean over targets (Efron &
+Tibshirani 1993, ch. 13), so that seeds of one target are not taken for independent evidence.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bench.analysis.curves import Curves, Rows, mean_over_seeds
+from bench.problem.seeds import rng_for
+from methods.base import Array
+
+CHECKPOINTS = (0, 1, 2, 3, 5, 10, 20, 50, 100)
+METRICS = ("param_abs_error", "param_error", "stiff_error", "sloppy_error", "obs_error", "heldout_error")
+FAILURES = ("crashed", "timeout", "diverged", "skipped")
+COLUMNS = [
+    "experiment", "tuner", "range", "simulations", "metric", "median", "mean", "low", "high",
+    "runs", "failures", "fit_simulations", "fit_seconds", "tuner_seconds", "simulator_seconds",
+]  # fmt: skip
+
+
+def checkpoints(budget: int) -> list[int]:
+    """The standard numbers of simulations up to the budget, and the budget itself."""
+    return sorted({k for k in CHECKPOINTS if k <= budget} | {budget})
+
+
+def table(
+    runs: pd.DataFrame,
+    statuses: pd.DataFrame,
+    budget: int,
+    trainings: Mapping[str, tuple[float, float]] | None = None,
+    resamples: int = 2000,
+) -> pd.DataFrame:
+    """The table of a comparison in long form, columns as `COLUMNS`.
+
+    Args:
+        runs: rows of runs.parquet.
+        statuses: rows of status.csv.
+        budget: largest number of simulations to report.
+        trainings: simulations and seconds of one training, by tuner.
+        resamples: bootstrap resamples.
+    """
+    points = checkpoints(budget)
+    rows = Rows(runs, statuses, budget)
+    spent = [rows.spent(name) if name in runs else None for name in ("tuner_seconds", "simulator_seconds")]
+    curves = {m: rows.curves(m) for m in METRICS if m in runs and runs[m].notna().any()}
+    lines = []
+    for (experiment, tuner, kind), part in rows.keys.groupby(["experiment", "tuner", "range"], sort=False):
+        mine = part.index.to_numpy()
+        fit = (trainings or {}).get(str(tuner), (0.0, 0.0))
+        seconds = [np.full(len(points), np.nan) if s is None else s[mine][:, points].mean(axis=0) for s in spent]
+        counts = len(mine), int(rows.failed[mine].sum())
+        for metric, curve in curves.items():
+            values = _over_targets(curve, mine, points, (str(tuner), str(kind), metric), resamples)
+            lines += [
+                (experiment, tuner, kind, k, metric, *values[:, i], *counts, *fit, seconds[0][i], seconds[1][i])
+                for i, k in enumerate(points)
+            ]
+    skipped = statuses[statuses["status"] == "skipped"]
+    nothing = (0, "", *[np.nan] * 4, 0, 1, 0.0, 0.0, np.nan, np.nan)
+    lines += [(runs["experiment"].iloc[0] if len(runs) else "", t, "", *nothing) for t in skipped["tuner"]]
+    return pd.DataFrame(lines, columns=COLUMNS)
+
+
+def _over_targets(
+    curves: Curves, mine: NDArray[np.int64], points: list[int], names: tuple[str, str, str], resamples: int
+) -> Array:
+    """(4, len(points)): median, mean, low and high over targets of the runs in rows `mine`."""
+    _, groups = curves.where(np.isin(np.arange(len(curves.used)), mine)).by_target()
+    values = mean_over_seeds(curves.values[mine][:, points], groups)
+    low, high = interval(values, np.mean, *names, resamples=resamples)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a column of failures alone has no mean: NaN, shown
+        return np.array([np.nanmedian(values, axis=0), np.nanmean(values, axis=0), low, high])
+
+
+def target_curves(runs: pd.DataFrame, metric: str, points: list[int]) -> pd.DataFrame:
+    """One row a target (sorted), one column for each of `points`: the mean over the seeds of its runs."""
+    rows = Rows(runs, pd.DataFrame({"run": [], "status": []}), max(points))
+    names, groups = (curves := rows.curves(metric)).by_target()
+    values = mean_over_seeds(curves.values[:, points], groups)
+    return pd.DataFrame(values, index=pd.Index(names, name="target"), columns=points)
+
+
+def interval(values: Array, statistic: Callable[..., Any], *names: str, resamples: int = 2000) -> tuple[Array, Array]:
+    """95 % percentile-bootstrap interval of a statistic over rows of `values` (n, m); NaN for fewer than two rows.
+
+    Args:
+        values: what was measured, one row a target.
+        statistic: np.mean or np.median.
+        names: what the resampling's random stream depends on.
+        resamples: number of resamples.
+    """
+    values = values[np.isfinite(values).all(axis=1)]
+    if len(values) < 2:
+        return np.full(values.shape[1], np.nan), np.full(values.shape[1], np.nan)
+    from scipy.stats import bootstrap
+
+    rng = rng_for("bootstrap", *names)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a constant column: the interval is that constant
+        found = bootstrap((values,), statistic, n_resamples=resamples, method="percentile", vectorized=True, rng=rng)
+    return np.asarray(found.confidence_interval.low), np.asarray(found.confidence_interval.high)
+
+
+def summary(table: pd.DataFrame, metric: str, kind: str) -> pd.DataFrame:
+    """Mean error by tuner (rows) and number of simulations (columns), best last column first."""
+    part = table[(table["metric"] == metric) & (table["range"] == kind)]
+    means = part.pivot(index="tuner", columns="simulations", values="mean")
+    return means.sort_values(by=means.columns[-1])

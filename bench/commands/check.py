@@ -1,0 +1,20 @@
+"""The command `simgap check`."""
+
+from __future__ import annotations
+
+import argparse
+
+
+def add_check(check: argparse.ArgumentParser) -> None:
+    """The options of `simgap check`."""
+    check.add_argument("name", metavar="NAME", help="registered name, e.g. cma_es, pendulum or drag.linear")
+    check.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file that defines it")
+    check.set_defaults(command=_check)
+
+
+def _check(options: argparse.Namespace) -> int:
+    from bench.checks.command import run
+    from bench.registry import load_plugins
+
+    load_plugins(options.plugin)
+    return 0 if run(options.name, options.plugin, print) else 1

@@ -1,0 +1,65 @@
+"""Fits short pieces of the runs first, each from initial states of its own, to begin long runs near the right minimum.
+
+Over a long run a small change of a period, a limit or a delay moves the trajectory far from the data, so the sum of
+squares has many minima. Over pieces it has few, since every piece begins where the data are (multiple shooting;
+H. G. Bock 1983, doi:10.1007/978-1-4684-7324-7_7). What the pieces find is where fits of the whole runs begin; it
+decides nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from bench.gap.model.fit import Fit, Start
+from bench.gap.model.world import Mask, World
+from sims.recording.recording import Run
+
+PIECES, LEAST = 4, 20
+"""Of each run so many pieces, if each has so many samples; else fewer."""
+
+
+def pieces(world: World) -> World | None:
+    """The world of the pieces, with the same parameters; None where every run is too short for two.
+
+    None for what bounces, too: a piece that begins beside an impact leaves open on which side of it, and a ball that
+    comes to rest is searched for a minimum among hundreds of small bounces (minutes, on the exam's updrafts).
+    """
+    if world.simulator.system.bounces:
+        return None
+    runs = [piece for run in world.runs for piece in _cut(run)]
+    if len(runs) == len(world.runs):
+        return None
+    freed = [p.name for p in world.freed]
+    cut = World(world.kind, world.recording, runs, world.engine, world.extra, freed, world.library)
+    cut.longest, cut.travel = world.longest, world.travel  # what is periodic goes on from piece to piece
+    return cut
+
+
+def _cut(run: Run) -> list[Run]:
+    seen: Mask = np.any(np.isfinite(np.stack(list(run.channels.values()))), axis=0)
+    count = int(np.clip(seen.sum() // LEAST, 1, PIECES))
+    edges = np.linspace(0, run.times.size, count + 1).astype(int)
+    parts = [slice(a, b) for a, b in pairwise(edges)]
+    if any(seen[part].sum() < LEAST // 2 for part in parts):
+        return [run]
+    return [
+        replace(
+            run,
+            name=f"{run.name}.{i}",
+            times=run.times[part],
+            channels={name: values[part] for name, values in run.channels.items()},
+            inputs={name: values[part] for name, values in run.inputs.items()},
+            initial=run.initial if i == 0 else {},
+            extra={},
+        )
+        for i, part in enumerate(parts)
+    ]
+
+
+def whole(world: World, found: Fit) -> Start:
+    """Where a fit of the whole runs begins, from a fit of their pieces."""
+    first = np.cumsum([0, *(len(_cut(run)) for run in world.runs)])[:-1]
+    return Start(found.effects, found.theta, found.states[first])

@@ -1,0 +1,132 @@
+"""The page of an explanation: one file, readable without a network or scripts, in the light, in the dark and in print.
+
+Ten seconds come first: what is wrong, the gain, the run that shows it. Every text from a file or plugin passes `safe`.
+"""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Iterator, Sequence
+from math import isfinite
+from pathlib import Path
+
+from bench.gap.report.account import closes, effort, following, headline, heldout_unit, interval
+from bench.gap.report.sections import candidates, numbers, reading, remains, safe, where, why, worst_first
+from bench.gap.report.story import Story
+from bench.gap.report.words import clean, joined, name_of, number, percent, pretty, with_unit
+from sims.base import InputError
+
+_KINDS = {
+    "adequate": "adequate: no gap found",
+    "named": "named: the cause is found",
+    "ambiguous": "ambiguous: one of several causes",
+    "partial": "partial: a cause is found, and something remains",
+    "unknown": "unknown: a gap, but no known cause",
+    "unidentifiable": "unidentifiable: the data do not suffice",
+}
+_CAPTIONS = {
+    "overview": "Above: measured and simulated; below: the residual, what is measured less what is simulated. "
+    "In the grey band 95 % of the sensor's noise would lie.",
+    "where": "Left: size of the residual by run, channel and phase; the dotted line at 1 is the noise floor, the grey "
+    "bar what noise without memory gives by chance. Right: the variables that the residual follows most.",
+    "candidates": "Left: evidence for each candidate, with the probability p of as much by chance. Right: what each "
+    "gains on held-out runs.",
+}
+
+
+def write_report(story: Story, folder: Path, figures: Sequence[Path]) -> Path:
+    """Write ``report.html`` into `folder`, the PNG files among `figures` within it; returns its path.
+
+    Raises:
+        InputError: the folder cannot be made or written to.
+    """
+    path = folder / "report.html"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(page(story, figures), encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot be written ({error.strerror})") from None
+    return path
+
+
+def page(story: Story, figures: Sequence[Path]) -> str:
+    """The page as HTML."""
+    pictures = {p.stem: _figure(story, p) for p in figures if p.suffix == ".png"}
+    style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+    parts = [
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{safe(headline(story), 120)} {safe(story.title, 80)}</title>",
+        f"<style>\n{style}</style>\n</head>\n<body>\n<main>",
+        *_opening(story),
+        pictures.get("overview", ""),
+        *why(story),
+        *where(story, pictures.get("where", "")),
+        *candidates(story, pictures.get("candidates", "")),
+        *numbers(story),
+        *remains(story),
+        *reading(),
+        f"</main>\n{_footer(story)}\n</body>\n</html>\n",
+    ]
+    return "\n".join(part for part in parts if part)
+
+
+def _opening(story: Story) -> Iterator[str]:
+    yield f'<header>\n<p class="recording">{safe(story.title)}</p>'
+    yield f'<p><span class="badge">{_KINDS[story.verdict["verdict"]]}</span></p>'
+    yield f"<h1>{safe(headline(story))}</h1>"
+    for text in following(story):
+        yield f'<p class="lead">{safe(text, 1000)}</p>'
+    yield "</header>"
+    yield from _gain(story)
+
+
+def _gain(story: Story) -> Iterator[str]:
+    """Bars of the held-out error before, after and of the floor."""
+    found = story.verdict["heldout"]
+    if found is None:
+        return
+    tuned = "before: tuned simulation" if story.verdict["causes"] else "tuned simulation"
+    rows = [("before", tuned, found["rmse_base"]), ("floor", "noise floor", found["noise_floor"])]
+    if story.verdict["causes"]:
+        rows.insert(1, ("after", "after: with what was found", found["rmse_extended"]))
+    most = max((value for _, _, value in rows if value is not None and isfinite(value)), default=0.0)
+    yield '<section class="gain" aria-label="error on held-out runs">'
+    if closes(found) and story.verdict["causes"]:
+        share = percent(found["gap_closed"])
+        yield f'<p class="closed"><strong>{share} of the gap closed</strong>{interval(found)}</p>'
+    yield '<p class="soft">Error on held-out runs (RMSE): shorter is better, the noise floor is best.</p>'
+    for kind, name, value in rows:
+        width = 100.0 * value / most if value is not None and most > 0 else 0.0
+        bar = f'<span><span class="bar {kind}" style="display:block;width:{width:.1f}%"></span></span>'
+        amount = safe(with_unit(number(value), heldout_unit(story)))
+        yield f'<div class="row"><span>{name}</span>{bar}<span class="value">{amount}</span></div>'
+    yield "</section>"
+
+
+def _figure(story: Story, path: Path) -> str:
+    data = b64encode(path.read_bytes()).decode("ascii")
+    alt = safe(_alternative(story, path.stem), 700)
+    caption = f"{_CAPTIONS.get(path.stem, '')} <span>For print: {safe(path.with_suffix('.pdf').name)}</span>"
+    image = f'<img src="data:image/png;base64,{data}" alt="{alt}">'
+    return f"<figure>\n{image}\n<figcaption>{caption}</figcaption>\n</figure>"
+
+
+def _alternative(story: Story, stem: str) -> str:
+    """What a figure shows, for those who do not see it."""
+    if stem == "overview":
+        names = joined([clean(c.name, 30) for c in story.channels])
+        return f"Measured and simulated {names} of the run that fits worst, with the residual. {headline(story)}"
+    if stem == "where":
+        parts = [f"{p.kind} {clean(p.label, 30)} {number(p.before, 2)}" for p in worst_first(story.places)[:5]]
+        return f"Size of the residual in units of the noise, the largest before: {'; '.join(parts)}."
+    best = [f"{name_of(c['effect'])} {number(c['score'])}" for c in story.verdict["candidates"][:5]]
+    return f"Scores of the candidates, the best: {'; '.join(best)}."
+
+
+def _footer(story: Story) -> str:
+    units = safe(joined([pretty(c.unit) or "1" for c in story.channels]), 100)
+    return (
+        f'<footer class="soft">\n<p>Recording: <code>{safe(story.path, 300)}</code> (channels in {units}). '
+        f"{safe(effort(story))} Made by simgap explain.</p>\n</footer>"
+    )

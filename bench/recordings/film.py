@@ -1,0 +1,53 @@
+"""A recorded ball filmed: a video, and the camera that made it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bench.problem.seeds import rng_for
+from sims.ball.system import BallSystem
+from sims.base import InputError, unknown
+from sims.camera.camera import Camera
+from sims.camera.files import Filmed, beside, described
+from sims.camera.look import Look
+from sims.camera.render import Stage
+from sims.camera.video import write_video
+from sims.recording.recording import read_recording, system_of
+from sims.recording.write import refuse_existing
+
+
+def write(recording: Path, out: Path, run: str | None, pixels: int, seed: int) -> tuple[int, float]:
+    """Film one run with a published camera of this seed; returns the number of frames and the seconds.
+
+    Raises:
+        InputError: the recording is of no ball or has no heights, or the video cannot be written.
+    """
+    refuse_existing([out, beside(out)])
+    if pixels < 16 or pixels % 2:
+        raise InputError(f"--size {pixels}: expected an even number of at least 16 pixels")
+    if (system := system_of(recording)) != BallSystem.name:
+        raise InputError(f"{recording}: expected a recording of system ball, found {system}")
+    data = read_recording(recording, BallSystem, whole=True)
+    runs = {r.name: r for r in data.runs}
+    if run is not None and run not in runs:
+        raise unknown(f"run in {recording}", run, list(runs))
+    chosen = runs[run] if run is not None else data.runs[0]
+    if "z" not in chosen.channels:
+        raise InputError(f"{recording}: expected the channel z, found {', '.join(chosen.channels)}")
+    zero = np.zeros(chosen.times.size)
+    positions = np.stack([chosen.channels.get(name, zero) for name in ("x", "y", "z")], axis=1)
+    if not np.isfinite(positions).all():
+        raise InputError(f"{recording}: run {chosen.name}: has missing samples; a film shows the ball in every frame")
+    radius = {**data.constants, **chosen.constants}.get("radius", _default("radius"))
+    rng = rng_for("film", seed)
+    camera, look = Camera.published(rng, pixels), Look.drawn(rng)
+    stage = Stage(camera, look, radius, rng)
+    told = {beside(out): described(Filmed(camera, radius, float(positions[0, 0]), float(positions[0, 1])))}
+    write_video(out, stage.film(positions), chosen.times, look.crf, told)
+    return len(positions), float(chosen.times[-1] - chosen.times[0])
+
+
+def _default(name: str) -> float:
+    return next(c.value for c in BallSystem.constants if c.name == name)

@@ -1,0 +1,93 @@
+"""A film tracked: the recording, its description, and a picture of the track."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.recordings import metres
+from bench.recordings.picture import drawn
+from sims.ball.system import BallSystem
+from sims.base import InputError, frozen
+from sims.camera.files import beside, read_filmed
+from sims.camera.track import Track, rough, track
+from sims.camera.video import Video
+from sims.recording.recording import Recording, Run
+from sims.recording.write import refuse_existing, write_recording
+
+_DIGITS = 9
+
+
+class Found(NamedTuple):
+    """What was tracked: notes for the user, and lines to print."""
+
+    notes: tuple[str, ...]
+    lines: tuple[str, ...]
+
+
+def write(video: Path, out: Path, diameter: float | None, fps: float | None, scale: str | None) -> Found:
+    """Track `video`; write `out`, its description, and the track's picture beside it.
+
+    Args:
+        video: the film.
+        out: NAME.csv, a new file.
+        diameter: of the ball, m.
+        fps: frames a second instead of the file's time stamps.
+        scale: "camera", "diameter" or "fall"; None for the best there is.
+
+    Raises:
+        InputError: anything that cannot be, in one line.
+    """
+    if out.suffix != ".csv":
+        raise InputError(f"--out {out}: expected a name that ends in .csv")
+    pictures = [out.with_suffix(".png"), out.with_suffix(".pdf")]
+    refuse_existing([out, out.with_suffix(".toml"), *pictures])
+    if diameter is not None and not (np.isfinite(diameter) and diameter > 0):
+        raise InputError(f"--ball-diameter {diameter:g}: expected more than 0 m")
+    film = Video(video, fps)
+    try:
+        seen = track(film)
+        heights = _heights(seen, video, diameter, scale)
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith(str(video)) else f"{video}: {text}") from None
+    first, last = metres.released(seen), int(seen.seen[-1])
+    notes = [*film.notes, *seen.notes, *heights.notes]
+    if first > seen.seen[0]:
+        notes.append(f"the ball is held until {seen.times[first]:.2f} s; what is before that is left out")
+    part = slice(first, last + 1)
+    z = heights.z[part]
+    noise = float(np.nanmax([rough(z), metres.scatter(seen.times[part], z), 0.0]))
+    if not noise > 0:
+        noise = seen.noise * heights.radius / float(np.nanmedian(seen.radius))
+    shown = dict(zip(pictures, drawn(seen, heights, part, f"{video.name}: {heights.how}"), strict=True))
+    write_recording(out, _recording(seen, heights, noise, part, video), BallSystem, digits=_DIGITS, beside=shown)
+    count = int(np.isfinite(heights.z[part]).sum())
+    lines = (
+        f"{out}: {count} of {part.stop - part.start} frames with the ball, z in metres {heights.how}",
+        f"noise of one sample: {seen.noise:.2g} px, {1e3 * noise:.2g} mm",
+        f"{pictures[0]}: the track",
+    )
+    return Found(tuple(notes), lines)
+
+
+def _heights(seen: Track, video: Path, diameter: float | None, scale: str | None) -> metres.Heights:
+    known = beside(video)
+    if scale == "camera" or (scale is None and known.is_file()):
+        return metres.by_camera(seen, read_filmed(known))
+    if scale == "diameter" and diameter is None:
+        raise InputError("--scale diameter: expected --ball-diameter METRES")
+    return metres.by_scale(seen, diameter, scale)
+
+
+def _recording(seen: Track, heights: metres.Heights, noise: float, part: slice, video: Path) -> Recording:
+    pixels = {"u": seen.u, "v": seen.v, "radius_px": seen.radius}
+    run = Run(
+        "1", frozen(seen.times[part]), {"z": frozen(heights.z[part])}, {}, {}, {}, False,
+        {name: frozen(values[part]) for name, values in pixels.items()},
+    )  # fmt: skip
+    title = f"{video.name}, tracked; z {heights.how}"
+    constants = {"radius": heights.radius, "gravity": metres.GRAVITY}
+    return Recording(Path(), BallSystem.name, title, constants, {"z": noise}, (run,), dict.fromkeys(pixels, "px"))

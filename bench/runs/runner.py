@@ -1,0 +1,249 @@
+"""Runs an experiment: tuners x targets x seeds in worker processes; every finished run is kept the moment it ends."""
+
+from __future__ import annotations
+
+import math
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+from bench.problem.experiment import Entry, Experiment
+from bench.problem.identifiability import Spectrum
+from bench.problem.problem import Problem, Target
+from bench.registry import SkippedError, tuners
+from bench.runs.guard import limits
+from bench.runs.identity import Identities
+from bench.runs.pools import Call, DeathError, LocalPool, LostError, Pool
+from bench.runs.rows import rows, status_of, unfinished
+from bench.runs.training import Training, WeightsError, build, train
+from bench.runs.worker import Order, Outcome, perform
+from bench.store.status import Status
+from sims.base import InputError
+
+Progress = Callable[[str, int], Callable[[], None]]
+"""Called with a title and a number of steps; gives the function to call after each step."""
+
+
+def _silent(_title: str, _steps: int) -> Callable[[], None]:
+    return lambda: None
+
+
+class Keep(Protocol):
+    """Where finished runs go, each by its place in the plan; `statuses` says which there are."""
+
+    statuses: dict[int, Status]
+
+    def add(self, place: int, columns: Mapping[str, Any], status: Status) -> None:
+        """Keep the rows and the status of a finished run."""
+        ...
+
+
+class Memory:
+    """Keeps runs in memory."""
+
+    def __init__(self) -> None:
+        self.columns: dict[int, Mapping[str, Any]] = {}
+        self.statuses: dict[int, Status] = {}
+
+    def add(self, place: int, columns: Mapping[str, Any], status: Status) -> None:
+        """Keep the rows and the status of a finished run."""
+        self.columns[place], self.statuses[place] = columns, status
+
+
+@dataclass
+class Results:
+    """A comparison: its problem, its plan once there is one, where its runs are kept, and what training cost.
+
+    `spectra` says what each target's data identify, by its name, where that can be asked.
+    """
+
+    problem: Problem
+    kept: Keep = field(default_factory=Memory)
+    plan: list[Job] = field(default_factory=list)
+    trainings: dict[tuple[str, int], Training] = field(default_factory=dict)
+    spectra: dict[str, Spectrum] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    interrupted: bool = False
+    stopped: str = ""
+
+    def training_rows(self) -> list[tuple[str, int, int, float]]:
+        """Rows of training.csv: tuner, seed, simulations, seconds."""
+        return [(label, seed, t.simulations, t.seconds) for (label, seed), t in self.trainings.items()]
+
+    def skipped_rows(self) -> list[dict[str, Any]]:
+        """Rows of status.csv for tuners that could not be used."""
+        simulator = self.problem.experiment.simulator
+        fixed = {"target": "", "seed": 0, "status": "skipped", "simulations": 0, "seconds": 0.0}
+        return [
+            {"run": label, "tuner": label, "simulator": simulator, **fixed, "reason": reason}
+            for label, reason in self.skipped.items()
+        ]
+
+
+@dataclass(frozen=True)
+class Job:
+    """An order and the target it is for, truth included; stays in the parent process."""
+
+    order: Order
+    target: Target
+
+
+def seeds_of(experiment: Experiment, entry: Entry) -> int:
+    """How many seeds an entry runs: its own number, the experiment's, or one where nothing is random."""
+    kind = tuners.get(entry.tuner)
+    if not (kind.stochastic or kind.learned):
+        return 1
+    return entry.seeds or experiment.seeds
+
+
+def check(experiment: Experiment) -> dict[str, str]:
+    """Build every tuner once, so that a fault shows before the work; returns the skipped entries with their reason."""
+    skipped = {}
+    for entry in experiment.tuners:
+        try:
+            build(entry)
+        except SkippedError as reason:
+            skipped[entry.label] = str(reason)
+    return skipped
+
+
+def prepare(experiment: Experiment) -> Results:
+    """Check an experiment whole before any work: its simulator, recording, tuners and their options; plan its runs.
+
+    Raises:
+        InputError: a fault in it.
+    """
+    if not experiment.tuners:
+        raise InputError(f"experiment {experiment.name}: names no tuner; add a [tuners.NAME] table or use --tuners")
+    if experiment.memory:
+        limits()
+    results = Results(Problem(experiment), skipped=check(experiment))
+    entries = [entry for entry in experiment.tuners if entry.label not in results.skipped]
+    results.plan = list(_plan(experiment, entries, results.problem.targets()))
+    results.problem.close()
+    return results
+
+
+def _plan(experiment: Experiment, entries: list[Entry], targets: list[Target]) -> Iterator[Job]:
+    """Every run, target by target, so that the time left can be estimated from the time gone."""
+    name = Identities(experiment).run
+    for target in targets:
+        for entry in entries:
+            budget = entry.budget or experiment.budget
+            for seed in range(seeds_of(experiment, entry)):
+                run = name(entry, target.sealed, seed, budget)
+                yield Job(Order(run, entry, seed, target.sealed, budget), target)
+
+
+def run(
+    results: Results,
+    plugins: Sequence[str] = (),
+    jobs: int = 2,
+    progress: Progress = _silent,
+    pool: Pool | None = None,
+) -> None:
+    """Make every run of a prepared experiment that is not kept already; `results.kept` gets each as it ends.
+
+    Args:
+        results: from `prepare`.
+        plugins: plugin files that workers need; the caller has loaded them in this process.
+        jobs: worker processes. The results do not depend on their number.
+        progress: told of every step.
+        pool: where to run instead, e.g. on a cluster.
+
+    Raises:
+        InputError: workers cannot be had.
+    """
+    with pool or LocalPool(jobs) as workers:
+        workers.load(plugins)
+        try:
+            _run(results, workers, progress)
+        except KeyboardInterrupt:
+            results.interrupted = True
+        except LostError as error:
+            results.stopped = str(error)
+
+
+def _run(results: Results, pool: Pool, progress: Progress) -> None:
+    missing = [place for place in range(len(results.plan)) if place not in results.kept.statuses]
+    _identify(results, progress)
+    failures = _train(pool, results, progress)
+    step = progress("running", len(missing))
+    ready: list[int] = []
+    for place in missing:
+        order = results.plan[place].order
+        if (failure := failures.get((order.entry.label, order.seed))) is not None:
+            _file(results, place, failure)
+            step()
+        else:
+            ready.append(place)
+    calls = _Calls(results, ready)
+    for i, outcome in pool.results(calls, results.problem.experiment.timeout):
+        _file(results, ready[i], outcome)
+        step()
+
+
+def _identify(results: Results, progress: Progress) -> None:
+    """Find what each target's data identify, which only the parent process can: it takes the truth."""
+    problem, targets = results.problem, {job.target.sealed.name: job.target for job in results.plan}
+    if any(target.truth is not None for target in targets.values()) and problem.identifiable:
+        step = progress("identifiability", len(targets))
+        for name, target in targets.items():
+            if (found := problem.spectrum(target)) is not None:
+                results.spectra[name] = found
+            step()
+        problem.close()
+
+
+class _Calls(Sequence[Call]):
+    """The calls for these places of the plan, each made when it is asked for: a million of them would fill memory."""
+
+    def __init__(self, results: Results, places: list[int]) -> None:
+        self._results, self._places = results, places
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, i: Any) -> Any:
+        order = self._results.plan[self._places[i]].order
+        training = self._results.trainings.get((order.entry.label, order.seed))
+        if training is not None:
+            order = replace(order, weights=training.path)
+        return perform, (self._results.problem.experiment, order)
+
+
+def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, int], Exception]:
+    """Train every learned entry with each of its seeds; returns the reasons of those that failed."""
+    experiment = results.problem.experiment
+    usable = [e for e in experiment.tuners if e.label not in results.skipped and tuners.get(e.tuner).learned]
+    wanted = [(e, seed) for e in usable for seed in range(seeds_of(experiment, e))]
+    failures: dict[tuple[str, int], Exception] = {}
+    if wanted:
+        step = progress("training", len(wanted))
+        calls = [(train, (experiment, entry, seed)) for entry, seed in wanted]
+        for place, trained in pool.results(calls, math.inf):
+            entry, seed = wanted[place]
+            if isinstance(trained, Training):
+                results.trainings[entry.label, seed] = trained
+            elif isinstance(trained, WeightsError):  # a fault of the user's: nothing has been run yet
+                raise trained
+            else:
+                failures[entry.label, seed] = trained
+            step()
+    return failures
+
+
+def _file(results: Results, place: int, outcome: Outcome | Exception) -> None:
+    """Keep what a worker gave back: an outcome, or the error that ended it."""
+    problem, job = results.problem, results.plan[place]
+    if isinstance(outcome, TimeoutError):
+        reason = f"killed past its limit of {problem.experiment.timeout:g} s"
+        outcome = unfinished(problem, job.target, "timeout", reason)
+    elif isinstance(outcome, DeathError):
+        outcome = unfinished(problem, job.target, "crashed", str(outcome))
+    elif isinstance(outcome, Exception):
+        reason = "".join(traceback.format_exception(outcome))
+        outcome = unfinished(problem, job.target, "crashed", reason)
+    columns = rows(problem, job.order, job.target, outcome, results.spectra.get(job.target.sealed.name))
+    results.kept.add(place, columns, status_of(problem, job.order, outcome))

@@ -1,0 +1,210 @@
+"""Trains learned tuners once for each simulator and seed, and keeps what they learned as plain tensors.
+
+The file's name is a hash of everything that went in: the tuner's and simulator's source and options, the training range
+and scenarios, budget, seed, the versions of the packages that compute and the device. The file holds the same hash, so
+that one which was put in another's place is noticed. Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import json
+import os
+import sys
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.problem.experiment import Entry, Experiment
+from bench.problem.problem import Problem
+from bench.problem.recorded import find_recording
+from bench.problem.seeds import rng_for
+from bench.registry import simulators, tuners
+from methods.base import Array, Tuner, Watch
+from sims.base import InputError
+
+_COUNTS = "__simulations_and_seconds__"
+_KEY = "__key__"
+
+
+class WeightsError(InputError):
+    """A file of trained weights that cannot be used."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """What one training cost when it was done, and where its tensors lie; `found` where that was earlier."""
+
+    path: Path
+    simulations: int
+    seconds: float
+    found: bool = False
+
+
+def build(entry: Entry) -> Tuner:
+    """The tuner of an entry, with its options.
+
+    Raises:
+        InputError: an option that the tuner does not have, or a value that it refuses.
+    """
+    kind = tuners.get(entry.tuner)
+    try:
+        return kind(**entry.options)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"tuner {entry.label}: {error}") from None
+
+
+def folder() -> Path:
+    """Where trained weights are kept: $SIMGAP_CACHE, else simgap/ in the user's cache folder."""
+    if os.environ.get("SIMGAP_CACHE"):
+        return Path(os.environ["SIMGAP_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "simgap"
+
+
+def key(experiment: Experiment, entry: Entry, seed: int) -> str:
+    """The hash of everything that determines the trained weights."""
+    document = experiment.document()
+    training = ("simulator", "observe", "noise", "settings", "constants", "parameters", "initial", "inputs", "sampling")
+    what = {name: document[name] for name in training} | {
+        "experiment": experiment.name,  # the seed's stream depends on it
+        "recording": recording_digest(experiment),
+        "tuner": entry.tuner,
+        "options": dict(entry.options),
+        "budget": experiment.training_budget,
+        "seed": seed,
+        "source": [source(tuners.get(entry.tuner)), source(simulators.get(experiment.simulator))],
+        "versions": [sys.version, *(package_version(name) for name in _PACKAGES)],
+        "device": device(),
+    }
+    text = json.dumps(what, sort_keys=True, default=str)
+    return f"{entry.tuner}-{experiment.simulator}-{seed}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+_PACKAGES = ("mujoco", "numpy", "pybullet", "sbi", "scipy", "torch")
+
+
+@cache
+def device() -> str:
+    """Where networks are trained here: the GPU's name, or cpu."""
+    if importlib.util.find_spec("torch") is None:
+        return "cpu"
+    import torch
+
+    return str(torch.cuda.get_device_name()) if torch.cuda.is_available() else "cpu"
+
+
+def recording_digest(experiment: Experiment) -> str:
+    """Hash of the recording's two files; empty where the experiment has none."""
+    if experiment.recording is None:
+        return ""
+    table = find_recording(experiment.recording.path)
+    return hashlib.sha256(table.read_bytes() + table.with_suffix(".toml").read_bytes()).hexdigest()
+
+
+def source(kind: type) -> str:
+    """Digest of the source of the package folder (or plugin file) that a class comes from."""
+    path = Path(inspect.getfile(kind))
+    files = sorted(path.parent.glob("*.py")) if kind.__module__.split(".")[0] in ("methods", "sims") else [path]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+def package_version(name: str) -> str:
+    """Name and version of an installed package, or that it is absent."""
+    try:
+        return f"{name} {version(name)}"
+    except PackageNotFoundError:
+        return f"{name} absent"
+
+
+def train(experiment: Experiment, entry: Entry, seed: int, watch: Watch | None = None, anew: bool = False) -> Training:
+    """Train, or find trained: the tensors' file and what the training cost when it was done.
+
+    Args:
+        experiment: the training ground and budget.
+        entry: the tuner with its options.
+        seed: of the training.
+        watch: looks on, if it comes to training.
+        anew: train even where there are weights, and replace them.
+
+    Raises:
+        WeightsError: there is a file, and it is damaged or foreign.
+    """
+    name = key(experiment, entry, seed)
+    path = folder() / f"{name}.npz"
+    if path.exists() and not anew:
+        simulations, seconds = _checked(path, name)[_COUNTS]
+        trained(entry, path)
+        return Training(path, int(simulations), float(seconds), found=True)
+    tuner = build(entry)
+    tuner.watch = watch
+    problem = Problem(experiment)
+    practice = problem.practice(experiment.training_budget)
+    started = perf_counter()
+    rng = rng_for(experiment.name, "fit", tuner.trains_as or entry.tuner, seed)
+    tuner.fit(practice, rng, experiment.training_budget)
+    seconds = perf_counter() - started
+    problem.close()
+    about = {_COUNTS: np.array([practice.used, seconds]), _KEY: np.frombuffer(name.encode(), dtype=np.uint8)}
+    _write(path, {**tuner.state(), **about})
+    return Training(path, practice.used, seconds)
+
+
+def _write(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
+    """Write a whole file or none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.stem}.{os.getpid()}.partial")  # so that a reader never meets half a file
+    try:
+        with partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def trained(entry: Entry, path: Path) -> Tuner:
+    """The tuner with the tensors of `path`.
+
+    Raises:
+        WeightsError: the file is missing, damaged, or foreign.
+    """
+    tuner = build(entry)
+    state = _checked(path, path.stem)
+    del state[_COUNTS], state[_KEY]
+    try:
+        tuner.restore(state)
+    except ValueError as error:
+        raise WeightsError(f"{path}: not the weights of {entry.label}: {error}; {_REMEDY}") from None
+    return tuner
+
+
+_REMEDY = "delete it to have it trained again"
+
+
+def _checked(path: Path, name: str) -> dict[str, Array]:
+    """The arrays of a file of trained weights.
+
+    Raises:
+        WeightsError: it is missing, damaged, or was trained for something else than `name`.
+    """
+    try:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            arrays = {member: file[member] for member in file.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, AttributeError):
+        raise WeightsError(f"{path}: expected trained weights, found none or a damaged file; {_REMEDY}") from None
+    counts, held = arrays.get(_COUNTS, np.empty(0)), arrays.get(_KEY, np.empty(0))
+    if counts.shape != (2,) or counts.dtype != np.float64 or held.dtype != np.uint8 or held.ndim != 1:
+        raise WeightsError(f"{path}: expected trained weights, found arrays {sorted(arrays)[:4]}; {_REMEDY}")
+    found = held.tobytes().decode("utf-8", "replace")
+    if found != name:
+        raise WeightsError(f"{path}: expected the weights of {name}, found those of {found:.80}; {_REMEDY}")
+    return arrays

@@ -1,0 +1,218 @@
+"""The folder of a comparison: exact configuration, versions and machine, a row a simulation, a status a run."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from datetime import datetime, timezone
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from bench import __version__
+from bench.problem.experiment import Experiment, parse
+from bench.store.journal import FOLDER, Journal, replace_text
+from bench.store.status import STATUS_COLUMNS
+from sims.base import InputError
+from sims.recording.recording import read_toml
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def free_folder(experiment: Experiment, out: str | None, results: Path = Path("results")) -> Path:
+    """Where a new run may be written: `out`, or a folder below results/ named for the experiment and the time.
+
+    Raises:
+        InputError: `out` exists and has something in it.
+    """
+    stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
+    folder = Path(out) if out else results / f"{experiment.name}-{stamp}"
+    number = 1
+    while not out and folder.exists():
+        number += 1
+        folder = results / f"{experiment.name}-{stamp}-{number}"
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            f"--out {folder}: exists and is not empty; results are never overwritten: "
+            f"name another folder, or finish what is in it with --resume {folder}"
+        )
+    return folder
+
+
+class Configuration(NamedTuple):
+    """What a folder is for: the experiment, how it was started, and hashes of what must not change."""
+
+    experiment: Experiment
+    plugins: list[str]
+    fingerprint: dict[str, str]
+
+
+def create(folder: Path, configuration: Configuration, jobs: int) -> None:
+    """Make the folder with experiment.toml and environment.json in it, all at once or not at all.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    import tomli_w
+
+    experiment = configuration.experiment
+    environment = {
+        "simgap": __version__,
+        "experiment": experiment.name,
+        "plugins": [str(Path(p).resolve()) for p in configuration.plugins],
+        "jobs": jobs,
+        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "python": sys.version,
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "processors": os.cpu_count(),
+        "fingerprint": configuration.fingerprint,
+        "packages": dict(sorted({d.metadata["Name"]: d.version for d in distributions()}.items())),
+    }
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+        text = tomli_w.dumps(_plain(experiment.document()))
+        (partial / "experiment.toml").write_text(text, encoding="utf-8")
+        (partial / "environment.json").write_text(json.dumps(environment, indent=1) + "\n", encoding="utf-8")
+        (partial / FOLDER).mkdir()
+        partial.replace(folder)
+    except OSError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise InputError(f"--out {folder}: cannot be made ({error.strerror})") from None
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as lists, mappings as dictionaries: what TOML can hold."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    return value
+
+
+def configuration(folder: Path) -> Configuration:
+    """What the folder of a comparison is for.
+
+    Raises:
+        InputError: it is no such folder, or a file in it is damaged.
+    """
+    path = folder / "experiment.toml"
+    if not path.is_file():
+        raise InputError(f"{folder}: expected the folder of a comparison with experiment.toml in it, found none")
+    environment = _environment(folder)
+    plugins, fingerprint = environment.get("plugins", []), environment.get("fingerprint", {})
+    if not _texts(plugins) or not isinstance(fingerprint, dict) or not _texts(list(fingerprint.values())):
+        raise InputError(f"{folder / 'environment.json'}: expected lists of plugins and hashes, found something else")
+    experiment = parse(str(environment["experiment"]), read_toml(path), path)
+    return Configuration(experiment, plugins, fingerprint)
+
+
+def _texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, str) for item in value)
+
+
+def _environment(folder: Path) -> dict[str, Any]:
+    path = folder / "environment.json"
+    try:
+        environment = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{folder}: not a complete comparison: {path.name}: {_line(error)}") from None
+    if not isinstance(environment, dict) or not isinstance(environment.get("experiment"), str):
+        raise InputError(f"{folder}: not a complete comparison: {path.name} does not name the experiment")
+    return environment
+
+
+def _line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def write_results(
+    folder: Path,
+    journal: Journal,
+    trainings: Iterable[tuple[str, int, int, float]],
+    skipped: Iterable[Mapping[str, Any]],
+) -> None:
+    """Write runs.parquet, training.csv and status.csv in the order of the plan, each whole or not at all.
+
+    Args:
+        folder: the comparison's.
+        journal: its finished runs.
+        trainings: tuner, seed, simulations and seconds of each training.
+        skipped: rows of status.csv for tuners that could not be used.
+    """
+    import pandas as pd
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    partial = folder / ".runs.parquet.partial"
+    writer = None
+    for rows in journal.tables():
+        writer = writer or parquet.ParquetWriter(partial, rows.schema, compression="zstd")
+        writer.write_table(rows)
+    if writer is None:
+        parquet.write_table(pa.table({}), partial)
+    else:
+        writer.close()
+    partial.replace(folder / "runs.parquet")
+    training = pd.DataFrame(sorted(trainings), columns=["tuner", "seed", "simulations", "seconds"])
+    replace_text(folder / "training.csv", training.to_csv(index=False))
+    rows_of_statuses = [asdict(journal.statuses[place]) for place in sorted(journal.statuses)] + list(skipped)
+    statuses = pd.DataFrame(rows_of_statuses, columns=STATUS_COLUMNS)
+    replace_text(folder / "status.csv", statuses.to_csv(index=False))
+
+
+class Stored(NamedTuple):
+    """A comparison read back: experiment, runs, statuses, and (simulations, seconds) of one training by tuner."""
+
+    experiment: Experiment
+    runs: pd.DataFrame
+    statuses: pd.DataFrame
+    costs: dict[str, tuple[float, float]]
+
+
+def read(folder: Path, columns: Sequence[str] | None = None) -> Stored:
+    """Read the folder of a comparison that was finished or interrupted.
+
+    Args:
+        folder: the comparison's.
+        columns: of the runs, where not all are wanted; those that there are not are left out.
+
+    Raises:
+        InputError: the folder lacks a file of a comparison, or one is damaged.
+    """
+    import pandas as pd
+    from pyarrow import ArrowException, parquet
+
+    experiment = configuration(folder).experiment
+    path = folder / "runs.parquet"
+    if not path.exists() and (folder / FOLDER).exists():
+        raise InputError(f"{folder}: not finished, and nothing written yet; simgap compare --resume {folder}")
+    try:
+        there = parquet.read_schema(path).names
+        runs = parquet.read_table(path, columns=[c for c in there if columns is None or c in columns]).to_pandas()
+        statuses = pd.read_csv(folder / "status.csv", keep_default_na=False)
+        training = pd.read_csv(folder / "training.csv")
+        missing = {"run", "tuner", "k"} - set(runs.columns) if len(runs.columns) else set()
+        missing |= {"run", "tuner", "status", "reason"} - set(statuses.columns)
+        if missing:
+            raise InputError(f"{folder}: not a complete comparison: no column {', '.join(sorted(missing))}")
+        costs = _costs(training)
+    except (OSError, ValueError, KeyError, ArrowException) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{folder}: not a complete comparison: {_line(error)}") from None
+    return Stored(experiment, runs, statuses, costs)
+
+
+def _costs(training: pd.DataFrame) -> dict[str, tuple[float, float]]:
+    """Simulations and seconds of one training, the mean over seeds, by tuner."""
+    means = training.groupby("tuner")[["simulations", "seconds"]].mean()
+    values = means.to_numpy(dtype=float)
+    return {str(name): (float(row[0]), float(row[1])) for name, row in zip(means.index, values, strict=True)}

@@ -1,0 +1,260 @@
+"""Finished runs on disk the moment they end: a record each, appended; many records become one Parquet part.
+
+The folder ``segments`` of a comparison that is under way holds ``plan.txt`` (the id of every run, in order),
+``NNNNNN.journal`` (records that are being appended) and ``NNNNNN.parquet`` (parts). A part is written beside its
+journal, renamed, and only then is the journal deleted; where both are found, the part holds everything. A record that
+was cut off by a kill fails its checksum and is dropped: its run was not finished. What is appended survives the end of
+any process; the end of the machine may cost the runs since the last part.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import struct
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from bench.store.status import Status
+from sims.base import InputError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+FOLDER = "segments"
+_HEAD = struct.Struct(">4sII")
+_MARK = b"run\n"
+PART_RUNS = 1000
+"""Records that become a part together."""
+
+
+class Journal:
+    """The finished runs of a comparison in `folder`; opening it recovers whatever an earlier process left.
+
+    Attributes:
+        statuses: of every finished run, by its place in the plan.
+
+    Raises:
+        InputError: another process is at work in the folder, or a part is damaged.
+    """
+
+    def __init__(self, folder: Path, part_runs: int = PART_RUNS) -> None:
+        self.folder = folder / FOLDER
+        self.folder.mkdir(exist_ok=True)
+        self._lock = _locked(self.folder / "lock")
+        self._part_runs = part_runs
+        self.statuses: dict[int, Status] = {}
+        self._index: dict[Path, list[int]] = {}
+        self._records: list[tuple[int, Status, pa.Table]] = []
+        try:
+            self._read_parts()
+        except InputError:
+            self._lock.close()
+            raise
+        self._number = 1 + max((int(p.stem) for p in self._index), default=0)
+        for stale in self.folder.glob("*.journal"):
+            if int(stale.stem) < self._number:
+                stale.unlink()
+        self._file = self._reopened(self._path("journal"))
+
+    def _read_parts(self) -> None:
+        for path in sorted(self.folder.glob("*.parquet")):
+            statuses = part_statuses(path)
+            self.statuses |= statuses
+            self._index[path] = sorted(statuses)
+
+    def _path(self, ending: str) -> Path:
+        return self.folder / f"{self._number:06d}.{ending}"
+
+    def _reopened(self, path: Path) -> IO[bytes]:
+        """The journal, its whole records read and a cut-off one dropped, ready to append."""
+        end = 0
+        if path.exists():
+            for place, status, rows, end in records(path):  # noqa: B007 - the last end is where to go on
+                self._records.append((place, status, rows))
+                self.statuses[place] = status
+        file = path.open("r+b" if path.exists() else "w+b", buffering=0)
+        file.truncate(end)
+        file.seek(end)
+        return file
+
+    def add(self, place: int, columns: Mapping[str, Any], status: Status) -> None:
+        """Keep a finished run; when this returns, it survives a kill."""
+        import pyarrow as pa
+
+        rows = pa.table(dict(columns))
+        payload = _packed(place, status, rows)
+        self._file.write(_HEAD.pack(_MARK, len(payload), zlib.crc32(payload)) + payload)
+        self._records.append((place, status, rows))
+        self.statuses[place] = status
+        if len(self._records) >= self._part_runs:
+            self._make_part()
+
+    def _make_part(self) -> None:
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        self._records.sort(key=lambda record: record[0])
+        statuses = json.dumps([[place, asdict(status)] for place, status, _ in self._records])
+        tables = [_placed(place, rows) for place, _, rows in self._records]
+        whole = pa.concat_tables(tables).replace_schema_metadata({"statuses": statuses})
+        path = self._path("parquet")
+        partial = path.with_suffix(".partial")
+        parquet.write_table(whole, partial, compression="zstd")
+        _to_disk(partial)
+        partial.replace(path)
+        self._file.close()
+        self._path("journal").unlink()
+        self._index[path] = [place for place, _, _ in self._records]
+        self._records = []
+        self._number += 1
+        self._file = self._reopened(self._path("journal"))
+
+    def tables(self, runs: int = 2000) -> Iterator[pa.Table]:
+        """The rows of all finished runs in the order of the plan, about `runs` runs at a time."""
+        import pyarrow as pa
+        from pyarrow import compute, parquet
+
+        pending = {place: rows for place, _, rows in self._records}
+        places = sorted(self.statuses)
+        for first in range(0, len(places), runs):
+            chunk = places[first : first + runs]
+            low, high = chunk[0], chunk[-1]
+            parts = [_placed(place, pending[place]) for place in chunk if place in pending]
+            for path, held in self._index.items():
+                if held[0] <= high and held[-1] >= low:
+                    between = (compute.field("place") >= low) & (compute.field("place") <= high)
+                    parts.append(parquet.read_table(path, filters=between))
+            whole = pa.concat_tables([part.replace_schema_metadata() for part in parts])
+            order = compute.sort_indices(whole, sort_keys=[("place", "ascending"), ("k", "ascending")])
+            yield whole.take(order).drop_columns(["place"])
+
+    def close(self) -> None:
+        """Let others work in the folder."""
+        self._file.close()
+        self._lock.close()
+
+    def discard(self) -> None:
+        """Delete the segments; their content stands elsewhere. Renamed first, so that no half of them is ever met."""
+        self.close()
+        gone = self.folder.with_name(f".{FOLDER}.gone")
+        shutil.rmtree(gone, ignore_errors=True)
+        self.folder.rename(gone)
+        shutil.rmtree(gone)
+
+
+def _placed(place: int, rows: pa.Table) -> pa.Table:
+    import numpy as np
+    import pyarrow as pa
+
+    return rows.append_column("place", pa.array(np.full(len(rows), place)))
+
+
+def _packed(place: int, status: Status, rows: pa.Table) -> bytes:
+    import pyarrow as pa
+
+    sink = pa.BufferOutputStream()
+    head = json.dumps([place, asdict(status)])
+    rows = rows.replace_schema_metadata({"status": head})
+    with pa.ipc.new_stream(sink, rows.schema) as stream:
+        stream.write_table(rows)
+    packed: bytes = sink.getvalue().to_pybytes()
+    return packed
+
+
+def records(path: Path) -> Iterator[tuple[int, Status, pa.Table, int]]:
+    """Place, status, rows, and the offset behind it, of every whole record of a journal."""
+    import pyarrow as pa
+
+    data, end = path.read_bytes(), 0
+    while end + _HEAD.size <= len(data):
+        mark, length, checksum = _HEAD.unpack_from(data, end)
+        payload = data[end + _HEAD.size : end + _HEAD.size + length]
+        if mark != _MARK or len(payload) < length or zlib.crc32(payload) != checksum:
+            return
+        end += _HEAD.size + length
+        rows = pa.ipc.open_stream(payload).read_all()
+        place, status = json.loads(rows.schema.metadata[b"status"])
+        yield place, Status(**status), rows.replace_schema_metadata(), end
+
+
+def part_statuses(path: Path) -> dict[int, Status]:
+    """Statuses of a part, by place, from its footer alone.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        held = json.loads(parquet.read_schema(path).metadata[b"statuses"])
+        return {int(place): Status(**status) for place, status in held}
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
+        raise InputError(f"{path}: expected a part of a comparison, found damage: {_first_line(error)}") from None
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def finished(folder: Path) -> dict[int, Status]:
+    """Statuses of the finished runs below `folder`, by place, while another process may be at work there."""
+    found: dict[int, Status] = {}
+    for path in sorted((folder / FOLDER).glob("*.journal")):
+        with suppress(FileNotFoundError):  # it became a part a moment ago, which is listed below
+            found |= {place: status for place, status, _, _ in records(path)}
+    for path in sorted((folder / FOLDER).glob("*.parquet")):
+        found |= part_statuses(path)
+    return found
+
+
+def write_plan(folder: Path, ids: Sequence[str]) -> None:
+    """Write the id of every run, in the order of the plan."""
+    replace_text(folder / FOLDER / "plan.txt", "".join(f"{name}\n" for name in ids))
+
+
+def read_plan(folder: Path) -> list[str] | None:
+    """The ids of the plan; None where there is none yet.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    path = folder / FOLDER / "plan.txt"
+    try:
+        return path.read_text(encoding="utf-8").splitlines() if path.is_file() else None
+    except ValueError:
+        raise InputError(f"{path}: expected the ids of the runs as UTF-8 text, found other bytes") from None
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a whole file or nothing."""
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(text, encoding="utf-8")
+    _to_disk(partial)
+    partial.replace(path)
+
+
+def _to_disk(path: Path) -> None:
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+def _locked(path: Path) -> IO[str]:
+    """The lock of the folder: held until this process ends, however it ends."""
+    file = path.open("a", encoding="ascii")
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError:  # no such locks on this system
+        pass
+    except OSError:
+        file.close()
+        raise InputError(f"{path.parent.parent}: another simgap is at work there; wait for it, or end it") from None
+    return file

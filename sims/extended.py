@@ -1,0 +1,247 @@
+"""Extended simulators on disk: `extended.toml` is written by explain and loads back as a simulator like any other.
+
+The file names the system, the effects and every number with its interval. Loaded, it is a registered simulator whose
+nominal values are the fitted ones, so `compare`, `simulate` and every tuner take it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims import effects as library
+from sims.base import InputError, Parameter, Simulator, unknown
+from sims.recording.recording import read_toml
+from sims.simulated import Simulated, effect_parameters
+
+FORMAT = 1
+SPREAD = 0.2
+"""The training range of a fitted number reaches at least this share of it to either side."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """A fitted number with its 95 % interval, None where the data do not bound it."""
+
+    value: float
+    unit: str
+    low: float | None
+    high: float | None
+
+    def table(self) -> dict[str, Any]:
+        """As TOML, which has no null."""
+        interval = {} if self.low is None or self.high is None else {"low": self.low, "high": self.high}
+        return {"value": self.value, "unit": self.unit, **interval}
+
+
+@dataclass(frozen=True)
+class Extended:
+    """An extended simulator.
+
+    Attributes:
+        name: under which it registers.
+        system: the system's registered name.
+        engine: the engine it was fitted with; None for a simulator that steps itself.
+        title: of the recording that it was fitted to.
+        parameters: the system's own.
+        effects: coefficients by effect, in the order in which a signal passes them.
+        constants: as the recording states them, and fitted ones.
+        observe: channels that the recording had.
+    """
+
+    name: str
+    system: str
+    engine: str | None
+    title: str
+    parameters: Mapping[str, Number]
+    effects: Mapping[str, Mapping[str, Number]]
+    constants: Mapping[str, float]
+    observe: Sequence[str]
+
+
+def write(extended: Extended, path: Path) -> None:
+    """Write the file."""
+    import tomli_w
+
+    document = {
+        "format": FORMAT,
+        "name": extended.name,
+        "system": extended.system,
+        **({"engine": extended.engine} if extended.engine else {}),
+        "title": extended.title,
+        "observe": list(extended.observe),
+        "constants": dict(extended.constants),
+        "parameters": {name: number.table() for name, number in extended.parameters.items()},
+        "effects": {
+            name: {coefficient: number.table() for coefficient, number in numbers.items()}
+            for name, numbers in extended.effects.items()
+        },
+    }
+    path.write_text(tomli_w.dumps(document), encoding="utf-8")
+
+
+def read(path: Path) -> Extended:
+    """Read and check a file.
+
+    Raises:
+        InputError: it is missing, malformed, or of another format.
+    """
+    document = read_toml(path)
+    if document.get("format") != FORMAT:
+        raise InputError(
+            f"{path}: expected an extended simulator with format = {FORMAT}, found {document.get('format')!r}"
+        )
+    for key in document:
+        if key not in ("format", "name", "system", "engine", "title", "observe", "constants", "parameters", "effects"):
+            raise unknown(f"key of {path}", key, ["name", "system", "engine", "title", "observe", "constants", "..."])
+    name, system = (_text(path, document, key) for key in ("name", "system"))
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]*", name):
+        raise InputError(f"{path}: name: expected letters, digits, '_', '.' and '-', found {name!r}")
+    observe = document.get("observe", [])
+    if not isinstance(observe, list) or not observe or not all(isinstance(c, str) for c in observe):
+        raise InputError(f"{path}: observe: expected a list of channel names, found {observe!r}")
+    constants = {key: _real(path, f"constants.{key}", v) for key, v in _table(path, document, "constants").items()}
+    parameters = {key: _number(path, f"parameters.{key}", v) for key, v in _table(path, document, "parameters").items()}
+    effects = {
+        key: {c: _number(path, f"effects.{key}.{c}", v) for c, v in _table(path, {key: value}, key).items()}
+        for key, value in _table(path, document, "effects").items()
+    }
+    engine = _text(path, document, "engine") if "engine" in document else None
+    return Extended(name, system, engine, str(document.get("title", "")), parameters, effects, constants, observe)
+
+
+def _table(path: Path, document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = document.get(key, {})
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: {key}: expected a table, found {value!r}")
+    return value
+
+
+def _text(path: Path, document: Mapping[str, Any], key: str) -> str:
+    value = document.get(key)
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{path}: {key}: expected a text, found {value!r}")
+    return value
+
+
+def _real(path: Path, where: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise InputError(f"{path}: {where}: expected a finite number, found {value!r}")
+    return float(value)
+
+
+def _number(path: Path, where: str, value: object) -> Number:
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: {where}: expected a table with value and unit, found {value!r}")
+    low, high = (_real(path, f"{where}.{k}", value[k]) if k in value else None for k in ("low", "high"))
+    return Number(_real(path, f"{where}.value", value.get("value")), _text(path, value, "unit"), low, high)
+
+
+def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
+    """The extended simulator as a class that registers like any other; made without arguments it is the fitted one.
+
+    Args:
+        extended: what was read.
+        kind: the simulator's class of its system.
+
+    Raises:
+        InputError: a parameter, effect, coefficient, constant or channel that does not exist.
+    """
+    places = [p.name for p in kind.parameters]
+    for name in extended.parameters:
+        if name not in places:
+            raise unknown(f"parameter of system {extended.system}", name, places)
+    values = _coefficients(extended, kind)
+    own = [_at(p, extended.parameters[p.name]) if p.name in extended.parameters else p for p in kind.parameters]
+    names, observed = list(extended.effects), list(extended.observe)
+    engine_of: dict[str, Any] = {"engine": extended.engine} if extended.engine else {}
+    fresh = kind(extended.constants, observed, effects=names, **engine_of)
+    added = [_at(p, n) for p, n in zip(fresh.parameters[len(own) :], values, strict=True)]
+    fresh.close()
+
+    def __init__(  # noqa: N807
+        self: Simulated,
+        constants: Mapping[str, float] | None = None,
+        observe: Sequence[str] | None = None,
+        **settings: Any,
+    ) -> None:
+        known = {**extended.constants, **(constants or {})}
+        kind.__init__(self, known, observe or observed, effects=names, **{**engine_of, **settings})
+        self.parameters = (*own, *added)
+
+    body = {"__init__": __init__, "system": kind.system, "extends": extended.system}
+    made: type[Simulated] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
+    made.name = extended.name
+    made.says = f"{extended.system} with {', '.join(names) or 'nothing added'}, fitted to: {extended.title}"
+    made.parameters = (*own, *added)
+    return made
+
+
+def refuse_extended(kind: type[Simulated]) -> None:
+    """Raise InputError if a simulator has been extended already: its effects cannot be chosen again."""
+    if hasattr(kind, "extends"):
+        raise InputError(f"simulator {kind.name} is extended already; name the system it extends, {kind.extends}")
+
+
+def _coefficients(extended: Extended, kind: type[Simulated]) -> list[Number]:
+    """Every coefficient in the simulator's order."""
+    values = []
+    for name, numbers in extended.effects.items():
+        there = library.get(name).on(kind.system)
+        for given in numbers:
+            if given not in [c.name for c in there]:
+                raise unknown(f"coefficient of effect {name}", given, [c.name for c in there])
+        for p, c in zip(effect_parameters(library.get(name), kind.system, extended.observe), there, strict=True):
+            values.append(numbers.get(c.name, Number(0.0, p.unit, None, None)))
+    return values
+
+
+def _at(parameter: Parameter, number: Number) -> Parameter:
+    """The parameter with a fitted number for its nominal value, and a training range around it."""
+    reach = max(SPREAD * abs(number.value), 1e-12)
+    if number.low is not None and number.high is not None:
+        reach = max(reach, 3.0 * (number.high - number.low) / 2.0)
+    low, high = parameter.bounds
+    low, high = min(low, number.value), max(high, number.value)
+    inner = (max(low, number.value - reach), min(high, number.value + reach))
+    training = inner if inner[0] < inner[1] else None
+    return replace(parameter, nominal=number.value, bounds=(low, high), training=training)
+
+
+Find = Callable[[str], type[Simulator]]
+"""Gives the simulator that is registered under a name."""
+
+
+def load(path: Path, find: Find) -> type[Simulated]:
+    """The extended simulator in a file.
+
+    Args:
+        path: extended.toml.
+        find: looks up the system that it extends.
+
+    Raises:
+        InputError: the file, or the system it names, is not usable.
+    """
+    return opened(path, find)[2]
+
+
+def opened(path: Path, find: Find) -> tuple[Extended, type[Simulated], type[Simulated]]:
+    """What is in a file, the simulator of its system, and the extended simulator.
+
+    Raises:
+        InputError: the file, or the system it names, is not usable.
+    """
+    extended = read(path)
+    try:
+        kind = find(extended.system)
+        if not issubclass(kind, Simulated):
+            raise InputError(f"system {extended.system} takes no effects")
+        refuse_extended(kind)
+        return extended, kind, simulator_of(extended, kind)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

@@ -1,0 +1,155 @@
+"""Measured data: a table `NAME.csv` and its description `NAME.toml`, read and checked, never guessed, never written.
+
+The table has the columns `run`, `t` (seconds, increasing within a run) and one for each channel and input, in the units
+that the description states; an empty cell is a missing sample. What is read is in SI units. Every fault found gives one
+line: file, row, column, what was expected, what was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from sims.base import Array, InputError, frozen
+from sims.recording.description import (
+    Declared,
+    Description,
+    RunMarks,
+    check_names,
+    description_of,
+    read_description,
+    read_toml,
+    system_of,
+    tomllib,
+)
+from sims.recording.table import TableRun, read_table
+from sims.recording.units import SAME, Scale
+
+__all__ = ["Declared", "Recording", "Run", "read_recording", "read_toml", "system_of", "tomllib"]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a recording.
+
+    Attributes:
+        name: as in the `run` column.
+        times: (T,) seconds.
+        channels: measured signals by name, each (T,), SI units, NaN where missing.
+        inputs: input signals by name, each (T,), SI units.
+        constants: constants that this run states for itself.
+        initial: known initial state.
+        held_out: for measuring only, never for fitting.
+        extra: columns that no channel or input of the system is, each (T,), in the units they are written in.
+    """
+
+    name: str
+    times: Array
+    channels: Mapping[str, Array]
+    inputs: Mapping[str, Array]
+    constants: Mapping[str, float]
+    initial: Mapping[str, float]
+    held_out: bool
+    extra: Mapping[str, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording: the system it is of, its constants, each channel's noise where stated (1 sigma), its runs.
+
+    `extra` has the units of the columns that belong to no channel or input, such as pixels of a tracked film.
+    """
+
+    path: Path
+    system: str
+    title: str
+    constants: Mapping[str, float]
+    noise: Mapping[str, float]
+    runs: tuple[Run, ...]
+    extra: Mapping[str, str] = field(default_factory=dict)
+
+    def training(self) -> tuple[Run, ...]:
+        """Runs for fitting."""
+        return tuple(run for run in self.runs if not run.held_out)
+
+    def held_out(self) -> tuple[Run, ...]:
+        """Runs for measuring."""
+        return tuple(run for run in self.runs if run.held_out)
+
+
+def read_recording(path: str | Path, declared: Declared, whole: bool = False) -> Recording:
+    """Read `NAME.csv` and `NAME.toml` and check them against a system's channels, inputs, constants and states.
+
+    Args:
+        path: the table.
+        declared: the system, or a simulator of it; `system_of` says which system the recording states.
+        whole: hold nothing out but the runs that are marked, and do not divide a single run.
+
+    Raises:
+        InputError: anything malformed, in one line.
+    """
+    table = Path(path)
+    description = description_of(table)
+    about = read_description(description, declared)
+    parts = read_table(table, list(about.channels), list(about.inputs), list(about.extra))
+    check_names(description, about.runs, [part.name for part in parts])
+    runs = [_run(table, part, about) for part in parts]
+    kept = tuple(runs) if whole else _split(description, runs)
+    return Recording(table, about.system, about.title, about.constants, about.noise, kept, about.extra)
+
+
+_UNMARKED = RunMarks({}, {}, None)
+
+
+def _run(table: Path, part: TableRun, about: Description) -> Run:
+    marks = about.runs.get(part.name, _UNMARKED)
+    channels, inputs = (
+        {n: _converted(table, part, n, s) for n, s in scales.items()} for scales in (about.channels, about.inputs)
+    )
+    extra = {name: part.columns[name] for name in about.extra}
+    return Run(part.name, part.times, channels, inputs, marks.constants, marks.initial, bool(marks.held_out), extra)
+
+
+def _converted(table: Path, part: TableRun, name: str, scale: Scale) -> Array:
+    values = part.columns[name]
+    if scale == SAME:
+        return values
+    with np.errstate(over="ignore"):
+        result = values * scale.gain + scale.offset
+    if np.isinf(result).any():
+        raise InputError(f"{table}: run {part.name!r}, column {name}: a value is too large to convert to SI units")
+    return frozen(result)
+
+
+def _split(path: Path, runs: Sequence[Run]) -> tuple[Run, ...]:
+    """The runs with some held out: those marked, else every third run, else the last third of a single run."""
+    if any(run.held_out for run in runs):
+        if all(run.held_out for run in runs):
+            raise InputError(f"{path}: every run is marked held_out; expected at least one that is not, for fitting")
+        return tuple(runs)
+    if len(runs) == 1:
+        return _halves(path, runs[0])
+    marked = [i % 3 == 2 or (len(runs) == 2 and i == 1) for i in range(len(runs))]
+    return tuple(replace(run, held_out=mark) for run, mark in zip(runs, marked, strict=True))
+
+
+def _halves(path: Path, run: Run) -> tuple[Run, ...]:
+    cut = (2 * len(run.times)) // 3
+    parts = _slice(run, slice(None, cut), False), _slice(run, slice(cut, None), True)
+    for part in parts:
+        if len(part.times) < 2 or not any(np.isfinite(v).any() for v in part.channels.values()):
+            raise InputError(
+                f"{path}: the only run is too short to hold its last third out: {len(run.times)} rows; expected at "
+                "least 4, with samples in both parts"
+            )
+    return parts
+
+
+def _slice(run: Run, part: slice, held_out: bool) -> Run:
+    signals = run.channels, run.inputs, run.extra
+    channels, inputs, extra = ({k: v[part] for k, v in each.items()} for each in signals)
+    initial = run.initial if part.start is None else {}
+    return Run(run.name, run.times[part], channels, inputs, run.constants, initial, held_out, extra)

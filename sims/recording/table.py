@@ -1,0 +1,200 @@
+"""The table of a recording, `NAME.csv`: read cell by cell, every fault with its row and column.
+
+Rows are lines of the file, counted from 1 with the header, as an editor shows them.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice, pairwise
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+
+from sims.base import Array, InputError, frozen
+from sims.recording.fast import WORTHWHILE, read_fast
+
+_CHUNK = 1 << 13
+_NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
+_LONGEST = 40
+
+
+class TableRun(NamedTuple):
+    """The rows of one run: its name, times (T,), and the other columns by name, each (T,); NaN where missing."""
+
+    name: str
+    times: Array
+    columns: dict[str, Array]
+
+
+def shown(cell: object) -> str:
+    """A value from a user's file as a message quotes it: short."""
+    text = repr(cell)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
+
+def read_table(path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str] = ()) -> list[TableRun]:
+    """The runs of a table in order of appearance. A channel's or extra cell may be empty; an input's may not.
+
+    Raises:
+        InputError: anything malformed, in one line.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+    try:
+        return _Table(path, channels, inputs, extra).read()
+    except UnicodeDecodeError:
+        raise _not_text(path) from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _not_text(path: Path) -> InputError:
+    data = path.read_bytes()
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return InputError(f"{path}: expected UTF-8 text, found UTF-16; save it as UTF-8")
+    try:
+        data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        row, byte = data.count(b"\n", 0, error.start) + 1, data[error.start]
+        return InputError(f"{path}, row {row}: expected UTF-8 text, found the byte 0x{byte:02x}; save it as UTF-8")
+    return InputError(f"{path}: expected UTF-8 text")
+
+
+class _Table:
+    def __init__(self, path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str]) -> None:
+        self.path = path
+        self.wanted = ["run", "t", *inputs, *channels, *extra]
+        self.gaps = {*channels, *extra}
+        self.channels, self.inputs = channels, inputs
+
+    def read(self) -> list[TableRun]:
+        records = self._records()
+        header = self._header(next(records, []))
+        found = None
+        if self.path.stat().st_size >= WORTHWHILE:
+            found = read_fast(self.path, header, self.wanted[1:], self.gaps)
+        names, columns = found or self._cells(header, records)
+        if not names:
+            raise InputError(f"{self.path}: expected rows of data, found none")
+        for name in self.channels:
+            if np.isnan(columns[name]).all():
+                raise InputError(f"{self.path}: column {name} has no sample; leave the channel out")
+        return self._runs(names, columns)
+
+    def _cells(self, header: list[str], records: Iterator[list[str]]) -> tuple[list[str], dict[str, Array]]:
+        """Run names row by row, and the other columns, from the rows behind the header."""
+        names: list[str] = []
+        parts: list[list[Array]] = []
+        while rows := list(islice(records, _CHUNK)):
+            cells = dict(zip(header, zip(*self._even(rows, len(header), len(names)), strict=True), strict=True))
+            parts.append([self._numbers(name, cells[name], len(names)) for name in self.wanted[1:]])
+            names += [name.strip() for name in cells["run"]]
+        columns = map(np.concatenate, zip(*parts, strict=True)) if parts else [np.empty(0)] * len(self.wanted[1:])
+        return names, dict(zip(self.wanted[1:], columns, strict=True))
+
+    def _records(self) -> Iterator[list[str]]:
+        """Header and rows; blank lines are passed over."""
+        with self.path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file, strict=True, skipinitialspace=True)
+            try:
+                yield from (row for row in reader if row)
+            except csv.Error as error:
+                raise InputError(f"{self.path}, row {reader.line_num}: not a CSV table: {error}") from None
+
+    def _header(self, cells: list[str]) -> list[str]:
+        header = [cell.strip() for cell in cells]
+        if len(header) < 2:
+            text = "".join(header)
+            marks = [name for mark, name in ((";", "semicolons"), ("\t", "tabs")) if mark in text]
+            found = f"{marks[0]} (save it with commas)" if marks else shown(text)
+            raise InputError(
+                f"{self.path}, row 1: expected columns {', '.join(self.wanted)} between commas, found {found}"
+            )
+        for place, name in enumerate(header):
+            if not name:
+                raise InputError(f"{self.path}, row 1: column {place + 1} has no name")
+            if name in header[:place]:
+                raise InputError(f"{self.path}, row 1: column {shown(name)} stands twice")
+        for name in self.wanted:
+            if name not in header:
+                raise InputError(f"{self.path}: expected column '{name}', found columns {_listed(header)}")
+        for name in header:
+            if name not in self.wanted:
+                there = f"{self.path.with_suffix('.toml').name} declares {_listed(self.wanted[2:])}"
+                raise InputError(f"{self.path}: column {shown(name)} is not declared; {there}")
+        return header
+
+    def _even(self, rows: list[list[str]], width: int, first: int) -> list[list[str]]:
+        """The rows, each checked to have as many cells as the header; `first` is the number of the first."""
+        if set(map(len, rows)) != {width}:
+            record, row = next((i, row) for i, row in enumerate(rows) if len(row) != width)
+            raise InputError(
+                f"{self.path}, row {self._line(first + record)}: expected {width} cells as in the header, "
+                f"found {len(row)}"
+            )
+        return rows
+
+    def _numbers(self, name: str, cells: Sequence[str], first: int) -> Array:
+        """One column's cells as numbers; an empty cell is NaN where the column may have gaps."""
+        try:
+            values = np.array(list(map(float, cells)))
+        except ValueError:
+            values = np.array([float(c) if _NUMBER.fullmatch(c) else math.nan for c in cells])
+        suspects: Iterable[int] = np.flatnonzero(~np.isfinite(values)).tolist()
+        joined = "".join(cells)
+        if "_" in joined or not joined.isascii():  # float() takes 1_000 and the digits of other scripts
+            suspects = range(len(cells))
+        for i in suspects:
+            if cells[i].strip() or name not in self.gaps:
+                self._check(name, cells[i], first + i)
+        return values
+
+    def _check(self, name: str, cell: str, record: int) -> None:
+        if not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
+            more = "; an input has no missing samples" if name in self.inputs and not cell.strip() else ""
+            self._fault(record, name, f"expected a finite number, found {shown(cell)}{more}")
+
+    def _runs(self, names: list[str], columns: dict[str, Array]) -> list[TableRun]:
+        edges = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(names)) if a != b), len(names)]
+        self._increasing(columns["t"], edges)
+        runs: dict[str, TableRun] = {}
+        for begin, end in pairwise(edges):
+            name = names[begin]
+            if not name:
+                self._fault(begin, "run", "expected the name of a run, found none")
+            if name in runs:
+                self._fault(begin, "run", f"run {shown(name)} goes on after another began; expected its rows together")
+            part = {c: frozen(columns[c][begin:end]) for c in self.wanted[2:]}
+            if end - begin < 2:
+                self._fault(begin, "run", f"run {shown(name)} has one row; expected at least two")
+            if not any(np.isfinite(part[c]).any() for c in self.channels):
+                self._fault(begin, self.channels[0], f"run {shown(name)} has no sample of any channel")
+            runs[name] = TableRun(name, frozen(columns["t"][begin:end]), part)
+        return list(runs.values())
+
+    def _increasing(self, t: Array, edges: list[int]) -> None:
+        bad = t[1:] <= t[:-1]
+        bad[np.array(edges[1:-1], dtype=int) - 1] = False  # a run may begin earlier than the one before ended
+        if bad.any():
+            i = int(np.argmax(bad))
+            self._fault(i + 1, "t", f"expected more than {t[i]:.12g} s, found {t[i + 1]:.12g} s")
+
+    def _fault(self, record: int, column: str, message: str) -> NoReturn:
+        raise InputError(f"{self.path}, row {self._line(record)}, column {column}: {message}")
+
+    def _line(self, record: int) -> int:
+        """The line on which row `record` (from 0) ends: read again, since only a fault asks for it."""
+        with self.path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file, strict=True, skipinitialspace=True)
+            next(islice((row for row in reader if row), record + 1, None))
+            return reader.line_num
+
+
+def _listed(names: Sequence[str], most: int = 12) -> str:
+    """Names for a message, the first few of many."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

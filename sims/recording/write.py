@@ -1,0 +1,164 @@
+"""Recordings written by this project: `NAME.csv` and `NAME.toml`, all of it or nothing, never over what is there."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sims.base import Array, InputError, unknown
+from sims.recording.description import description_of
+from sims.recording.recording import Declared, Recording, Run
+
+_EXACT = 17
+Content = str | bytes
+"""Of a file; text is written as UTF-8."""
+
+
+def write_recording(
+    path: str | Path,
+    recording: Recording,
+    declared: Declared,
+    *,
+    digits: int = _EXACT,
+    beside: Mapping[Path, Content] | None = None,
+) -> None:
+    """Write a recording such that `read_recording` gives the same back, in SI units.
+
+    Args:
+        path: the table to write; `recording.path` is not used.
+        recording: what to write; its runs have different names and the same columns.
+        declared: the system, for the units.
+        digits: significant digits of a number; 17 keep every bit.
+        beside: other files to write with it, all or none.
+
+    Raises:
+        InputError: a file exists already or cannot be written, or the runs cannot stand in one table.
+    """
+    table = Path(path)
+    if table.suffix != ".csv":
+        raise InputError(f"{table}: expected a name that ends in .csv")
+    if not recording.runs:
+        raise InputError(f"{table}: expected at least one run, found none")
+    texts: dict[Path, Content] = {
+        table: _table(recording.runs, digits),
+        description_of(table): _description(recording, declared),
+    }
+    publish({**texts, **(beside or {})})
+
+
+def publish(files: Mapping[Path, Content]) -> None:
+    """Write all files or none; readers never see half of one.
+
+    Raises:
+        InputError: one exists already, or cannot be written.
+    """
+    refuse_existing(files)
+    made: list[Path] = []
+    with contextlib.ExitStack() as undo:
+        drafts = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in files}
+        try:
+            for path, draft in drafts.items():
+                undo.callback(draft.unlink, missing_ok=True)
+                content = files[path]
+                with draft.open("xb") as file:
+                    file.write(content.encode() if isinstance(content, str) else content)
+            for path, draft in drafts.items():
+                _place(draft, path)
+                made.append(path)
+        except BaseException as error:
+            for done in made:
+                done.unlink()
+            if isinstance(error, FileExistsError):
+                raise _exists(path) from None
+            if isinstance(error, OSError):
+                raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+            raise
+
+
+def refuse_existing(paths: Iterable[Path]) -> None:
+    """Check that none of the files exists.
+
+    Raises:
+        InputError: one does.
+    """
+    for path in paths:
+        if path.exists():
+            raise _exists(path)
+
+
+def _exists(path: Path) -> InputError:
+    return InputError(f"{path}: exists already; recordings are never overwritten, name another file")
+
+
+def _place(draft: Path, path: Path) -> None:
+    try:
+        os.link(draft, path)  # unlike a rename, fails if someone made the file meanwhile
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links
+        draft.rename(path)
+
+
+def _table(runs: Sequence[Run], digits: int) -> str:
+    inputs, channels = list(runs[0].inputs), list(runs[0].channels)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    extra = list(runs[0].extra)
+    writer.writerow(["run", "t", *inputs, *channels, *extra])
+    seen: set[str] = set()
+    for run in runs:
+        if run.name in seen:
+            raise InputError(f"two runs are called {run.name!r}; expected different names")
+        seen.add(run.name)
+        for names, there, kind in _signals(run, inputs, channels, extra):
+            if set(names) != set(there):
+                raise unknown(f"{kind} of run {run.name}", ", ".join(set(names) ^ set(there)), names or ["none"])
+        columns = [run.times, *(there[n] for names, there, _ in _signals(run, inputs, channels, extra) for n in names)]
+        writer.writerows(zip([run.name] * len(run.times), *(_cells(c, digits) for c in columns), strict=True))
+    return text.getvalue()
+
+
+def _signals(
+    run: Run, inputs: list[str], channels: list[str], extra: list[str]
+) -> tuple[tuple[list[str], Mapping[str, Array], str], ...]:
+    return (inputs, run.inputs, "input"), (channels, run.channels, "channel"), (extra, run.extra, "extra column")
+
+
+def _cells(values: Array, digits: int) -> list[str]:
+    shortest = repr if digits >= _EXACT else f"{{:.{digits}g}}".format
+    return [shortest(v) if math.isfinite(v) else "" for v in values.tolist()]
+
+
+def _description(recording: Recording, declared: Declared) -> str:
+    import tomli_w
+
+    units = {c.name: c.unit for c in (*declared.inputs, *declared.channels)}
+    first = recording.runs[0]
+    document: dict[str, Any] = {"system": recording.system, "title": recording.title}
+    document["channels"] = {n: {"unit": units[n], **_stated(recording.noise, n)} for n in first.channels}
+    if first.inputs:
+        document["inputs"] = {n: {"unit": units[n]} for n in first.inputs}
+    if first.extra:
+        document["extra"] = {n: {"unit": recording.extra.get(n, "1")} for n in first.extra}
+    if recording.constants:
+        document["constants"] = dict(recording.constants)
+    runs = {run.name: _marks(run) for run in recording.runs}
+    if any(runs.values()):
+        document["runs"] = {name: marks for name, marks in runs.items() if marks}
+    return tomli_w.dumps(document)
+
+
+def _stated(noise: Mapping[str, float], name: str) -> dict[str, float]:
+    return {"noise": noise[name]} if noise.get(name) else {}
+
+
+def _marks(run: Run) -> dict[str, Any]:
+    marks: dict[str, Any] = {"held_out": True} if run.held_out else {}
+    marks |= dict(run.constants)
+    return {**marks, "initial": dict(run.initial)} if run.initial else marks

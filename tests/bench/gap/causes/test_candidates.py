@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+
+from bench.gap.causes.candidates import FREQUENCIES, SHAPES, directions, simulate_with
+from bench.gap.model.fit import Fitter, Start
+from sims.base import Scenario
+from sims.pendulum.simulator import Pendulum
+from tests.bench.gap.made import recording, searched, white, world
+
+
+def fitted(there):
+    return Fitter(there, white(there, 0.003)).fit([Start((), there.nominal(), there.guess)], 20)[0]
+
+
+@pytest.fixture(scope="module")
+def swing():
+    there = world(recording(runs=2, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"], seed=1))
+    return there, fitted(there)
+
+
+def of(found, effect):
+    return [i for i, probe in enumerate(found.probes) if probe.effect == effect]
+
+
+@pytest.mark.parametrize(
+    ("effect", "size"),
+    [("drag.linear", 1e-6), ("drag.quadratic", 1e-7), ("spring.linear", 1e-6), ("sensor.bias", 1e-4)],
+)
+def test_a_direction_is_the_derivative_of_the_trajectory(swing, effect, size):
+    there, fit = swing
+    found = directions(there, fit, [effect])
+    (column,) = of(found, effect)
+    for r, track in enumerate(there.tracks):
+        initial = dict(zip(there.states, fit.states[r].tolist(), strict=True))
+        scenario = Scenario(track.scenario.times, initial)
+        with_it, without = (
+            Pendulum(fixed={effect: c}, time_step=1e-3).simulate(fit.theta[None, :1], scenario)[0] for c in (size, 0.0)
+        )
+        expected = (with_it - without) / size
+        np.testing.assert_allclose(found.values[r, :, :, column], expected, atol=0.01 * np.abs(expected).max())
+
+
+def test_effects_that_change_nothing_here_have_no_direction(swing):
+    there, fit = swing
+    found = directions(there, fit, there.library)
+    acting = {probe.effect for probe in found.probes}
+    assert not acting & {"input.gain", "input.delay", "input.lag", "input.saturation", "input.deadband", "backlash"}
+    assert {"drag.linear", "friction.coulomb", "gravity.scale", "sensor.delay", "clock.skew"} <= acting
+    assert found.values.shape == (*there.observed.shape, len(found.probes))
+    assert np.isfinite(found.values).all()
+    assert (np.abs(found.values).max(axis=(0, 1, 2)) > 0).all()
+
+
+def test_driven_runs_try_limits_of_the_input():
+    made = recording("slider", runs=2, seconds=1, rate=50, inputs=["u=sine:2:1"], noise=["0.003"])
+    there = world(made, candidates=["input.gain", "input.saturation", "input.deadband"])
+    found = directions(there, fitted(there), there.library)
+    limits = sorted(found.probes[i].c[0] for i in of(found, "input.saturation") if found.probes[i].fixed)
+    np.testing.assert_allclose(limits, [0.3, 0.7, 1.2, 1.7, 1.9, 1.98], rtol=2e-3)
+    (gain,) = of(found, "input.gain")
+    assert found.probes[gain].signed
+    x = found.values[0, :, there.channels.index("x"), gain]
+    expected = there.tracks[0].observed[:, there.channels.index("x")]
+    np.testing.assert_allclose(x, expected, atol=0.02)  # what the input does to a slider at rest, once more
+
+
+def test_shapes_are_laid_on_a_grid_and_those_of_one_shape_act_together(swing):
+    there, fit = swing
+    found = directions(there, fit, ["friction.stribeck", "force.periodic"])
+    groups = {}
+    for i in of(found, "friction.stribeck"):
+        groups.setdefault(found.probes[i].group, []).append(found.probes[i])
+    assert len(groups) == SHAPES
+    for members in groups.values():
+        assert {p.place for p in members} == {0, 1}, "coulomb and extra, at one Stribeck speed"
+        assert len({p.c[2] for p in members}) == 1
+        assert not any(p.signed for p in members)
+    speeds = sorted({members[0].c[2] for members in groups.values()})
+    np.testing.assert_allclose([speeds[0], speeds[-1]], [0.02, 2.0], rtol=1e-12)
+    frequencies = {found.probes[i].group for i in of(found, "force.periodic")}
+    assert 4 <= len(frequencies) <= FREQUENCIES
+
+
+def test_what_modifies_an_effect_is_tried_beside_it():
+    search, model = searched(
+        recording("ball", runs=1, seconds=0.8, rate=50, noise=["0.005"], initial=["z=4", "vx=1", "vy=0.5"]), 0.005
+    )
+    found = directions(search.world, model.fit, ["wind"])
+    columns = of(found, "wind")
+    winds = {tuple(found.probes[i].c[1:]) for i in columns}
+    assert (0.0, 0.0) in winds, "drag in still air"
+    assert len(winds) == 25
+    assert {found.probes[i].place for i in columns} == {0}
+    along = [i for i in columns if found.probes[i].c[1] == 7.0 and found.probes[i].c[2] == 0.0]
+    x = search.world.channels.index("x")
+    assert found.values[0, -1, x, along[0]] > 0, "it blows the ball along x"
+
+
+def test_an_effect_added_to_a_model_is_simulated_with_what_the_model_has(swing):
+    there, fit = swing
+    changed = simulate_with(there, fit, [("drag.linear", np.array([0.0])), ("sensor.bias", np.array([0.25]))])
+    seen = np.isfinite(there.observed)
+    np.testing.assert_allclose(changed[0][seen], fit.simulated[seen], atol=1e-4)
+    q = there.channels.index("q")
+    np.testing.assert_allclose((changed[1] - fit.simulated)[..., q], 0.25, atol=1e-4)

@@ -1,0 +1,216 @@
+"""Scores against generalised least squares done the long way, with whole matrices."""
+
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+
+from bench.gap.causes.candidates import Directions, Probe
+from bench.gap.causes.score_test import Group, Products, explained, groups, score, tail
+from bench.gap.model.noise import GRID, Noise, surrogates
+from tests.bench.gap.made import correlated, covariance_of, linear_fit
+
+SIGMA = np.array([0.5, 2.0])
+RUNS, SAMPLES, Q, STATES, K = 3, 14, 2, 2, 5
+
+
+def problem(seed=0, holes=0.0):
+    """Jacobian, directions, residual and mask of a small problem; two directions nearly alike."""
+    rng = np.random.default_rng(seed)
+    jacobian = rng.normal(size=(RUNS, SAMPLES, 2, Q + STATES))
+    directions = rng.normal(size=(RUNS, SAMPLES, 2, K)) * [1.0, 1e3, 1.0, 1e-3, 1.0]
+    directions[..., 4] = directions[..., 0] + 0.3 * directions[..., 4]
+    residual = rng.normal(size=(RUNS, SAMPLES, 2)) * SIGMA + 0.4 * directions[..., 0]
+    seen = rng.random(residual.shape) >= holes
+    return jacobian, directions, np.where(seen, residual, 0.0), seen
+
+
+def dense(jacobian, seen, phi, *values):
+    """Values (R, T, C, ...) as independent numbers (n, ...), less what parameters and initial states absorb.
+
+    The square root of the inverse covariance of each run and channel, taken of the whole matrix.
+    """
+    design, rest = [], [[] for _ in values]
+    for r in range(RUNS):
+        for c in range(2):
+            here = seen[r, :, c]
+            root = np.linalg.cholesky(np.linalg.inv(covariance_of(here[None], phi))).T / SIGMA[c]
+            own = np.zeros((int(here.sum()), Q + RUNS * STATES))
+            own[:, :Q] = jacobian[r, here, c, :Q]
+            own[:, Q + r * STATES : Q + (r + 1) * STATES] = jacobian[r, here, c, Q:]
+            design.append(root @ own)
+            for part, value in zip(rest, values, strict=True):
+                part.append(root @ value[r, here, c])
+    matrix = np.vstack(design)
+    result = []
+    for part in rest:
+        whole = np.concatenate(part)
+        result.append(whole - matrix @ np.linalg.lstsq(matrix, whole, rcond=None)[0])
+    return result
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.3, 0.8, 0.95])
+@pytest.mark.parametrize("holes", [0.0, 0.2])
+def test_products_are_those_of_whole_matrices(phi, holes):
+    jacobian, directions, residual, seen = problem(1, holes)
+    jacobian, directions = (np.where(seen[..., None], part, 0.0) for part in (jacobian, directions))
+    products = Products(linear_fit(jacobian, Q), residual[..., None], directions, seen, SIGMA)
+    total, gram, cross = products.projected(phi)
+    d, r = dense(jacobian, seen, phi, directions, residual)
+    assert total[0] == pytest.approx(r @ r, rel=1e-9)
+    np.testing.assert_allclose(gram, d.T @ d, rtol=1e-8, atol=1e-9 * np.abs(d.T @ d).max())
+    np.testing.assert_allclose(cross[:, 0], d.T @ r, rtol=1e-7)
+
+
+def probes(signed=True):
+    return tuple(Probe("abcd"[min(i, 3)], 0, 0, np.ones(1), signed) for i in range(K))
+
+
+def log_likelihood(residual, seen, phi):
+    """Twice it, the common sigma estimated, up to a constant."""
+    count = int(seen.sum())
+    determinants = sum(
+        np.linalg.slogdet(covariance_of(seen[r, :, c][None], phi))[1] for r in range(RUNS) for c in range(2)
+    )
+    return -count * np.log(residual @ residual) - determinants
+
+
+def test_scores_are_gains_in_log_likelihood_at_the_best_correlation():
+    jacobian, directions, residual, seen = problem(2)
+    found = score(linear_fit(jacobian, Q), residual, Directions(probes(), directions), seen, Noise(SIGMA, np.zeros(2)))
+    nothing, best = -np.inf, dict.fromkeys("abcd", -np.inf)
+    for phi in GRID:
+        d, r = dense(jacobian, seen, phi, directions, residual)
+        nothing = max(nothing, log_likelihood(r, seen, phi))
+        for name, columns in {"a": [0], "b": [1], "c": [2], "d": [3, 4]}.items():
+            left = r - d[:, columns] @ np.linalg.lstsq(d[:, columns], r, rcond=None)[0]
+            best[name] = max(best[name], log_likelihood(left, seen, phi))
+    expected = {name: value - nothing for name, value in best.items()}
+    assert found.effects == tuple(sorted(expected, key=lambda name: -expected[name]))
+    np.testing.assert_allclose(found.score, [expected[name] for name in found.effects], rtol=1e-6)
+    assert found.effects[0] == "a", "it makes the difference"
+    (peak,) = found.peaks[0]
+    assert peak[1][0] == pytest.approx(0.4, abs=0.15)
+    assert found.p_value == 1.0, "without surrogates nothing is known of chance"
+
+
+def test_coefficients_that_cannot_be_negative_are_held_at_zero():
+    jacobian, directions, residual, seen = problem(3)
+    d, r = dense(jacobian, seen, 0.0, directions, residual)
+    scale = np.linalg.norm(d, axis=0)
+    gram, cross = d.T @ d, np.stack([d.T @ r, -(d.T @ r)], axis=1)
+    group = Group("x", (0, 1, 2, 3), (True,) * 4)
+    gain, c = explained(gram, cross, group)
+    for column, sign in enumerate((1.0, -1.0)):
+        solved, left = nnls(d[:, :4] / scale[:4], sign * r)
+        assert gain[column] == pytest.approx(r @ r - left**2, rel=1e-8)
+        np.testing.assert_allclose(c[:, column], solved / scale[:4], rtol=1e-6, atol=1e-12)
+        assert (c[:, column] == 0).sum() == (solved == 0).sum() > 0
+    free, _ = explained(gram, cross, Group("x", (0, 1, 2, 3), (False,) * 4))
+    left = r - d[:, :4] @ np.linalg.lstsq(d[:, :4], r, rcond=None)[0]
+    np.testing.assert_allclose(free, r @ r - left @ left, rtol=1e-8)
+    assert (free > gain).all()
+
+
+def test_a_large_group_is_one_regression_and_equal_columns_count_once():
+    jacobian, directions, residual, seen = problem(4)
+    doubled = np.concatenate([directions, 7.0 * directions[..., :2]], axis=3)
+    d, r = dense(jacobian, seen, 0.0, doubled, residual)
+    group = Group("x", tuple(range(7)), (False,) * 7)
+    gain, c = explained(d.T @ d, (d.T @ r)[:, None], group)
+    left = r - d @ np.linalg.lstsq(d, r, rcond=None)[0]
+    assert gain[0] == pytest.approx(r @ r - left @ left, rel=1e-6)
+    np.testing.assert_allclose(r - d @ c[:, 0], left, atol=1e-6)
+    pair, _ = explained(d.T @ d, (d.T @ r)[:, None], Group("x", (0, 5), (False, False)))
+    one, _ = explained(d.T @ d, (d.T @ r)[:, None], Group("x", (0,), (False,)))
+    assert pair[0] == pytest.approx(one[0], rel=1e-9)
+
+
+def test_what_the_model_absorbs_is_no_evidence():
+    jacobian, directions, residual, seen = problem(5)
+    directions[..., 0] = 3.0 * jacobian[..., 0] - jacobian[..., 3]
+    found = score(linear_fit(jacobian, Q), residual, Directions(probes(), directions), seen, Noise(SIGMA, np.zeros(2)))
+    assert found.score[found.effects.index("a")] == pytest.approx(0.0, abs=1e-6)
+    directions[..., 1] = 1e9 * jacobian[..., 1] + directions[..., 2]  # of two alike little but rounding is left
+    directions[..., 3] = 1e9 * jacobian[..., 1] + directions[..., 2]
+    products = Products(linear_fit(jacobian, Q), residual[..., None], directions, seen, SIGMA)
+    for phi in GRID:
+        _, gram, cross = products.projected(phi)
+        np.testing.assert_array_equal(gram, gram.T)
+        assert not gram[[0, 1, 3]].any()
+        assert not cross[[0, 1, 3]].any()
+        assert np.linalg.eigvalsh(gram[2:3, 2:3])[0] > 0
+
+
+def test_directions_of_an_effect_act_together_within_a_group():
+    marked = [
+        Probe("a", 0, 0, np.ones(2), True),
+        Probe("a", 0, 1, np.ones(2), False),
+        Probe("a", 1, 0, np.ones(2), True),
+    ]
+    made = groups(Directions(tuple(marked), np.zeros((1, 1, 1, 3))))
+    assert [(g.columns, g.positive) for g in made] == [((0, 1), (False, True)), ((2,), (False,))]
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.8])
+def test_p_values_of_clean_residuals_are_uniform(phi):
+    """200 residuals of noise alone: as many below each level as the level says, within three standard errors."""
+    rng = np.random.default_rng(6)
+    times = np.linspace(0, 1, 150)
+    jacobian = np.stack([times, np.ones(150), np.sin(5 * times)], axis=1)[None, :, None].repeat(2, axis=0)
+    smooth = np.stack([np.cos(k * times + k) for k in range(1, 9)], axis=1)
+    directions = Directions(
+        tuple(Probe("abcdefgh"[k], 0, 0, np.ones(1), k % 2 == 0) for k in range(8)),
+        smooth[None, :, None].repeat(2, axis=0) * np.array([1.0, -0.5])[:, None, None, None],
+    )
+    fit, seen, p = linear_fit(jacobian, 1), np.ones((2, 150, 1), dtype=bool), []
+    for _ in range(200):
+        residual = correlated(rng, phi, 0.1, (2, 150, 1))
+        for r in range(2):
+            j = jacobian[r, :, 0, 1:]
+            residual[r, :, 0] -= j @ np.linalg.lstsq(j, residual[r, :, 0], rcond=None)[0]
+        like = surrogates(residual, seen, 60, rng)
+        p.append(score(fit, residual, directions, seen, Noise(np.array([0.1]), np.zeros(1)), like).p_value)
+    p = np.array(p)
+    assert (p < 0.01).mean() <= 0.03
+    for level in (0.1, 0.3, 0.5):
+        assert (p < level).mean() == pytest.approx(level, abs=3 * np.sqrt(level * (1 - level) / 200) + 0.03), level
+
+
+def test_a_cause_has_a_small_p_value():
+    jacobian, directions, residual, seen = problem(7)
+    rng = np.random.default_rng(0)
+    like = surrogates(residual - 0.4 * directions[..., 0], seen, 100, rng)
+    noise = Noise(SIGMA, np.zeros(2))
+    fit, made = linear_fit(jacobian, Q), Directions(probes(), directions)
+    clean = score(fit, residual - 0.4 * directions[..., 0], made, seen, noise, like)
+    caused = score(fit, residual + 0.6 * directions[..., 0], made, seen, noise, like)
+    assert clean.p_value > 0.05
+    assert caused.p_value < 1e-4
+    assert caused.by_chance.shape == (4, 100)
+    np.testing.assert_allclose(np.quantile(caused.by_chance, 0.9, axis=1), 0.0, atol=1e-9)
+
+
+def test_the_tail_beyond_the_surrogates_is_exponential():
+    drawn = np.random.default_rng(1).exponential(2.0, size=(1, 4000))
+    for value in (1.0, 4.0, 12.0, 40.0):
+        assert np.log(tail(drawn, np.array([value]))) == pytest.approx(-value / 2, rel=0.12)
+    assert tail(drawn, np.zeros(0)) == 1.0
+    assert tail(np.zeros((1, 10)), np.array([5.0])) == pytest.approx(1 / 11), "ten surrogates cannot say more"
+
+
+def test_an_effect_of_many_shapes_keeps_the_best_that_beat_their_neighbours():
+    rng = np.random.default_rng(8)
+    t = np.arange(400) / 100.0
+    frequencies = np.linspace(0.5, 8.0, 40)
+    waves = np.stack([f(2 * np.pi * hertz * t) for hertz in frequencies for f in (np.sin, np.cos)], axis=-1)
+    made = 0.5 * np.sin(2 * np.pi * frequencies[10] * t) + 0.3 * np.cos(2 * np.pi * frequencies[30] * t)
+    residual = (made + 0.1 * rng.standard_normal(400))[None, :, None]
+    seen = np.ones(residual.shape, dtype=bool)
+    found = Directions(tuple(Probe("wave", k // 2, k % 2, np.ones(3), True) for k in range(80)), waves[None, :, None])
+    fit = linear_fit(1e-9 * rng.standard_normal((1, 400, 1, 2)), 1)
+    (peaks,) = score(fit, residual, found, seen, Noise(np.array([0.1]), np.zeros(1))).peaks
+    by_place = {group.columns[0] // 2: c for group, c in peaks}
+    assert {10, 30} <= set(by_place)
+    np.testing.assert_allclose(by_place[10], [0.5, 0.0], atol=0.05)
+    np.testing.assert_allclose(by_place[30], [0.0, 0.3], atol=0.05)
+    assert len(peaks) == 3

@@ -1,0 +1,95 @@
+"""Short pieces of runs: what they are, why they are, and what they bring to the fits of whole runs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.gap.causes import name, search
+from bench.gap.model.fit import Fitter, Start
+from bench.gap.model.multiple_shooting import PIECES, pieces, whole
+from sims.ball.simulator import Ball
+from sims.pendulum.simulator import Pendulum
+from tests.bench.gap.made import recorded, searched, white, with_runs, world
+
+TIMES = np.arange(0, 12.0, 0.02)
+LONG = recorded(Pendulum(), [0.0035], [{"q": 1.2}, {"q": -0.8, "qd": 2.0}], TIMES, noise=[0.002, 0.01])
+
+
+def test_pieces_are_the_runs_cut_up_and_nothing_else():
+    there = world(LONG)
+    cut = pieces(there)
+    assert len(cut.tracks) == 2 * PIECES
+    again = np.concatenate([t.scenario.times for t in cut.tracks[:PIECES]])
+    assert again.tolist() == TIMES.tolist(), "time goes on, as what is periodic must"
+    assert np.concatenate([t.observed for t in cut.tracks[PIECES:]]).tolist() == there.tracks[1].observed.tolist()
+    assert [p.name for p in cut.parameters] == [p.name for p in there.parameters]
+    assert (cut.longest, cut.travel) == (there.longest, there.travel)
+
+
+def test_what_is_known_of_the_beginning_is_known_of_the_first_piece_alone():
+    told = with_runs(LONG, [replace(run, initial={"q": 1.2}) for run in LONG.runs])
+    known = pieces(world(told)).known[:, 0]
+    assert known.tolist() == ([True] + [False] * (PIECES - 1)) * 2
+
+
+def test_runs_too_short_for_two_pieces_are_left_alone():
+    short = recorded(Pendulum(), [0.0035], [{"q": 1.2}], np.arange(39) * 0.02, noise=[0.002, 0.01])
+    assert pieces(world(short)) is None
+    assert len(pieces(world(with_runs(short, [*short.runs, LONG.runs[0]]))).tracks) == 1 + PIECES
+
+
+def test_over_pieces_the_sum_of_squares_has_one_minimum_where_whole_runs_have_many():
+    there = world(LONG)
+    cut = pieces(there)
+    sigma = np.array([0.002, 0.01])
+
+    def minima(some):
+        inertias = np.geomspace(0.0028, 0.0047, 40)
+        starts = []
+        for inertia in inertias:
+            theta = some.nominal()
+            theta[0] = inertia
+            starts.append(Start((), theta, some.guess))
+        fits = Fitter(some, white(some, sigma), parameters=False).fit(starts, 8)
+        cost = np.array([f.cost for f in fits])
+        return int(((cost[1:-1] < cost[:-2]) & (cost[1:-1] < cost[2:])).sum()), inertias[cost.argmin()]
+
+    many, _ = minima(there)
+    one, best = minima(cut)
+    assert many >= 3
+    assert one == 1
+    assert best == pytest.approx(0.0035, rel=0.02)
+
+
+def test_a_fit_of_pieces_begins_that_of_whole_runs_with_their_first_pieces():
+    there = world(LONG)
+    cut = pieces(there)
+    theta = cut.nominal()
+    theta[0] = 0.0045  # on whole runs the fit from here ends beside the truth
+    noise = [0.002, 0.01]
+    found = Fitter(cut, white(cut, noise)).fit([Start((), theta, cut.guess)], 12)[0]
+    start = whole(there, found)
+    assert start.states.tolist() == found.states[[0, PIECES]].tolist()
+    fits = Fitter(there, white(there, noise)).fit([start, Start((), theta, there.guess)], 20)
+    assert fits[0].theta[0] == pytest.approx(0.0035, rel=1e-3)
+    assert fits[1].cost > 100.0 * fits[0].cost
+
+
+def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkeypatch):
+    monkeypatch.setattr(search, "NOMINATED", 1)
+    dragged = Pendulum(effects=["drag.quadratic"])
+    data = recorded(
+        dragged, [0.0035, 4e-7], [{"q": 1.2}, {"q": -0.8, "qd": 2.0}, {"q": 2.0}], TIMES[:250], [0.002, 0.01]
+    )
+    library = ["drag.linear", "drag.quadratic", "friction.coulomb", "friction.load", "spring.linear"]
+    looking, _ = searched(data, [0.002, 0.01], candidates=library)
+    found = name.settled(looking, looking.run())
+    tried = {n for names in looking.models for n in names}
+    assert {"drag.linear", "friction.coulomb", "friction.load"} <= tried
+    assert found.names == ("drag.quadratic",)
+
+
+def test_what_bounces_is_left_whole():
+    falls = recorded(Ball(observe=["z"]), [0.6], [{"z": 2.0}, {"z": 3.0}], np.arange(200) * 0.02, noise=0.002)
+    assert pieces(world(falls)) is None

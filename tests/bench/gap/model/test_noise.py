@@ -1,0 +1,149 @@
+import numpy as np
+import pytest
+
+from bench.gap.model.noise import Noise, forgets, likelihood, log_determinant, surrogates, whitened
+from tests.bench.gap.made import correlated, covariance_of
+
+
+def everything(values):
+    return np.ones(values.shape, dtype=bool)
+
+
+def holes(shape, share, seed):
+    return np.random.default_rng(seed).random(shape) > share
+
+
+def autocorrelation(values, lag):
+    here, later = (values[..., :-lag, :], values[..., lag:, :]) if lag else (values, values)
+    return float((here * later).mean() / np.square(values).mean())
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.4, 0.9, -0.3])
+def test_whitening_makes_noise_that_remembers_independent_and_of_variance_one(phi):
+    noise = Noise(np.array([0.3, 7.0]), np.full(2, phi))
+    made = correlated(np.random.default_rng(1), phi, noise.sigma, (40, 500, 2))
+    white = whitened(made, everything(made), noise)
+    for c in range(2):
+        assert white[:, :, c].std() == pytest.approx(1.0, abs=0.015)
+    for lag in (1, 2, 3):
+        assert abs(autocorrelation(white, lag)) < 0.015
+    assert white[:, 0].std() == pytest.approx(1.0, abs=0.2), "the first sample counts as much as the others"
+
+
+def test_whitening_by_hand_starts_anew_across_a_hole():
+    noise = Noise(np.array([2.0]), np.array([0.6]))
+    values = np.array([1.0, 2.0, 99.0, 4.0, 5.0]).reshape(1, 5, 1)
+    seen = np.array([1, 1, 0, 1, 1], dtype=bool).reshape(1, 5, 1)
+    white = whitened(values, seen, noise)[0, :, 0]
+    np.testing.assert_allclose(white, [0.5, (1.0 - 0.3) / 0.8, 0.0, 2.0, (2.5 - 1.2) / 0.8], rtol=1e-14)
+
+
+def test_whitening_treats_derivatives_like_the_samples():
+    rng = np.random.default_rng(3)
+    values, noise = rng.normal(size=(3, 20, 2, 4)), Noise(np.array([0.1, 3.0]), np.array([0.5, -0.2]))
+    seen = holes((3, 20, 2), 0.2, 5)
+    together = whitened(values, seen, noise)
+    for k in range(4):
+        np.testing.assert_array_equal(together[..., k], whitened(values[..., k], seen, noise))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25])
+def test_likelihood_is_that_of_the_normal_distribution(share):
+    residual = correlated(np.random.default_rng(4), 0.7, 0.02, (3, 30, 1))
+    seen = holes(residual.shape, share, 6)
+    found = likelihood(np.where(seen, residual, 0.0), seen)
+    r, count, phi = residual[seen], int(seen.sum()), float(found.phi[0])
+    correlation = covariance_of(seen[:, :, 0], phi)
+    variance = float(r @ np.linalg.solve(correlation, r)) / count
+    assert found.sigma[0] == pytest.approx(variance**0.5, rel=1e-9)
+    assert found.value == pytest.approx(-count * np.log(variance) - np.linalg.slogdet(correlation)[1], rel=1e-9)
+    half = log_determinant(seen, phi)
+    assert 2 * half == pytest.approx(-np.linalg.slogdet(correlation)[1], rel=1e-9)
+    for other in np.linspace(-0.4, 0.98, 70):  # nowhere is it higher by more than its grid is coarse
+        correlation = covariance_of(seen[:, :, 0], other)
+        there = -count * np.log(r @ np.linalg.solve(correlation, r) / count) - np.linalg.slogdet(correlation)[1]
+        assert there < found.value + 0.1
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.5, 0.8, 0.95])
+def test_likelihood_finds_sigma_and_correlation(phi):
+    made = correlated(np.random.default_rng(7), phi, 0.02, (6, 800, 1))
+    found = likelihood(made, everything(made))
+    assert found.phi[0] == pytest.approx(phi, abs=0.025)
+    assert found.sigma[0] == pytest.approx(0.02, rel=0.06)
+
+
+def test_each_channel_has_its_own_noise_and_holes_do_not_spoil_it():
+    sigma, phi = np.array([0.01, 4.0]), np.array([0.85, 0.2])
+    made = correlated(np.random.default_rng(8), phi, sigma, (6, 800, 2))
+    seen = holes(made.shape, 0.15, 9)
+    found = likelihood(np.where(seen, made, 0.0), seen)
+    np.testing.assert_allclose(found.phi, phi, atol=0.03)
+    np.testing.assert_allclose(found.sigma, sigma, rtol=0.06)
+    apart = [likelihood(np.where(seen, made, 0.0)[..., [c]], seen[..., [c]]).value for c in range(2)]
+    assert found.value == pytest.approx(sum(apart), rel=1e-12)
+
+
+def test_lost_degrees_of_freedom_enlarge_sigma_and_leave_the_value():
+    made = np.random.default_rng(10).normal(size=(2, 50, 1))
+    full, fewer = likelihood(made, everything(made)), likelihood(made, everything(made), 19.0)
+    assert fewer.sigma[0] / full.sigma[0] == pytest.approx((100 / 81) ** 0.5, rel=1e-12)
+    assert fewer.value == full.value
+
+
+def test_a_channel_without_samples_is_left_out():
+    made = np.random.default_rng(11).normal(size=(2, 50, 2))
+    seen = everything(made)
+    seen[:, :, 1] = False
+    found = likelihood(np.where(seen, made, 0.0), seen)
+    assert found.value == likelihood(made[..., :1], seen[..., :1]).value
+    assert np.isnan(found.sigma[1])
+    assert np.isfinite(found.sigma[0])
+
+
+def test_surrogates_keep_variance_and_autocorrelation():
+    rng = np.random.default_rng(12)
+    made = rng.standard_normal((6, 700, 2))
+    for t in range(2, 700):  # a second-order autoregression that rings, and white noise beside it
+        made[:, t, 0] += 1.2 * made[:, t - 1, 0] - 0.6 * made[:, t - 2, 0]
+    made *= [0.01, 5.0]
+    like = surrogates(made, everything(made), 60, np.random.default_rng(0))
+    assert like.shape == (60, 6, 700, 2)
+    np.testing.assert_allclose(like.std(axis=(0, 1, 2)), made.std(axis=(0, 1)), rtol=0.05)
+    for lag in range(1, 9):
+        for c in range(2):
+            kept = autocorrelation(like[..., [c]], lag)
+            assert kept == pytest.approx(autocorrelation(made[..., [c]], lag), abs=0.05), (lag, c)
+    apart = np.corrcoef(like[:, 0, :, 0])[np.triu_indices(60, 1)]
+    assert abs(apart.mean()) < 0.01, "one surrogate tells nothing of another"
+
+
+def test_surrogates_are_the_same_for_a_seed_and_zero_where_nothing_was_seen():
+    made = correlated(np.random.default_rng(13), 0.6, 1.0, (3, 100, 1))
+    seen = holes(made.shape, 0.2, 14)
+    one, two, other = (surrogates(np.where(seen, made, 0.0), seen, 7, np.random.default_rng(s)) for s in (5, 5, 6))
+    np.testing.assert_array_equal(one, two)
+    assert not np.array_equal(one, other)
+    assert (one[:, ~seen] == 0).all()
+    assert (one[:, seen] != 0).all()
+
+
+def test_surrogates_of_nothing_are_nothing():
+    seen = np.ones((1, 30, 1), dtype=bool)
+    assert not surrogates(np.zeros((1, 30, 1)), seen, 5, np.random.default_rng(0)).any()
+    few = surrogates(np.array([1.0, -2.0, 3.0]).reshape(1, 3, 1), seen[:, :3], 9, np.random.default_rng(0))
+    assert set(np.abs(few).ravel()) <= {1.0, 2.0, 3.0}
+
+
+def test_first_order_noise_is_told_from_structure_that_is_as_large():
+    seen = np.ones((4, 300, 2), dtype=bool)
+    chances = {"noise": [], "structure": []}
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        noise = correlated(rng, 0.7, np.array([1.0, 5.0]), seen.shape)
+        wave = np.sin(np.arange(300) / 15.0 + rng.uniform(0, 6))[None, :, None] * np.ones(seen.shape)
+        mixed = rng.standard_normal(seen.shape) * np.array([1.0, 5.0]) + 1.2 * wave
+        for name, values in (("noise", noise), ("structure", mixed)):
+            chances[name].append(forgets(values, seen, likelihood(values, seen)))
+    assert np.mean(np.array(chances["noise"]) > 0.01) > 0.9
+    assert max(chances["structure"]) < 1e-6

@@ -1,0 +1,212 @@
+import re
+from base64 import b64decode
+from dataclasses import replace
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.gap.report.page import page, write_report
+from bench.gap.report.sections import errors_of
+from sims.base import InputError
+from tests.bench.gap.stories import DRAG, EVIL, HELD_OUT, TILT, evil, story
+from tests.bench.gap.test_account import VERDICTS
+
+VOID = {"meta", "img", "br", "link", "input", "line", "circle"}
+PIXEL = b"\x89PNG\r\n\x1a\n-not-really-an-image"
+
+
+class Reader(HTMLParser):
+    """Checks that elements nest, and gathers tags, attributes and texts."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.attributes, self.texts, self.headline = [], [], [], [], ""
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += [(tag, *pair) for pair in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.texts.append(data)
+        if "h1" in self.open:
+            self.headline += data
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.texts).replace("\xa0", " ").split())
+
+
+@pytest.fixture
+def figures(tmp_path):
+    paths = [
+        tmp_path / f"{name}{ending}" for name in ("overview", "where", "candidates") for ending in (".png", ".pdf")
+    ]
+    for path in paths:
+        path.write_bytes(PIXEL + path.name.encode())
+    return paths
+
+
+def cells(text, first):
+    """The cells of the first table row that begins with a text."""
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr[^>]*>(.*?)</tr>", text, re.DOTALL)]
+    return next([unescape(c).replace("\xa0", " ") for c in row] for row in rows if row and row[0] == first)
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_every_verdict_makes_a_sound_page_that_begins_with_its_headline(verdict, figures):
+    from bench.gap.report.account import headline
+
+    told = story(verdict)
+    html = page(told, figures)
+    reader = Reader(html)
+    assert html.startswith("<!DOCTYPE html>\n<html lang=")
+    assert reader.headline == headline(told)
+    assert reader.tags.count("title") == reader.tags.count("h1") == 1
+    assert reader.tags.index("h1") < reader.tags.index("img") < reader.tags.index("h2")
+    assert f"{verdict}:" in reader.text
+    assert not re.search(r"\bnan\b|None|\binf\b", reader.text)
+
+
+def test_it_needs_neither_network_nor_scripts(figures):
+    html = page(story(), figures)
+    reader = Reader(html)
+    assert not set(reader.tags) & {"script", "link", "iframe", "object", "base", "form"}
+    assert not re.search(r"https?:|//[a-z]|@import|url\(", re.sub(r"base64,[^\"]*", "", html))
+    assert all(
+        value.startswith("data:image/png;base64,") for _, name, value in reader.attributes if name in ("src", "href")
+    )
+
+
+def test_texts_from_files_and_plugins_are_escaped(figures):
+    html = page(evil(), figures)
+    reader = Reader(html)
+    assert "script" not in reader.tags
+    assert "<script" not in html
+    assert html.count("&lt;script&gt;alert(1)&lt;/script&gt;") > 20
+    assert "\x1b" not in html
+    assert "\x00" not in html
+    assert reader.headline.startswith(f"The simulation lacks {EVIL} or {EVIL}")
+
+
+def test_attributes_cannot_be_escaped_from(figures):
+    quote = '" onerror="alert(1)'
+    told = story()
+    named = replace(told, parameters=tuple(replace(p, name=quote) for p in told.parameters), title=quote)
+    named = replace(named, channels=tuple(replace(c, name=quote) for c in told.channels))
+    assert not [a for a in Reader(page(named, figures)).attributes if a[1].startswith("on")]
+
+
+def test_figures_are_embedded_with_alternatives_that_say_what_they_show(figures):
+    html = page(story(), figures)
+    found = re.findall(r'src="data:image/png;base64,([^"]+)" alt="([^"]+)"', html)
+    data = [b64decode(part) for part, _ in found]
+    assert data == [PIXEL + name for name in (b"overview.png", b"where.png", b"candidates.png")]
+    overview, where, candidates = (alt for _, alt in found)
+    assert "q and qd" in overview
+    assert "linear drag" in overview
+    assert "phase last third 16" in where
+    assert "linear drag 812" in candidates
+
+
+def test_numbers_are_those_of_the_story(figures):
+    told = story(causes=[DRAG, TILT])
+    html = page(told, figures)
+    text = Reader(html).text
+    assert "Together they close 90 % of the gap (85 to 94 %)" in text
+    assert "90 % of the gap closed (85 to 94 %)" in text
+    for value in ("0.37 rad", "0.045 rad", "0.01 rad"):
+        assert value in text
+    widths = [float(w) for w in re.findall(r"width:([\d.]+)%", html)]
+    assert widths == pytest.approx([100, 100 * 0.045 / 0.37, 100 * 0.01 / 0.37], abs=0.05)
+    assert cells(html, "run 4") == ["run 4", "800", "13.20", "1.10"]
+    assert cells(html, "linear drag")[:2] == ["linear drag", "<code>drag.linear</code>"]
+    assert cells(html, "linear drag")[2:] == ["812", "1×10⁻⁹", "0.9", "found"]
+    assert cells(html, "Coulomb friction")[2:] == ["807", "1×10⁻⁷", "0.89", "not needed"]
+    assert cells(html, "correction of gravity")[4] == "–"
+    assert "2.20×10⁻⁴ (2.00×10⁻⁴ to 2.40×10⁻⁴) N·m·s/rad" in text
+    assert "0.0310 (0.0280 to 0.0340)" in text
+    assert "0.00351 (0.00345 to 0.00357) kg·m²" in cells(html, "inertia")
+    assert "+5.4 %, had absorbed part of the gap" in cells(html, "inertia")
+    assert cells(html, "restitution")[1] == "0.7, nominal: not touched by the data"
+    assert "1,412 simulations of system pendulum on engine batch, 2.1 s" in text
+
+
+def test_errors_of_channels_are_recomputed_from_the_runs(figures):
+    told = story()
+    row = cells(page(told, figures), "qd")
+    assert row[:3] == ["qd", "0.05 rad/s", "estimated, steps of 0.002"]
+    for column, side in ((3, told.fitting), (5, told.held_out)):
+        for i, simulated in enumerate((side.before, side.after)):
+            left = (side.observed - simulated)[:, :, 1]
+            assert row[column + i] == f"{np.sqrt(np.nanmean(left**2)):.3g} rad/s"
+    empty = replace(told.fitting, observed=np.full_like(told.fitting.observed, np.nan))
+    assert np.isnan(errors_of(empty)).all()
+
+
+def test_sets_that_cannot_be_told_apart_come_with_reason_and_experiment(figures):
+    text = Reader(page(story("ambiguous"), figures)).text
+    assert "linear drag (score 812, held-out gain 0.9) and Coulomb friction (score 807, held-out gain 0.89)" in text
+    assert text.count("Release it from 1.5 rad instead of 0.5 rad") >= 2
+
+
+def test_after_is_not_shown_where_nothing_was_found(figures):
+    for verdict in ("adequate", "unknown", "unidentifiable"):
+        html = page(story(verdict), figures)
+        assert "RMS after" not in html
+        assert 'class="bar after"' not in html
+
+
+def test_it_says_what_remains(figures):
+    assert "The noise of qd is estimated from the data, not stated." in Reader(page(story(), figures)).text
+    text = Reader(page(story(remains=()), figures)).text
+    assert re.search(r"the residual of the held-out runs is 1 times the noise", text)
+
+
+def test_what_is_open_is_not_called_settled(figures):
+    assert "Structure that no known cause explains: the residual" in Reader(page(story("unknown"), figures)).text
+    assert "Structure that no known cause" in Reader(page(story("partial", remains=()), figures)).text
+    assert "Nothing that stands out" in Reader(page(story("adequate"), figures)).text
+
+
+def test_gaps_in_what_is_known_do_not_break_the_page():
+    bare = story(
+        "unidentifiable", heldout=None, held_out=None, candidates=[], places=(), profiles=(), parameters=(), why=()
+    )
+    reader = Reader(page(bare, []))
+    assert "No candidate was tried." in reader.text
+    assert "img" not in reader.tags
+    nothing = {**HELD_OUT, "rmse_base": None, "rmse_extended": None, "gap_closed": None, "low": None, "high": None}
+    assert "tuned simulation – rad" in Reader(page(story(heldout=nothing), [])).text
+
+
+def test_many_runs_are_cut_to_the_worst():
+    told = story()
+    many = replace(told, places=tuple(replace(told.places[0], label=f"r{i}", before=float(i)) for i in range(1, 500)))
+    html = page(many, [])
+    assert "The 40 worst of 499." in html
+    assert cells(html, "run r499")[2] == "499.00"
+    assert "run r459<" not in html
+
+
+def test_it_is_written_as_utf_8_or_refused_in_one_line(tmp_path, figures):
+    path = write_report(story(), tmp_path / "new", figures)
+    assert path == tmp_path / "new" / "report.html"
+    assert "kg·m²" in path.read_bytes().decode("utf-8")
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_report(story(), Path(blocked), figures)

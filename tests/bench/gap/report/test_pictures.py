@@ -1,0 +1,161 @@
+import warnings
+from dataclasses import replace
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from bench.gap.report.page import write_report
+from bench.gap.report.panels import MOST_CANDIDATES, chosen_places, profile_panel, ranked, standing, telling
+from bench.gap.report.pictures import draw, kept, worst
+from bench.gap.report.story import Place
+from sims.base import InputError
+from tests.bench.gap.stories import evil, story
+
+NAMES = [f"{name}{ending}" for name in ("overview", "where", "candidates") for ending in (".png", ".pdf")]
+
+
+def pixels(path):
+    return matplotlib.image.imread(path)[:, :, :3]
+
+
+@pytest.fixture(scope="module")
+def named(tmp_path_factory):
+    return draw(story(), tmp_path_factory.mktemp("named"))
+
+
+def test_each_figure_is_written_in_both_formats_and_shows_something(named):
+    assert [p.name for p in named] == NAMES
+    for path in named:
+        if path.suffix == ".pdf":
+            assert path.read_bytes().startswith(b"%PDF-")
+            assert path.stat().st_size > 5_000
+        else:
+            image = pixels(path)
+            assert image.std() > 0.1
+            assert min(image.shape[:2]) > 300
+            edge = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+            assert edge.min() == 1.0  # nothing is cut off
+
+
+def test_before_and_after_are_both_drawn_where_there_is_an_after(named, tmp_path):
+    def share(path, red, green, blue):
+        return (np.abs(pixels(path) - np.array([red, green, blue]) / 255).max(axis=2) < 0.02).mean()
+
+    blue = (0x00, 0x72, 0xB2)
+    assert share(named[0], *blue) > 5e-3
+    adequate = draw(story("adequate"), tmp_path)
+    assert share(adequate[0], *blue) == 0.0
+    assert share(adequate[0], 0xD5, 0x5E, 0x00) > 1e-3
+
+
+def test_figures_are_the_same_again(named, tmp_path):
+    again = draw(story(), tmp_path)
+    assert [p.read_bytes() for p in again] == [p.read_bytes() for p in named]
+
+
+def test_a_page_with_its_figures_stays_small(named, tmp_path):
+    assert 100_000 < write_report(story(), tmp_path, named).stat().st_size < 2_000_000
+
+
+def test_any_text_can_be_a_label(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert [p.name for p in draw(evil(), tmp_path)] == NAMES
+
+
+def test_what_is_not_there_is_not_drawn(tmp_path):
+    bare = story("unidentifiable", candidates=[], places=(), profiles=(), held_out=None, heldout=None)
+    assert [p.name for p in draw(bare, tmp_path)] == NAMES[:2]
+
+
+def test_a_folder_that_cannot_be_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        draw(story(), tmp_path / "file")
+
+
+def test_the_run_shown_has_the_largest_gap_of_the_held_out_ones():
+    told = story()
+    shot = worst(told)
+    assert shot.held_out
+    assert shot.side.names[shot.row] == "held 2"
+    rest = worst(replace(told, held_out=None))
+    assert not rest.held_out
+    assert rest.side.names[rest.row] == "4"
+
+
+def test_a_run_without_samples_is_never_the_worst():
+    told = story()
+    observed = told.held_out.observed.copy()
+    observed[1] = np.nan
+    shot = worst(replace(told, held_out=replace(told.held_out, observed=observed)))
+    assert shot.row == 0
+
+
+def test_of_many_channels_the_worst_three_are_shown():
+    told = story()
+    side, tiles = told.held_out, (1, 1, 3)
+    wide = replace(
+        side,
+        observed=np.tile(side.observed, tiles),
+        before=np.tile(side.before, tiles).copy(),
+        after=np.tile(side.after, tiles),
+    )
+    wide.before[:, :, [1, 4, 5]] += 5.0
+    shot = worst(replace(told, held_out=wide, channels=told.channels * 3))
+    assert shot.channels == [1, 4, 5]
+
+
+def test_long_runs_are_thinned_without_losing_peaks():
+    values = np.sin(np.arange(50_000) / 50.0)
+    values[[12_345, 23_456]] = 9.0, -7.0
+    values[30_000:40_000] = np.nan
+    rows = kept(values)
+    assert rows.size <= 3000
+    assert {12_345, 23_456} <= set(rows.tolist())
+    assert kept(values[:3000]).size == 3000
+
+
+def test_profiles_are_chosen_by_how_much_they_stand_out_one_a_variable_first():
+    chosen = telling(story().profiles)
+    assert [p.variable for p in chosen] == ["speed", "position", "time", "speed"]
+    empty = replace(chosen[0], before=np.full(12, np.nan))
+    assert telling([empty, chosen[1]]) == [chosen[1]]
+
+
+def test_bars_of_a_profile_are_two_standard_errors_long():
+    from matplotlib.figure import Figure
+
+    axis = Figure().subplots()
+    profile = story().profiles[0]
+    profile_panel(axis, profile, "rad", extended=False)
+    (lines,) = axis.containers[0].lines[2]
+    lengths = [segment[1, 1] - segment[0, 1] for segment in lines.get_segments()]
+    assert lengths == pytest.approx([4 * 0.01 / 12] * 11)
+
+
+def test_the_worst_places_are_shown_in_their_order():
+    places = [Place("run", str(i), 100, float(i % 10), 1.0) for i in range(30)] + [Place("run", "x", 0, 99.0, 1.0)]
+    shown = chosen_places(places)
+    assert [p.label for p in shown] == ["7", "8", "9", "17", "18", "19", "28", "29"]
+
+
+def test_what_is_found_is_among_the_candidates_shown_although_it_scores_low():
+    names = [f"e{i}" for i in range(40)] + ["drag.linear"]
+    told = story(
+        candidates=[
+            {"effect": n, "score": 100.0 - i, "p_value": 0.5, "heldout_gain": None} for i, n in enumerate(names)
+        ]
+    )
+    shown = [c["effect"] for c in ranked(told)]
+    assert len(shown) == MOST_CANDIDATES
+    assert shown[0] == "e0"
+    assert shown[-1] == "drag.linear"
+
+
+def test_the_standing_of_a_candidate():
+    assert [standing(story(), n) for n in ("drag.linear", "friction.coulomb")] == ["found", "not needed"]
+    told = story("ambiguous")
+    assert {standing(told, n) for n in ("drag.linear", "friction.coulomb")} == {"found, but cannot be told apart"}
+    assert standing(told, "my.plugin") == "not needed"

@@ -1,0 +1,107 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.gap.score_model import scored
+from bench.recordings.simulate import Wish
+from bench.recordings.simulate import write as simulate
+from sims.base import InputError
+from sims.extended import Extended, Number, write
+
+MODEL = Extended(
+    "swing", "pendulum", "batch", "", {"inertia": Number(4e-3, "kg*m^2", None, None)},
+    {"drag.linear": {"coefficient": Number(6e-4, "N*m*s/rad", None, None)}},
+    {"mass": 0.15, "length": 0.15, "gravity": 9.81}, ["q", "qd"],
+)  # fmt: skip
+WISH = Wish(
+    "pendulum",
+    ["4e-3"],
+    ["drag.linear=6e-4"],
+    [],
+    ["q=0.003", "qd=0.02"],
+    [],
+    ["q=-1.5:1.5"],
+    [],
+    3,
+    1.5,
+    60.0,
+    "mujoco",
+    5,
+)
+
+
+@pytest.fixture
+def files(tmp_path):
+    simulate(WISH, tmp_path / "swing.csv")
+    write(MODEL, tmp_path / "extended.toml")
+    return tmp_path / "extended.toml", tmp_path / "swing.csv"
+
+
+def test_a_true_model_errs_by_the_noise(files):
+    found = scored(*files)
+    assert found["rmse"]["q"] == pytest.approx(0.003, rel=0.1)
+    assert found["rmse"]["qd"] == pytest.approx(0.02, rel=0.1)
+    assert found["normalised_rmse"] == pytest.approx(1.0, abs=0.06)
+    assert (found["runs"], found["samples"]) == (3, 270)
+    assert found["units"] == {"q": "rad", "qd": "rad/s"}
+
+
+def test_a_wrong_model_errs_by_more(files):
+    model, recording = files
+    write(replace(MODEL, effects={}), model)
+    without = scored(model, recording)
+    assert without["rmse"]["q"] > 0.015
+    assert without["normalised_rmse"] == pytest.approx(
+        np.sqrt(np.mean([(without["rmse"]["q"] / 0.003) ** 2, (without["rmse"]["qd"] / 0.02) ** 2])), rel=1e-9
+    )
+    write(replace(MODEL, constants={**MODEL.constants, "gravity": 1.6}), model)
+    stated = scored(model, recording)
+    assert stated["normalised_rmse"] == pytest.approx(1.0, abs=0.06), "the recording states its own gravity"
+
+
+def test_held_out_runs_alone(files):
+    model, recording = files
+    found = scored(model, recording, held_out=True)
+    assert (found["runs"], found["samples"]) == (1, 90)
+    text = recording.with_suffix(".toml").read_text()
+    recording.with_suffix(".toml").write_text(text.replace("held_out = true", "held_out = false"))
+    with pytest.raises(InputError, match=r"swing.csv: --held-out: no run is marked held_out"):
+        scored(model, recording, held_out=True)
+
+
+def test_missing_samples_do_not_count(files):
+    model, recording = files
+    lines = recording.read_text().splitlines()
+    for i in range(5, 25):
+        run, t, q, _ = lines[i].split(",")
+        lines[i] = f"{run},{t},{q},"
+    lines[30] = ",".join([*lines[30].split(",")[:2], "", ""])
+    recording.write_text("\n".join(lines) + "\n")
+    found = scored(model, recording)
+    assert found["samples"] == 269
+    assert found["normalised_rmse"] == pytest.approx(1.0, abs=0.06)
+
+
+def test_what_cannot_be_scored_is_one_line(files, tmp_path):
+    model, recording = files
+    simulate(Wish("slider", runs=1, seconds=0.5), tmp_path / "other.csv")
+    simulate(replace(WISH, observe=["q"], noise=["0.003"]), tmp_path / "angle.csv")
+    for other, message in [
+        ("other.csv", "other.csv|other.toml"),
+        ("angle.csv", "unknown channel of .*angle.csv 'qd'; there are: q"),
+        ("none.csv", "none.csv|none.toml"),
+    ]:
+        with pytest.raises(InputError, match=message) as caught:
+            scored(model, tmp_path / other)
+        assert str(caught.value).isprintable()
+    write(replace(MODEL, effects={"drag.linear": {"coefficient": Number(1e6, "N*m*s/rad", None, None)}}), model)
+    with pytest.raises(InputError, match="the simulation failed with the parameters of"):
+        scored(model, recording)
+
+
+def test_another_system_is_refused(files, tmp_path):
+    model, _ = files
+    simulate(Wish("servo", runs=1, seconds=0.5), tmp_path / "arm.csv")
+    with pytest.raises(InputError, match=r"arm.csv: expected a recording of pendulum, as .* is; found one of servo"):
+        scored(model, tmp_path / "arm.csv")

@@ -1,0 +1,266 @@
+"""Bounce-shot studies: Wilson's interval, what goes over from a drop to a shot, who hits, and the command."""
+
+import importlib.util
+import json
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binomtest
+
+from bench import cli
+from bench.problem.experiment import load, names
+from bench.runs.training import train
+from bench.shot import study, tune
+from bench.shot.deal import deal, deals, record
+from bench.shot.rows import rows_of
+from bench.shot.settings import settings_of
+from bench.shot.table import ALL, table, wilson
+from bench.shot.throw import throw
+from bench.shot.tune import Known, Model, carry, models
+from sims.ball.simulator import Ball
+from sims.base import InputError
+from sims.recording.recording import read_recording
+from sims.shot.world import Ground, fly
+
+vision = pytest.mark.skipif(
+    not all(map(importlib.util.find_spec, ("av", "cv2"))), reason="PyAV and OpenCV are not installed: simgap[vision]"
+)
+
+
+SMALL = """
+simulator = "ball"
+observe = ["z"]
+targets = 1
+settings = { engine = "batch" }
+tuners = { least_squares = {} }"""
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    return load("bounce-shot").with_tuners(["least_squares"])
+
+
+def test_wilson_interval_of_known_counts():
+    assert wilson(8, 10) == pytest.approx((0.4901625, 0.9433178), abs=1e-6)
+    assert wilson(0, 10) == pytest.approx((0.0, 0.2775328), abs=1e-6)
+    assert wilson(50, 50)[1] == 1.0
+    exact = binomtest(261, 300).proportion_ci(0.95, method="wilson")
+    assert wilson(261, 300) == pytest.approx((exact.low, exact.high), abs=1e-12)
+    assert all(math.isnan(v) for v in wilson(0, 0))
+
+
+def test_table_counts_misses_that_never_met_the_plane():
+    row = {"method": "m", "simulations": 10, "seconds": 0.1, "status": "done", "prediction_error": 0.02}
+    rows = [{**row, "ball": b, "hit": o < 0.15, "off": o} for b, o in (("a", 0.1), ("a", 0.2), ("b", 0.05))]
+    rows.append({**row, "ball": "b", "hit": False, "off": math.nan, "prediction_error": math.nan, "status": "no plan"})
+    lines = table(pd.DataFrame(rows)).set_index("ball")
+    assert lines.hits.to_dict() == {"a": 1, "b": 1, ALL: 2}
+    assert lines.rate[ALL] == 0.5
+    assert (lines.low[ALL], lines.high[ALL]) == pytest.approx(wilson(2, 4))
+    assert lines.off_90[ALL] == math.inf
+    assert lines.failures.to_dict() == {"a": 0, "b": 1, ALL: 1}
+
+
+def test_what_belongs_to_the_camera_stays_there_and_a_vertical_force_becomes_gravity():
+    found = {
+        "drag.quadratic": (0.1,), "restitution.speed": (-0.1,), "sensor.bias": (0.01,), "clock.skew": (0.01,),
+        "force.bias": (0.5,), "wind": (0.1, 1.0, 0.0),
+    }  # fmt: skip
+    carried = carry(found, 9.81)
+    assert carried == {
+        "drag.quadratic": (0.1,), "restitution.speed": (-0.1,), "gravity.scale": (-0.5 / 9.81,),
+        "wind": (0.1, 1.0, 0.0),
+    }  # fmt: skip
+
+
+def test_deals_do_not_depend_on_methods_or_numbers(experiment):
+    settings = settings_of(experiment)
+    few, many = (deals(replace(experiment, targets=n), settings) for n in (1, 3))
+    assert [d.name for d in few] == [f"{ball}-000" for ball in settings.balls]
+    assert many[: len(few)] == few
+    assert len({d.ball.restitution for d in many}) == len(many)
+    assert all(0.7 <= d.scene.hoop_x <= 1.1 and 0.30 <= d.scene.angle <= 0.40 for d in many)
+
+
+@vision
+@pytest.mark.parametrize("kind", ["squash", "golf"])
+def test_a_filmed_drop_is_tracked_to_millimetres(experiment, tmp_path, kind):
+    """A squash ball meets its shadow at the bounce, which then goes on as the ball went before."""
+    settings, path = settings_of(experiment), tmp_path / "drop.csv"
+    dealt = deal(experiment, settings, kind, 0)
+    record(experiment, dealt, settings, path)
+    recording = read_recording(path, Ball, whole=True)
+    run = recording.runs[0]
+    radius = recording.constants["radius"]
+    true = fly(dealt.ball, Ground(0.0, settings.friction), (0.0, 0.0, run.channels["z"][0]), run.times)[:, 2]
+    rms = float(np.sqrt(np.nanmean((run.channels["z"] - true) ** 2)))
+    assert np.isfinite(run.channels["z"]).mean() > 0.95
+    assert rms < 4e-3
+    assert radius == dealt.ball.radius
+    assert recording.noise["z"] < 4e-3
+    assert {path.with_suffix(end).is_file() for end in (".mp4", ".camera.toml", ".png")} == {True}
+
+
+def test_recorded_drop_reads_as_any_recording_of_a_ball(experiment, tmp_path):
+    settings, path = replace(settings_of(experiment), filmed=0.0), tmp_path / "drop.csv"
+    experiment = replace(experiment, noise={"z": 0.01})
+    dealt = deal(experiment, settings, "tennis", 0)
+    record(experiment, dealt, settings, path)
+    record(experiment, dealt, settings, path)  # what is there stays
+    recording = read_recording(path, Ball, whole=True)
+    z = recording.runs[0].channels["z"]
+    assert len(z) == 150
+    assert recording.noise == {"z": 0.01}
+    assert recording.constants["radius"] == 0.0335
+    fall = z[: round(60 * 0.45)]
+    t = np.arange(len(fall)) / 60
+    assert np.polyfit(t, fall, 2)[0] == pytest.approx(-9.81 / 2, rel=0.06)
+
+
+@vision
+def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_camera_stood(tmp_path, monkeypatch):
+    monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path / "cache"))
+    experiment = load("bounce-shot").with_tuners(["tunenet-vision", "least_squares"])
+    experiment = experiment.chosen(training_budget=400)
+    settings, path = settings_of(experiment), tmp_path / "drop.csv"
+    assert settings.rows == ("tunenet-vision",)
+    watching, metres = (tune.tuned_in(experiment, settings, entry) for entry in experiment.tuners)
+    assert (watching.simulator, watching.observe, metres.simulator) == ("ball-filmed", ("z", "v"), "ball")
+    weights = {"tunenet-vision": train(watching, experiment.tuners[0], 0).path}
+    found = {}
+    for kind in ("golf", "squash"):
+        dealt = deal(experiment, settings, kind, 0)
+        record(experiment, dealt, settings, path)
+        seen = rows_of(read_recording(path, Ball, whole=True), watching, dealt.ball.radius)
+        assert not [name for s in seen.scenarios for name in s.constants if "camera" in name]
+        assert np.isnan(seen.observed[:, 0]).all()
+        # the ball lies on the ground at the end, lower in the picture than where it was let go
+        assert np.isfinite(seen.observed[:, 1]).mean() > 0.9
+        assert np.nanmax(seen.observed[:, 1]) - seen.observed[np.isfinite(seen.observed[:, 1])][0, 1] > 100
+        for left in ("drop.camera.toml", "drop.mp4"):
+            (tmp_path / left).unlink()
+        known = Known(dealt.name, path, dealt.scene, weights)
+        recording = read_recording(path, Ball, whole=True)
+        by_rows, by_metres = (
+            tune._tuned(experiment, settings, entry, known, recording, {}) for entry in experiment.tuners
+        )
+        assert by_rows.restitution == pytest.approx(by_metres.restitution, abs=0.06)
+        assert by_rows.simulations <= experiment.budget
+        found[kind] = by_rows.restitution
+        for left in ("drop.csv", "drop.toml", "drop.png", "drop.pdf"):
+            (tmp_path / left).unlink()
+    assert found["golf"] - found["squash"] > 0.2  # 0.86 and 0.54 by the tables
+
+
+@vision
+def test_a_drop_that_cannot_be_tracked_is_a_row_and_not_the_end(experiment, tmp_path, capsys):
+    """A film of 16 pixels' height shows a golf ball on a fifth of a pixel."""
+    text = f"""{SMALL}
+budget = 2
+sampling = {{ rate = 60.0, samples = 60 }}
+shot = {{ balls = ["golf"], filmed = 16 }}
+"""
+    (tmp_path / "small.toml").write_text(text)
+    out = tmp_path / "out"
+    assert cli.main(["compare", str(tmp_path / "small.toml"), "--jobs", "1", "--out", str(out)]) == 0
+    rows = pd.read_csv(out / "status.csv")
+    assert set(rows["status"]) == {"no recording"}
+    assert rows["reason"].str.contains("no ball found").all()
+    assert not pd.read_csv(out / "shots.csv")["hit"].any()
+    assert pd.read_csv(out / "shots.csv")["seen"].eq(0).all()
+    assert "no recording: least_squares in 1 shots" in capsys.readouterr().out
+
+
+def test_methods_get_the_recording_and_the_scene_and_not_the_ball():
+    assert {f.name for f in fields(Known)} == {"name", "recording", "scene", "weights"}
+
+
+def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp_path, monkeypatch):
+    """And a failure of explain is a row, not the end."""
+
+    def broken(_):
+        return Model("explain", 0.5, {}, 0, 0.0, "crashed", "no"), {}
+
+    monkeypatch.setattr(tune, "_explained", broken)
+    settings = settings_of(experiment)
+    dealt = deal(experiment, settings, "rubber", 1)
+    path = tmp_path / "drop.csv"
+    record(experiment, dealt, settings, path)
+    made = {row["method"]: Model(**row) for row in models(experiment, settings, Known("x", path, dealt.scene, {}))}
+    assert list(made) == ["nominal", "least_squares", "explain"]
+    assert made["nominal"].restitution == 0.5
+    assert made["least_squares"].restitution == pytest.approx(dealt.ball.restitution, abs=0.03)
+    assert made["least_squares"].simulations <= experiment.budget
+    untuned, tuned = (throw(dealt, settings, made[m]) for m in ("nominal", "least_squares"))
+    assert not untuned.hit
+    assert untuned.off > 0.5
+    assert tuned.hit
+    assert tuned.prediction_error < 0.04 < untuned.prediction_error
+    assert math.isnan(made["explain"].height)
+    perfect = replace(made["least_squares"], height=math.nan)
+    assert not throw(dealt, settings, perfect).hit
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"hoop": 1}, "unknown entry of .shot. in experiment bounce-shot 'hoop'; there are: angle"),
+        ({"balls": ["moon"]}, "unknown ball 'moon'"),
+        ({"angle": 0.3}, r"shot.angle: expected \[low, high\], found 0.3"),
+        ({"hoop_x": [2, 1]}, "expected 0 <= low <= high"),
+        (
+            {"rows": ["tunenet-visoin"], "filmed": 320},
+            "unknown tuner in shot.rows of experiment bounce-shot 'tunenet-v",
+        ),
+        ({"rows": ["tunenet-vision"], "filmed": 0}, "shot.rows: only a film has pixel rows"),
+        ({"balls": []}, "shot.balls: expected at least one ball"),
+        ({"release": "small"}, "shot.release: expected a number of at least 0, found 'small'"),
+    ],
+)
+def test_faults_of_the_table_are_one_line(experiment, change, message):
+    with pytest.raises(InputError, match=message):
+        settings_of(replace(experiment, shot=change))
+
+
+def test_world_that_cannot_be_had_is_skipped_with_its_reason(experiment, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(study.world, "missing", lambda: "the world needs mujoco")
+    assert cli.main(["compare", "bounce-shot", "--out", str(tmp_path / "out")]) == 0
+    assert "skipped: the world needs mujoco" in capsys.readouterr().out
+
+
+def test_command_from_recorded_drop_to_table_and_again_from_what_is_kept(tmp_path, capsys):
+    assert "bounce-shot" in names()
+    text = f"""{SMALL}
+budget = 6
+constants = {{ gravity = 9.81, radius = 0.03 }}
+noise = {{ z = 0.01 }}
+initial = {{ z = [1.4, 1.8] }}
+sampling = {{ rate = 60.0, samples = 100 }}
+shot = {{ balls = ["golf"] }}
+"""
+    (tmp_path / "mine.toml").write_text(text)
+    out = tmp_path / "out"
+    assert cli.main(["compare", str(tmp_path / "mine.toml"), "--jobs", "1", "--out", str(out)]) == 0
+    lines = pd.read_csv(out / "table.csv").set_index(["method", "ball"])
+    assert list(lines.index.unique("method")) == ["nominal", "least_squares", "explain", "least_squares + explain"]
+    assert lines.loc[("least_squares", "golf"), "shots"] == 1
+    assert lines.loc[("least_squares", ALL), "simulations"] <= 6
+    assert set(pd.read_csv(out / "status.csv")["status"]) <= {"done", "converged"}
+    for figure in ("success", "off", "shots"):
+        assert (out / "figures" / f"{figure}.png").stat().st_size > 10_000
+        assert (out / "figures" / f"{figure}.pdf").exists()
+    assert (out / "figures" / "shot.gif").stat().st_size > 10_000
+    kept = (out / "shots" / "golf-000.json").read_text()
+    assert {row["method"] for row in json.loads(kept)["rows"]} == set(lines.index.unique("method"))
+    before = (out / "table.csv").read_text()
+    assert cli.main(["compare", "--resume", str(out)]) == 0
+    assert (out / "shots" / "golf-000.json").read_text() == kept
+    assert (out / "table.csv").read_text() == before
+    assert cli.main(["status", str(out)]) == 0
+    assert "1 of 1 shots made, complete" in capsys.readouterr().out
+    (out / "shots" / "golf-000.json").write_text("{")
+    assert cli.main(["compare", "--resume", str(out)]) == 2
+    assert "damaged; delete it" in capsys.readouterr().err
