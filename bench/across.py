@@ -20,7 +20,8 @@ from sims.base import InputError
 
 
 def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> None:
-    """Statistics over several comparisons: ranks over problems, joint runtime distribution, ERT and pairs of each.
+    """Statistics over several comparisons: ranks over problems, joint runtime distribution, ERT and
+    pairs of each.
 
     Raises:
         InputError: a folder is not that of a comparison, or they share no tuners.
@@ -49,9 +50,15 @@ def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> No
     pd.concat([pairs(c) for c in all_curves]).to_csv(out / "pairs.csv", index=False)
     ranked = pd.concat([ranks(c) for c in all_curves])[tuners].rank(axis=1)
     ranked.to_csv(out / "ranks.csv", index_label="problem")
-    say(f"mean rank over {len(ranked)} problems (1 is best)\n{ranked.mean().sort_values().round(2).to_string()}")
-    experiment = Experiment("all", f"{len(ranked)} problems", tuners=tuple(Entry(t, t) for t in tuners))
-    table = pd.DataFrame([{"tuner": t, "run": t, "k": 0, "rank": r} for t, r in ranked.mean().items()])
+    say(
+        f"mean rank over {len(ranked)} problems (1 is best)\n{ranked.mean().sort_values().round(2).to_string()}"
+    )
+    experiment = Experiment(
+        "all", f"{len(ranked)} problems", tuners=tuple(Entry(t, t) for t in tuners)
+    )
+    table = pd.DataFrame(
+        [{"tuner": t, "run": t, "k": 0, "rank": r} for t, r in ranked.mean().items()]
+    )
     style = Styles(experiment, table, "rank")
     joint = {t: np.mean([share[t] for share in shares], axis=0) for t in tuners}
     made = [figures.joint_runtime_figure(out, experiment, style, joint)]

@@ -1,7 +1,7 @@
 """The command line of simgap; `simgap --help` lists its commands.
 
-Heavy packages are imported by the commands that need them, so that `simgap --help` is quick. A fault of the user's is
-one line on stderr and exit code 2; an internal error keeps its traceback.
+Heavy packages are imported by the commands that need them, so that `simgap --help` is quick. A
+fault of the user's is one line on stderr and exit code 2; an internal error keeps its traceback.
 """
 
 from __future__ import annotations

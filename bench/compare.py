@@ -1,4 +1,6 @@
-"""Begins a comparison in a new folder, or finishes one that was interrupted; what `simgap compare` and `status` do."""
+"""Begins a comparison in a new folder, or finishes one that was interrupted; what `simgap compare`
+and `status` do.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ if TYPE_CHECKING:
 Say = Callable[[str], None]
 
 
-def begin(experiment: Experiment, plugins: Sequence[str], out: str | None, jobs: int) -> tuple[Path, Results]:
+def begin(
+    experiment: Experiment, plugins: Sequence[str], out: str | None, jobs: int
+) -> tuple[Path, Results]:
     """A new folder and the results that will be kept there.
 
     Raises:
@@ -36,10 +40,12 @@ def begin(experiment: Experiment, plugins: Sequence[str], out: str | None, jobs:
 
 
 def resume(folder: Path, plugins: Sequence[str]) -> tuple[list[str], Results]:
-    """The plugins and results of a folder that was interrupted: what is finished is kept, what is missing remains.
+    """The plugins and results of a folder that was interrupted: what is finished is kept, what is
+    missing remains.
 
     Raises:
-        InputError: it is no such folder, it is damaged, or something that matters has changed since it was begun.
+        InputError: it is no such folder, it is damaged, or something that matters has changed since
+            it was begun.
     """
     from bench.registry import load_plugins
     from bench.runs.identity import fingerprint
@@ -61,10 +67,22 @@ def only_resume(options: object) -> None:
     Raises:
         InputError: there are some.
     """
-    names = ("experiment", "tuners", "targets", "seeds", "budget", "training_budget", "timeout", "memory", "out")
+    names = (
+        "experiment",
+        "tuners",
+        "targets",
+        "seeds",
+        "budget",
+        "training_budget",
+        "timeout",
+        "memory",
+        "out",
+    )
     given = [name for name in names if getattr(options, name) is not None]
     if given:
-        raise InputError(f"--resume takes the configuration of its folder as it is; leave out {', '.join(given)}")
+        raise InputError(
+            f"--resume takes the configuration of its folder as it is; leave out {', '.join(given)}"
+        )
 
 
 def refuse_changes(folder: Path, before: dict[str, str], now: dict[str, str]) -> None:
@@ -74,7 +92,9 @@ def refuse_changes(folder: Path, before: dict[str, str], now: dict[str, str]) ->
         InputError: something changed since the folder was begun.
     """
     if not before:
-        raise InputError(f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison")
+        raise InputError(
+            f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison"
+        )
     changed = [what for what in now if before.get(what) != now[what]]
     if changed:
         what = changed[0]
@@ -94,10 +114,14 @@ def _attach(folder: Path, results: Results) -> None:
     journal = Journal(folder)
     if planned is None:
         write_plan(folder, ids)
-    foreign = [place for place, s in journal.statuses.items() if place >= len(ids) or ids[place] != s.run]
+    foreign = [
+        place for place, s in journal.statuses.items() if place >= len(ids) or ids[place] != s.run
+    ]
     if foreign or (planned is not None and planned != ids):
         journal.close()
-        raise InputError(f"{folder}: its plan is not the one that its configuration gives; start a new comparison")
+        raise InputError(
+            f"{folder}: its plan is not the one that its configuration gives; start a new comparison"
+        )
     results.kept = journal
 
 
@@ -109,13 +133,25 @@ def _complete(folder: Path, ids: list[str]) -> dict[int, Any]:
     """
     from bench.store.folder import read
 
-    stored = [str(name) for name in read(folder, ["run", "tuner", "k"]).statuses.query("status != 'skipped'")["run"]]
+    stored = [
+        str(name)
+        for name in read(folder, ["run", "tuner", "k"]).statuses.query("status != 'skipped'")["run"]
+    ]
     if stored != ids:
-        raise InputError(f"{folder}: expected {len(ids)} runs, found {len(stored)} or others; start a new comparison")
+        raise InputError(
+            f"{folder}: expected {len(ids)} runs, found {len(stored)} or others; start a new comparison"
+        )
     return dict.fromkeys(range(len(ids)))
 
 
-def make(folder: Path, results: Results, plugins: Sequence[str], jobs: int, bar: Progress, pool: Pool | None) -> bool:
+def make(
+    folder: Path,
+    results: Results,
+    plugins: Sequence[str],
+    jobs: int,
+    bar: Progress,
+    pool: Pool | None,
+) -> bool:
     """Make what is missing and write the results; returns whether the comparison is complete.
 
     Raises:
@@ -144,7 +180,9 @@ def _write_spectra(folder: Path, results: Results) -> None:
     if results.spectra:
         from bench.analysis.spectra import spectra_table
 
-        table = spectra_table(results.problem.experiment, results.spectra, results.problem.cube.parameters)
+        table = spectra_table(
+            results.problem.experiment, results.spectra, results.problem.cube.parameters
+        )
         replace_text(folder / "identifiability.csv", table.to_csv(index=False))
 
 
@@ -157,7 +195,10 @@ def status(folder: Path, every: bool, say: Say) -> bool:
     held = configuration(folder)
     planned, ends = _ends(folder)
     missing = len(planned) - len(ends)
-    say(f"{held.experiment.name}: {len(ends)} of {len(planned)} runs finished" + (", complete" if not missing else ""))
+    say(
+        f"{held.experiment.name}: {len(ends)} of {len(planned)} runs finished"
+        + (", complete" if not missing else "")
+    )
     say("  " + ", ".join(f"{what} {value}" for what, value in held.fingerprint.items()))
     tuners = dict.fromkeys(name.split("/")[0] for name in planned)
     counts = Counter((run.split("/")[0], status) for run, (status, _) in ends.items())
@@ -189,5 +230,8 @@ def _ends(folder: Path) -> tuple[list[str], dict[str, tuple[str, str]]]:
 
     rows = read(folder, ["run", "tuner", "k"]).statuses
     rows = rows[rows["status"] != "skipped"]
-    ends = {str(run): (str(s), str(r)) for run, s, r in zip(rows["run"], rows["status"], rows["reason"], strict=True)}
+    ends = {
+        str(run): (str(s), str(r))
+        for run, s, r in zip(rows["run"], rows["status"], rows["reason"], strict=True)
+    }
     return list(ends), ends

@@ -1,7 +1,8 @@
-"""Finds tuners, simulators and effects: the project's own, installed plugins' and those of `--plugin FILE`.
+"""Finds tuners, simulators and effects: the project's own, installed plugins' and those of
+`--plugin FILE`.
 
-All come in the same way, through the entry-point groups `simgap.tuners` and `simgap.simulators`, and are imported
-only when asked for. What cannot be imported is listed as skipped, with the reason.
+All come in the same way, through the entry-point groups `simgap.tuners` and `simgap.simulators`,
+and are imported only when asked for. What cannot be imported is listed as skipped, with the reason.
 """
 
 from __future__ import annotations
@@ -63,9 +64,13 @@ class Registry(Generic[T]):
             raise unknown(self.kind, name, self.names())
         if not (inspect.isclass(found) and issubclass(found, self.base)):
             raise SkippedError(f"{name} is not a {self.base.__name__}: {found!r}")
-        missing = [package for package in found.requires if importlib.util.find_spec(package) is None]
+        missing = [
+            package for package in found.requires if importlib.util.find_spec(package) is None
+        ]
         if missing:
-            raise SkippedError(f"needs {', '.join(missing)}, not installed (pip install {' '.join(missing)})")
+            raise SkippedError(
+                f"needs {', '.join(missing)}, not installed (pip install {' '.join(missing)})"
+            )
         result: type[T] = found
         return result
 
@@ -85,7 +90,9 @@ class Registry(Generic[T]):
             InputError: the name is taken.
         """
         if found.name in self.names():
-            raise InputError(f"plugin {path}: {self.kind} '{found.name}' exists already; give it another name")
+            raise InputError(
+                f"plugin {path}: {self.kind} '{found.name}' exists already; give it another name"
+            )
         self._from_files[found.name] = found
 
 
@@ -98,7 +105,8 @@ _loaded: set[Path] = set()
 def load_plugins(paths: Iterable[str | Path]) -> None:
     """Register every tuner, simulator and effect that is defined in the files, once.
 
-    A file ending in .toml is an extended simulator as `simgap explain` writes it, loaded after what it may extend.
+    A file ending in .toml is an extended simulator as `simgap explain` writes it, loaded after what
+    it may extend.
 
     Raises:
         InputError: a file is missing, does not run, or defines none of them.
@@ -111,10 +119,20 @@ def load_plugins(paths: Iterable[str | Path]) -> None:
             _loaded.add(path)
             continue
         module = _run(path)
-        found = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module.__name__]
-        parts = [c for c in found if issubclass(c, (Tuner, Simulator, Effect)) and not inspect.isabstract(c)]
+        found = [
+            c
+            for c in vars(module).values()
+            if inspect.isclass(c) and c.__module__ == module.__name__
+        ]
+        parts = [
+            c
+            for c in found
+            if issubclass(c, (Tuner, Simulator, Effect)) and not inspect.isabstract(c)
+        ]
         if not parts:
-            raise InputError(f"plugin {path}: defines neither a Tuner nor a Simulator nor an Effect")
+            raise InputError(
+                f"plugin {path}: defines neither a Tuner nor a Simulator nor an Effect"
+            )
         for part in parts:
             _named(part, path)
             if issubclass(part, Tuner):
@@ -133,10 +151,14 @@ def _named(part: type, path: Path) -> None:
     """Refuse a name that tables, files and command lines could not hold."""
     name = getattr(part, "name", None)
     if not (isinstance(name, str) and _NAME.match(name)):
-        raise InputError(f"plugin {path}: class {part.__name__}: expected name = 'plain_name', found {name!r:.80}")
+        raise InputError(
+            f"plugin {path}: class {part.__name__}: expected name = 'plain_name', found {name!r:.80}"
+        )
     requires = getattr(part, "requires", ())
     if not (isinstance(requires, tuple | list) and all(isinstance(r, str) for r in requires)):
-        raise InputError(f"plugin {path}: class {part.__name__}: expected requires = ('package', ...)")
+        raise InputError(
+            f"plugin {path}: class {part.__name__}: expected requires = ('package', ...)"
+        )
 
 
 def _run(path: Path) -> ModuleType:

@@ -23,7 +23,8 @@ from bench.store.folder import Stored, read
 
 
 def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
-    """Write table and figures of the comparison in `folder` from what is stored there, and say what came out.
+    """Write table and figures of the comparison in `folder` from what is stored there, and say what
+    came out.
 
     Returns:
         How many runs failed.
@@ -40,10 +41,14 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     channel = problem.channels[problem.error_channel]
     parameters = problem.cube.parameters
     single = parameters[0] if len(parameters) == 1 else None
-    name = "" if single is None else single.name + (f" [{single.unit}]" if single.unit != "1" else "")
+    name = (
+        "" if single is None else single.name + (f" [{single.unit}]" if single.unit != "1" else "")
+    )
     figures = draw(folder, stored.experiment, stored.runs, f"{channel.name} [{channel.unit}]", name)
     figures += summarise(folder, stored)
-    figures += identifiability_figures(folder, stored.experiment, stored.runs, f"{channel.name} [{channel.unit}]")
+    figures += identifiability_figures(
+        folder, stored.experiment, stored.runs, f"{channel.name} [{channel.unit}]"
+    )
     for kind in lines["range"][lines["range"] != ""].unique():
         say("\n" + _text(lines, kind, f"{channel.name} [{channel.unit}]", name))
         if more := _directions(lines, kind, f"{channel.name} [{channel.unit}]"):
@@ -63,11 +68,15 @@ def _text(lines: pd.DataFrame, kind: str, channel: str, parameter: str) -> str:
     """One range as a table for the terminal."""
     present = set(lines["metric"])
     if kind == "real":
-        metric, what = ("heldout_error", "held-out") if "heldout_error" in present else ("obs_error", "fitted")
+        metric, what = (
+            ("heldout_error", "held-out") if "heldout_error" in present else ("obs_error", "fitted")
+        )
         title = f"mean {what} RMSE of {channel} after N simulations"
     else:
         metric = "param_abs_error" if "param_abs_error" in present else "param_error"
-        where = "targets in the training range" if kind == "in" else "targets anywhere in the bounds"
+        where = (
+            "targets in the training range" if kind == "in" else "targets anywhere in the bounds"
+        )
         title = f"mean absolute error of {parameter or 'the parameters [training widths]'} after N simulations, {where}"
     means = summary(lines, metric, kind)
     fits = lines.drop_duplicates("tuner").set_index("tuner")["fit_simulations"]
@@ -78,7 +87,9 @@ def _text(lines: pd.DataFrame, kind: str, channel: str, parameter: str) -> str:
 
 
 def _directions(lines: pd.DataFrame, kind: str, channel: str) -> str:
-    """Errors along stiff and sloppy directions, and of prediction, of one range; empty where there are none."""
+    """Errors along stiff and sloppy directions, and of prediction, of one range; empty where there
+    are none.
+    """
     titles = {"stiff_error": "stiff", "sloppy_error": "sloppy", "heldout_error": "unseen"}
     part = lines[(lines["range"] == kind) & lines["metric"].isin(titles)]
     if kind == "real" or part.empty:
@@ -101,21 +112,31 @@ def _directions(lines: pd.DataFrame, kind: str, channel: str) -> str:
 def _seconds(lines: pd.DataFrame) -> str:
     """What a tuner took beside what its simulations took, and its training."""
     last = lines[lines["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
-    columns = {"tuner": "tuner_seconds", "simulator": "simulator_seconds", "one training": "fit_seconds"}
+    columns = {
+        "tuner": "tuner_seconds",
+        "simulator": "simulator_seconds",
+        "one training": "fit_seconds",
+    }
     table = pd.DataFrame({name: last[column] for name, column in columns.items()}).rename_axis(None)
     return f"mean seconds of a run\n{table.to_string(float_format=lambda v: f'{v:.2g}')}"
 
 
 def failure_lines(failed: pd.DataFrame) -> list[str]:
-    """A table of failures: a line for each tuner and kind, with the first reason's error and where it was raised."""
+    """A table of failures: a line for each tuner and kind, with the first reason's error and where
+    it was raised.
+    """
     lines = []
     for (tuner, status), group in failed.groupby(["tuner", "status"], sort=False):
-        lines.append((str(tuner), str(len(group)), str(status), first_line(str(group["reason"].iloc[0]))))
+        lines.append(
+            (str(tuner), str(len(group)), str(status), first_line(str(group["reason"].iloc[0])))
+        )
     if not lines:
         return []
     lines.insert(0, ("tuner", "runs", "status", "first reason"))
     widths = [max(len(line[i]) for line in lines) for i in range(3)]
-    laid_out = [f"{a:{widths[0]}}  {b:>{widths[1]}}  {c:{widths[2]}}  {d}".rstrip() for a, b, c, d in lines]
+    laid_out = [
+        f"{a:{widths[0]}}  {b:>{widths[1]}}  {c:{widths[2]}}  {d}".rstrip() for a, b, c, d in lines
+    ]
     return ["", "failures", *laid_out]
 
 
@@ -128,7 +149,8 @@ def first_line(reason: str) -> str:
     frames = [i for i, line in enumerate(lines) if _FRAME.search(line)]
     if not frames:
         return lines[-1].strip()
-    # The error's own words begin behind the last frame, at the margin; what follows them may be pages.
+    # The error's own words begin behind the last frame, at the margin; what follows them may be
+    # pages.
     words = next((line for line in lines[frames[-1] + 1 :] if line[:1].strip()), lines[-1])
     file, number, function = _FRAME.findall(lines[frames[-1]])[0]
     return f"{words} ({Path(file).name}, line {number}, in {function})"
@@ -138,14 +160,30 @@ WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_second
 
 
 NEEDED = (
-    "run", "experiment", "tuner", "target", "seed", "range", "k", "param_error", "param_abs_error", "stiff_error",
-    "sloppy_error", "obs_error", "heldout_error", "outside", "tuner_seconds", "simulator_seconds",
-)  # fmt: skip
+    "run",
+    "experiment",
+    "tuner",
+    "target",
+    "seed",
+    "range",
+    "k",
+    "param_error",
+    "param_abs_error",
+    "stiff_error",
+    "sloppy_error",
+    "obs_error",
+    "heldout_error",
+    "outside",
+    "tuner_seconds",
+    "simulator_seconds",
+)
 """Columns of the runs that tables and figures use."""
 
 
 def summarise(folder: Path, stored: Stored) -> list[Path]:
-    """Write ert.csv, pairs.csv, break_even.csv, who_wins.csv and their figures; returns the figures' PNG files."""
+    """Write ert.csv, pairs.csv, break_even.csv, who_wins.csv and their figures; returns the
+    figures' PNG files.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -186,15 +224,24 @@ def summarise(folder: Path, stored: Stored) -> list[Path]:
 
 
 def _telling(held: Mapping[float, Mapping[str, Mapping[str, Price]]]) -> float:
-    """The tightest level that at least half of the tuners reach in some run, in every range; else the loosest."""
+    """The tightest level that at least half of the tuners reach in some run, in every range; else
+    the loosest.
+    """
     for level in sorted(held):
-        if all(2 * sum(np.isfinite(p.effort.ert()) for p in t.values()) >= len(t) for t in held[level].values()):
+        if all(
+            2 * sum(np.isfinite(p.effort.ert()) for p in t.values()) >= len(t)
+            for t in held[level].values()
+        ):
             return level
     return max(held)
 
 
 def _prices(
-    rows: Rows, curves: Curves, level: float, experiment: Experiment, fits: Mapping[str, tuple[float, float]]
+    rows: Rows,
+    curves: Curves,
+    level: float,
+    experiment: Experiment,
+    fits: Mapping[str, tuple[float, float]],
 ) -> dict[str, dict[str, Price]]:
     tuner_seconds, simulator_seconds = rows.spent("tuner_seconds"), rows.spent("simulator_seconds")
     result = {}
@@ -203,5 +250,5 @@ def _prices(
         part = curves.where(mask)
         result[str(kind)] = prices(
             part, level, experiment.budget, tuner_seconds[mask], simulator_seconds[mask], fits
-        )  # fmt: skip
+        )
     return result

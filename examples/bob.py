@@ -1,4 +1,6 @@
-"""A weight that hangs on a spring and is pulled by an input, stepped by MuJoCo: a user's own simulator, whole."""
+"""A weight that hangs on a spring and is pulled by an input, stepped by MuJoCo: a user's own
+simulator, whole.
+"""
 
 import mujoco
 

@@ -8,15 +8,25 @@ from sims.own import BulletWorld, OwnSimulator
 
 class Puck(OwnSimulator):
     name, says, requires = "puck", "a puck that slides down an inclined plane", ("pybullet",)
-    parameters = (Parameter("friction", "1", 0.3, (0.0, 0.5), (0.1, 0.4), says="friction of the puck on the plane"),)
-    constants = (Constant("incline", "rad", 0.5), Constant("mass", "kg", 0.16), Constant("gravity", "m/s^2", 9.81))
+    parameters = (
+        Parameter(
+            "friction", "1", 0.3, (0.0, 0.5), (0.1, 0.4), says="friction of the puck on the plane"
+        ),
+    )
+    constants = (
+        Constant("incline", "rad", 0.5),
+        Constant("mass", "kg", 0.16),
+        Constant("gravity", "m/s^2", 9.81),
+    )
     channels = (Channel("x", "m", says="way down the plane"), Channel("v", "m/s", says="its rate"))
     states, coordinates, rates = {"x": 0.0, "v": 0.0}, ("x",), ("v",)
 
     def reset(self, theta, constants, initial):
         self.world = world = BulletWorld()
         self.mass, down, g = constants["mass"], constants["incline"], constants["gravity"]
-        world.setGravity(g * math.sin(down), 0, -g * math.cos(down))  # seen from the plane, whose x runs down
+        world.setGravity(
+            g * math.sin(down), 0, -g * math.cos(down)
+        )  # seen from the plane, whose x runs down
         plane = world.createMultiBody(0, world.createCollisionShape(world.GEOM_PLANE))
         world.changeDynamics(plane, -1, lateralFriction=1)  # Bullet multiplies it by the puck's
         box = world.createCollisionShape(world.GEOM_BOX, halfExtents=[0.05, 0.05, 0.01])
@@ -34,7 +44,9 @@ class Puck(OwnSimulator):
         return {"x": self.place[0], "v": self.world.getBaseVelocity(self.puck)[0][0]}
 
     def apply_force(self, force):
-        self.world.applyExternalForce(self.puck, -1, [force[0], 0, 0], self.place, self.world.WORLD_FRAME)
+        self.world.applyExternalForce(
+            self.puck, -1, [force[0], 0, 0], self.place, self.world.WORLD_FRAME
+        )
 
     def inertia(self):
         return self.mass

@@ -1,7 +1,7 @@
 """The tuner's contract: a run is a generator that yields proposals and receives evaluations.
 
-A tuner works in the unit cube and never sees units, the simulator or the truth. The harness (`bench`) owns the loop:
-it simulates, counts, times and logs; the method reads like its paper.
+A tuner works in the unit cube and never sees units, the simulator or the truth. The harness
+(`bench`) owns the loop: it simulates, counts, times and logs; the method reads like its paper.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ class Evaluation(NamedTuple):
     """What the simulator showed for the proposals of one `yield`.
 
     Attributes:
-        proposals: what was simulated (n, dim): the proposals, moved into the unit cube where they lay outside it.
+        proposals: what was simulated (n, dim): the proposals, moved into the unit cube where they
+            lay outside it.
         observations: (n, T, C), SI units.
         losses: (n,), each `Task.loss` of its observation; not finite where the simulation failed.
     """
@@ -35,12 +36,13 @@ class Evaluation(NamedTuple):
 class Ask(NamedTuple):
     """Proposals together with what the tuner would deliver now.
 
-    Yield a bare array to have the harness recommend the proposal of the lowest loss seen; yield an `Ask` to recommend
-    something else. The recommendation holds until the next `yield`.
+    Yield a bare array to have the harness recommend the proposal of the lowest loss seen; yield an
+    `Ask` to recommend something else. The recommendation holds until the next `yield`.
 
     Attributes:
         points: (n, dim) or (dim,) proposals, unit cube.
-        recommend: (dim,), unit cube, made from the evaluations received so far; None for the lowest loss seen.
+        recommend: (dim,), unit cube, made from the evaluations received so far; None for the lowest
+            loss seen.
     """
 
     points: Array
@@ -55,9 +57,10 @@ class Scene(NamedTuple):
     """What the experimenter knows of a target's scenario beside its observation.
 
     Attributes:
-        initial: (K,) initial values that no channel begins with, and constants of the run, run by run in the order of
-            their names, SI units.
-        inputs: (T, U) input signals in the order of their names, SI units; the runs follow one another along T.
+        initial: (K,) initial values that no channel begins with, and constants of the run, run by
+            run in the order of their names, SI units.
+        inputs: (T, U) input signals in the order of their names, SI units; the runs follow one
+            another along T.
     """
 
     initial: Array
@@ -75,9 +78,10 @@ class Task:
     Attributes:
         dim: number of parameters.
         start: (dim,) where every tuner starts on this target, unit cube.
-        observed: (T, C) the target's observation, SI units; NaN where a sample is missing. The runs of a recording
-            with several runs follow one another along T.
-        scale: (C,) what a residual is divided by: the channel's noise where known, else its typical magnitude.
+        observed: (T, C) the target's observation, SI units; NaN where a sample is missing. The runs
+            of a recording with several runs follow one another along T.
+        scale: (C,) what a residual is divided by: the channel's noise where known, else its typical
+            magnitude.
         training: (2, dim) lower and upper corner of the training range, unit cube.
         budget: number of simulations the tuner may use.
         lengths: number of samples of each run; they add up to T.
@@ -94,20 +98,24 @@ class Task:
     scene: Scene = NOTHING
 
     def residuals(self, observations: Array) -> Array:
-        """Scaled differences simulated - observed, (n, T * C); zero where the target's sample is missing."""
+        """Scaled differences simulated - observed, (n, T * C); zero where the target's sample is
+        missing.
+        """
         difference = (observations - self.observed) / self.scale
         return np.where(np.isnan(self.observed), 0.0, difference).reshape(len(observations), -1)
 
 
 class Practice(Protocol):
-    """The simulator as a learned tuner meets it in `fit`: counted, and fenced to the training range.
+    """The simulator as a learned tuner meets it in `fit`: counted, and fenced to the training
+    range.
 
     Attributes:
         dim: number of parameters.
         training: (2, dim) corners of the training range, unit cube.
         scale: (C,) as in `Task`.
         lengths: as in `Task`.
-        scene: as in `Task`, of the scenario in which `simulate` was last called; of any before that.
+        scene: as in `Task`, of the scenario in which `simulate` was last called; of any before
+            that.
         used: simulations made so far.
         budget: simulations allowed.
     """
@@ -125,7 +133,8 @@ class Practice(Protocol):
         ...
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
-        """Observations (n, T, C) of `points` (n, dim), all in one scenario drawn by `rng` as targets' are.
+        """Observations (n, T, C) of `points` (n, dim), all in one scenario drawn by `rng` as
+        targets' are.
 
         Raises:
             ValueError: a point outside the training range.
@@ -139,11 +148,15 @@ class Watch(Protocol):
 
     @property
     def ground(self) -> Practice:
-        """More simulations of the training range, which only measure; the training budget does not count them."""
+        """More simulations of the training range, which only measure; the training budget does not
+        count them.
+        """
         ...
 
     def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
-        """Told of each pass over the data of one stage of the training: its number from 1, and the losses."""
+        """Told of each pass over the data of one stage of the training: its number from 1, and the
+        losses.
+        """
         ...
 
 
@@ -152,20 +165,22 @@ class BudgetExceededError(RuntimeError):
 
 
 class Tuner:
-    """Base of all tuners. Subclasses implement `tune`; learned ones also `fit`, `state` and `restore`.
+    """Base of all tuners. Subclasses implement `tune`; learned ones also `fit`, `state` and
+    `restore`.
 
-    Options are keyword arguments with defaults (a dataclass does well). An instance is used for one run after another
-    and must not keep anything from one to the next, except what `fit` learned.
+    Options are keyword arguments with defaults (a dataclass does well). An instance is used for one
+    run after another and must not keep anything from one to the next, except what `fit` learned.
 
     Attributes:
-        name: how the tuner is called in tables; derived from the class name where not given (RandomSearch ->
-            random_search).
+        name: how the tuner is called in tables; derived from the class name where not given
+            (RandomSearch -> random_search).
         requires: importable packages without which this tuner is listed as skipped.
         stochastic: whether `tune` uses its generator; where not, one seed tells all.
         learned: whether `fit` must have been called before `tune`.
-        trains_as: another tuner that trains in the same way; its random stream is used, so that a comparison of the two
-            compares what they do with the same network.
-        known_failures: conformance checks (by function name) that it fails on purpose, with the reason.
+        trains_as: another tuner that trains in the same way; its random stream is used, so that a
+            comparison of the two compares what they do with the same network.
+        known_failures: conformance checks (by function name) that it fails on purpose, with the
+            reason.
         watch: looks on during `fit`, where the tuner tells it of its progress.
     """
 
@@ -183,7 +198,9 @@ class Tuner:
             cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
-        """Yield proposals (n, dim) in the unit cube, receive their `Evaluation`; return a reason to stop early."""
+        """Yield proposals (n, dim) in the unit cube, receive their `Evaluation`; return a reason to
+        stop early.
+        """
         raise NotImplementedError(f"{type(self).__name__} does not implement tune")
 
     def fit(self, simulator: Practice, rng: np.random.Generator, budget: int) -> None:
@@ -208,12 +225,12 @@ class _Stopped(BaseException):
 def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) -> Steps:
     """Turn an optimiser that only takes an objective function into a tuner's generator.
 
-    The optimiser runs in a thread of its own and is never at work at the same time as the harness: each call of the
-    objective hands one point over and waits for its loss.
+    The optimiser runs in a thread of its own and is never at work at the same time as the harness:
+    each call of the objective hands one point over and waits for its loss.
 
     Args:
-        minimise: called with the objective (dim,) -> loss; returns the reason for which it stopped, or None. It must
-            let exceptions of the objective through.
+        minimise: called with the objective (dim,) -> loss; returns the reason for which it stopped,
+            or None. It must let exceptions of the objective through.
 
     Returns:
         The generator; its return value is the reason.
@@ -265,4 +282,6 @@ def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) ->
         answered.release()
         worker.join(timeout=5.0)
         if worker.is_alive():
-            raise RuntimeError("the optimiser swallowed the exception that ends its run; its thread cannot be stopped")
+            raise RuntimeError(
+                "the optimiser swallowed the exception that ends its run; its thread cannot be stopped"
+            )

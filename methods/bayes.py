@@ -1,8 +1,9 @@
-"""Bayesian optimisation with a Gaussian process and expected improvement, as scikit-optimize has it.
+"""Bayesian optimisation with a Gaussian process and expected improvement, as scikit-optimize has
+it.
 
-Sources: D. R. Jones, M. Schonlau, W. J. Welch, Efficient global optimization of expensive black-box functions, Journal
-of Global Optimization 13, 1998, doi:10.1023/A:1008306431147; T. Head et al., scikit-optimize,
-doi:10.5281/zenodo.1157319.
+Sources: D. R. Jones, M. Schonlau, W. J. Welch, Efficient global optimization of expensive black-box
+functions, Journal of Global Optimization 13, 1998, doi:10.1023/A:1008306431147; T. Head et al.,
+scikit-optimize, doi:10.5281/zenodo.1157319.
 """
 
 from __future__ import annotations
@@ -18,10 +19,11 @@ from methods.base import Steps, Task, Tuner
 
 @dataclass(eq=False)
 class Bayes(Tuner):
-    """skopt.Optimizer with the process of gp_minimize, asked and told one point at a time; recommends the lowest loss.
+    """skopt.Optimizer with the process of gp_minimize, asked and told one point at a time;
+    recommends the lowest loss.
 
-    The library's defaults of `candidates`, `polished` and `fits` (10000, 5 and 2) take several times as long and do not
-    lower the errors on the bouncing ball.
+    The library's defaults of `candidates`, `polished` and `fits` (10000, 5 and 2) take several
+    times as long and do not lower the errors on the bouncing ball.
 
     Attributes:
         initial: points before the first model, the start included.
@@ -51,7 +53,9 @@ class Bayes(Tuner):
             if np.isfinite(loss):
                 worst = max(worst, float(loss))
             with _quiet():
-                optimiser.tell([float(x) for x in point], float(loss) if np.isfinite(loss) else worst)
+                optimiser.tell(
+                    [float(x) for x in point], float(loss) if np.isfinite(loss) else worst
+                )
                 point = optimiser.ask()
 
     def optimiser(self, dim: int, seed: int) -> Any:
@@ -60,7 +64,9 @@ class Bayes(Tuner):
         from skopt.utils import cook_estimator
 
         cube = [(0.0, 1.0)] * dim
-        process = cook_estimator("GP", space=cube, random_state=seed, n_restarts_optimizer=self.fits, noise=self.noise)
+        process = cook_estimator(
+            "GP", space=cube, random_state=seed, n_restarts_optimizer=self.fits, noise=self.noise
+        )
         return Optimizer(
             cube,
             base_estimator=process,
@@ -68,14 +74,19 @@ class Bayes(Tuner):
             initial_point_generator=self.design,
             acq_func="EI",
             acq_optimizer="lbfgs",
-            acq_optimizer_kwargs={"n_points": self.candidates, "n_restarts_optimizer": self.polished},
+            acq_optimizer_kwargs={
+                "n_points": self.candidates,
+                "n_restarts_optimizer": self.polished,
+            },
             model_queue_size=1,
             random_state=seed,
         )
 
 
 class _quiet(warnings.catch_warnings):  # noqa: N801 - used like a function
-    """scikit-optimize warns of each repeated point and of each fit that runs into a bound: silenced here, locally."""
+    """scikit-optimize warns of each repeated point and of each fit that runs into a bound: silenced
+    here, locally.
+    """
 
     def __enter__(self) -> None:
         super().__enter__()

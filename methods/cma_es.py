@@ -1,8 +1,9 @@
 """Covariance matrix adaptation, as pycma has it.
 
-Sources: N. Hansen, The CMA evolution strategy: a tutorial, 2016, arXiv:1604.00772; N. Hansen, Y. Akimoto, P. Baudis,
-CMA-ES/pycma, doi:10.5281/zenodo.2559634; restarts with a growing population: A. Auger, N. Hansen, A restart CMA
-evolution strategy with increasing population size, CEC 2005, doi:10.1109/CEC.2005.1554902.
+Sources: N. Hansen, The CMA evolution strategy: a tutorial, 2016, arXiv:1604.00772; N. Hansen, Y.
+Akimoto, P. Baudis, CMA-ES/pycma, doi:10.5281/zenodo.2559634; restarts with a growing population: A.
+Auger, N. Hansen, A restart CMA evolution strategy with increasing population size, CEC 2005,
+doi:10.1109/CEC.2005.1554902.
 """
 
 from __future__ import annotations
@@ -20,18 +21,19 @@ from methods.base import Array, Ask, Steps, Task, Tuner
 class CMAES(Tuner):
     """CMA-ES in the unit cube.
 
-    pycma refuses a single parameter; there a second coordinate is added that the simulation ignores. The published
-    comparison let CMA-ES search the drop height too, although it was known; its settings are `sigma=0.1,
-    population=10, recommend="mean", evaluate_start=False`.
+    pycma refuses a single parameter; there a second coordinate is added that the simulation
+    ignores. The published comparison let CMA-ES search the drop height too, although it was known;
+    its settings are `sigma=0.1, population=10, recommend="mean", evaluate_start=False`.
 
     Attributes:
-        sigma: first standard deviation, a share of the cube; pycma's manual advises about a quarter of the range.
+        sigma: first standard deviation, a share of the cube; pycma's manual advises about a quarter
+            of the range.
         population: points in a generation; None for pycma's own choice.
         recommend: the lowest loss seen, or the mean of the distribution.
-        evaluate_start: simulate the start before the first generation, as pycma's fmin does if asked; pycma alone only
-            draws points around it.
-        restarts: where pycma stops with budget left, start again at a random point with twice the population,
-            as far as the budget has room for it.
+        evaluate_start: simulate the start before the first generation, as pycma's fmin does if
+            asked; pycma alone only draws points around it.
+        restarts: where pycma stops with budget left, start again at a random point with twice the
+            population, as far as the budget has room for it.
     """
 
     name = "cma_es"
@@ -53,7 +55,11 @@ class CMAES(Tuner):
             while not strategy.stop():
                 generation = strategy.ask()
                 points = np.array(generation)[:, : task.dim]
-                seen = yield points if self.recommend == "best" else Ask(points, self._mean(strategy, task.dim))
+                seen = (
+                    yield points
+                    if self.recommend == "best"
+                    else Ask(points, self._mean(strategy, task.dim))
+                )
                 strategy.tell(generation, _finite(seen.losses))
             if not self.restarts:
                 return "pycma: " + ", ".join(strategy.stop())
@@ -61,7 +67,9 @@ class CMAES(Tuner):
             population = max(min(2 * strategy.popsize, task.budget), strategy.popsize)
 
     def _strategy(self, centre: Array, population: int | None, rng: np.random.Generator) -> Any:
-        """A strategy with a generator of its own: by default pycma seeds and uses NumPy's global one."""
+        """A strategy with a generator of its own: by default pycma seeds and uses NumPy's global
+        one.
+        """
         import cma
 
         options: dict[str, Any] = {

@@ -1,14 +1,17 @@
-"""Greedy entropy search: simulate where it is most uncertain whether the minimiser of the error lies there.
+"""Greedy entropy search: simulate where it is most uncertain whether the minimiser of the error
+lies there.
 
-Source: S. Zhu, A. Kimmel, K. E. Bekris, A. Boularias, Fast model identification via physics engines for data-efficient
-policy search, IJCAI 2018, doi:10.24963/ijcai.2018/451 (arXiv:1710.08893), algorithm 1. The candidates' quasi-random
+Source: S. Zhu, A. Kimmel, K. E. Bekris, A. Boularias, Fast model identification via physics engines
+for data-efficient policy search, IJCAI 2018, doi:10.24963/ijcai.2018/451 (arXiv:1710.08893),
+algorithm 1. The candidates' quasi-random
 sequence: M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018,
 https://extremelearning.com.au/unreasonable-effectiveness-of-quasirandom-sequences/.
 
-The error over the parameters θ is a Gaussian process; P(θ) is the share of its posterior draws whose minimiser, among
-candidates, is θ; the next simulation is where -P log P is largest. As published the candidates are a fixed grid, which
-bounds the accuracy, and the search stops when its estimate repeats, which is often too early. The default draws new
-candidates each time, dense around the likely minimisers, models the logarithm of the error, and goes on.
+The error over the parameters θ is a Gaussian process; P(θ) is the share of its posterior draws
+whose minimiser, among candidates, is θ; the next simulation is where -P log P is largest. As
+published the candidates are a fixed grid, which bounds the accuracy, and the search stops when its
+estimate repeats, which is often too early. The default draws new candidates each time, dense around
+the likely minimisers, models the logarithm of the error, and goes on.
 """
 
 from __future__ import annotations
@@ -23,13 +26,16 @@ from methods.gaussian_process import GaussianProcess, Settings
 
 @dataclass(eq=False)
 class EntropySearch(Tuner):
-    """Greedy entropy search; recommends the lowest loss seen, or as published the candidate of the largest P.
+    """Greedy entropy search; recommends the lowest loss seen, or as published the candidate of the
+    largest P.
 
     Attributes:
-        published: the fixed grid over the cube (the authors of the comparison laid it between their smallest and
-            largest test target, which a tuner cannot know), the plain error, and the stop.
+        published: the fixed grid over the cube (the authors of the comparison laid it between their
+            smallest and largest test target, which a tuner cannot know), the plain error, and the
+            stop.
         grid: number of grid points, if published (quasi-random where there are several parameters).
-        repeats_within: change of the estimate, a share of the cube, at which the published search stops.
+        repeats_within: change of the estimate, a share of the cube, at which the published search
+            stops.
         draws: draws of the posterior; 200 if published.
         initial: simulations before the first model, the start included.
         everywhere: candidates all over the cube.
@@ -87,25 +93,35 @@ class EntropySearch(Tuner):
                 asked = design[n]
                 continue
             values = logarithm(finite(losses))
-            process = GaussianProcess(points, values, self.process, hyper, fit=n < 20 or n % self.refit == 0)
+            process = GaussianProcess(
+                points, values, self.process, hyper, fit=n < 20 or n % self.refit == 0
+            )
             hyper = process.hyper
             candidates = self._candidates(process, points[values.argmin()], rng)
             score = uncertainty(minimiser_probability(process, candidates, self.draws, rng))
             asked = candidates[score[1:].argmax() + 1]  # the first is simulated already
 
     def _candidates(self, process: GaussianProcess, best: Array, rng: np.random.Generator) -> Array:
-        """The best point seen, quasi-random points, and points around the likely minimisers at all scales."""
+        """The best point seen, quasi-random points, and points around the likely minimisers at all
+        scales.
+        """
         dim = len(best)
         wide = spread(self.everywhere, rng.uniform(size=dim))
         distances = np.linalg.norm(process.points - best, axis=1)
         finest = max(0.1 * np.min(distances, where=distances > 0.0, initial=0.5), 1e-9)
-        scales = np.exp(rng.uniform(np.log(finest), np.log(0.5), size=(self.nearby, 1))) / np.sqrt(dim)
-        centres = np.where(np.arange(self.nearby)[:, None] % 2 == 0, best, wide[process.predict(wide).argmin()])
+        scales = np.exp(rng.uniform(np.log(finest), np.log(0.5), size=(self.nearby, 1))) / np.sqrt(
+            dim
+        )
+        centres = np.where(
+            np.arange(self.nearby)[:, None] % 2 == 0, best, wide[process.predict(wide).argmin()]
+        )
         near = centres + scales * rng.standard_normal((self.nearby, dim))
         return np.vstack([best, wide, np.clip(near, 0.0, 1.0)])
 
 
-def minimiser_probability(process: GaussianProcess, candidates: Array, draws: int, rng: np.random.Generator) -> Array:
+def minimiser_probability(
+    process: GaussianProcess, candidates: Array, draws: int, rng: np.random.Generator
+) -> Array:
     """P (n,): the share of joint posterior draws in which each candidate (n, dim) is the minimiser."""
     minimisers = process.sample(candidates, draws, rng).argmin(axis=1)
     return np.bincount(minimisers, minlength=len(candidates)) / draws

@@ -1,4 +1,5 @@
-"""Gaussian-process regression with a constant mean, its hyper-parameters at their most probable values.
+"""Gaussian-process regression with a constant mean, its hyper-parameters at their most probable
+values.
 
 Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, 2006,
 doi:10.7551/mitpress/3206.001.0001; equation numbers are theirs.
@@ -20,7 +21,8 @@ class Settings:
 
     Attributes:
         kernel: squared exponential (4.9) or Matérn 5/2 (4.17).
-        length: a length scale's median, a share of the cube, and its standard deviation in units of the logarithm.
+        length: a length scale's median, a share of the cube, and its standard deviation in units of
+            the logarithm.
         noise: the same for the noise variance, as a share of the process's variance.
     """
 
@@ -30,7 +32,8 @@ class Settings:
 
 
 class GaussianProcess:
-    """The posterior given n simulations; mean and variance are profiled out, length scales and noise are fitted.
+    """The posterior given n simulations; mean and variance are profiled out, length scales and
+    noise are fitted.
 
     Attributes:
         hyper: (dim + 1,) logarithms of the length scales and of the noise.
@@ -39,9 +42,16 @@ class GaussianProcess:
     """
 
     def __init__(
-        self, points: Array, values: Array, settings: Settings, hyper: Array | None = None, fit: bool = True
+        self,
+        points: Array,
+        values: Array,
+        settings: Settings,
+        hyper: Array | None = None,
+        fit: bool = True,
     ) -> None:
-        """Condition on `values` (n,) at `points` (n, dim); start the fit from `hyper`, or take it as it is."""
+        """Condition on `values` (n,) at `points` (n, dim); start the fit from `hyper`, or take it
+        as it is.
+        """
         self.points, self.values, self.settings = points, values, settings
         self._squares = (points[:, None] - points) ** 2
         dim = points.shape[1]
@@ -55,7 +65,9 @@ class GaussianProcess:
         self.mean, self.variance, self._alpha = _profile(self._lower, values)
 
     def _correlation(self, squares: Array, hyper: Array | None = None) -> tuple[Array, Array]:
-        """Correlation of pairs with squared differences (n, m, dim), and its derivative by their scaled sum."""
+        """Correlation of pairs with squared differences (n, m, dim), and its derivative by their
+        scaled sum.
+        """
         lengths = (self.hyper if hyper is None else hyper)[:-1]
         scaled = squares @ np.exp(-2.0 * lengths)
         if self.settings.kernel == "rbf":
@@ -76,7 +88,14 @@ class GaussianProcess:
 
         low, high = self._centre - 4.0 * self._width, self._centre + 4.0 * self._width
         bounds = list(zip(low, high, strict=True))
-        found = minimize(objective, self.hyper, jac=True, bounds=bounds, method="L-BFGS-B", options={"maxiter": 20})
+        found = minimize(
+            objective,
+            self.hyper,
+            jac=True,
+            bounds=bounds,
+            method="L-BFGS-B",
+            options={"maxiter": 20},
+        )
         return np.asarray(found.x)
 
     def _evidence(self, hyper: Array) -> tuple[float, Array]:
@@ -89,7 +108,9 @@ class GaussianProcess:
         _, variance, alpha = _profile(lower, self.values)
         value = 0.5 * n * np.log(variance) + np.log(np.diag(lower)).sum()
         weight = 0.5 * (cho_solve((lower, True), np.eye(n)) - np.outer(alpha, alpha) / variance)
-        by_length = np.einsum("ij,ijd->d", weight * slope, self._squares) * -2.0 * np.exp(-2.0 * hyper[:-1])
+        by_length = (
+            np.einsum("ij,ijd->d", weight * slope, self._squares) * -2.0 * np.exp(-2.0 * hyper[:-1])
+        )
         return float(value), np.append(by_length, np.trace(weight) * np.exp(hyper[-1]))
 
     def predict(self, points: Array) -> Array:
@@ -99,7 +120,9 @@ class GaussianProcess:
         return mean
 
     def sample(self, points: Array, draws: int, rng: np.random.Generator) -> Array:
-        """Joint posterior draws (draws, m) at (m, dim), by a Cholesky factor of their covariance (2.26)."""
+        """Joint posterior draws (draws, m) at (m, dim), by a Cholesky factor of their covariance
+        (2.26).
+        """
         from scipy.linalg import solve_triangular
 
         cross, _ = self._correlation((points[:, None] - self.points) ** 2)
@@ -107,14 +130,19 @@ class GaussianProcess:
         explained = solve_triangular(self._lower, cross.T, lower=True)
         spread = _cholesky(prior - explained.T @ explained, 1e-10)
         noise = rng.standard_normal((draws, len(points)))
-        return np.asarray(self.mean + cross @ self._alpha + self.variance**0.5 * (noise @ spread.T), dtype=np.float64)
+        return np.asarray(
+            self.mean + cross @ self._alpha + self.variance**0.5 * (noise @ spread.T),
+            dtype=np.float64,
+        )
 
 
 def _cholesky(matrix: Array, jitter: float) -> Array:
     """Lower factor of matrix + jitter, with as much more jitter as it takes."""
     while True:
         try:
-            return np.asarray(np.linalg.cholesky(matrix + jitter * np.eye(len(matrix))), dtype=np.float64)
+            return np.asarray(
+                np.linalg.cholesky(matrix + jitter * np.eye(len(matrix))), dtype=np.float64
+            )
         except np.linalg.LinAlgError:
             jitter = max(10.0 * jitter, 1e-12)
 

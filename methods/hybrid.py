@@ -1,8 +1,9 @@
-"""A learned start and a least-squares finish: TuneNet (arXiv 1907.11200) while it pays, then Levenberg-Marquardt.
+"""A learned start and a least-squares finish: TuneNet (arXiv 1907.11200) while it pays, then
+Levenberg-Marquardt.
 
-The network's first steps are worth more than any search's, since it knows the simulator. Its last ones are not:
-outside its training range and under noise its estimate may settle where the simulation does not fit. The loss tells
-which it is.
+The network's first steps are worth more than any search's, since it knows the simulator. Its last
+ones are not: outside its training range and under noise its estimate may settle where the
+simulation does not fit. The loss tells which it is.
 """
 
 from __future__ import annotations
@@ -18,16 +19,20 @@ from methods.tunenet import SETTLED, Search, TuneNet
 
 _EXACT = 1e-13
 """Rounding: a loss below this share of the observation's root mean square."""
-_WHOLE = LeastSquares((1.0,), ahead=True, patience=2, damping=1e-6, step_tolerance=_EXACT, reproduced=_EXACT)
+_WHOLE = LeastSquares(
+    (1.0,), ahead=True, patience=2, damping=1e-6, step_tolerance=_EXACT, reproduced=_EXACT
+)
 """All samples at once, for a start that is near."""
 
 
 @dataclass(eq=False)
 class Hybrid(TuneNet):
-    """TuneNet as long as each step divides the loss; then least squares, which takes over what has been simulated.
+    """TuneNet as long as each step divides the loss; then least squares, which takes over what has
+    been simulated.
 
-    The finish begins at the lowest loss seen, with the secants of the points nearby in place of finite differences. It
-    fits all samples first, then with growing horizons, then from new starts (`methods.least_squares`).
+    The finish begins at the lowest loss seen, with the secants of the points nearby in place of
+    finite differences. It fits all samples first, then with growing horizons, then from new starts
+    (`methods.least_squares`).
 
     Attributes:
         pays: a network step pays if it brings the loss below this share of the lowest so far.
@@ -83,12 +88,16 @@ class Hybrid(TuneNet):
         return idle == 0
 
     def _model(self, run: Run, finish: LeastSquares) -> Simulates[Model]:
-        """The linear model at the lowest loss: secants to points nearby, finite differences in what they leave out."""
+        """The linear model at the lowest loss: secants to points nearby, finite differences in what
+        they leave out.
+        """
         best = int(np.nanargmin(np.where(np.isfinite(run.losses), run.losses, np.nan)))
         point, residual = run.tried[best], run.residuals[best]
         steps = np.array(run.tried) - point
         usable = np.isfinite(run.losses) & (np.abs(steps).max(axis=1) <= self.near)
-        usable &= np.abs(steps).max(axis=1) >= finish.smallest_difference  # nearer ones differ by rounding
+        usable &= (
+            np.abs(steps).max(axis=1) >= finish.smallest_difference
+        )  # nearer ones differ by rounding
         order = [i for i in np.argsort((steps**2).sum(axis=1), kind="stable") if usable[i]]
         basis: list[Array] = []
         chosen: list[int] = []
@@ -110,7 +119,9 @@ class Hybrid(TuneNet):
             changes += list(found[whole] - residual)
         if not changes:
             return Model(point, residual, np.zeros((len(residual), len(point))))
-        slopes = np.asarray(np.linalg.lstsq(directions, np.array(changes), rcond=None)[0], dtype=np.float64)
+        slopes = np.asarray(
+            np.linalg.lstsq(directions, np.array(changes), rcond=None)[0], dtype=np.float64
+        )
         return Model(point, residual, slopes.T)
 
 

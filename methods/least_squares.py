@@ -1,17 +1,20 @@
-"""Levenberg-Marquardt on the difference between simulated and observed samples: what a practitioner tries first.
+"""Levenberg-Marquardt on the difference between simulated and observed samples: what a practitioner
+tries first.
 
-Sources: D. W. Marquardt, An algorithm for least-squares estimation of nonlinear parameters, SIAM J. Appl. Math. 11(2),
-1963, doi:10.1137/0111030. J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., 2006, chapter 10,
-doi:10.1007/978-0-387-40065-5. H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05, Technical
-University of Denmark. K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, 2nd ed.,
-IMM lecture note, 2004, section 3.5 (the secant version). C. G. Broyden, A class of methods for solving nonlinear
-simultaneous equations, Math. Comp. 19, 1965, doi:10.1090/S0025-5718-1965-0198670-6.
+Sources: D. W. Marquardt, An algorithm for least-squares estimation of nonlinear parameters, SIAM J.
+Appl. Math. 11(2), 1963, doi:10.1137/0111030. J. Nocedal, S. J. Wright, Numerical Optimization, 2nd
+ed., 2006, chapter 10, doi:10.1007/978-0-387-40065-5. H. B. Nielsen, Damping parameter in
+Marquardt's method, IMM-REP-1999-05, Technical University of Denmark. K. Madsen, H. B. Nielsen, O.
+Tingleff, Methods for non-linear least squares problems, 2nd ed., IMM lecture note, 2004, section
+3.5 (the secant version). C. G. Broyden, A class of methods for solving nonlinear simultaneous
+equations, Math. Comp. 19, 1965, doi:10.1090/S0025-5718-1965-0198670-6.
 
-Two things go beyond the textbook. A small change of a parameter grows along a simulation until impacts fall into other
-time steps, so the residual as a whole is jagged, with many local minima, while its first part is smooth: the fit starts
-on the first samples of each run and takes in more of them step by step. (This is continuation from an easy problem to
-the hard one; C. Bunks et al. do it with the frequencies of seismic data, Geophysics 60(5), 1995,
-doi:10.1190/1.1443880.) And what remains of the budget is spent on new starts, far from everything tried so far.
+Two things go beyond the textbook. A small change of a parameter grows along a simulation until
+impacts fall into other time steps, so the residual as a whole is jagged, with many local minima,
+while its first part is smooth: the fit starts on the first samples of each run and takes in more of
+them step by step. (This is continuation from an easy problem to the hard one; C. Bunks et al. do it
+with the frequencies of seismic data, Geophysics 60(5), 1995, doi:10.1190/1.1443880.) And what
+remains of the budget is spent on new starts, far from everything tried so far.
 """
 
 from __future__ import annotations
@@ -33,24 +36,29 @@ Mask = NDArray[np.bool_]
 
 @dataclass(eq=False)
 class LeastSquares(Tuner):
-    """Levenberg-Marquardt with secant updates, a growing horizon and new starts; recommends the lowest loss seen.
+    """Levenberg-Marquardt with secant updates, a growing horizon and new starts; recommends the
+    lowest loss seen.
 
     `LeastSquares(horizons=(1.0,), secant=False, difference=1e-4, restart=False)` is the textbook's.
 
     Attributes:
-        horizons: shares of each run's samples to fit, one after another; (1.0,) fits all of them at once.
-        secant: keep the Jacobian up to date with Broyden's formula, and take finite differences anew only where that
-            fails; otherwise take finite differences after every step that succeeds.
-        difference: longest step of the finite differences, a share of the cube; it shrinks with the fit's own steps.
+        horizons: shares of each run's samples to fit, one after another; (1.0,) fits all of them at
+            once.
+        secant: keep the Jacobian up to date with Broyden's formula, and take finite differences
+            anew only where that fails; otherwise take finite differences after every step that
+            succeeds.
+        difference: longest step of the finite differences, a share of the cube; it shrinks with the
+            fit's own steps.
         smallest_difference: its lower limit.
         damping: first damping, relative to the squared sensitivities.
         patience: a fit is stuck after this many steps in succession without progress.
         progress: share by which a step must lower the sum of squares to count as progress.
         step_tolerance: a fit has converged when its step is shorter than this share of the cube.
         restart: whether to start again elsewhere when the target has not been reproduced.
-        reproduced: the target is reproduced when the loss is below this share of the observation's root mean square.
-        ahead: recommend a step before it is simulated where all samples are fitted and the last step did what the model
-            promised; otherwise the lowest loss seen.
+        reproduced: the target is reproduced when the loss is below this share of the observation's
+            root mean square.
+        ahead: recommend a step before it is simulated where all samples are fitted and the last
+            step did what the model promised; otherwise the lowest loss seen.
     """
 
     horizons: tuple[float, ...] = (0.0625, 0.09, 0.125, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)
@@ -79,7 +87,9 @@ class LeastSquares(Tuner):
         """One fit from `point`, of which nothing is known."""
         (residual,) = yield from run.simulate(point[None])
         if not np.isnan(residual).any():
-            yield from self.fit_model(run, (yield from self._differentiate(run, point, residual, self.difference)))
+            yield from self.fit_model(
+                run, (yield from self._differentiate(run, point, residual, self.difference))
+            )
 
     def fit_model(self, run: Run, model: Model) -> Simulates[None]:
         """One fit over all horizons, beginning with a model."""
@@ -90,8 +100,12 @@ class LeastSquares(Tuner):
             if run.finished:
                 return
 
-    def _differentiate(self, run: Run, point: Array, residual: Array, longest: float) -> Simulates[Model]:
-        """One-sided differences, inward at the upper border; to the other side where a simulation failed."""
+    def _differentiate(
+        self, run: Run, point: Array, residual: Array, longest: float
+    ) -> Simulates[Model]:
+        """One-sided differences, inward at the upper border; to the other side where a simulation
+        failed.
+        """
         h = min(max(longest, self.smallest_difference), self.difference)
         steps = np.where(point + h > 1.0, -h, h)
         moved = yield from run.simulate(point + np.diag(steps))
@@ -103,7 +117,9 @@ class LeastSquares(Tuner):
 
     def _descend(self, run: Run, model: Model, chosen: Mask) -> Simulates[Model]:
         """Levenberg-Marquardt on the chosen samples until they are fitted, or it is stuck."""
-        worthwhile = 1e-8 if chosen.all() else 0.1  # of the sum of squares; early horizons need not be polished
+        worthwhile = (
+            1e-8 if chosen.all() else 0.1
+        )  # of the sum of squares; early horizons need not be polished
         damping, stalled, failed = _Damping(self.damping), 0, 0
         while stalled < self.patience:
             before = model.error(chosen)
@@ -125,7 +141,9 @@ class LeastSquares(Tuner):
             if run.finished:
                 break
             if (better and not self.secant) or (failed == 2 and len(step) > 1):
-                model = yield from self._differentiate(run, model.point, model.residual, float(np.abs(step).max()))
+                model = yield from self._differentiate(
+                    run, model.point, model.residual, float(np.abs(step).max())
+                )
         return model
 
 
@@ -141,14 +159,17 @@ class _Damping:
         if gain > 0.0:
             self.mu, self.nu = self.mu * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 2.0
         elif np.isnan(gain):
-            self.mu = 4.0 * self.mu + 3.0  # a quarter of the step, where the parameters do not interact
+            self.mu = (
+                4.0 * self.mu + 3.0
+            )  # a quarter of the step, where the parameters do not interact
         else:
             self.mu, self.nu = self.mu * self.nu, self.nu * 2.0
 
 
 @dataclass
 class Model:
-    """The residual near a point: r(θ + s) ≈ residual + jacobian s; arrays (dim,), (samples,), (samples, dim).
+    """The residual near a point: r(θ + s) ≈ residual + jacobian s; arrays (dim,), (samples,),
+    (samples, dim).
 
     `trusted` where the last step did at least half of what was promised.
     """
@@ -167,7 +188,9 @@ class Model:
         return bool((self.jacobian[chosen] ** 2).mean() > 1e-6 * (self.jacobian**2).mean())
 
     def step(self, chosen: Mask, mu: float) -> tuple[Array, float]:
-        """(JᵀJ + μ diag JᵀJ) s = -Jᵀr within the cube, and the decrease of the sum of squares that it promises."""
+        """(JᵀJ + μ diag JᵀJ) s = -Jᵀr within the cube, and the decrease of the sum of squares that
+        it promises.
+        """
         r, jacobian = self.residual[chosen], self.jacobian[chosen]
         gradient = jacobian.T @ r
         free = ~((self.point <= 0.0) & (gradient > 0.0) | (self.point >= 1.0) & (gradient < 0.0))
@@ -209,7 +232,9 @@ class Run:
     def seen(self, evaluation: Evaluation) -> Array:
         """Note what was simulated; its residuals."""
         proposals, observations, losses = evaluation
-        residuals = np.where(np.isfinite(losses)[:, None], self.task.residuals(observations), np.nan)
+        residuals = np.where(
+            np.isfinite(losses)[:, None], self.task.residuals(observations), np.nan
+        )
         self.tried.extend(proposals)
         self.residuals.extend(residuals)
         self.losses.extend(losses.tolist())

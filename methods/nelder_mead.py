@@ -1,8 +1,9 @@
 """Nelder and Mead's simplex in a box, as nlopt has it (LN_NELDERMEAD).
 
-Sources: J. A. Nelder, R. Mead, A simplex method for function minimization, The Computer Journal 7(4), 1965,
-doi:10.1093/comjnl/7.4.308; the treatment of bounds: M. J. Box, The Computer Journal 8(1), 1965,
-doi:10.1093/comjnl/8.1.42; S. G. Johnson, The NLopt nonlinear-optimization package, https://github.com/stevengj/nlopt.
+Sources: J. A. Nelder, R. Mead, A simplex method for function minimization, The Computer Journal
+7(4), 1965, doi:10.1093/comjnl/7.4.308; the treatment of bounds: M. J. Box, The Computer Journal
+8(1), 1965, doi:10.1093/comjnl/8.1.42; S. G. Johnson, The NLopt nonlinear-optimization package,
+https://github.com/stevengj/nlopt.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ class NelderMead(Tuner):
     """nlopt's simplex from the start on; recommends the lowest loss seen.
 
     Attributes:
-        initial_step: edge of the first simplex, a share of the cube; None for nlopt's own choice, which depends on the
-            distance of the start from the bounds.
-        step_tolerance: nlopt's absolute tolerance on the parameters; 0 goes on to the limit of rounding.
+        initial_step: edge of the first simplex, a share of the cube; None for nlopt's own choice,
+            which depends on the distance of the start from the bounds.
+        step_tolerance: nlopt's absolute tolerance on the parameters; 0 goes on to the limit of
+            rounding.
     """
 
     requires = ("nlopt",)

@@ -1,9 +1,11 @@
-"""Neural posterior estimation: a normalising flow learns p(parameters | observation) from simulations.
+"""Neural posterior estimation: a normalising flow learns p(parameters | observation) from
+simulations.
 
-Sources: G. Papamakarios, I. Murray, Fast ε-free inference of simulation models with Bayesian conditional density
-estimation, NeurIPS 2016, arXiv 1605.06376; D. Greenberg, M. Nonnenmacher, J. Macke, Automatic posterior transformation
-for likelihood-free inference, ICML 2019, arXiv 1905.07488; the flow: G. Papamakarios, T. Pavlakou, I. Murray, Masked
-autoregressive flow for density estimation, NeurIPS 2017, arXiv 1705.07057. Built and trained by the `sbi` package (JOSS
+Sources: G. Papamakarios, I. Murray, Fast ε-free inference of simulation models with Bayesian
+conditional density estimation, NeurIPS 2016, arXiv 1605.06376; D. Greenberg, M. Nonnenmacher, J.
+Macke, Automatic posterior transformation for likelihood-free inference, ICML 2019, arXiv
+1905.07488; the flow: G. Papamakarios, T. Pavlakou, I. Murray, Masked autoregressive flow for
+density estimation, NeurIPS 2017, arXiv 1705.07057. Built and trained by the `sbi` package (JOSS
 5(52), 2020, doi:10.21105/joss.02505), which is an optional extra: pip install simgap[npe].
 """
 
@@ -23,9 +25,11 @@ from methods.learning.rehearsal import rehearse
 
 @dataclass(eq=False)
 class NPE(Tuner):
-    """Recommends the mean of the learned posterior, simulates it, then draws from it and keeps the lowest loss.
+    """Recommends the mean of the learned posterior, simulates it, then draws from it and keeps the
+    lowest loss.
 
-    It reads the same numbers of an observation as TuneNet does (`methods.learning.pair_inputs`), of the target alone.
+    It reads the same numbers of an observation as TuneNet does (`methods.learning.pair_inputs`), of
+    the target alone.
 
     Attributes:
         scenarios: training scenarios, at most as many as the budget allows.
@@ -33,11 +37,12 @@ class NPE(Tuner):
         points: points to which each run is resampled.
         inputs: inputs kept of those an observation offers.
         strictness: see `methods.learning.pair_inputs.weighed_inputs`.
-        noise: sensor noise that every second training observation gets, 1 sigma, in units of each channel's standard
-            deviation in training.
+        noise: sensor noise that every second training observation gets, 1 sigma, in units of each
+            channel's standard deviation in training.
         hidden: units of each layer of the flow.
         transforms: autoregressive layers of the flow.
-        epochs: passes over the training data at most; it stops when the held-out loss no longer falls.
+        epochs: passes over the training data at most; it stops when the held-out loss no longer
+            falls.
         draws: posterior samples behind the mean.
         told: as in `methods.tunenet.TuneNet`.
     """
@@ -66,7 +71,9 @@ class NPE(Tuner):
         Raises:
             ValueError: a budget of less than two scenarios.
         """
-        data = rehearse(simulator, rng, budget, self.scenarios, max(self.each, 2 * (simulator.dim + 1)))
+        data = rehearse(
+            simulator, rng, budget, self.scenarios, max(self.each, 2 * (simulator.dim + 1))
+        )
         spoilt = data.spoilt(self.noise * data.flat.std(axis=(0, 1)), rng)
         self._read = read = Reader.learned(data, self._reading())
         rows = np.concatenate([read.table(some).reshape(-1, read.size) for some in (data, spoilt)])
@@ -74,9 +81,13 @@ class NPE(Tuner):
         with quietly(rng):
             from sbi import inference
 
-            trainer = inference.NPE(density_estimator=self._builder(), tracker=Silent(), show_progress_bars=False)
+            trainer = inference.NPE(
+                density_estimator=self._builder(), tracker=Silent(), show_progress_bars=False
+            )
             trainer.append_simulations(_tensor(theta), _tensor(rows))
-            self._flow = trainer.train(max_num_epochs=self.epochs, training_batch_size=min(100, len(rows) // 4))
+            self._flow = trainer.train(
+                max_num_epochs=self.epochs, training_batch_size=min(100, len(rows) // 4)
+            )
 
     def _reading(self) -> Reading:
         return Reading(self.points, self.inputs, self.strictness, told=self.told)
@@ -93,7 +104,9 @@ class NPE(Tuner):
         """The flow's tensors and what it reads, by name; empty before `fit`."""
         if self._read is None:
             return {}
-        tensors = {f"flow.{name}": np.array(t.numpy()) for name, t in self._flow.state_dict().items()}
+        tensors = {
+            f"flow.{name}": np.array(t.numpy()) for name, t in self._flow.state_dict().items()
+        }
         return tensors | self._read.state()
 
     def restore(self, state: dict[str, Array]) -> None:
@@ -103,11 +116,17 @@ class NPE(Tuner):
             ValueError: arrays of other names or shapes, or numbers that are not finite.
         """
         flow = {name: array for name, array in state.items() if name.startswith("flow.")}
-        read, foreign = Reader.restored({n: a for n, a in state.items() if n not in flow}, self._reading())
+        read, foreign = Reader.restored(
+            {n: a for n, a in state.items() if n not in flow}, self._reading()
+        )
         broken = [name for name, array in flow.items() if not np.isfinite(array).all()]
         if foreign or broken:
-            raise ValueError(f"array {[*foreign, *broken][0]}: expected an array of the flow, of finite numbers")
-        self._flow = self._rebuilt({name.removeprefix("flow."): a for name, a in flow.items()}, read.size)
+            raise ValueError(
+                f"array {[*foreign, *broken][0]}: expected an array of the flow, of finite numbers"
+            )
+        self._flow = self._rebuilt(
+            {name.removeprefix("flow."): a for name, a in flow.items()}, read.size
+        )
         self._read = read
 
     def _rebuilt(self, arrays: dict[str, Array], inputs: int) -> Any:
@@ -120,11 +139,17 @@ class NPE(Tuner):
             raise ValueError("expected the arrays of a flow, found others")
         rng = np.random.default_rng(0)
         with quietly(rng):
-            flow = self._builder()(*(_tensor(rng.standard_normal((4, size))) for size in (dim, inputs)))
+            flow = self._builder()(
+                *(_tensor(rng.standard_normal((4, size))) for size in (dim, inputs))
+            )
             try:
-                flow.load_state_dict({name: torch.from_numpy(np.array(a)) for name, a in arrays.items()})
+                flow.load_state_dict(
+                    {name: torch.from_numpy(np.array(a)) for name, a in arrays.items()}
+                )
             except (RuntimeError, TypeError) as error:
-                raise ValueError(f"expected the arrays of a flow: {' '.join(str(error).split())[:200]}") from None
+                raise ValueError(
+                    f"expected the arrays of a flow: {' '.join(str(error).split())[:200]}"
+                ) from None
         return flow
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
@@ -133,7 +158,11 @@ class NPE(Tuner):
             raise RuntimeError("npe has not been trained; call fit or restore first")
         row = self._read(task.observed[None], task.lengths, task.scene)
         with quietly(rng):
-            drawn = self._flow.sample((max(self.draws, task.budget),), condition=_tensor(row)).detach()[:, 0].numpy()
+            drawn = (
+                self._flow.sample((max(self.draws, task.budget),), condition=_tensor(row))
+                .detach()[:, 0]
+                .numpy()
+            )
         drawn = np.clip(np.nan_to_num(drawn.astype(np.float64), nan=0.5), 0.0, 1.0)
         mean = drawn.mean(axis=0)
         yield Ask(mean, recommend=mean)

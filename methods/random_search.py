@@ -1,6 +1,7 @@
 """Uniform random search, the yardstick below which no tuner should fall.
 
-Source: J. Bergstra, Y. Bengio, Random search for hyper-parameter optimization, JMLR 13, 2012, pages 281-305.
+Source: J. Bergstra, Y. Bengio, Random search for hyper-parameter optimization, JMLR 13, 2012, pages
+281-305.
 """
 
 from __future__ import annotations

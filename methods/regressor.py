@@ -15,12 +15,15 @@ from methods.learning.reader import Reading
 
 @dataclass(eq=False)
 class Regressor(PairTuner):
-    """TuneNet's network on the target alone: its proposed input is zero, its output the parameters themselves.
+    """TuneNet's network on the target alone: its proposed input is zero, its output the parameters
+    themselves.
 
-    It needs no simulation of the target: it recommends its one estimate from the beginning, simulates it, and stops.
+    It needs no simulation of the target: it recommends its one estimate from the beginning,
+    simulates it, and stops.
 
     Attributes:
-        published: the network and training of the authors' released code; other options are ignored except `points`.
+        published: the network and training of the authors' released code; other options are ignored
+            except `points`.
         scenarios: training scenarios, at most as many as the budget allows.
         each: simulations in each scenario, at least 2 (dim + 1).
         points: points to which each run is resampled.
@@ -30,8 +33,10 @@ class Regressor(PairTuner):
         epochs: passes over the training data.
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
-        told: read what is known of the scenario too, where scenarios differ in it (`methods.learning.circumstances`).
-        channels: first and last channel that is read, by number, where targets do not show the others; None for all.
+        told: read what is known of the scenario too, where scenarios differ in it
+            (`methods.learning.circumstances`).
+        channels: first and last channel that is read, by number, where targets do not show the
+            others; None for all.
         clean: as in `methods.tunenet.TuneNet`.
     """
 
@@ -56,16 +61,23 @@ class Regressor(PairTuner):
         """How the network is built and trained."""
         if self.published:
             return PUBLISHED
-        return Design(antisymmetric=False, epochs=self.epochs, rate=self.rate, weight_decay=self.weight_decay)
+        return Design(
+            antisymmetric=False, epochs=self.epochs, rate=self.rate, weight_decay=self.weight_decay
+        )
 
     def reading(self) -> Reading:
         """What it reads."""
         if self.published:
             return Reading(self.points, noise=0.0, raw=True)
         return Reading(
-            self.points, self.inputs, self.strictness, self.noise,
-            told=self.told, channels=self.channels, clean=self.clean,
-        )  # fmt: skip
+            self.points,
+            self.inputs,
+            self.strictness,
+            self.noise,
+            told=self.told,
+            channels=self.channels,
+            clean=self.clean,
+        )
 
     def layout(self, dim: int) -> tuple[int, int]:
         """Training scenarios at most, and simulations in each."""

@@ -16,30 +16,39 @@ from methods.learning.reader import Reading
 
 @dataclass(eq=False)
 class TuneNet(PairTuner):
-    """A network trained on pairs of simulations estimates the parameter difference from two observations.
+    """A network trained on pairs of simulations estimates the parameter difference from two
+    observations.
 
-    Algorithm 1 adds that estimate to the guess, simulates the new guess, and repeats; it recommends its newest guess.
+    Algorithm 1 adds that estimate to the guess, simulates the new guess, and repeats; it recommends
+    its newest guess.
 
-    The default differs from the published method in what the network sees (`methods.learning.pair_inputs`), in its training
-    (`methods.learning.pair_network.Design`), in h(o, o) = 0 by construction, and in the step: the estimates are read as the
-    residuals of an equation h = 0, solved by Broyden's method (Math. Comp. 19, 1965; in one dimension the secant),
-    which starts as Algorithm 1 does and converges where the network's scale is wrong, as outside its training range.
+    The default differs from the published method in what the network sees
+    (`methods.learning.pair_inputs`), in its training (`methods.learning.pair_network.Design`), in
+    h(o, o) = 0 by construction, and in the step: the estimates are read as the residuals of an
+    equation h = 0, solved by Broyden's method (Math. Comp. 19, 1965; in one dimension the secant),
+    which starts as Algorithm 1 does and converges where the network's scale is wrong, as outside
+    its training range.
 
     Attributes:
         scenarios: training scenarios, at most as many as the budget allows.
-        each: simulations in each scenario, at least 2 (dim + 1); every two of them are a training pair.
+        each: simulations in each scenario, at least 2 (dim + 1); every two of them are a training
+            pair.
         points: points to which each run is resampled; L in Algorithm 1.
         inputs: inputs kept of those an observation offers.
         strictness: see `methods.learning.pair_inputs.weighed_inputs`.
-        noise: sensor noise that a second network prepares for, 1 sigma, in units of each channel's standard deviation
-            in training; used where the target is rougher than the simulations. 0 for no second network.
+        noise: sensor noise that a second network prepares for, 1 sigma, in units of each channel's
+            standard deviation in training; used where the target is rougher than the simulations. 0
+            for no second network.
         epochs: passes over the training data.
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
-        told: read what is known of the scenario too, where scenarios differ in it (`methods.learning.circumstances`).
-        channels: first and last channel that is read, by number, where targets do not show the others; None for all.
-        clean: whether targets may be as clean as simulations. False for a sensor whose errors last for many samples: a
-            smooth target is no clean one then, and there is one network, trained with `noise`.
+        told: read what is known of the scenario too, where scenarios differ in it
+            (`methods.learning.circumstances`).
+        channels: first and last channel that is read, by number, where targets do not show the
+            others; None for all.
+        clean: whether targets may be as clean as simulations. False for a sensor whose errors last
+            for many samples: a smooth target is no clean one then, and there is one network,
+            trained with `noise`.
         broyden: solve h = 0; without it each step is that of Algorithm 1.
     """
 
@@ -66,9 +75,14 @@ class TuneNet(PairTuner):
     def reading(self) -> Reading:
         """What it reads."""
         return Reading(
-            self.points, self.inputs, self.strictness, self.noise,
-            told=self.told, channels=self.channels, clean=self.clean,
-        )  # fmt: skip
+            self.points,
+            self.inputs,
+            self.strictness,
+            self.noise,
+            told=self.told,
+            channels=self.channels,
+            clean=self.clean,
+        )
 
     def layout(self, dim: int) -> tuple[int, int]:
         """Training scenarios at most, and simulations in each."""
@@ -91,7 +105,8 @@ class TuneNet(PairTuner):
 
 @dataclass(eq=False)
 class TuneNetPublished(PairTuner):
-    """The network, training, data and steps of the authors' released code: TuneNet as it was published.
+    """The network, training, data and steps of the authors' released code: TuneNet as it was
+    published.
 
     Attributes:
         points: points to which each run is resampled; L in Algorithm 1.
@@ -136,7 +151,9 @@ _REACH = 10.0
 
 
 class Search:
-    """Broyden's method on h(simulation of x, target) = 0, beginning with the step of Algorithm 1: slope -1."""
+    """Broyden's method on h(simulation of x, target) = 0, beginning with the step of Algorithm 1:
+    slope -1.
+    """
 
     def __init__(self, task: Task) -> None:
         self._slope = -np.eye(task.dim)
@@ -154,7 +171,9 @@ class Search:
         if self._last is not None:
             step, change = point - self._last[0], residual - self._last[1]
             if step @ step > 0.0:
-                self._slope = self._slope + np.outer(change - self._slope @ step, step) / (step @ step)
+                self._slope = self._slope + np.outer(change - self._slope @ step, step) / (
+                    step @ step
+                )
         self._last = point, residual
         if self._residual is None or residual @ residual < self._residual @ self._residual:
             self.best, self._residual, self._setbacks = point, residual, 0
@@ -164,9 +183,11 @@ class Search:
         return self._bracketed(guess, point, residual) if len(point) == 1 else guess
 
     def _step(self, residual: Array) -> Array:
-        """Broyden's step from the best point, at most twice Algorithm 1's; the latter where the former turns back.
+        """Broyden's step from the best point, at most twice Algorithm 1's; the latter where the
+        former turns back.
 
-        The first setback has its remedy in the slope that it taught; after more of them the step is halved each time.
+        The first setback has its remedy in the slope that it taught; after more of them the step is
+        halved each time.
         """
         try:
             step = np.linalg.solve(self._slope, -residual)
@@ -174,15 +195,18 @@ class Search:
             step = residual
         if not step @ residual > 0.0:
             step = residual
-        longest = _LONGEST * float(np.linalg.norm(residual)) / max(float(np.linalg.norm(step)), 1e-300)
+        longest = (
+            _LONGEST * float(np.linalg.norm(residual)) / max(float(np.linalg.norm(step)), 1e-300)
+        )
         share = min(1.0, longest) / 2.0 ** max(self._setbacks - 1, 0)
         return np.asarray(step * share, dtype=np.float64)
 
     def _bracketed(self, guess: Array, point: Array, residual: Array) -> Array:
-        """In one dimension, after a setback, keep between a point that was too low and one that was too high.
+        """In one dimension, after a setback, keep between a point that was too low and one that was
+        too high.
 
-        Halfway to the other end is far where that was one of the first points; what is nearly right already then needs
-        no such step, and where the estimates are rough it would be lost.
+        Halfway to the other end is far where that was one of the first points; what is nearly right
+        already then needs no such step, and where the estimates are rough it would be lost.
         """
         if residual[0] > 0.0:
             self._low = max(self._low, point[0])
@@ -190,7 +214,9 @@ class Search:
             self._high = min(self._high, point[0])
         known = np.isfinite([self._low, self._high]).all() and self._low < self._high
         if self._setbacks and known and not self._low < guess[0] < self._high:
-            far = _REACH * float(np.abs(self._residual).max()) if self._residual is not None else 1.0
+            far = (
+                _REACH * float(np.abs(self._residual).max()) if self._residual is not None else 1.0
+            )
             halfway = np.array([(self._low + self._high) / 2.0])
             inside: Array = np.clip(halfway, self.best - far, self.best + far)
             return inside

@@ -1,4 +1,6 @@
-"""TuneNet on vision: simulated heights against what a tracker saw; Allevato et al., CoRL 2019, arXiv 1907.11200."""
+"""TuneNet on vision: simulated heights against what a tracker saw; Allevato et al., CoRL 2019,
+arXiv 1907.11200.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +17,19 @@ _LAST = 1_000_000
 
 @dataclass(eq=False)
 class TuneNetVision(TuneNet):
-    """TuneNet with another sensor on the target's side: the network itself learns how the two correspond.
+    """TuneNet with another sensor on the target's side: the network itself learns how the two
+    correspond.
 
-    The proposed side reads the first channel of the simulation, as `z` of simulator ball-filmed; the target's side
-    reads the other channels of the target, as the pixel row `v`, and nothing of what is known of the camera, as
-    published. Gaps of the target are bridged by the proposed model (`methods.learning.bridging`). Where there is one channel
-    both sides read it. Inputs, training and the step are otherwise those of `methods.tunenet.TuneNet`; h(o, o) = 0
-    cannot hold by construction, since no target is seen as a simulation is.
+    The proposed side reads the first channel of the simulation, as `z` of simulator ball-filmed;
+    the target's side reads the other channels of the target, as the pixel row `v`, and nothing of
+    what is known of the camera, as published. Gaps of the target are bridged by the proposed model
+    (`methods.learning.bridging`). Where there is one channel both sides read it. Inputs, training
+    and the step are otherwise those of `methods.tunenet.TuneNet`; h(o, o) = 0 cannot hold by
+    construction, since no target is seen as a simulation is.
 
     Attributes:
-        scenarios: training scenarios, each with a camera of its own, at most as many as the budget allows.
+        scenarios: training scenarios, each with a camera of its own, at most as many as the budget
+            allows.
         noise: of the tracker, 1 sigma, in units of the channel's standard deviation in training.
         clean: as in TuneNet; a tracker's errors do last.
         told: read what is known of the scenario, such as where the camera stands.

@@ -1,9 +1,10 @@
 """TuRBO-1: Bayesian optimisation in one trust region, with Thompson sampling.
 
-Sources: D. Eriksson, M. Pearce, J. Gardner, R. Turner, M. Poloczek, Scalable global optimization via local Bayesian
-optimization, NeurIPS 2019, arXiv 1910.01739 (section 2; constants from its supplement); M. Balandat et al., BoTorch: a
-framework for efficient Monte-Carlo Bayesian optimization, NeurIPS 2020, arXiv 1910.06403. Gaussian process and sampling
-are the `botorch` package's, which is an optional extra: pip install simgap[turbo].
+Sources: D. Eriksson, M. Pearce, J. Gardner, R. Turner, M. Poloczek, Scalable global optimization
+via local Bayesian optimization, NeurIPS 2019, arXiv 1910.01739 (section 2; constants from its
+supplement); M. Balandat et al., BoTorch: a framework for efficient Monte-Carlo Bayesian
+optimization, NeurIPS 2020, arXiv 1910.06403. Gaussian process and sampling are the `botorch`
+package's, which is an optional extra: pip install simgap[turbo].
 """
 
 from __future__ import annotations
@@ -21,18 +22,21 @@ from methods.learning.quiet import quietly
 
 @dataclass(eq=False)
 class TuRBO(Tuner):
-    """A box around the best point that grows with successes and shrinks with failures; recommends the lowest loss.
+    """A box around the best point that grows with successes and shrinks with failures; recommends
+    the lowest loss.
 
-    Where the box has shrunk below its smallest length, it starts again elsewhere with new initial points.
+    Where the box has shrunk below its smallest length, it starts again elsewhere with new initial
+    points.
 
     Attributes:
-        initial: points before the first model, per parameter, the start included; at least 2 in all.
+        initial: points before the first model, per parameter, the start included; at least 2 in
+            all.
         candidates: points among which a Thompson sample is compared.
         length: first side of the trust region, unit cube.
         longest: its largest side.
         shortest: below this side it starts again.
-        successes: improvements in succession after which the side is doubled; it is halved after as many failures in
-            succession as there are parameters, at least 4.
+        successes: improvements in succession after which the side is doubled; it is halved after as
+            many failures in succession as there are parameters, at least 4.
     """
 
     name: ClassVar[str] = "turbo"
@@ -46,7 +50,9 @@ class TuRBO(Tuner):
     successes: int = 3
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
-        """Initial points, then one Thompson sample at a time; again from new points when the region has collapsed."""
+        """Initial points, then one Thompson sample at a time; again from new points when the region
+        has collapsed.
+        """
         first: Array | None = task.start
         while True:
             points = list(_spread(rng, max(2, self.initial * task.dim), task.dim))
@@ -72,7 +78,9 @@ class TuRBO(Tuner):
             points, losses = np.vstack([points, point]), np.append(losses, loss)
         return None
 
-    def _sampled(self, points: Array, losses: Array, length: float, rng: np.random.Generator) -> Array:
+    def _sampled(
+        self, points: Array, losses: Array, length: float, rng: np.random.Generator
+    ) -> Array:
         """The best of a Thompson sample of the process over candidates in the trust region."""
         import torch
 
@@ -90,12 +98,16 @@ class TuRBO(Tuner):
             sides = length * sides / np.exp(np.log(sides).mean())
             candidates = self._candidates(points[values.argmin()], sides, rng)
             with torch.no_grad():
-                chosen = MaxPosteriorSampling(model=model, replacement=False)(torch.from_numpy(candidates))
+                chosen = MaxPosteriorSampling(model=model, replacement=False)(
+                    torch.from_numpy(candidates)
+                )
             best: Array = np.clip(chosen.numpy()[0].astype(np.float64), 0.0, 1.0)
         return best
 
     def _candidates(self, centre: Array, sides: Array, rng: np.random.Generator) -> Array:
-        """Points in the box around `centre`; in many dimensions each differs from it in about 20 of them."""
+        """Points in the box around `centre`; in many dimensions each differs from it in about 20 of
+        them.
+        """
         low, high = np.clip(centre - sides / 2.0, 0.0, 1.0), np.clip(centre + sides / 2.0, 0.0, 1.0)
         spread = low + (high - low) * _spread(rng, self.candidates, len(centre))
         moved = rng.uniform(size=spread.shape) <= min(20.0 / len(centre), 1.0)
@@ -124,10 +136,14 @@ def _process(points: Array, values: Array) -> Any:
     from gpytorch.likelihoods import GaussianLikelihood
     from gpytorch.mlls import ExactMarginalLogLikelihood
 
-    kernel = MaternKernel(nu=2.5, ard_num_dims=points.shape[1], lengthscale_constraint=Interval(0.005, 4.0))
+    kernel = MaternKernel(
+        nu=2.5, ard_num_dims=points.shape[1], lengthscale_constraint=Interval(0.005, 4.0)
+    )
     likelihood = GaussianLikelihood(noise_constraint=Interval(1e-8, 1e-3))
     x, y = torch.from_numpy(points), torch.from_numpy(values)[:, None]
-    model = SingleTaskGP(x, y, covar_module=ScaleKernel(kernel), likelihood=likelihood, outcome_transform=None)
+    model = SingleTaskGP(
+        x, y, covar_module=ScaleKernel(kernel), likelihood=likelihood, outcome_transform=None
+    )
     with suppress(ModelFittingError):  # the kernel as it stands serves as well
         fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
     return model.eval()

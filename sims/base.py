@@ -1,8 +1,8 @@
 """Contracts of the simulated worlds: parameters, channels, scenarios, simulators.
 
-Nothing in this module knows an engine. A simulator maps *parameters x scenario* to an *observation*; everything a
-tuner may change is a `Parameter`, everything the experimenter controls or knows is in the `Scenario`, everything the
-sensors give is a `Channel`. All numbers are SI.
+Nothing in this module knows an engine. A simulator maps *parameters x scenario* to an
+*observation*; everything a tuner may change is a `Parameter`, everything the experimenter controls
+or knows is in the `Scenario`, everything the sensors give is a `Channel`. All numbers are SI.
 """
 
 from __future__ import annotations
@@ -19,10 +19,13 @@ Array = NDArray[np.float64]
 
 
 class InputError(ValueError):
-    """Something the user gave cannot be used; the message is one line: what was expected, found, and what to do."""
+    """Something the user gave cannot be used; the message is one line: what was expected, found,
+    and what to do.
+    """
 
     def __init__(self, message: str) -> None:
-        # Names and cells from a user's file may hold anything; what would break the line or a terminal is escaped.
+        # Names and cells from a user's file may hold anything; what would break the line or a
+        # terminal is escaped.
         super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in message))
 
 
@@ -47,7 +50,8 @@ class Parameter:
         unit: SI unit, ``1`` for a pure number.
         nominal: the value one would use knowing nothing of the target.
         bounds: physically possible range; the search box of every tuner.
-        training: the part of `bounds` that learned tuners may see while training (default: all of it).
+        training: the part of `bounds` that learned tuners may see while training (default: all of
+            it).
         log: whether the unit cube is logarithmic in this parameter.
         says: one sentence a person understands.
     """
@@ -63,13 +67,17 @@ class Parameter:
     def __post_init__(self) -> None:
         low, high = self.bounds
         if not (np.isfinite([low, high]).all() and low < high):
-            raise InputError(f"parameter {self.name}: bounds must be finite and increasing, found {self.bounds}")
+            raise InputError(
+                f"parameter {self.name}: bounds must be finite and increasing, found {self.bounds}"
+            )
         if self.log and low <= 0:
             raise InputError(
                 f"parameter {self.name}: a log-scaled parameter needs positive bounds, found {self.bounds}"
             )
         if not low <= self.nominal <= high:
-            raise InputError(f"parameter {self.name}: nominal {self.nominal} lies outside its bounds {self.bounds}")
+            raise InputError(
+                f"parameter {self.name}: nominal {self.nominal} lies outside its bounds {self.bounds}"
+            )
         inner_low, inner_high = self.training_range
         if not low <= inner_low < inner_high <= high:
             raise InputError(
@@ -89,7 +97,8 @@ class Channel:
     Attributes:
         name: e.g. ``z``.
         unit: SI unit.
-        scale: a typical magnitude in that unit; weighs channels against each other where no sensor noise is known.
+        scale: a typical magnitude in that unit; weighs channels against each other where no sensor
+            noise is known.
         says: one sentence a person understands.
     """
 
@@ -101,7 +110,9 @@ class Channel:
 
 @dataclass(frozen=True)
 class Constant:
-    """A number of a system that is known, not tuned: name, unit, default, one sentence, whether it must be > 0."""
+    """A number of a system that is known, not tuned: name, unit, default, one sentence, whether it
+    must be > 0.
+    """
 
     name: str
     unit: str
@@ -115,7 +126,8 @@ class Scenario:
     """What the experimenter controls or knows of one run.
 
     Attributes:
-        times: sample times (T,) in seconds, increasing; the state at ``times[0]`` is the initial state.
+        times: sample times (T,) in seconds, increasing; the state at ``times[0]`` is the initial
+            state.
         initial: initial state by name, SI units; what is left out takes the system's default.
         inputs: input signals by name, each (T,), held constant from one sample to the next.
         constants: constants that differ from the simulator's own in this run.
@@ -128,12 +140,21 @@ class Scenario:
 
     def __post_init__(self) -> None:
         times = frozen(self.times)
-        if times.ndim != 1 or times.size == 0 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise InputError("a scenario's times must be finite and increasing, at least one sample")
+        if (
+            times.ndim != 1
+            or times.size == 0
+            or not np.isfinite(times).all()
+            or (np.diff(times) <= 0).any()
+        ):
+            raise InputError(
+                "a scenario's times must be finite and increasing, at least one sample"
+            )
         inputs = {name: frozen(signal) for name, signal in self.inputs.items()}
         for name, signal in inputs.items():
             if signal.shape != times.shape:
-                raise InputError(f"input '{name}' has shape {signal.shape}, the scenario has {times.size} samples")
+                raise InputError(
+                    f"input '{name}' has shape {signal.shape}, the scenario has {times.size} samples"
+                )
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "inputs", inputs)
         object.__setattr__(self, "initial", {k: float(v) for k, v in self.initial.items()})
@@ -143,8 +164,8 @@ class Scenario:
 class UnitCube:
     """The map between physical parameters and the unit cube in which every tuner works.
 
-    0..1 spans each parameter's `bounds`, linearly, or logarithmically for log-scaled parameters. This is the only place
-    where that map is made.
+    0..1 spans each parameter's `bounds`, linearly, or logarithmically for log-scaled parameters.
+    This is the only place where that map is made.
     """
 
     def __init__(self, parameters: Sequence[Parameter]) -> None:
@@ -154,7 +175,9 @@ class UnitCube:
         bounds = np.array([p.bounds for p in self.parameters], dtype=np.float64).reshape(-1, 2)
         self._low, self._high = self._scaled(bounds.T)
         self._span = self._high - self._low
-        self.training: Array = frozen(self.inverse(np.array([p.training_range for p in self.parameters]).T))
+        self.training: Array = frozen(
+            self.inverse(np.array([p.training_range for p in self.parameters]).T)
+        )
 
     @property
     def dim(self) -> int:
@@ -189,8 +212,9 @@ class UnitCube:
 class Simulator(ABC):
     """Parameters x scenario -> observation, many parameter vectors at once.
 
-    A subclass declares what it is in class attributes and implements `simulate`. The same parameters and scenario must
-    give the same observation bit for bit, whatever was simulated before.
+    A subclass declares what it is in class attributes and implements `simulate`. The same
+    parameters and scenario must give the same observation bit for bit, whatever was simulated
+    before.
 
     Attributes:
         parameters: what may be tuned, in the order of a parameter vector's entries.
@@ -210,36 +234,46 @@ class Simulator(ABC):
     states: Mapping[str, float] = {}
     requires: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, constants: Mapping[str, float] | None = None, observe: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, constants: Mapping[str, float] | None = None, observe: Sequence[str] | None = None
+    ) -> None:
         """Set the constants and choose what is observed.
 
         Args:
             constants: values for `constants` other than their defaults.
-            observe: names of the channels to return, in this order (default: all the system has); `channels` then
-                holds these, and `columns` where they stand among the system's.
+            observe: names of the channels to return, in this order (default: all the system has);
+                `channels` then holds these, and `columns` where they stand among the system's.
 
         Raises:
-            InputError: for a constant or channel the simulator does not have, or an impossible value.
+            InputError: for a constant or channel the simulator does not have, or an impossible
+                value.
         """
-        self.constant_values = self._constants({c.name: c.value for c in self.constants}, constants or {})
+        self.constant_values = self._constants(
+            {c.name: c.value for c in self.constants}, constants or {}
+        )
         names = [c.name for c in self.channels]
         chosen = names if observe is None else list(observe)
         for name in chosen:
             if name not in names:
                 raise unknown(f"channel of simulator {self.name}", name, names)
         if not chosen or len(set(chosen)) < len(chosen):
-            raise InputError(f"simulator {self.name}: observe needs one or more different channels, found {chosen}")
+            raise InputError(
+                f"simulator {self.name}: observe needs one or more different channels, found {chosen}"
+            )
         self.columns = [names.index(name) for name in chosen]
         self.channels = tuple(self.channels[i] for i in self.columns)
 
     @abstractmethod
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
-        """Simulate each row of `theta` (n, dim), physical units; returns observations (n, T, C), SI units.
+        """Simulate each row of `theta` (n, dim), physical units; returns observations (n, T, C), SI
+        units.
 
-        A lane whose simulation fails numerically is filled with NaN; it never spoils its neighbours.
+        A lane whose simulation fails numerically is filled with NaN; it never spoils its
+        neighbours.
 
         Raises:
-            InputError: the scenario names a constant, input or initial state that the simulator does not have.
+            InputError: the scenario names a constant, input or initial state that the simulator
+                does not have.
         """
 
     def close(self) -> None:
@@ -258,24 +292,35 @@ class Simulator(ABC):
         known = {c.name: np.zeros(scenario.times.size) for c in self.inputs}
         return self._checked("input", known, scenario.inputs)
 
-    def _constants(self, known: Mapping[str, float], given: Mapping[str, float]) -> dict[str, float]:
+    def _constants(
+        self, known: Mapping[str, float], given: Mapping[str, float]
+    ) -> dict[str, float]:
         values = self._checked("constant", known, given)
         for c in self.constants:
             if c.positive and values[c.name] <= 0:
-                raise InputError(f"constant '{c.name}' of simulator {self.name} must be > 0, found {values[c.name]}")
+                raise InputError(
+                    f"constant '{c.name}' of simulator {self.name} must be > 0, found {values[c.name]}"
+                )
         return values
 
-    def _checked(self, kind: str, known: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    def _checked(
+        self, kind: str, known: Mapping[str, Any], given: Mapping[str, Any]
+    ) -> dict[str, Any]:
         for name, value in given.items():
             if name not in known:
                 raise unknown(f"{kind} of simulator {self.name}", name, list(known) or ["none"])
             if not np.isfinite(value).all():
-                raise InputError(f"{kind} '{name}' of simulator {self.name} must be finite, found {value}")
+                raise InputError(
+                    f"{kind} '{name}' of simulator {self.name} must be finite, found {value}"
+                )
         return {**known, **given}
 
 
-def adjusted(parameters: Sequence[Parameter], changes: Mapping[str, Mapping[str, Any]]) -> tuple[Parameter, ...]:
-    """`parameters` with some attributes replaced by an experiment's: ``{"restitution": {"training": (0.3, 0.7)}}``.
+def adjusted(
+    parameters: Sequence[Parameter], changes: Mapping[str, Mapping[str, Any]]
+) -> tuple[Parameter, ...]:
+    """`parameters` with some attributes replaced by an experiment's: ``{"restitution": {"training":
+    (0.3, 0.7)}}``.
 
     Raises:
         InputError: unknown parameter or attribute name.
@@ -291,6 +336,8 @@ def adjusted(parameters: Sequence[Parameter], changes: Mapping[str, Mapping[str,
     pairs = ("bounds", "training")
     result = []
     for p in parameters:
-        new: dict[str, Any] = {k: tuple(v) if k in pairs else v for k, v in changes.get(p.name, {}).items()}
+        new: dict[str, Any] = {
+            k: tuple(v) if k in pairs else v for k, v in changes.get(p.name, {}).items()
+        }
         result.append(replace(p, **new))
     return tuple(result)

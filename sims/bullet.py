@@ -19,7 +19,9 @@ NO_LIMIT = 1e100
 
 @functools.cache
 def engine() -> Any:
-    """The module ``pybullet``, imported on first use: it takes a while and most commands never simulate."""
+    """The module ``pybullet``, imported on first use: it takes a while and most commands never
+    simulate.
+    """
     with _output_discarded():
         import pybullet
     return pybullet
@@ -27,7 +29,9 @@ def engine() -> Any:
 
 @contextlib.contextmanager
 def _output_discarded() -> Iterator[None]:
-    """Discard what C code prints (PyBullet says when it was built), so that the output is ours alone."""
+    """Discard what C code prints (PyBullet says when it was built), so that the output is ours
+    alone.
+    """
     flush = ctypes.CDLL(None).fflush if os.name == "posix" else lambda _: None
     flush(None)  # what others printed before is theirs to keep
     with contextlib.ExitStack() as undo:
@@ -44,10 +48,11 @@ def _output_discarded() -> Iterator[None]:
 
 
 class World:
-    """One Bullet world: connected when first needed, kept from rollout to rollout, closed with its owner.
+    """One Bullet world: connected when first needed, kept from rollout to rollout, closed with its
+    owner.
 
-    Building a world costs as much as simulating a hundred samples, so it is built once for each set of constants; the
-    owner must start every rollout by setting all that a rollout may have changed.
+    Building a world costs as much as simulating a hundred samples, so it is built once for each set
+    of constants; the owner must start every rollout by setting all that a rollout may have changed.
 
     Args:
         build: called with (client, constants) on an empty world; returns the moving body's id.
@@ -77,7 +82,9 @@ class World:
         return self._client, self._body
 
     def discard(self) -> None:
-        """Build afresh before the next rollout: this world is in a state that resetting bodies cannot undo."""
+        """Build afresh before the next rollout: this world is in a state that resetting bodies
+        cannot undo.
+        """
         self._built_for = None
 
     def close(self) -> None:
@@ -89,9 +96,14 @@ class World:
 
 
 def joint(
-    client: int, kind: int, axis: tuple[float, float, float], mass: float, centre: tuple[float, float, float]
+    client: int,
+    kind: int,
+    axis: tuple[float, float, float],
+    mass: float,
+    centre: tuple[float, float, float],
 ) -> int:
-    """A body on one joint that is fixed to the world and resists nothing; returns the body's id, the joint being 0.
+    """A body on one joint that is fixed to the world and resists nothing; returns the body's id,
+    the joint being 0.
 
     Args:
         client: the world.
@@ -114,8 +126,8 @@ def joint(
         linkJointAxis=[axis],
         physicsClientId=client,
     )
-    # By default Bullet adds air resistance, sleep when nothing moves, a speed limit of 100, and a motor that brakes the
-    # joint.
+    # By default Bullet adds air resistance, sleep when nothing moves, a speed limit of 100, and a
+    # motor that brakes the joint.
     p.changeDynamics(
         body,
         -1,

@@ -1,7 +1,9 @@
-"""Extended simulators on disk: `extended.toml` is written by explain and loads back as a simulator like any other.
+"""Extended simulators on disk: `extended.toml` is written by explain and loads back as a simulator
+like any other.
 
-The file names the system, the effects and every number with its interval. Loaded, it is a registered simulator whose
-nominal values are the fitted ones, so `compare`, `simulate` and every tuner take it.
+The file names the system, the effects and every number with its interval. Loaded, it is a
+registered simulator whose nominal values are the fitted ones, so `compare`, `simulate` and every
+tuner take it.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ class Number:
 
     def table(self) -> dict[str, Any]:
         """As TOML, which has no null."""
-        interval = {} if self.low is None or self.high is None else {"low": self.low, "high": self.high}
+        interval = (
+            {} if self.low is None or self.high is None else {"low": self.low, "high": self.high}
+        )
         return {"value": self.value, "unit": self.unit, **interval}
 
 
@@ -97,22 +101,56 @@ def read(path: Path) -> Extended:
             f"{path}: expected an extended simulator with format = {FORMAT}, found {document.get('format')!r}"
         )
     for key in document:
-        if key not in ("format", "name", "system", "engine", "title", "observe", "constants", "parameters", "effects"):
-            raise unknown(f"key of {path}", key, ["name", "system", "engine", "title", "observe", "constants", "..."])
+        if key not in (
+            "format",
+            "name",
+            "system",
+            "engine",
+            "title",
+            "observe",
+            "constants",
+            "parameters",
+            "effects",
+        ):
+            raise unknown(
+                f"key of {path}",
+                key,
+                ["name", "system", "engine", "title", "observe", "constants", "..."],
+            )
     name, system = (_text(path, document, key) for key in ("name", "system"))
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]*", name):
-        raise InputError(f"{path}: name: expected letters, digits, '_', '.' and '-', found {name!r}")
+        raise InputError(
+            f"{path}: name: expected letters, digits, '_', '.' and '-', found {name!r}"
+        )
     observe = document.get("observe", [])
     if not isinstance(observe, list) or not observe or not all(isinstance(c, str) for c in observe):
         raise InputError(f"{path}: observe: expected a list of channel names, found {observe!r}")
-    constants = {key: _real(path, f"constants.{key}", v) for key, v in _table(path, document, "constants").items()}
-    parameters = {key: _number(path, f"parameters.{key}", v) for key, v in _table(path, document, "parameters").items()}
+    constants = {
+        key: _real(path, f"constants.{key}", v)
+        for key, v in _table(path, document, "constants").items()
+    }
+    parameters = {
+        key: _number(path, f"parameters.{key}", v)
+        for key, v in _table(path, document, "parameters").items()
+    }
     effects = {
-        key: {c: _number(path, f"effects.{key}.{c}", v) for c, v in _table(path, {key: value}, key).items()}
+        key: {
+            c: _number(path, f"effects.{key}.{c}", v)
+            for c, v in _table(path, {key: value}, key).items()
+        }
         for key, value in _table(path, document, "effects").items()
     }
     engine = _text(path, document, "engine") if "engine" in document else None
-    return Extended(name, system, engine, str(document.get("title", "")), parameters, effects, constants, observe)
+    return Extended(
+        name,
+        system,
+        engine,
+        str(document.get("title", "")),
+        parameters,
+        effects,
+        constants,
+        observe,
+    )
 
 
 def _table(path: Path, document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
@@ -138,12 +176,17 @@ def _real(path: Path, where: str, value: object) -> float:
 def _number(path: Path, where: str, value: object) -> Number:
     if not isinstance(value, dict):
         raise InputError(f"{path}: {where}: expected a table with value and unit, found {value!r}")
-    low, high = (_real(path, f"{where}.{k}", value[k]) if k in value else None for k in ("low", "high"))
-    return Number(_real(path, f"{where}.value", value.get("value")), _text(path, value, "unit"), low, high)
+    low, high = (
+        _real(path, f"{where}.{k}", value[k]) if k in value else None for k in ("low", "high")
+    )
+    return Number(
+        _real(path, f"{where}.value", value.get("value")), _text(path, value, "unit"), low, high
+    )
 
 
 def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
-    """The extended simulator as a class that registers like any other; made without arguments it is the fitted one.
+    """The extended simulator as a class that registers like any other; made without arguments it is
+    the fitted one.
 
     Args:
         extended: what was read.
@@ -157,7 +200,10 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
         if name not in places:
             raise unknown(f"parameter of system {extended.system}", name, places)
     values = _coefficients(extended, kind)
-    own = [_at(p, extended.parameters[p.name]) if p.name in extended.parameters else p for p in kind.parameters]
+    own = [
+        _at(p, extended.parameters[p.name]) if p.name in extended.parameters else p
+        for p in kind.parameters
+    ]
     names, observed = list(extended.effects), list(extended.observe)
     engine_of: dict[str, Any] = {"engine": extended.engine} if extended.engine else {}
     fresh = kind(extended.constants, observed, effects=names, **engine_of)
@@ -177,15 +223,21 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
     body = {"__init__": __init__, "system": kind.system, "extends": extended.system}
     made: type[Simulated] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
     made.name = extended.name
-    made.says = f"{extended.system} with {', '.join(names) or 'nothing added'}, fitted to: {extended.title}"
+    made.says = (
+        f"{extended.system} with {', '.join(names) or 'nothing added'}, fitted to: {extended.title}"
+    )
     made.parameters = (*own, *added)
     return made
 
 
 def refuse_extended(kind: type[Simulated]) -> None:
-    """Raise InputError if a simulator has been extended already: its effects cannot be chosen again."""
+    """Raise InputError if a simulator has been extended already: its effects cannot be chosen
+    again.
+    """
     if hasattr(kind, "extends"):
-        raise InputError(f"simulator {kind.name} is extended already; name the system it extends, {kind.extends}")
+        raise InputError(
+            f"simulator {kind.name} is extended already; name the system it extends, {kind.extends}"
+        )
 
 
 def _coefficients(extended: Extended, kind: type[Simulated]) -> list[Number]:
@@ -196,7 +248,9 @@ def _coefficients(extended: Extended, kind: type[Simulated]) -> list[Number]:
         for given in numbers:
             if given not in [c.name for c in there]:
                 raise unknown(f"coefficient of effect {name}", given, [c.name for c in there])
-        for p, c in zip(effect_parameters(library.get(name), kind.system, extended.observe), there, strict=True):
+        for p, c in zip(
+            effect_parameters(library.get(name), kind.system, extended.observe), there, strict=True
+        ):
             values.append(numbers.get(c.name, Number(0.0, p.unit, None, None)))
     return values
 

@@ -1,7 +1,9 @@
-"""A user's own model in PyBullet, MuJoCo or anything else that steps, as a simulator; see docs/own-simulator.md.
+"""A user's own model in PyBullet, MuJoCo or anything else that steps, as a simulator; see
+docs/own-simulator.md.
 
-Subclass `OwnSimulator`, declare what it is, and give `reset`, `step` and `observe`. Effects on inputs and sensors then
-act on it as on any other; effects that are forces and dry frictions do if it takes forces (`apply_force`, `inertia`).
+Subclass `OwnSimulator`, declare what it is, and give `reset`, `step` and `observe`. Effects on
+inputs and sensors then act on it as on any other; effects that are forces and dry frictions do if
+it takes forces (`apply_force`, `inertia`).
 """
 
 from __future__ import annotations
@@ -36,7 +38,9 @@ class OwnSystem(System):
 
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:
-        """A force needs the simulator's hook; dry friction its inertia besides; an impact is out of reach."""
+        """A force needs the simulator's hook; dry friction its inertia besides; an impact is out of
+        reach.
+        """
         if issubclass(effect, Contact):
             return "an own simulator does not say when it strikes something"
         if not issubclass(effect, Force | Friction):
@@ -51,19 +55,21 @@ class OwnSystem(System):
             return str(reason)
         return ""
 
-    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:  # noqa: ARG002
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Not known outside the simulator."""
         raise _UnsaidError("it does not say its mass")
 
-    def weight(self, moment: Moment) -> Array:  # noqa: ARG002
+    def weight(self, moment: Moment) -> Array:
         """Not known outside the simulator."""
         raise _UnsaidError("it does not say what gravity does to it")
 
-    def drive(self, moment: Moment) -> Array:  # noqa: ARG002
+    def drive(self, moment: Moment) -> Array:
         """Not known outside the simulator."""
         raise _UnsaidError("it does not say what its inputs do to it")
 
-    def observe(self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]) -> dict[str, Array]:  # noqa: ARG002
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
         """The motion of an own simulator is what it observes."""
         return {c.name: x[:, :, i] for i, c in enumerate(self.channels)}
 
@@ -89,11 +95,12 @@ def _ask(effect: type[Effect], system: type[OwnSystem]) -> None:
 class OwnSimulator(Simulated):
     """Base of a user's own simulator.
 
-    Declare the attributes of `Simulator` (name, says, parameters, channels, constants, inputs, states, requires), then
-    those below where they apply, and write `reset`, `step` and `observe`.
+    Declare the attributes of `Simulator` (name, says, parameters, channels, constants, inputs,
+    states, requires), then those below where they apply, and write `reset`, `step` and `observe`.
 
     Attributes:
-        time_step: the longest step in seconds; `step` is called with this or less, so that every sample is hit.
+        time_step: the longest step in seconds; `step` is called with this or less, so that every
+            sample is hit.
         kind: how its forces count: ``linear`` in N, ``rotary`` in N m, ``point`` per unit mass.
         coordinates: states that are its generalised position, for effects that are forces.
         rates: states that are their rates, in the same order.
@@ -113,12 +120,17 @@ class OwnSimulator(Simulated):
         forced = {*cls.coordinates, *cls.rates}
         declared = {
             **{
-                name: getattr(cls, name) for name in ("name", "parameters", "channels", "constants", "inputs", "states")
+                name: getattr(cls, name)
+                for name in ("name", "parameters", "channels", "constants", "inputs", "states")
             },
-            "says": cls.__dict__.get("says") or " ".join((cls.__doc__ or cls.says).split("\n\n")[0].split()),
+            "says": cls.__dict__.get("says")
+            or " ".join((cls.__doc__ or cls.says).split("\n\n")[0].split()),
             "kind": cls.kind,
             "coordinates": cls.coordinates,
-            "rates": (*cls.rates, *(name for name in cls.states if name not in forced)),  # whatever else has a start
+            "rates": (
+                *cls.rates,
+                *(name for name in cls.states if name not in forced),
+            ),  # whatever else has a start
             "sensed": tuple(c.name for c in cls.channels),
             "simulator": cls,
         }
@@ -128,11 +140,18 @@ class OwnSimulator(Simulated):
 
     def __setattr__(self, name: str, value: object) -> None:
         if name in _TAKEN and name in self.__dict__:
-            raise InputError(f"simulator {self.name}: the attribute '{name}' is the base class's; name yours otherwise")
+            raise InputError(
+                f"simulator {self.name}: the attribute '{name}' is the base class's; name yours otherwise"
+            )
         super().__setattr__(name, value)
 
     @abstractmethod
-    def reset(self, theta: Mapping[str, float], constants: Mapping[str, float], initial: Mapping[str, float]) -> None:
+    def reset(
+        self,
+        theta: Mapping[str, float],
+        constants: Mapping[str, float],
+        initial: Mapping[str, float],
+    ) -> None:
         """Start a run: parameters, constants and initial state by name.
 
         It must set all that a run may have changed, so that a run depends on nothing before it.
@@ -144,14 +163,18 @@ class OwnSimulator(Simulated):
 
     @abstractmethod
     def observe(self) -> Mapping[str, float]:
-        """What the sensors give now, at least every channel; for force effects the coordinates and rates as well."""
+        """What the sensors give now, at least every channel; for force effects the coordinates and
+        rates as well.
+        """
 
     def apply_force(self, force: Array) -> None:
         """Optional: add a generalised force (D,) along the coordinates, for the next step alone."""
         raise NotImplementedError
 
     def inertia(self) -> float:
-        """Optional: generalised inertia now (kg or kg m^2; 1 for ``point``), with which friction can hold still."""
+        """Optional: generalised inertia now (kg or kg m^2; 1 for ``point``), with which friction
+        can hold still.
+        """
         raise NotImplementedError
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
@@ -159,7 +182,9 @@ class OwnSimulator(Simulated):
             raise InputError(f"simulator {self.name} steps itself; it has no engine '{name}'")
         step = dict(settings).pop("time_step", self.time_step)
         if extra := [key for key in settings if key != "time_step"]:
-            raise InputError(f"simulator {self.name} has no setting '{extra[0]}'; there is: time_step")
+            raise InputError(
+                f"simulator {self.name} has no setting '{extra[0]}'; there is: time_step"
+            )
         if isinstance(step, bool) or not isinstance(step, int | float) or not 0 < step < np.inf:
             raise InputError(f"time_step must be a positive number of seconds, found {step}")
         return OwnEngine(self, step)
@@ -178,7 +203,9 @@ def _check(cls: type[OwnSimulator]) -> None:
     if not cls.channels or not cls.parameters:
         raise InputError(f"simulator {cls.name}: expected at least one parameter and one channel")
     if len(cls.coordinates) != len(cls.rates):
-        raise InputError(f"simulator {cls.name}: expected a rate for each of {cls.coordinates}, found {cls.rates}")
+        raise InputError(
+            f"simulator {cls.name}: expected a rate for each of {cls.coordinates}, found {cls.rates}"
+        )
     for name in (*cls.coordinates, *cls.rates):
         if name not in cls.states:
             raise InputError(
@@ -187,7 +214,9 @@ def _check(cls: type[OwnSimulator]) -> None:
 
 
 class BulletWorld:
-    """A world in PyBullet, whose functions are its methods; it prints nothing and ends with its last reference."""
+    """A world in PyBullet, whose functions are its methods; it prints nothing and ends with its
+    last reference.
+    """
 
     def __init__(self) -> None:
         self._engine = engine()

@@ -32,7 +32,9 @@ class OwnEngine:
         """Nothing to give back."""
 
     def integrate(self, lanes: Lanes) -> Motion:
-        """Readings (L, R, C) in place of positions, a row after every `lanes.every` steps and one before the first."""
+        """Readings (L, R, C) in place of positions, a row after every `lanes.every` steps and one
+        before the first.
+        """
         count, width = lanes.steps.shape[1] // lanes.every + 1, len(lanes.system.channels)
         result = np.full((len(lanes.theta), count, width), np.nan)
         for lane in range(len(lanes.theta)):
@@ -43,9 +45,13 @@ class OwnEngine:
 
     def _run(self, lanes: Lanes, lane: int) -> Array | None:
         system, world = lanes.system, self.world
-        theta = dict(zip((p.name for p in system.parameters), lanes.theta[lane].tolist(), strict=True))
+        theta = dict(
+            zip((p.name for p in system.parameters), lanes.theta[lane].tolist(), strict=True)
+        )
         constants = {name: float(value[lane, 0]) for name, value in lanes.constants.items()}
-        initial = dict(zip((*system.coordinates, *system.rates), [*lanes.x[lane], *lanes.v[lane]], strict=True))
+        initial = dict(
+            zip((*system.coordinates, *system.rates), [*lanes.x[lane], *lanes.v[lane]], strict=True)
+        )
         if not np.isfinite([*theta.values(), *constants.values(), *initial.values()]).all():
             return None
         world.reset(theta, constants, {name: float(value) for name, value in initial.items()})
@@ -72,7 +78,9 @@ class OwnEngine:
 
 def _seen(world: OwnSimulator, seen: Mapping[str, float], name: str) -> float:
     if name not in seen:
-        raise InputError(f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(seen)}")
+        raise InputError(
+            f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(seen)}"
+        )
     return float(seen[name])
 
 
@@ -80,7 +88,9 @@ class _Forces:
     """The effects' forces on one lane."""
 
     def __init__(self, lanes: Lanes, lane: int, world: OwnSimulator) -> None:
-        acting = [(effect, c[:, lane : lane + 1]) for effect, c in lanes.effects if c[:, lane].any()]
+        acting = [
+            (effect, c[:, lane : lane + 1]) for effect, c in lanes.effects if c[:, lane].any()
+        ]
         self.forces = [(effect, c) for effect, c in acting if isinstance(effect, Force)]
         self.frictions = [(effect, c) for effect, c in acting if isinstance(effect, Friction)]
         self.any = bool(acting)

@@ -1,8 +1,10 @@
-"""When a simulation steps, and what its plant feels: sample instants, steps and inputs of many lanes at once.
+"""When a simulation steps, and what its plant feels: sample instants, steps and inputs of many
+lanes at once.
 
-Effects that shift time (a sensor's delay, a skewed clock) move the instants at which the world is sampled; effects on
-the input change the signal before the integration starts, since it does not depend on the plant. So every engine has
-them. What a lane gets does not depend on the others, but for steps of no length in which it waits for them.
+Effects that shift time (a sensor's delay, a skewed clock) move the instants at which the world is
+sampled; effects on the input change the signal before the integration starts, since it does not
+depend on the plant. So every engine has them. What a lane gets does not depend on the others, but
+for steps of no length in which it waits for them.
 """
 
 from __future__ import annotations
@@ -51,7 +53,9 @@ class Runs:
     of: Indices
 
     def spread(self, rows: NDArray[Number]) -> NDArray[Number]:
-        """Rows (N, ...) of the distinct scenarios as rows of the lanes; one row is that of all, and shares memory."""
+        """Rows (N, ...) of the distinct scenarios as rows of the lanes; one row is that of all, and
+        shares memory.
+        """
         if len(rows) == 1:
             return np.broadcast_to(rows, (self.of.size, *rows.shape[1:]))
         return rows[self.of]
@@ -66,7 +70,10 @@ def make_runs(scenarios: Sequence[Scenario]) -> Runs:
     for lane, scenario in enumerate(scenarios):
         group = by_object.get(id(scenario))
         if group is None:
-            content = scenario.times.tobytes(), *((name, u.tobytes()) for name, u in sorted(scenario.inputs.items()))
+            content = (
+                scenario.times.tobytes(),
+                *((name, u.tobytes()) for name, u in sorted(scenario.inputs.items())),
+            )
             group = by_content.setdefault(content, len(distinct))
             if group == len(distinct):
                 distinct.append(scenario)
@@ -82,7 +89,8 @@ Commands = Sequence[Mapping[str, Array]]
 def make_plan(runs: Runs, commands: Commands, acting: Acting, largest_step: float) -> Plan:
     """Steps through every instant at which a sample is taken or a changed command felt.
 
-    A sample that would be taken before the start shows the initial state. Shorter runs wait at their end.
+    A sample that would be taken before the start shows the initial state. Shorter runs wait at
+    their end.
 
     Args:
         runs: scenarios of the lanes.
@@ -116,22 +124,31 @@ def _changes(runs: Runs, commands: Commands, shifting: Sequence[tuple[Effect, Ar
     """Instants (L, K) at which a changed command is felt; zero where a lane has fewer."""
     columns = []
     for place, name in enumerate(commands[0]):
-        rows = [(s.times - s.times[0])[1:][np.diff(u[name]) != 0] for s, u in zip(runs.distinct, commands, strict=True)]
+        rows = [
+            (s.times - s.times[0])[1:][np.diff(u[name]) != 0]
+            for s, u in zip(runs.distinct, commands, strict=True)
+        ]
         size = max(row.size for row in rows)
-        given = np.stack([np.concatenate([row, np.zeros(size - row.size)]) for row in rows])[runs.of]
+        given = np.stack([np.concatenate([row, np.zeros(size - row.size)]) for row in rows])[
+            runs.of
+        ]
         felt = given
         for effect, c in shifting if place == 0 else ():
-            if isinstance(effect, Input):  # the inverse of a map of time that is a shift, or close to one
+            if isinstance(
+                effect, Input
+            ):  # the inverse of a map of time that is a shift, or close to one
                 felt = np.where(acts(c), felt + (felt - effect.times(c, felt)), felt)
         columns.append(felt)
     return np.concatenate(columns, axis=1) if columns else np.zeros((runs.of.size, 0))
 
 
 def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, Indices]:
-    """Steps and their ends (N, S) through instants (N, T), after how many a state is kept, which one at each instant.
+    """Steps and their ends (N, S) through instants (N, T), after how many a state is kept, which
+    one at each instant.
 
-    An interval is divided into equal steps; those of a lane depend on no other. They are laid into blocks of as many
-    steps as most intervals have, and steps of no length fill the last block of an interval.
+    An interval is divided into equal steps; those of a lane depend on no other. They are laid into
+    blocks of as many steps as most intervals have, and steps of no length fill the last block of an
+    interval.
     """
     lanes, samples = instants.shape
     before = np.concatenate([np.zeros((lanes, 1)), instants[:, :-1]], axis=1)
@@ -142,14 +159,18 @@ def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, I
     blocks = -(-parts // every)
     rows = np.cumsum(blocks, axis=1)
     size = max(int(rows[:, -1].max()), 1)
-    # From here on one entry a block: its interval, its number in the lane, the numbers of its steps in the interval.
+    # From here on one entry a block: its interval, its number in the lane, the numbers of its steps
+    # in the interval.
     interval = np.repeat(np.arange(lanes * samples), blocks.ravel())
     lane = interval // samples
     block = np.arange(interval.size) - (np.cumsum(rows[:, -1]) - rows[:, -1])[lane]
     number = (block - (rows - blocks).ravel()[interval])[:, None] * every + np.arange(every)
     count = parts.ravel()[interval, None]
     length = intervals.ravel()[interval, None] / count
-    steps, ends = np.zeros((lanes, size, every)), np.repeat(instants[:, -1], size * every).reshape(lanes, size, every)
+    steps, ends = (
+        np.zeros((lanes, size, every)),
+        np.repeat(instants[:, -1], size * every).reshape(lanes, size, every),
+    )
     steps[lane, block] = np.where(number < count, length, 0.0)
     inside = before.ravel()[interval, None] + (number + 1) * length
     ends[lane, block] = np.where(number + 1 < count, inside, instants.ravel()[interval, None])
@@ -161,10 +182,11 @@ def _padded(values: Array, size: int) -> Array:
 
 
 def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> dict[str, Array]:
-    """What the plant feels over each step, (L, S) by name: each command's mean over the step, through the effects.
+    """What the plant feels over each step, (L, S) by name: each command's mean over the step,
+    through the effects.
 
-    A command holds its value from one recorded sample to the next, and had its first value before the first. Effects
-    act on the first input.
+    A command holds its value from one recorded sample to the next, and had its first value before
+    the first. Effects act on the first input.
 
     Args:
         plan: the steps.
@@ -175,21 +197,32 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
     names = list(commands[0])
     effects = tuple((effect, c, acts(c)) for effect, c in acting if c.any())
     begin = _before(plan.ends)
-    felt = {name: _felt(runs, [u[name] for u in commands], begin, plan.ends) for name in names[1 if effects else 0 :]}
+    felt = {
+        name: _felt(runs, [u[name] for u in commands], begin, plan.ends)
+        for name in names[1 if effects else 0 :]
+    }
     if not effects:
         return felt
     end = plan.ends
     for effect, c, on in reversed(effects):
         assert isinstance(effect, Input)
-        begin, end = np.where(on, effect.times(c, begin), begin), np.where(on, effect.times(c, end), end)
+        begin, end = (
+            np.where(on, effect.times(c, begin), begin),
+            np.where(on, effect.times(c, end), end),
+        )
     lasting = _lasting(plan.steps)
-    values = np.take_along_axis(_felt(runs, [u[names[0]] for u in commands], begin, end), lasting, axis=1)
+    values = np.take_along_axis(
+        _felt(runs, [u[names[0]] for u in commands], begin, end), lasting, axis=1
+    )
     start = np.array([u[names[0]][0] for u in commands])[runs.of, None]
     for effect, c, on in effects:
         assert isinstance(effect, Input)
         begun = effect.feel(c, Signal(start, np.zeros_like(start), start, np.zeros_like(start)))
         passed = effect.feel(c, Signal(values, plan.steps, start, plan.ends))
-        values, start = np.where(on, np.take_along_axis(passed, lasting, axis=1), values), np.where(on, begun, start)
+        values, start = (
+            np.where(on, np.take_along_axis(passed, lasting, axis=1), values),
+            np.where(on, begun, start),
+        )
     return {names[0]: values, **felt}
 
 
@@ -201,7 +234,9 @@ def _before(ends: Array) -> Array:
 
 
 def _lasting(steps: Array) -> Indices:
-    """(L, S) for each step itself if it has a length, else the last before it that has: waiting feels nothing new."""
+    """(L, S) for each step itself if it has a length, else the last before it that has: waiting
+    feels nothing new.
+    """
     own = np.arange(steps.shape[1])
     last: Indices = np.maximum.accumulate(np.where(steps > 0, own, 0), axis=1)
     return last
@@ -221,7 +256,9 @@ def _felt(runs: Runs, signals: Sequence[Array], begin: Array, end: Array) -> Arr
 
 
 def _means(times: Array, values: Array, begin: Array, end: Array) -> Array:
-    """Means over [begin, end] of the signal that holds values[i] from times[i] on; its value where begin = end."""
+    """Means over [begin, end] of the signal that holds values[i] from times[i] on; its value where
+    begin = end.
+    """
     place = np.clip(np.searchsorted(times, begin, side="right") - 1, 0, times.size - 1)
     value: Array = values[place]
     last = np.clip(np.searchsorted(times, end, side="left") - 1, 0, times.size - 1)
@@ -240,7 +277,10 @@ def _area(times: Array, values: Array, area: Array, t: Array) -> Array:
 
 
 def _shifts(effect: Effect) -> bool:
-    return isinstance(effect, (Input, Sensor)) and type(effect).times not in (Input.times, Sensor.times)
+    return isinstance(effect, (Input, Sensor)) and type(effect).times not in (
+        Input.times,
+        Sensor.times,
+    )
 
 
 def acts(c: Array) -> NDArray[np.bool_]:

@@ -12,7 +12,20 @@ from sims import effects as library
 from sims.base import Array, InputError, Parameter, Scenario, Simulator
 from sims.engines import engine_named
 from sims.plan import Plan, acts, felt_inputs, make_plan, make_runs
-from sims.system import Acting, Contact, Effect, Engine, Force, Friction, Input, Lanes, Motion, Sensor, Signal, System
+from sims.system import (
+    Acting,
+    Contact,
+    Effect,
+    Engine,
+    Force,
+    Friction,
+    Input,
+    Lanes,
+    Motion,
+    Sensor,
+    Signal,
+    System,
+)
 
 
 class Simulated(Simulator):
@@ -22,13 +35,14 @@ class Simulated(Simulator):
         constants: values for `constants` other than their defaults.
         observe: channels to return, in order (default: all).
         engine: pybullet, mujoco or batch.
-        effects: effects whose coefficients are parameters, behind the system's own, in the order in which a signal
-            passes them: registered names, or classes that need no registering.
+        effects: effects whose coefficients are parameters, behind the system's own, in the order in
+            which a signal passes them: registered names, or classes that need no registering.
         fixed: effects with known coefficients: a number, or a list where an effect has several.
         settings: the engine's own, e.g. ``time_step``.
 
     Raises:
-        InputError: an unknown name, an effect that the system cannot have, an engine that cannot carry it.
+        InputError: an unknown name, an effect that the system cannot have, an engine that cannot
+            carry it.
     """
 
     system: ClassVar[type[System]]
@@ -48,7 +62,9 @@ class Simulated(Simulator):
         self._declared = self.system()
         self.engine = self._engine(engine, settings)
         self.effects = [self._effect(effect) for effect in effects]
-        self.fixed = [(self._effect(name), _row(name, value)) for name, value in (fixed or {}).items()]
+        self.fixed = [
+            (self._effect(name), _row(name, value)) for name, value in (fixed or {}).items()
+        ]
         named = [effect.name for effect in self.effects]
         doubled = [name for name in named if name in (fixed or {}) or named.count(name) > 1]
         if doubled:
@@ -60,14 +76,20 @@ class Simulated(Simulator):
                     f"effect {effect.name}: expected up to {len(there)} values ({', '.join(there)}), found {values}"
                 )
         observed = [c.name for c in self.channels]
-        extra = tuple(p for effect in self.effects for p in effect_parameters(effect, self.system, observed))
+        extra = tuple(
+            p for effect in self.effects for p in effect_parameters(effect, self.system, observed)
+        )
         self.parameters = (*self.system.parameters, *extra)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         system = cls.system
         cls.name, cls.says = system.name, system.says
-        cls.parameters, cls.channels, cls.constants = system.parameters, system.channels, system.constants
+        cls.parameters, cls.channels, cls.constants = (
+            system.parameters,
+            system.channels,
+            system.constants,
+        )
         cls.inputs, cls.states = system.inputs, system.states
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
@@ -76,15 +98,22 @@ class Simulated(Simulator):
     def _effect(self, named: str | type[Effect]) -> Effect:
         effect = library.get(named) if isinstance(named, str) else named
         if reason := effect.misses(self.system):
-            raise InputError(f"system {self.system.name} cannot have effect {effect.name}: {reason}")
+            raise InputError(
+                f"system {self.system.name} cannot have effect {effect.name}: {reason}"
+            )
         return effect()
 
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
-        """Simulate each row of `theta` (n, dim) in one scenario; returns (n, T, C). See `Simulator.simulate`."""
+        """Simulate each row of `theta` (n, dim) in one scenario; returns (n, T, C). See
+        `Simulator.simulate`.
+        """
         return self.simulate_lanes(theta, [scenario] * len(theta))
 
     def simulate_lanes(
-        self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array] | None = None
+        self,
+        theta: Array,
+        scenarios: Sequence[Scenario],
+        initial: Mapping[str, Array] | None = None,
     ) -> Array:
         """Simulate each row of `theta` (L, dim) in its own scenario, all in one call of the engine.
 
@@ -96,10 +125,12 @@ class Simulated(Simulator):
             initial: initial states (L,) by name, in place of the scenarios' own.
 
         Returns:
-            Observations (L, T, C), T that of the longest scenario; behind the end of a shorter one stand NaN.
+            Observations (L, T, C), T that of the longest scenario; behind the end of a shorter one
+            stand NaN.
 
         Raises:
-            InputError: a wrong shape, or a scenario that names a constant, input or state that the system lacks.
+            InputError: a wrong shape, or a scenario that names a constant, input or state that the
+                system lacks.
         """
         theta = np.asarray(theta, dtype=np.float64)
         if theta.ndim != 2 or theta.shape != (len(scenarios), len(self.parameters)):
@@ -113,7 +144,11 @@ class Simulated(Simulator):
             plan = make_plan(runs, commands, _of(acting, (Input, Sensor)), self.engine.largest_step)
             inputs = felt_inputs(plan, runs, commands, _of(acting, Input)) if self.inputs else {}
             sensors = tuple((effect, c) for effect, c in _of(acting, Sensor) if c.any())
-            every = 1 if any(isinstance(effect, Sensor) and effect.filters for effect, _ in sensors) else plan.every
+            every = (
+                1
+                if any(isinstance(effect, Sensor) and effect.filters for effect, _ in sensors)
+                else plan.every
+            )
             own = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
             constants, x, v = self._known(scenarios, initial or {})
             forces = _of(acting, (Force, Friction, Contact))
@@ -129,7 +164,8 @@ class Simulated(Simulator):
         self.engine.close()
 
     def _acting(self, theta: Array) -> Acting:
-        """Effects with their coefficients (K, L, 1): the tuned ones from `theta`, then the fixed ones.
+        """Effects with their coefficients (K, L, 1): the tuned ones from `theta`, then the fixed
+        ones.
 
         Those that the system does not have, or that were not given, are zero.
         """
@@ -139,7 +175,12 @@ class Simulated(Simulator):
             acting.append((effect, _coefficients(effect, theta[:, place : place + count].T)))
             place += count
         for effect, values in self.fixed:
-            acting.append((effect, _coefficients(effect, np.repeat(np.array(values)[:, None], len(theta), axis=1))))
+            acting.append(
+                (
+                    effect,
+                    _coefficients(effect, np.repeat(np.array(values)[:, None], len(theta), axis=1)),
+                )
+            )
         return tuple(acting)
 
     def _known(
@@ -152,7 +193,10 @@ class Simulated(Simulator):
             if place.setdefault(id(scenario), len(distinct)) == len(distinct):
                 distinct.append(scenario)
         of = np.array([place[id(scenario)] for scenario in scenarios])
-        known, began = [self.run_constants(s) for s in distinct], [self.run_initial(s) for s in distinct]
+        known, began = (
+            [self.run_constants(s) for s in distinct],
+            [self.run_initial(s) for s in distinct],
+        )
         constants = {name: np.array([row[name] for row in known])[of, None] for name in known[0]}
         states = {name: np.array([row[name] for row in began])[of] for name in began[0]}
         states = self._checked("initial state", states, initial)
@@ -177,8 +221,12 @@ class Simulated(Simulator):
             for effect, c in sensors:
                 assert isinstance(effect, Sensor)
                 if effect.filters or name == valued:
-                    begun = effect.read(c, Signal(start, np.zeros_like(start), start, np.zeros_like(start)))
-                    read = effect.read(c, Signal(values, np.diff(times, axis=1, prepend=0.0), start, times))
+                    begun = effect.read(
+                        c, Signal(start, np.zeros_like(start), start, np.zeros_like(start))
+                    )
+                    read = effect.read(
+                        c, Signal(values, np.diff(times, axis=1, prepend=0.0), start, times)
+                    )
                     values, start = np.where(acts(c), read, values), np.where(acts(c), begun, start)
             observations[:, :, place] = _chosen(values, rows)
         observations += 0.0  # no zero is negative: whatever made it, it is the same zero
@@ -192,7 +240,9 @@ def _kept(plan: Plan, every: int) -> Array:
 
 def _chosen(values: Array, rows: NDArray[np.intp]) -> Array:
     """values[l, rows[l, t]], without a copy where all of the first values are chosen."""
-    if (rows[:1] == np.arange(rows.shape[1])).all() and (rows.strides[0] == 0 or (rows == rows[:1]).all()):
+    if (rows[:1] == np.arange(rows.shape[1])).all() and (
+        rows.strides[0] == 0 or (rows == rows[:1]).all()
+    ):
         return values[:, : rows.shape[1]]
     chosen: Array = np.take_along_axis(values, rows, axis=1)
     return chosen
@@ -201,13 +251,17 @@ def _chosen(values: Array, rows: NDArray[np.intp]) -> Array:
 def effect_parameters(
     effect: Effect | type[Effect], system: type[System], observed: Sequence[str] = ()
 ) -> tuple[Parameter, ...]:
-    """The coefficients of an effect as parameters, named for the effect and searched in their plausible range."""
+    """The coefficients of an effect as parameters, named for the effect and searched in their
+    plausible range.
+    """
     result, there = [], effect.on(system)
     for c in there:
         name = effect.name if len(there) == 1 else f"{effect.name}.{c.name}"
         low, high = c.range(system.kind)
         unit = c.unit_on(system, observed) or ""
-        result.append(Parameter(name, unit, min(max(0.0, low), high), (low, high), says=effect.says))
+        result.append(
+            Parameter(name, unit, min(max(0.0, low), high), (low, high), says=effect.says)
+        )
     return tuple(result)
 
 

@@ -1,12 +1,13 @@
-"""What a system is, what an effect gives to it, what an engine integrates: the seam between the three.
+"""What a system is, what an effect gives to it, what an engine integrates: the seam between the
+three.
 
-A *system* is declared once (`System`): names, units, and its generalised forces as array functions. An *engine*
-integrates it (`Engine`), many lanes at once. An *effect* (`Effect`) adds one contribution through one hook. None of
-them knows the others' insides: they meet in `Moment`, the instant at which forces are asked for, and in `Lanes`, the
-work for an engine.
+A *system* is declared once (`System`): names, units, and its generalised forces as array functions.
+An *engine* integrates it (`Engine`), many lanes at once. An *effect* (`Effect`) adds one
+contribution through one hook. None of them knows the others' insides: they meet in `Moment`, the
+instant at which forces are asked for, and in `Lanes`, the work for an engine.
 
-Shapes: L lanes (a parameter vector in a run), D coordinates, S steps, K coefficients. Per-lane numbers are (L, 1), so
-that they multiply generalised vectors (L, D) as they stand.
+Shapes: L lanes (a parameter vector in a run), D coordinates, S steps, K coefficients. Per-lane
+numbers are (L, 1), so that they multiply generalised vectors (L, D) as they stand.
 """
 
 from __future__ import annotations
@@ -68,13 +69,19 @@ class Moment:
         return self.system.weight(self)
 
     def push(self, axis: Literal["x", "y"]) -> Array:
-        """(L, D) generalised force of one m/s^2 of horizontal acceleration of everything, along `axis`."""
+        """(L, D) generalised force of one m/s^2 of horizontal acceleration of everything, along
+        `axis`.
+        """
         return self.system.push(self, axis)
 
     @property
     def load(self) -> Array:
-        """(L, 1) what a transmission carries: the drive from one side plus what it works against from the other."""
-        load: Array = np.abs(self.system.drive(self) + self.system.passive(self)).sum(axis=1, keepdims=True)
+        """(L, 1) what a transmission carries: the drive from one side plus what it works against
+        from the other.
+        """
+        load: Array = np.abs(self.system.drive(self) + self.system.passive(self)).sum(
+            axis=1, keepdims=True
+        )
         return load
 
     @property
@@ -83,7 +90,9 @@ class Moment:
         return self.x[:, self.system.primary, None]
 
     def along_primary(self, force: Array) -> Array:
-        """(L, D) generalised force: `force` (L, 1) along the primary coordinate, zero along the others."""
+        """(L, D) generalised force: `force` (L, 1) along the primary coordinate, zero along the
+        others.
+        """
         result = np.zeros_like(self.x)
         result[:, self.system.primary] = force[:, 0]
         return result
@@ -97,14 +106,16 @@ class System(ABC):
         parameters: what may be tuned.
         constants: known numbers with their defaults.
         inputs: signals it takes; effects on the input act on the first.
-        channels: what its sensors can give; effects on a sensor's value act on the first one observed of `sensed`.
+        channels: what its sensors can give; effects on a sensor's value act on the first one
+            observed of `sensed`.
         coordinates: state names of the generalised position, in order.
         rates: state names of the generalised velocity, in order.
         states: defaults of both.
         bounces: whether its last coordinate strikes ground at `floor`.
         sensed: channels that sensor effects may act on, in order of preference.
         primary: index of the coordinate that biases and springs act on.
-        uniform: whether its own force is the same everywhere and always, so that it moves along parabolas.
+        uniform: whether its own force is the same everywhere and always, so that it moves along
+            parabolas.
     """
 
     name: ClassVar[str]
@@ -129,7 +140,9 @@ class System(ABC):
 
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:  # noqa: ARG003
-        """Why it cannot have an effect although it has all that the effect `needs`; empty if it can."""
+        """Why it cannot have an effect although it has all that the effect `needs`; empty if it
+        can.
+        """
         return ""
 
     @abstractmethod
@@ -145,7 +158,9 @@ class System(ABC):
         return np.zeros_like(moment.x)
 
     def passive(self, moment: Moment) -> Array:
-        """(L, D) minus every generalised force of the system that is not the drive: what the drive works against."""
+        """(L, D) minus every generalised force of the system that is not the drive: what the drive
+        works against.
+        """
         return -self.weight(moment)
 
     def force(self, moment: Moment) -> Array:
@@ -153,12 +168,18 @@ class System(ABC):
         return self.drive(moment) - self.passive(moment)
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
-        """(L, D) generalised force of one m/s^2 of horizontal acceleration along `axis`; zero where it has none."""
+        """(L, D) generalised force of one m/s^2 of horizontal acceleration along `axis`; zero where
+        it has none.
+        """
         raise NotImplementedError
 
     @abstractmethod
-    def observe(self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]) -> dict[str, Array]:
-        """Channels (L, S) by name from positions, velocities, accelerations (L, S, D); constants are (L, 1)."""
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
+        """Channels (L, S) by name from positions, velocities, accelerations (L, S, D); constants
+        are (L, 1).
+        """
 
     def floor(self, constants: Mapping[str, Array]) -> Array:
         """(L, 1) value of the last coordinate at which it strikes the ground."""
@@ -173,7 +194,9 @@ class System(ABC):
         return None
 
     def grip(self, constants: Mapping[str, Array]) -> Array | None:  # noqa: ARG002
-        """(L, 1) largest share of tangential speed that an impact takes, less than 1 where the body spins up."""
+        """(L, 1) largest share of tangential speed that an impact takes, less than 1 where the body
+        spins up.
+        """
         return None
 
 
@@ -183,10 +206,11 @@ class Coefficient:
 
     Attributes:
         name: ``coefficient`` where the effect has only one.
-        units: for a point (per unit mass), linear and rotary system; None where the effect does not exist there.
+        units: for a point (per unit mass), linear and rotary system; None where the effect does not
+            exist there.
         plausible: the range one would expect, in the same order.
-        of: whose unit it has where `units` are only the usual ones: ``input`` the first input's, ``reading`` that of
-            the channel it acts on, ``reading/s`` the same per second.
+        of: whose unit it has where `units` are only the usual ones: ``input`` the first input's,
+            ``reading`` that of the channel it acts on, ``reading/s`` the same per second.
     """
 
     name: str
@@ -199,7 +223,9 @@ class Coefficient:
         return self.units[KINDS.index(kind)]
 
     def unit_on(self, system: System | type[System], observed: Sequence[str] = ()) -> str | None:
-        """The unit on this system, of whose channels those named `observed` are recorded (default: all)."""
+        """The unit on this system, of whose channels those named `observed` are recorded (default:
+        all).
+        """
         if self.of == "input" and system.inputs:
             return system.inputs[0].unit
         if self.of.startswith("reading"):
@@ -221,11 +247,12 @@ class Effect(ABC):
         name: ``family.form``.
         says: one sentence that a person understands, as the end of "the data say that ...".
         source: where the law stands.
-        coefficients: its numbers; all zero is off, and must change nothing, bit for bit. Those that a kind of system
-            does not have come last and stay zero there; a kind that lacks the first lacks the effect.
-        needs: what the system must have: ``input``; ``ground`` to strike; ``guide``, which a body that flies freely
-            lacks; ``gravity``; ``push``, a say in what horizontal acceleration does to it; ``space`` of three
-            dimensions; or empty.
+        coefficients: its numbers; all zero is off, and must change nothing, bit for bit. Those that
+            a kind of system does not have come last and stay zero there; a kind that lacks the
+            first lacks the effect.
+        needs: what the system must have: ``input``; ``ground`` to strike; ``guide``, which a body
+            that flies freely lacks; ``gravity``; ``push``, a say in what horizontal acceleration
+            does to it; ``space`` of three dimensions; or empty.
         contains: simpler effects that it turns into where some of its coefficients are zero.
         hook: which of the engine's hooks it uses; set by the hook classes.
     """
@@ -252,8 +279,12 @@ class Effect(ABC):
             "input": "" if system.inputs else "it has no input",
             "ground": "" if system.bounces else "it meets no ground",
             "guide": "it flies freely" if system.bounces else "",
-            "gravity": "" if any(c.name == "gravity" for c in system.constants) else "it states no gravity",
-            "push": "it does not say what horizontal acceleration does" if declared.push is System.push else "",
+            "gravity": ""
+            if any(c.name == "gravity" for c in system.constants)
+            else "it states no gravity",
+            "push": "it does not say what horizontal acceleration does"
+            if declared.push is System.push
+            else "",
             "space": "" if len(system.coordinates) == 3 else "it does not move in three dimensions",
         }[cls.needs]
         undefined = "" if cls.on(system) else f"it is not defined for a {system.kind} system"
@@ -276,7 +307,8 @@ class Force(Effect):
 
 
 class Friction(Effect):
-    """Dry friction: opposes motion with at most `limit`, and holds still at rest what pulls less than that.
+    """Dry friction: opposes motion with at most `limit`, and holds still at rest what pulls less
+    than that.
 
     Engines add up the limits of all frictions and apply one force against the motion.
     """
@@ -298,7 +330,9 @@ class Contact(Effect):
         return restitution
 
     def friction(self, c: Array) -> Array:
-        """(L, 1) friction coefficient: tangential speed lost is this times (1 + e) |vn|, never more than there is."""
+        """(L, 1) friction coefficient: tangential speed lost is this times (1 + e) |vn|, never more
+        than there is.
+        """
         return np.zeros_like(c[0])
 
 
@@ -307,7 +341,8 @@ class Signal:
     """A signal on the steps of an integration.
 
     Attributes:
-        values: (L, S); for an input the constant value over each step, for a reading the value at its end.
+        values: (L, S); for an input the constant value over each step, for a reading the value at
+            its end.
         steps: (L, S) lengths of the steps, seconds; zero where a lane waits.
         start: (L, 1) value before the first step.
         times: (L, S) seconds since the start of the run, at the end of each step.
@@ -320,7 +355,9 @@ class Signal:
 
 
 class Input(Effect):
-    """The first input as the plant feels it. Several are applied in the order of `bench` and the command line."""
+    """The first input as the plant feels it. Several are applied in the order of `bench` and the
+    command line.
+    """
 
     hook = "input"
     needs = "input"
@@ -342,7 +379,9 @@ class Sensor(Effect):
     """Whether `read` must see every step of the integration rather than the samples alone."""
 
     def times(self, c: Array, t: Array) -> Array:  # noqa: ARG002
-        """The instants (L, T) at which the world is really sampled, for recorded time stamps t since the start."""
+        """The instants (L, T) at which the world is really sampled, for recorded time stamps t
+        since the start.
+        """
         return t
 
     def read(self, c: Array, signal: Signal) -> Array:  # noqa: ARG002
@@ -366,7 +405,8 @@ class Lanes:
         v: (L, D) initial velocity.
         steps: (L, S) step lengths in seconds; zero where a lane has nothing more to do.
         inputs: felt inputs (L, S) by name, constant over each step.
-        effects: forces, frictions and contacts; inputs and sensors are dealt with outside the engine.
+        effects: forces, frictions and contacts; inputs and sensors are dealt with outside the
+            engine.
         every: keep the state after every this many steps (and the initial one).
     """
 
@@ -385,7 +425,8 @@ class Lanes:
 class Motion:
     """What an engine gives back: positions, velocities, accelerations (L, S // every + 1, D).
 
-    The acceleration is that of the smooth motion (an impact's shock is not in it). A lane that failed is NaN.
+    The acceleration is that of the smooth motion (an impact's shock is not in it). A lane that
+    failed is NaN.
     """
 
     x: Array

@@ -1,4 +1,5 @@
-"""Kills the runner, its workers and a cluster's workers at random moments, resumes, and compares with no kill at all.
+"""Kills the runner, its workers and a cluster's workers at random moments, resumes, and compares
+with no kill at all.
 
 `make chaos` makes 100 kills. Run `python -m tests.chaos --kills N [--seed S]` for another number.
 """
@@ -30,9 +31,20 @@ TUNERS = {"random": {}, "cma_es": {}, "least_squares": {}, "regressor": {"seeds"
 
 def start(folder, experiment, address, environment):
     """A new comparison, or the rest of one that was killed."""
-    begun = ["--resume", str(folder)] if folder.exists() else [str(experiment), "--out", str(folder)]
+    begun = (
+        ["--resume", str(folder)] if folder.exists() else [str(experiment), "--out", str(folder)]
+    )
     where = ["--cluster", address] if address else ["--jobs", "2"]
-    command = [sys.executable, "-m", "bench.cli", "compare", *begun, *where, "--plugin", str(PLUGINS / "spring.py")]
+    command = [
+        sys.executable,
+        "-m",
+        "bench.cli",
+        "compare",
+        *begun,
+        *where,
+        "--plugin",
+        str(PLUGINS / "spring.py"),
+    ]
     with errors_of(folder).open("w") as errors:
         return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=errors)
 
@@ -50,14 +62,18 @@ def victims(process, what, running):
 
 
 def disturbed(folder, experiment, kills, rng, running, environment):
-    """Kills at random moments until there were `kills`, or all is done; returns how many of each hit."""
+    """Kills at random moments until there were `kills`, or all is done; returns how many of each
+    hit.
+    """
     hits = Counter()
     process = start(folder, experiment, running and running.address, environment)
     while sum(hits.values()) < kills:
         time.sleep(rng.uniform(0.0, 2.5))
         if process.poll() is not None:
             if process.returncode != 0:
-                raise AssertionError(f"it ended by itself with {process.returncode}: {errors_of(folder).read_text()}")
+                raise AssertionError(
+                    f"it ended by itself with {process.returncode}: {errors_of(folder).read_text()}"
+                )
             return hits
         before = finished(folder)
         what = str(rng.choice(["runner", "cluster worker" if running else "worker"]))
@@ -83,7 +99,11 @@ def disturbed(folder, experiment, kills, rng, running, environment):
 
 def compare(folder, undisturbed):
     """Raise unless both folders hold the same, but for times."""
-    for name, read in (("status.csv", pd.read_csv), ("table.csv", pd.read_csv), ("runs.parquet", pd.read_parquet)):
+    for name, read in (
+        ("status.csv", pd.read_csv),
+        ("table.csv", pd.read_csv),
+        ("runs.parquet", pd.read_parquet),
+    ):
         a, b = (read(f / name) for f in (folder, undisturbed))
         pd.testing.assert_frame_equal(
             *(f.drop(columns=[c for c in MEASURED if c in f]) for f in (a, b)), check_exact=True
@@ -93,10 +113,19 @@ def compare(folder, undisturbed):
 
 
 def chaos(folder, kills, seed, on_cluster, targets=60):
-    """Rounds of a comparison, each disturbed, until there were `kills` kills; returns how many of each."""
+    """Rounds of a comparison, each disturbed, until there were `kills` kills; returns how many of
+    each.
+    """
     rng = np.random.default_rng(seed)
     experiment = folder / "chaos.toml"
-    document = {**SPRING, "targets": targets, "seeds": 2, "budget": 60, "training_budget": 60, "tuners": TUNERS}
+    document = {
+        **SPRING,
+        "targets": targets,
+        "seeds": 2,
+        "budget": 60,
+        "training_budget": 60,
+        "tuners": TUNERS,
+    }
     experiment.write_text(tomli_w.dumps(document))
     environment = {**os.environ, "SIMGAP_CACHE": str(folder / "cache")}
     undisturbed = folder / "undisturbed"
@@ -132,7 +161,10 @@ def main():
             hits, rounds, runs = chaos(Path(folder), kills, options.seed, on_cluster)
             where = "cluster" if on_cluster else "local"
             seconds = time.monotonic() - started
-            print(f"{where}: {dict(hits)} in {rounds} rounds of {runs} runs, {seconds:.0f} s: identical", flush=True)
+            print(
+                f"{where}: {dict(hits)} in {rounds} rounds of {runs} runs, {seconds:.0f} s: identical",
+                flush=True,
+            )
             total += hits
     print(f"{sum(total.values())} kills; nothing lost, nothing doubled, every table identical")
 

@@ -40,10 +40,17 @@ class Cluster:
 
     def workers(self):
         """The processes in which Dask's workers run: children of the nannies."""
-        return [c for nanny in self.nannies for c in psutil.Process(nanny.pid).children() if "spawn_main" in said(c)]
+        return [
+            c
+            for nanny in self.nannies
+            for c in psutil.Process(nanny.pid).children()
+            if "spawn_main" in said(c)
+        ]
 
     def stop(self):
-        processes = [psutil.Process(p.pid) for p in (*self.nannies, self.scheduler) if p.poll() is None]
+        processes = [
+            psutil.Process(p.pid) for p in (*self.nannies, self.scheduler) if p.poll() is None
+        ]
         everyone = [c for p in processes for c in p.children(recursive=True)] + processes
         for process in everyone:
             try:

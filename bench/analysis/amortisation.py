@@ -1,7 +1,9 @@
-"""When training pays: simulations of learned and of search tuners over many targets, and who wins at which cost.
+"""When training pays: simulations of learned and of search tuners over many targets, and who wins
+at which cost.
 
-A learned tuner costs its training once and little on each target. `break_even` says from how many targets on the sum
-is below a search tuner's; `winners` who needs the least time when a simulation takes c seconds.
+A learned tuner costs its training once and little on each target. `break_even` says from how many
+targets on the sum is below a search tuner's; `winners` who needs the least time when a simulation
+takes c seconds.
 """
 
 from __future__ import annotations
@@ -19,9 +21,19 @@ from bench.analysis.runtimes import Effort, effort, percentile_interval, resampl
 from methods.base import Array
 
 EVEN_COLUMNS = [
-    "experiment", "range", "threshold", "learned", "search", "fit_simulations", "fit_seconds", "ert_learned",
-    "ert_search", "targets", "low", "high",
-]  # fmt: skip
+    "experiment",
+    "range",
+    "threshold",
+    "learned",
+    "search",
+    "fit_simulations",
+    "fit_seconds",
+    "ert_learned",
+    "ert_search",
+    "targets",
+    "low",
+    "high",
+]
 COSTS: Array = np.logspace(-6, 3, 181)
 """Seconds that a simulation may take."""
 
@@ -43,7 +55,9 @@ class Price:
     simulation_seconds: float = 0.0
 
     def seconds(self, cost: Array, targets: float) -> Array:
-        """Seconds a target at `cost` seconds a simulation, where the training is shared by so many targets."""
+        """Seconds a target at `cost` seconds a simulation, where the training is shared by so many
+        targets.
+        """
         learning = max(self.fit_seconds - self.fit_simulations * self.simulation_seconds, 0.0)
         marginal = self.effort.ert() * cost + self.effort.tuner_seconds()
         result: Array = marginal + (self.fit_simulations * cost + learning) / targets
@@ -51,9 +65,13 @@ class Price:
 
 
 def prices(
-    curves: Curves, threshold: float, budget: int, tuner_seconds: Array, simulator_seconds: Array,
+    curves: Curves,
+    threshold: float,
+    budget: int,
+    tuner_seconds: Array,
+    simulator_seconds: Array,
     fits: Mapping[str, tuple[float, float]],
-) -> dict[str, Price]:  # fmt: skip
+) -> dict[str, Price]:
     """The price of every tuner in one experiment and range.
 
     Args:
@@ -79,14 +97,20 @@ def break_even(learned: Price, search: Price, picked: NDArray[np.int64] | None =
     0 where the search never reaches the threshold, infinite where training never pays.
     """
     hopeless = np.isinf(learned.effort.ert(picked))
-    with np.errstate(invalid="ignore", divide="ignore"):  # neither gets there, or they need the same
+    with np.errstate(
+        invalid="ignore", divide="ignore"
+    ):  # neither gets there, or they need the same
         saved = search.effort.ert(picked) - learned.effort.ert(picked)
         result: Array = np.where(hopeless | ~(saved > 0), np.inf, learned.fit_simulations / saved)
     return result
 
 
-def break_even_table(experiment: str, kind: str, threshold: float, held: Mapping[str, Price]) -> pd.DataFrame:
-    """Every learned tuner against every search tuner, with 95 % bootstrap intervals over targets, `EVEN_COLUMNS`."""
+def break_even_table(
+    experiment: str, kind: str, threshold: float, held: Mapping[str, Price]
+) -> pd.DataFrame:
+    """Every learned tuner against every search tuner, with 95 % bootstrap intervals over targets,
+    `EVEN_COLUMNS`.
+    """
     lines = []
     for name, learned in held.items():
         for other, search in held.items():
@@ -102,10 +126,14 @@ def break_even_table(experiment: str, kind: str, threshold: float, held: Mapping
 
 
 def winners(held: Mapping[str, Price], targets: float) -> list[tuple[float, float, str]]:
-    """(from, to, tuner): ranges of the cost of a simulation in seconds, and who needs the least time there."""
+    """(from, to, tuner): ranges of the cost of a simulation in seconds, and who needs the least
+    time there.
+    """
     names = [name for name, price in held.items() if np.isfinite(price.effort.ert())]
     if not names:
         return []
     best = np.argmin([held[name].seconds(COSTS, targets) for name in names], axis=0)
     edges = [0, *(np.flatnonzero(np.diff(best)) + 1).tolist(), len(COSTS)]
-    return [(float(COSTS[a]), float(COSTS[b - 1]), names[best[a]]) for a, b in itertools.pairwise(edges)]
+    return [
+        (float(COSTS[a]), float(COSTS[b - 1]), names[best[a]]) for a, b in itertools.pairwise(edges)
+    ]

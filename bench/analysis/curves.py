@@ -1,4 +1,6 @@
-"""Runs as one matrix: a row a run, a column for each number of simulations; what all statistics start from."""
+"""Runs as one matrix: a row a run, a column for each number of simulations; what all statistics
+start from.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ class Curves:
 
     Attributes:
         keys: a row a run: run, experiment, tuner, range, target, seed.
-        values: (R, K + 1) the metric after k simulations; a run that ended early keeps its last value.
+        values: (R, K + 1) the metric after k simulations; a run that ended early keeps its last
+            value.
         used: (R,) simulations that each run made.
         failed: (R,) whether it crashed, timed out or diverged.
     """
@@ -34,7 +37,12 @@ class Curves:
 
     def where(self, mask: NDArray[np.bool_]) -> Curves:
         """The runs for which `mask` (R,) holds."""
-        return Curves(self.keys[mask].reset_index(drop=True), self.values[mask], self.used[mask], self.failed[mask])
+        return Curves(
+            self.keys[mask].reset_index(drop=True),
+            self.values[mask],
+            self.used[mask],
+            self.failed[mask],
+        )
 
     def of(self, **values: str) -> Curves:
         """The runs whose keys have these values."""
@@ -53,7 +61,9 @@ class Curves:
         return [str(n) for n in names], [np.flatnonzero(codes == i) for i in range(len(names))]
 
     def final(self) -> Array:
-        """(R,) the metric at the end; infinite for a run that failed: it delivered nothing one could have trusted."""
+        """(R,) the metric at the end; infinite for a run that failed: it delivered nothing one
+        could have trusted.
+        """
         return np.where(self.failed | np.isnan(self.values[:, -1]), np.inf, self.values[:, -1])
 
 
@@ -94,7 +104,9 @@ class Rows:
         values = self.matrix(metric)
         last = np.minimum(self.used, self._budget)[:, None]
         columns = np.minimum(np.arange(self._budget + 1)[None], last)
-        return Curves(self.keys, np.take_along_axis(values, columns, axis=1), self.used, self.failed)
+        return Curves(
+            self.keys, np.take_along_axis(values, columns, axis=1), self.used, self.failed
+        )
 
     def spent(self, name: str) -> Array:
         """(R, budget + 1) a column of seconds, added up over the simulations so far."""
@@ -102,14 +114,18 @@ class Rows:
 
 
 def mean_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Array:
-    """(targets, ...) the mean of each target's rows of `values` (R, ...), without those that are NaN."""
+    """(targets, ...) the mean of each target's rows of `values` (R, ...), without those that are
+    NaN.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # nothing but NaN has no mean: NaN
         return np.array([np.nanmean(values[rows], axis=0) for rows in groups])
 
 
 class Decisive(NamedTuple):
-    """What decides a comparison: a metric, the runs that have it, and whether it counts in training widths."""
+    """What decides a comparison: a metric, the runs that have it, and whether it counts in training
+    widths.
+    """
 
     metric: str
     runs: pd.DataFrame
@@ -117,12 +133,17 @@ class Decisive(NamedTuple):
 
 
 def primary(runs: pd.DataFrame) -> Decisive:
-    """The metric that decides: the parameters' error where the truth is known, else the error on held-out runs.
+    """The metric that decides: the parameters' error where the truth is known, else the error on
+    held-out runs.
 
-    Where some target's data leave a direction sloppy, it is the error along stiff directions: nobody could know the
-    others. A target without a stiff direction then decides nothing.
+    Where some target's data leave a direction sloppy, it is the error along stiff directions:
+    nobody could know the others. A target without a stiff direction then decides nothing.
     """
-    if "sloppy_error" in runs and runs["sloppy_error"].notna().any() and runs["stiff_error"].notna().any():
+    if (
+        "sloppy_error" in runs
+        and runs["sloppy_error"].notna().any()
+        and runs["stiff_error"].notna().any()
+    ):
         return Decisive("stiff_error", runs[runs["stiff_error"].notna()], in_widths=True)
     candidates: tuple[Any, ...] = ("param_error", "heldout_error", "obs_error")
     metric = next(str(m) for m in candidates if m in runs and runs[m].notna().any())

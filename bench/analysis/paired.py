@@ -1,8 +1,9 @@
 """Tuner against tuner: paired tests over targets with effect sizes, and mean ranks over problems.
 
-Sources: F. Wilcoxon, Biometrics Bulletin 1(6), 1945 (scipy); S. Holm, Scand. J. Statist. 6, 1979 (statsmodels);
-D. S. Kerby, Comprehensive Psychology 3, 2014, for the matched-pairs rank-biserial correlation; J. Demsar, JMLR 7, 2006,
-for ranks over problems, Friedman's and Nemenyi's tests (scikit-posthocs).
+Sources: F. Wilcoxon, Biometrics Bulletin 1(6), 1945 (scipy); S. Holm, Scand. J. Statist. 6, 1979
+(statsmodels); D. S. Kerby, Comprehensive Psychology 3, 2014, for the matched-pairs rank-biserial
+correlation; J. Demsar, JMLR 7, 2006, for ranks over problems, Friedman's and Nemenyi's tests
+(scikit-posthocs).
 """
 
 from __future__ import annotations
@@ -17,12 +18,23 @@ from bench.analysis.curves import Curves, mean_over_seeds
 from methods.base import Array
 
 PAIR_COLUMNS = [
-    "experiment", "range", "a", "b", "targets", "a_better", "effect", "error_ratio", "p_value", "p_holm",
-]  # fmt: skip
+    "experiment",
+    "range",
+    "a",
+    "b",
+    "targets",
+    "a_better",
+    "effect",
+    "error_ratio",
+    "p_value",
+    "p_holm",
+]
 LEAST = 1e-12
 """Errors below this count as equal: rounding."""
 _WORST = 1e3
-"""Logarithm that stands for a target on which a run failed: worse than any error, and as bad as another failure."""
+"""Logarithm that stands for a target on which a run failed: worse than any error, and as bad as
+another failure.
+"""
 PROBLEMS = 5
 """Problems that mean ranks need at least."""
 
@@ -34,16 +46,19 @@ def log_errors(curves: Curves) -> pd.DataFrame:
         mine = curves.of(tuner=tuner)
         names, groups = mine.by_target()
         errors = mean_over_seeds(mine.final(), groups)
-        columns[tuner] = pd.Series(np.where(np.isinf(errors), _WORST, np.log(np.maximum(errors, LEAST))), index=names)
+        columns[tuner] = pd.Series(
+            np.where(np.isinf(errors), _WORST, np.log(np.maximum(errors, LEAST))), index=names
+        )
     return pd.DataFrame(columns)
 
 
 def pairs(curves: Curves) -> pd.DataFrame:
     """Every pair of tuners on the targets of each experiment and range, columns as `PAIR_COLUMNS`.
 
-    `a_better` is the share of targets on which a ends with the smaller error (ties count half); `effect` the
-    rank-biserial correlation, 1 where a is better on all targets, -1 where b is; `error_ratio` the median of a's error
-    over b's. Holm's correction is over all pairs of an experiment and range.
+    `a_better` is the share of targets on which a ends with the smaller error (ties count half);
+    `effect` the rank-biserial correlation, 1 where a is better on all targets, -1 where b is;
+    `error_ratio` the median of a's error over b's. Holm's correction is over all pairs of an
+    experiment and range.
     """
     from statsmodels.stats.multitest import multipletests
 
@@ -66,7 +81,9 @@ def _compared(a: Array, b: Array) -> tuple[int, float, float, float, float]:
 
     there = ~(np.isnan(a) | np.isnan(b))
     difference = a[there] - b[there]
-    better = float(((difference < 0) + 0.5 * (difference == 0)).mean()) if len(difference) else np.nan
+    better = (
+        float(((difference < 0) + 0.5 * (difference == 0)).mean()) if len(difference) else np.nan
+    )
     unequal = difference[difference != 0]
     if not len(unequal):
         return len(difference), better, 0.0, 1.0, 1.0
@@ -75,11 +92,18 @@ def _compared(a: Array, b: Array) -> tuple[int, float, float, float, float]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # few pairs or ties: it says that it approximates
         p = float(wilcoxon(unequal).pvalue)
-    return len(difference), better, effect, float(np.exp(np.clip(np.median(difference), -700, 700))), p
+    return (
+        len(difference),
+        better,
+        effect,
+        float(np.exp(np.clip(np.median(difference), -700, 700))),
+        p,
+    )
 
 
 def ranks(curves: Curves) -> pd.DataFrame:
-    """Rank of each tuner (columns) on each problem (rows): by the median over targets, failures last, 1 is best.
+    """Rank of each tuner (columns) on each problem (rows): by the median over targets, failures
+    last, 1 is best.
 
     A problem is an experiment and a range; tuners that miss a problem are left out.
     """

@@ -1,10 +1,12 @@
 """Expected running time and runtime distributions over error thresholds, as in COCO.
 
-Source: N. Hansen, A. Auger, D. Brockhoff, T. Tusar, Anytime performance assessment in blackbox optimization
-benchmarking, IEEE TEVC 26(6), 2022, sections III and IV; N. Hansen, A. Auger, R. Ros, S. Finck, P. Posik, Comparing
-results of 31 algorithms from BBOB-2009, GECCO 2010, for ERT. Two things differ on purpose. A run has reached a
-threshold after the simulation from which on what it would deliver *stays* within it: the first touch is known to
-nobody who has no truth. And a failed run has reached nothing and counts with its whole budget.
+Source: N. Hansen, A. Auger, D. Brockhoff, T. Tusar, Anytime performance assessment in blackbox
+optimization benchmarking, IEEE TEVC 26(6), 2022, sections III and IV; N. Hansen, A. Auger, R. Ros,
+S. Finck, P. Posik, Comparing results of 31 algorithms from BBOB-2009, GECCO 2010, for ERT. Two
+things differ on purpose. A run has reached a
+threshold after the simulation from which on what it would deliver *stays* within it: the first
+touch is known to nobody who has no truth. And a failed run has reached nothing and counts with its
+whole budget.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ LEVELS = (0.1, 0.01, 1e-3, 1e-4, 1e-6)
 def thresholds(curves: Curves, simulated: bool) -> tuple[Array, tuple[float, ...]]:
     """Thresholds of the distribution and levels of the table.
 
-    On a recording they lie between the median error of the starts and the least that anyone ended with.
+    On a recording they lie between the median error of the starts and the least that anyone ended
+    with.
     """
     if simulated:
         return THRESHOLDS, LEVELS
@@ -39,7 +42,9 @@ def thresholds(curves: Curves, simulated: bool) -> tuple[Array, tuple[float, ...
 
 
 def reached(curves: Curves, threshold: float) -> Array:
-    """(R,) simulations after which the error stays at or below `threshold`; infinite where it never does."""
+    """(R,) simulations after which the error stays at or below `threshold`; infinite where it never
+    does.
+    """
     beyond = ~(curves.values <= threshold)  # a NaN is beyond
     steps = beyond.shape[1]
     last = steps - np.argmax(beyond[:, ::-1], axis=1)  # one behind the last that is beyond
@@ -64,7 +69,9 @@ class Effort:
     runs: int
 
     def ert(self, picked: NDArray[np.int64] | None = None) -> Array:
-        """Simulations spent for each success, over the targets `picked` (..., n); infinite without a success."""
+        """Simulations spent for each success, over the targets `picked` (..., n); infinite without
+        a success.
+        """
         return _per_success(self.simulations, self.successes, picked)
 
     def tuner_seconds(self) -> float:
@@ -72,7 +79,9 @@ class Effort:
         return float(_per_success(self.seconds, self.successes, None))
 
 
-def _per_success(spent: Array, successes: NDArray[np.int64], picked: NDArray[np.int64] | None) -> Array:
+def _per_success(
+    spent: Array, successes: NDArray[np.int64], picked: NDArray[np.int64] | None
+) -> Array:
     if picked is not None:
         spent, successes = spent[picked], successes[picked]
     total, count = spent.sum(axis=-1), successes.sum(axis=-1)
@@ -80,7 +89,9 @@ def _per_success(spent: Array, successes: NDArray[np.int64], picked: NDArray[np.
     return result
 
 
-def effort(curves: Curves, threshold: float, budget: int, tuner_seconds: Array | None = None) -> Effort:
+def effort(
+    curves: Curves, threshold: float, budget: int, tuner_seconds: Array | None = None
+) -> Effort:
     """What it took the runs of one tuner to reach `threshold`.
 
     Args:
@@ -107,7 +118,9 @@ def effort(curves: Curves, threshold: float, budget: int, tuner_seconds: Array |
 
 
 def resampled(targets: int, *names: str, resamples: int = 1000) -> NDArray[np.int64]:
-    """(resamples, targets) places of targets drawn with replacement; the same for tuners that share the targets."""
+    """(resamples, targets) places of targets drawn with replacement; the same for tuners that share
+    the targets.
+    """
     return rng_for("resample", *names).integers(targets, size=(resamples, targets))
 
 
@@ -118,7 +131,18 @@ def percentile_interval(values: Array) -> tuple[float, float]:
     return float(ordered[int(0.025 * (n - 1))]), float(ordered[int(np.ceil(0.975 * (n - 1)))])
 
 
-ERT_COLUMNS = ["experiment", "range", "tuner", "threshold", "ert", "low", "high", "successes", "runs", "failures"]
+ERT_COLUMNS = [
+    "experiment",
+    "range",
+    "tuner",
+    "threshold",
+    "ert",
+    "low",
+    "high",
+    "successes",
+    "runs",
+    "failures",
+]
 
 
 def ert_table(curves: Curves, levels: tuple[float, ...], budget: int) -> pd.DataFrame:
@@ -130,9 +154,13 @@ def ert_table(curves: Curves, levels: tuple[float, ...], budget: int) -> pd.Data
             mine = part.of(tuner=tuner)
             for level in levels:
                 spent = effort(mine, level, budget)
-                low, high = percentile_interval(spent.ert(resampled(len(spent.successes), str(experiment), str(kind))))
+                low, high = percentile_interval(
+                    spent.ert(resampled(len(spent.successes), str(experiment), str(kind)))
+                )
                 counts = int(spent.successes.sum()), spent.runs, int(mine.failed.sum())
-                lines.append((experiment, kind, tuner, level, float(spent.ert()), low, high, *counts))
+                lines.append(
+                    (experiment, kind, tuner, level, float(spent.ert()), low, high, *counts)
+                )
     return pd.DataFrame(lines, columns=ERT_COLUMNS)
 
 

@@ -16,7 +16,9 @@ COLUMNS = ["experiment", "target", "range", "direction", "eigenvalue", "sigma", 
 def spectra_table(
     experiment: Experiment, spectra: Mapping[str, Spectrum], parameters: Sequence[Parameter]
 ) -> pd.DataFrame:
-    """A row a target and direction, the stiffest first: eigenvalue, 1 sigma, and the parameters' components."""
+    """A row a target and direction, the stiffest first: eigenvalue, 1 sigma, and the parameters'
+    components.
+    """
     lines = [
         [
             experiment.name,

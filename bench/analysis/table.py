@@ -1,8 +1,9 @@
 """Error against number of simulations: the table of a comparison.
 
-A run that ended early counts with its last recommendation. A target's value is the mean over its seeds; median and
-mean are over targets, and `low`..`high` is a 95 % percentile-bootstrap interval of the mean over targets (Efron &
-Tibshirani 1993, ch. 13), so that seeds of one target are not taken for independent evidence.
+A run that ended early counts with its last recommendation. A target's value is the mean over its
+seeds; median and mean are over targets, and `low`..`high` is a 95 % percentile-bootstrap interval
+of the mean over targets (Efron & Tibshirani 1993, ch. 13), so that seeds of one target are not
+taken for independent evidence.
 """
 
 from __future__ import annotations
@@ -20,12 +21,32 @@ from bench.problem.seeds import rng_for
 from methods.base import Array
 
 CHECKPOINTS = (0, 1, 2, 3, 5, 10, 20, 50, 100)
-METRICS = ("param_abs_error", "param_error", "stiff_error", "sloppy_error", "obs_error", "heldout_error")
+METRICS = (
+    "param_abs_error",
+    "param_error",
+    "stiff_error",
+    "sloppy_error",
+    "obs_error",
+    "heldout_error",
+)
 FAILURES = ("crashed", "timeout", "diverged", "skipped")
 COLUMNS = [
-    "experiment", "tuner", "range", "simulations", "metric", "median", "mean", "low", "high",
-    "runs", "failures", "fit_simulations", "fit_seconds", "tuner_seconds", "simulator_seconds",
-]  # fmt: skip
+    "experiment",
+    "tuner",
+    "range",
+    "simulations",
+    "metric",
+    "median",
+    "mean",
+    "low",
+    "high",
+    "runs",
+    "failures",
+    "fit_simulations",
+    "fit_seconds",
+    "tuner_seconds",
+    "simulator_seconds",
+]
 
 
 def checkpoints(budget: int) -> list[int]:
@@ -51,48 +72,80 @@ def table(
     """
     points = checkpoints(budget)
     rows = Rows(runs, statuses, budget)
-    spent = [rows.spent(name) if name in runs else None for name in ("tuner_seconds", "simulator_seconds")]
+    spent = [
+        rows.spent(name) if name in runs else None
+        for name in ("tuner_seconds", "simulator_seconds")
+    ]
     curves = {m: rows.curves(m) for m in METRICS if m in runs and runs[m].notna().any()}
     lines = []
-    for (experiment, tuner, kind), part in rows.keys.groupby(["experiment", "tuner", "range"], sort=False):
+    for (experiment, tuner, kind), part in rows.keys.groupby(
+        ["experiment", "tuner", "range"], sort=False
+    ):
         mine = part.index.to_numpy()
         fit = (trainings or {}).get(str(tuner), (0.0, 0.0))
-        seconds = [np.full(len(points), np.nan) if s is None else s[mine][:, points].mean(axis=0) for s in spent]
+        seconds = [
+            np.full(len(points), np.nan) if s is None else s[mine][:, points].mean(axis=0)
+            for s in spent
+        ]
         counts = len(mine), int(rows.failed[mine].sum())
         for metric, curve in curves.items():
             values = _over_targets(curve, mine, points, (str(tuner), str(kind), metric), resamples)
             lines += [
-                (experiment, tuner, kind, k, metric, *values[:, i], *counts, *fit, seconds[0][i], seconds[1][i])
+                (
+                    experiment,
+                    tuner,
+                    kind,
+                    k,
+                    metric,
+                    *values[:, i],
+                    *counts,
+                    *fit,
+                    seconds[0][i],
+                    seconds[1][i],
+                )
                 for i, k in enumerate(points)
             ]
     skipped = statuses[statuses["status"] == "skipped"]
     nothing = (0, "", *[np.nan] * 4, 0, 1, 0.0, 0.0, np.nan, np.nan)
-    lines += [(runs["experiment"].iloc[0] if len(runs) else "", t, "", *nothing) for t in skipped["tuner"]]
+    lines += [
+        (runs["experiment"].iloc[0] if len(runs) else "", t, "", *nothing) for t in skipped["tuner"]
+    ]
     return pd.DataFrame(lines, columns=COLUMNS)
 
 
 def _over_targets(
-    curves: Curves, mine: NDArray[np.int64], points: list[int], names: tuple[str, str, str], resamples: int
+    curves: Curves,
+    mine: NDArray[np.int64],
+    points: list[int],
+    names: tuple[str, str, str],
+    resamples: int,
 ) -> Array:
     """(4, len(points)): median, mean, low and high over targets of the runs in rows `mine`."""
     _, groups = curves.where(np.isin(np.arange(len(curves.used)), mine)).by_target()
     values = mean_over_seeds(curves.values[mine][:, points], groups)
     low, high = interval(values, np.mean, *names, resamples=resamples)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a column of failures alone has no mean: NaN, shown
+        warnings.simplefilter(
+            "ignore", RuntimeWarning
+        )  # a column of failures alone has no mean: NaN, shown
         return np.array([np.nanmedian(values, axis=0), np.nanmean(values, axis=0), low, high])
 
 
 def target_curves(runs: pd.DataFrame, metric: str, points: list[int]) -> pd.DataFrame:
-    """One row a target (sorted), one column for each of `points`: the mean over the seeds of its runs."""
+    """One row a target (sorted), one column for each of `points`: the mean over the seeds of its
+    runs.
+    """
     rows = Rows(runs, pd.DataFrame({"run": [], "status": []}), max(points))
     names, groups = (curves := rows.curves(metric)).by_target()
     values = mean_over_seeds(curves.values[:, points], groups)
     return pd.DataFrame(values, index=pd.Index(names, name="target"), columns=points)
 
 
-def interval(values: Array, statistic: Callable[..., Any], *names: str, resamples: int = 2000) -> tuple[Array, Array]:
-    """95 % percentile-bootstrap interval of a statistic over rows of `values` (n, m); NaN for fewer than two rows.
+def interval(
+    values: Array, statistic: Callable[..., Any], *names: str, resamples: int = 2000
+) -> tuple[Array, Array]:
+    """95 % percentile-bootstrap interval of a statistic over rows of `values` (n, m); NaN for fewer
+    than two rows.
 
     Args:
         values: what was measured, one row a target.
@@ -107,8 +160,17 @@ def interval(values: Array, statistic: Callable[..., Any], *names: str, resample
 
     rng = rng_for("bootstrap", *names)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a constant column: the interval is that constant
-        found = bootstrap((values,), statistic, n_resamples=resamples, method="percentile", vectorized=True, rng=rng)
+        warnings.simplefilter(
+            "ignore", RuntimeWarning
+        )  # a constant column: the interval is that constant
+        found = bootstrap(
+            (values,),
+            statistic,
+            n_resamples=resamples,
+            method="percentile",
+            vectorized=True,
+            rng=rng,
+        )
     return np.asarray(found.confidence_interval.low), np.asarray(found.confidence_interval.high)
 
 

@@ -14,7 +14,9 @@ from methods.base import Array
 
 
 class CheckError(AssertionError):
-    """A subject does not conform; the message says what was expected, what was found, and where to look."""
+    """A subject does not conform; the message says what was expected, what was found, and where to
+    look.
+    """
 
 
 def require(condition: bool, expected: str, found: object, look: str) -> None:
@@ -30,9 +32,11 @@ def same_bits(a: Array, b: Array) -> bool:
 
 @contextmanager
 def global_random_state_untouched(look: str) -> Iterator[None]:
-    """Raise `CheckError` if the block draws from, or seeds, the generators of `random`, numpy or (if loaded) torch.
+    """Raise `CheckError` if the block draws from, or seeds, the generators of `random`, numpy or
+    (if loaded) torch.
 
-    They are put into a state of their own first, so that seeding with a usual number shows, and back afterwards.
+    They are put into a state of their own first, so that seeding with a usual number shows, and
+    back afterwards.
     """
     python, legacy = random.getstate(), np.random.get_state()  # noqa: NPY002 - it is what must not change
     random.seed(82_589_933)
@@ -50,7 +54,10 @@ def global_random_state_untouched(look: str) -> Iterator[None]:
 
 def _random_states() -> dict[str, object]:
     legacy: Any = np.random.get_state(legacy=True)  # noqa: NPY002
-    states: dict[str, object] = {"random": random.getstate(), "numpy": (legacy[1].tobytes(), *legacy[2:])}
+    states: dict[str, object] = {
+        "random": random.getstate(),
+        "numpy": (legacy[1].tobytes(), *legacy[2:]),
+    }
     if "torch" in sys.modules:
         states["torch"] = sys.modules["torch"].random.get_rng_state().numpy().tobytes()
     return states

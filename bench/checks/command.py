@@ -1,4 +1,6 @@
-"""What `simgap check NAME` does: the conformance suite on a tuner, a simulator or an effect, each check isolated."""
+"""What `simgap check NAME` does: the conformance suite on a tuner, a simulator or an effect, each
+check isolated.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def kind_of(name: str) -> str:
     for kind, names in kinds.items():
         if name in names:
             return kind
-    raise unknown("tuner, simulator or effect", name, [n for names in kinds.values() for n in names])
+    raise unknown(
+        "tuner, simulator or effect", name, [n for names in kinds.values() for n in names]
+    )
 
 
 def _subject(kind: str, name: str) -> Any:
@@ -50,7 +54,11 @@ def attempt(kind: str, name: str, place: int) -> str:
         check(subject)
     except CheckError as error:
         return f"{_KNOWN}{known}" if known else str(error)
-    return f"expected to fail ({known}); found that it passes; see {name}.known_failures" if known else ""
+    return (
+        f"expected to fail ({known}); found that it passes; see {name}.known_failures"
+        if known
+        else ""
+    )
 
 
 def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> bool:
@@ -70,7 +78,9 @@ def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> bool:
     ends = _isolated(kind, name, plugins)
     for place, check in enumerate(checks):
         if check in _HERE and not any(isinstance(end, Exception) for end in ends.values()):
-            ends[place] = attempt(kind, name, place)  # it runs the subject here too, which is known to be safe now
+            ends[place] = attempt(
+                kind, name, place
+            )  # it runs the subject here too, which is known to be safe now
     failed = 0
     for place, check in enumerate(checks):
         line = _line(ends.get(place, "not made: the subject does not survive the others"))
@@ -79,13 +89,17 @@ def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> bool:
         title = check.__name__.removeprefix("check_").replace("_", " ")
         mark = "FAILED" if bad else "known " if line else "ok    "
         say(f"{mark}  {title}" + (f"\n        {line.removeprefix(_KNOWN)}" if line else ""))
-    summary = f"{failed} of {len(checks)} checks failed" if failed else f"all {len(checks)} checks passed"
+    summary = (
+        f"{failed} of {len(checks)} checks failed" if failed else f"all {len(checks)} checks passed"
+    )
     say(f"{kind} {name} ({subject.__module__}.{subject.__qualname__}): {summary}")
     return not failed
 
 
 def _isolated(kind: str, name: str, plugins: Sequence[str]) -> dict[int, Any]:
-    """How each check ends in a worker process; after two that had to be killed, or died, no more are made."""
+    """How each check ends in a worker process; after two that had to be killed, or died, no more
+    are made.
+    """
     places = [place for place, check in enumerate(_SUITES[kind]) if check not in _HERE]
     ends: dict[int, Any] = {}
     with LocalPool(1) as pool:

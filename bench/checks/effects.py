@@ -1,4 +1,6 @@
-"""Conformance of an effect; each check takes the effect's class and runs it on every system that can have it."""
+"""Conformance of an effect; each check takes the effect's class and runs it on every system that
+can have it.
+"""
 
 from __future__ import annotations
 
@@ -36,11 +38,15 @@ def _hosts(effect: type[Effect]) -> Iterator[type[Simulated]]:
 
 
 def _made(host: type[Simulated], effect: type[Effect]) -> Simulated:
-    """The host with this effect, registered or not; on the batch engine, or on its own where it steps itself."""
+    """The host with this effect, registered or not; on the batch engine, or on its own where it
+    steps itself.
+    """
     known = effects.names()
     if effect.name not in known or effects.get(effect.name) is not effect:
         if effect.name in known:
-            raise CheckError(f"expected a name of its own; found {effect.name}; see {effect.__name__}.name")
+            raise CheckError(
+                f"expected a name of its own; found {effect.name}; see {effect.__name__}.name"
+            )
         effects.register(effect)
     return host(engine=_engine(host), effects=[effect.name])
 
@@ -63,19 +69,30 @@ def _theta(simulator: Simulated, share: float) -> Array:
     """Nominal parameters, and every coefficient at a share of its plausible range."""
     own = len(simulator.system.parameters)
     values = [p.nominal for p in simulator.parameters[:own]]
-    values += [p.bounds[0] + share * (p.bounds[1] - p.bounds[0]) for p in simulator.parameters[own:]]
+    values += [
+        p.bounds[0] + share * (p.bounds[1] - p.bounds[0]) for p in simulator.parameters[own:]
+    ]
     return np.array([values])
 
 
 def check_declaration_is_complete(effect: type[Effect]) -> None:
-    """Name, sentence, source, and for each coefficient a unit and a range on at least one kind of system."""
+    """Name, sentence, source, and for each coefficient a unit and a range on at least one kind of
+    system.
+    """
     look = effect.__name__
     require(bool(_NAME.match(effect.name)), "a name family.form in lower case", effect.name, look)
-    require(bool(effect.says) and bool(effect.source), "a sentence and a source", (effect.says, effect.source), look)
+    require(
+        bool(effect.says) and bool(effect.source),
+        "a sentence and a source",
+        (effect.says, effect.source),
+        look,
+    )
     require(bool(effect.coefficients), "at least one coefficient", "none", look)
     for c in effect.coefficients:
         for unit, (low, high) in zip(c.units, c.plausible, strict=True):
-            require(unit is None or low < high, f"a plausible range for {c.name}", (low, high), look)
+            require(
+                unit is None or low < high, f"a plausible range for {c.name}", (low, high), look
+            )
     require(any(True for _ in _hosts(effect)), "a registered system that can have it", "none", look)
 
 
@@ -87,11 +104,15 @@ def check_contribution_is_nothing_at_zero(effect: type[Effect]) -> None:
     for host in _hosts(effect):
         system, acting = host.system(), effect()
         c = np.zeros((len(effect.coefficients), 2, 1))
-        same = all(same_bits(given, nothing) for given, nothing in _contributions(acting, c, host, system))
+        same = all(
+            same_bits(given, nothing) for given, nothing in _contributions(acting, c, host, system)
+        )
         require(same, f"no contribution on {host.name} at zero", "one", effect.__name__)
 
 
-def _contributions(acting: Effect, c: Array, host: type[Simulated], system: System) -> list[tuple[Array, Array]]:
+def _contributions(
+    acting: Effect, c: Array, host: type[Simulated], system: System
+) -> list[tuple[Array, Array]]:
     """Pairs of what the effect's hook gives and what it should give where the effect is off."""
     moment = _moment(host, system)
     speed, e = np.array([[0.3], [2.0]]), np.array([[0.4], [0.8]])
@@ -103,12 +124,17 @@ def _contributions(acting: Effect, c: Array, host: type[Simulated], system: Syst
     if isinstance(acting, Friction):
         return [(acting.limit(c, moment) + np.zeros((2, 1)), np.zeros((2, 1)))]
     if isinstance(acting, Contact):
-        return [(acting.restitution(c, e, speed), e), (acting.friction(c) + np.zeros((2, 1)), np.zeros((2, 1)))]
+        return [
+            (acting.restitution(c, e, speed), e),
+            (acting.friction(c) + np.zeros((2, 1)), np.zeros((2, 1))),
+        ]
     if isinstance(acting, Input):
         return [(acting.times(c, times), times), (acting.feel(c, signal), values)]
     if isinstance(acting, Sensor):
         return [(acting.times(c, times), times), (acting.read(c, signal), values)]
-    raise CheckError(f"expected one of the hook classes; found {type(acting).__mro__}; see sims.system")
+    raise CheckError(
+        f"expected one of the hook classes; found {type(acting).__mro__}; see sims.system"
+    )
 
 
 def _moment(host: type[Simulated], system: System) -> Moment:
@@ -119,17 +145,29 @@ def _moment(host: type[Simulated], system: System) -> Moment:
     inputs = {c.name: np.full((2, 1), 0.3) for c in host.inputs}
     numbers = np.linspace(0.2, 1.1, 2 * shape[1])
     return Moment(
-        system, theta, constants, np.full((2, 1), 0.4), numbers.reshape(shape), -numbers.reshape(shape), inputs
+        system,
+        theta,
+        constants,
+        np.full((2, 1), 0.4),
+        numbers.reshape(shape),
+        -numbers.reshape(shape),
+        inputs,
     )
 
 
 def check_it_shows_and_stays_finite(effect: type[Effect]) -> None:
-    """Somewhere inside its plausible range it changes the observation; well above the middle nothing becomes NaN.
+    """Somewhere inside its plausible range it changes the observation; well above the middle
+    nothing becomes NaN.
 
-    Several places, since a limit acts at its low end, where a force may pull a system away for good.
+    Several places, since a limit acts at its low end, where a force may pull a system away for
+    good.
     """
     for host in _hosts(effect):
-        simulator, plain, scenario = _made(host, effect), host(engine=_engine(host)), _scenario(host.system)
+        simulator, plain, scenario = (
+            _made(host, effect),
+            host(engine=_engine(host)),
+            _scenario(host.system),
+        )
         thetas = np.concatenate([_theta(simulator, share) for share in (0.05, 0.3, 0.7)])
         seen = simulator.simulate(thetas, scenario)
         look = f"{effect.__name__} on {host.name}"
@@ -145,7 +183,12 @@ def check_lanes_are_independent(effect: type[Effect]) -> None:
         lanes = np.concatenate([_theta(simulator, share) for share in (0.2, 0.5, 0.9)])
         together = simulator.simulate(lanes, scenario)
         alone = np.concatenate([simulator.simulate(lane[None], scenario) for lane in lanes])
-        require(same_bits(together, alone), "the same bits alone and among others", "others", effect.__name__)
+        require(
+            same_bits(together, alone),
+            "the same bits alone and among others",
+            "others",
+            effect.__name__,
+        )
 
 
 def check_impossible_hosts_are_refused(effect: type[Effect]) -> None:
@@ -155,9 +198,16 @@ def check_impossible_hosts_are_refused(effect: type[Effect]) -> None:
             try:
                 _made(host, effect)
             except InputError as error:
-                require(effect.name in str(error), "a message that names the effect", error, effect.__name__)
+                require(
+                    effect.name in str(error),
+                    "a message that names the effect",
+                    error,
+                    effect.__name__,
+                )
                 continue
-            raise CheckError(f"expected {host.name} to refuse it; found that it did not; see {effect.__name__}.needs")
+            raise CheckError(
+                f"expected {host.name} to refuse it; found that it did not; see {effect.__name__}.needs"
+            )
 
 
 EFFECT_CHECKS: tuple[Callable[[type[Effect]], None], ...] = (

@@ -25,7 +25,8 @@ def _pool(workers: int, plugins: tuple[str, ...]) -> LocalPool:
 def elsewhere(
     function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], workers: int, subject: type
 ) -> list[Any]:
-    """The result (or exception) of `function` for each of `arguments`, each in one of so many worker processes.
+    """The result (or exception) of `function` for each of `arguments`, each in one of so many
+    worker processes.
 
     Args:
         function: importable.
@@ -34,5 +35,7 @@ def elsewhere(
         subject: the class under test; where it comes from a plugin file, workers load that file.
     """
     plugins = (inspect.getfile(subject),) if subject.__module__.startswith("simgap_plugin_") else ()
-    results = dict(_pool(workers, plugins).results([(function, given) for given in arguments], LIMIT))
+    results = dict(
+        _pool(workers, plugins).results([(function, given) for given in arguments], LIMIT)
+    )
     return [results[place] for place in range(len(arguments))]

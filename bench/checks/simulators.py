@@ -26,8 +26,18 @@ def _points(simulator: Simulator, n: int, seed: int = 0) -> Array:
 def check_declaration_is_complete(kind: type[Simulator]) -> None:
     """Names are plain, units and sentences are there, nothing is declared twice."""
     look = kind.__name__
-    named: list[Parameter | Channel | Constant] = [*kind.parameters, *kind.channels, *kind.constants, *kind.inputs]
-    require(bool(kind.parameters and kind.channels and kind.says), "parameters, channels and a sentence", "none", look)
+    named: list[Parameter | Channel | Constant] = [
+        *kind.parameters,
+        *kind.channels,
+        *kind.constants,
+        *kind.inputs,
+    ]
+    require(
+        bool(kind.parameters and kind.channels and kind.says),
+        "parameters, channels and a sentence",
+        "none",
+        look,
+    )
     groups: tuple[tuple[Parameter | Channel | Constant, ...], ...]
     groups = (kind.parameters, kind.channels, kind.constants, kind.inputs)
     for group in groups:
@@ -44,7 +54,12 @@ def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
     for n, samples in ((1, 2), (3, 40), (1, 1)):
         seen = simulator.simulate(_points(simulator, n), _scenario(samples))
         shape = (n, samples, len(simulator.channels))
-        require(seen.shape == shape, f"observations of shape {shape}", seen.shape, f"{kind.__name__}.simulate")
+        require(
+            seen.shape == shape,
+            f"observations of shape {shape}",
+            seen.shape,
+            f"{kind.__name__}.simulate",
+        )
         require(
             bool(np.isfinite(seen).all()),
             "finite observations inside the bounds",
@@ -57,16 +72,29 @@ def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
 def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
     """Whatever was simulated before, here or in a fresh simulator, alone or among others."""
     simulator, other = kind(), kind()
-    points, look = _points(simulator, 6), f"what {kind.__name__} keeps from one simulation to the next"
+    points, look = (
+        _points(simulator, 6),
+        f"what {kind.__name__} keeps from one simulation to the next",
+    )
     together = simulator.simulate(points, _scenario())
     simulator.simulate(_points(simulator, 5, seed=9), _scenario(samples=77, rate=50.0))
-    alone = np.concatenate([simulator.simulate(point[None], _scenario()) for point in points[::-1]])[::-1]
+    alone = np.concatenate(
+        [simulator.simulate(point[None], _scenario()) for point in points[::-1]]
+    )[::-1]
     require(same_bits(together, alone), "the same bits after other simulations", "others", look)
     require(
-        same_bits(together, other.simulate(points, _scenario())), "the same bits in a new simulator", "others", look
+        same_bits(together, other.simulate(points, _scenario())),
+        "the same bits in a new simulator",
+        "others",
+        look,
     )
     simulator.close()
-    require(same_bits(together, simulator.simulate(points, _scenario())), "the same bits after close()", "others", look)
+    require(
+        same_bits(together, simulator.simulate(points, _scenario())),
+        "the same bits after close()",
+        "others",
+        look,
+    )
     simulator.close()
     other.close()
 
@@ -117,7 +145,9 @@ def check_every_parameter_shows(kind: type[Simulator]) -> None:
 
 
 def check_unknown_names_are_refused(kind: type[Simulator]) -> None:
-    """Constants, channels, inputs and initial states that do not exist give one line that lists those that do."""
+    """Constants, channels, inputs and initial states that do not exist give one line that lists
+    those that do.
+    """
     scenarios = (
         Scenario(np.arange(3.0), initial={"no_such": 1.0}),
         Scenario(np.arange(3.0), inputs={"no_such": np.zeros(3)}),
@@ -135,7 +165,9 @@ def check_unknown_names_are_refused(kind: type[Simulator]) -> None:
         except InputError as error:
             require("no_such" in str(error), "a message that names it", error, kind.__name__)
             continue
-        raise CheckError(f"expected InputError for an unknown name; found none; see {kind.__name__}")
+        raise CheckError(
+            f"expected InputError for an unknown name; found none; see {kind.__name__}"
+        )
 
 
 def check_chosen_channels_are_the_same_columns(kind: type[Simulator]) -> None:
@@ -148,7 +180,9 @@ def check_chosen_channels_are_the_same_columns(kind: type[Simulator]) -> None:
         np.ascontiguousarray(everything.simulate(points, _scenario())[:, :, ::-1]),
         np.ascontiguousarray(chosen.simulate(points, _scenario())),
     )
-    require(same, "the same columns in the order asked for", "others", f"{kind.__name__}: self.columns")
+    require(
+        same, "the same columns in the order asked for", "others", f"{kind.__name__}: self.columns"
+    )
     everything.close()
     chosen.close()
 

@@ -45,7 +45,9 @@ class _Practice:
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:  # noqa: ARG002
         if not ((points >= 0.25) & (points <= 0.75)).all():
-            raise CheckError("expected training inside the training range; found a point outside; see `fit`")
+            raise CheckError(
+                "expected training inside the training range; found a point outside; see `fit`"
+            )
         self.used += len(points)
         if self.used > self.budget:
             raise BudgetExceededError(f"{self.used} training simulations, {self.budget} allowed")
@@ -56,7 +58,9 @@ _learned: dict[tuple[type[Tuner], int], dict[str, Array]] = {}
 
 
 def ready(kind: type[Tuner], dim: int, anew: bool = False) -> Tuner:
-    """A tuner of this kind, trained on the toy simulator if it is a learned one: once a process, unless anew."""
+    """A tuner of this kind, trained on the toy simulator if it is a learned one: once a process,
+    unless anew.
+    """
     tuner = kind()
     if not anew and (kind, dim) in _learned:
         tuner.restore(_learned[kind, dim])
@@ -78,7 +82,12 @@ def _task(dim: int, budget: int, seed: int = 0) -> tuple[Task, Array]:
 
 
 def _run(
-    tuner: Tuner, dim: int, budget: int, seed: int = 0, fails: Callable[[int], bool] = lambda _: False, target: int = 0
+    tuner: Tuner,
+    dim: int,
+    budget: int,
+    seed: int = 0,
+    fails: Callable[[int], bool] = lambda _: False,
+    target: int = 0,
 ) -> Trace:
     """One run; simulation number k fails where `fails(k)`."""
     task, _ = _task(dim, budget, target)
@@ -104,18 +113,36 @@ def _ended_well(kind: type[Tuner], trace: Trace, when: str) -> None:
 
 
 def check_api_is_complete(kind: type[Tuner]) -> None:
-    """A plain name; made without arguments; `tune` is a generator; a learned one has fit, state and restore."""
+    """A plain name; made without arguments; `tune` is a generator; a learned one has fit, state and
+    restore.
+    """
     look = kind.__name__
     require(bool(_NAME.match(kind.name)), "a name in lower case", repr(kind.name), f"{look}.name")
     try:
         tuner = kind()
     except TypeError as error:
-        raise CheckError(f"expected a default for every option; found {error}; see {look}.__init__") from None
+        raise CheckError(
+            f"expected a default for every option; found {error}; see {look}.__init__"
+        ) from None
     steps = ready(kind, 2).tune(_task(2, 5)[0], np.random.default_rng(0))
-    require(inspect.isgenerator(steps), "a generator (with a yield)", type(steps).__name__, f"{look}.tune")
+    require(
+        inspect.isgenerator(steps),
+        "a generator (with a yield)",
+        type(steps).__name__,
+        f"{look}.tune",
+    )
     if tuner.learned:
-        missing = [name for name in ("fit", "state", "restore") if getattr(kind, name) is getattr(Tuner, name)]
-        require(not missing, "fit, state and restore of a learned tuner", f"no {', '.join(missing)}", look)
+        missing = [
+            name
+            for name in ("fit", "state", "restore")
+            if getattr(kind, name) is getattr(Tuner, name)
+        ]
+        require(
+            not missing,
+            "fit, state and restore of a learned tuner",
+            f"no {', '.join(missing)}",
+            look,
+        )
 
 
 def check_runs_in_one_and_in_ten_dimensions(kind: type[Tuner]) -> None:
@@ -138,14 +165,18 @@ def check_budget_is_exact(kind: type[Tuner]) -> None:
 def check_arguments_are_not_changed(kind: type[Tuner]) -> None:
     """The task and the evaluations are the harness's: nothing in them is written to."""
     task, _ = _task(2, 20)
-    task = replace(task, start=task.start.copy(), observed=task.observed.copy(), training=task.training.copy())
+    task = replace(
+        task, start=task.start.copy(), observed=task.observed.copy(), training=task.training.copy()
+    )
     given = [task.start, task.observed, task.scale, task.training]
     before = [array.copy() for array in given]
     steps = ready(kind, 2).tune(task, np.random.default_rng(0))
     try:
         asked = next(steps)
         for _ in range(10):
-            points = np.array(asked[0] if isinstance(asked, Ask) else asked, dtype=np.float64, ndmin=2).clip(0.0, 1.0)
+            points = np.array(
+                asked[0] if isinstance(asked, Ask) else asked, dtype=np.float64, ndmin=2
+            ).clip(0.0, 1.0)
             observations = _observe(points)
             losses = np.sqrt(((observations - task.observed) ** 2).mean(axis=(1, 2)))
             shown = [points, observations, losses]
@@ -156,11 +187,18 @@ def check_arguments_are_not_changed(kind: type[Tuner]) -> None:
     finally:
         steps.close()
     changed = [a.shape for a, b in zip(given, before, strict=True) if not same_bits(a, b)]
-    require(not changed, "arguments as they were", f"changed arrays of shapes {changed}", f"{kind.__name__}.tune")
+    require(
+        not changed,
+        "arguments as they were",
+        f"changed arrays of shapes {changed}",
+        f"{kind.__name__}.tune",
+    )
 
 
 def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
-    """Nothing outside 0..1 is proposed or recommended: the harness would move it, and the tuner not know."""
+    """Nothing outside 0..1 is proposed or recommended: the harness would move it, and the tuner not
+    know.
+    """
     asked: list[Array] = []
 
     class Watched(Tuner):
@@ -193,7 +231,9 @@ def check_same_seed_gives_the_same_run(kind: type[Tuner]) -> None:
         second = _run(tuner, 2, 25, seed=3)
     finally:
         np.random.set_state(saved)  # noqa: NPY002
-    same = same_bits(first.proposals, second.proposals) and same_bits(first.recommendations, second.recommendations)
+    same = same_bits(first.proposals, second.proposals) and same_bits(
+        first.recommendations, second.recommendations
+    )
     require(same, "the same run for the same seed", "another", f"{kind.__name__}.tune: use rng")
 
 
@@ -203,7 +243,12 @@ def check_runs_do_not_touch_each_other(kind: type[Tuner]) -> None:
     _run(used, 2, 15, seed=1)
     again, fresh = _run(used, 2, 15, seed=2), _run(ready(kind, 2), 2, 15, seed=2)
     same = same_bits(again.proposals, fresh.proposals)
-    require(same, "nothing kept from run to run", "a different run", f"what {kind.__name__}.tune keeps in self")
+    require(
+        same,
+        "nothing kept from run to run",
+        "a different run",
+        f"what {kind.__name__}.tune keeps in self",
+    )
 
 
 def check_global_random_state_is_left_alone(kind: type[Tuner]) -> None:
@@ -219,11 +264,15 @@ def check_stochastic_is_declared(kind: type[Tuner]) -> None:
         return
     tuner = ready(kind, 2)
     same = same_bits(_run(tuner, 2, 15, seed=1).proposals, _run(tuner, 2, 15, seed=2).proposals)
-    require(same, "stochastic = True", "another run with another seed", f"{kind.__name__}.stochastic")
+    require(
+        same, "stochastic = True", "another run with another seed", f"{kind.__name__}.stochastic"
+    )
 
 
 def check_failed_simulations_are_survived(kind: type[Tuner]) -> None:
-    """The first simulation, some, or all of them give NaN and an infinite loss: the run still ends well."""
+    """The first simulation, some, or all of them give NaN and an infinite loss: the run still ends
+    well.
+    """
     tuner = ready(kind, 2)
     for fails, when in (
         (lambda k: k == 1, "when the first simulation fails"),
@@ -234,22 +283,32 @@ def check_failed_simulations_are_survived(kind: type[Tuner]) -> None:
 
 
 def check_easy_problem_is_improved(kind: type[Tuner]) -> None:
-    """On a smooth, identifiable problem the recommendation after 60 simulations is better than the start."""
+    """On a smooth, identifiable problem the recommendation after 60 simulations is better than the
+    start.
+    """
     trace = _run(ready(kind, 2), 2, 60)
     task, truth = _task(2, 60)
-    before, after = (np.abs(point - truth).mean() for point in (task.start, trace.recommendations[-1]))
-    require(after < before / 2, f"an error below half of the start's, {before / 2:.3g}", f"{after:.3g}", kind.__name__)
+    before, after = (
+        np.abs(point - truth).mean() for point in (task.start, trace.recommendations[-1])
+    )
+    require(
+        after < before / 2,
+        f"an error below half of the start's, {before / 2:.3g}",
+        f"{after:.3g}",
+        kind.__name__,
+    )
 
 
 _LOOKS = (6, 12, 24)
-"""Targets after which `check_beats_random_search` looks; each look may be wrong in a third of 5 %."""
+"""Targets after which `check_beats_random_search` looks; each look may be wrong in a third of 5 %.
+"""
 
 
 def check_beats_random_search(kind: type[Tuner]) -> None:
     """On targets of the easy problem its errors after 30 simulations are below random search's.
 
-    One-sided Wilcoxon signed-rank tests of the paired log errors (scipy) at 5 % over at most three looks, so that a
-    clear case is soon done.
+    One-sided Wilcoxon signed-rank tests of the paired log errors (scipy) at 5 % over at most three
+    looks, so that a clear case is soon done.
     """
     from scipy.stats import wilcoxon
 
@@ -258,7 +317,11 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
     for look in _LOOKS:
         logs += [_final_logs((tuner, chance), target) for target in range(len(logs), look)]
         mine, random = np.array(logs).T
-        p = float(wilcoxon(mine, random, alternative="less").pvalue) if (mine != random).any() else 1.0
+        p = (
+            float(wilcoxon(mine, random, alternative="less").pvalue)
+            if (mine != random).any()
+            else 1.0
+        )
         if p < 0.05 / len(_LOOKS):
             return
     found = f"p = {p:.2g}, median error {np.exp(np.median(mine)):.2g} against {np.exp(np.median(random)):.2g}"
@@ -270,7 +333,9 @@ def _final_logs(subjects: tuple[Tuner, ...], target: int) -> Array:
     """Logarithms of the errors with which these tuners end on one target."""
     _, truth = _task(2, 30, target)
     traces = [_run(tuner, 2, 30, seed=target, target=target) for tuner in subjects]
-    return np.log([max(np.abs(trace.recommendations[-1] - truth).mean(), 1e-12) for trace in traces])
+    return np.log(
+        [max(np.abs(trace.recommendations[-1] - truth).mean(), 1e-12) for trace in traces]
+    )
 
 
 class _Chance(Tuner):
@@ -282,12 +347,19 @@ class _Chance(Tuner):
             yield rng.uniform(size=(1, task.dim))
 
 
-def run_digests(kind: type[Tuner], seeds: tuple[int, ...], learned: dict[str, Array] | None = None) -> list[str]:
-    """Hashes of a run with each seed, for comparison between processes; trains unless it is given what was learned."""
+def run_digests(
+    kind: type[Tuner], seeds: tuple[int, ...], learned: dict[str, Array] | None = None
+) -> list[str]:
+    """Hashes of a run with each seed, for comparison between processes; trains unless it is given
+    what was learned.
+    """
     if learned:
         _learned[kind, 2] = learned
     traces = [_run(ready(kind, 2), 2, 12, seed) for seed in seeds]
-    return [hashlib.sha256(t.proposals.tobytes() + t.recommendations.tobytes()).hexdigest()[:16] for t in traces]
+    return [
+        hashlib.sha256(t.proposals.tobytes() + t.recommendations.tobytes()).hexdigest()[:16]
+        for t in traces
+    ]
 
 
 def check_same_run_in_other_processes(kind: type[Tuner]) -> None:
@@ -319,7 +391,9 @@ def check_what_was_learned_can_be_stored(kind: type[Tuner]) -> None:
         kind().restore({"weights": np.zeros(3)})
     except ValueError:
         return
-    raise CheckError(f"expected ValueError for foreign weights; found none; see {kind.__name__}.restore")
+    raise CheckError(
+        f"expected ValueError for foreign weights; found none; see {kind.__name__}.restore"
+    )
 
 
 def check_instances_can_be_sent_to_workers(kind: type[Tuner]) -> None:
@@ -327,7 +401,9 @@ def check_instances_can_be_sent_to_workers(kind: type[Tuner]) -> None:
     try:
         pickle.loads(pickle.dumps(kind()))
     except Exception as error:
-        raise CheckError(f"expected a tuner that can be pickled; found {error!r}; see {kind.__name__}") from error
+        raise CheckError(
+            f"expected a tuner that can be pickled; found {error!r}; see {kind.__name__}"
+        ) from error
 
 
 TUNER_CHECKS: tuple[Callable[[type[Tuner]], None], ...] = (

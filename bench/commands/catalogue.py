@@ -15,16 +15,22 @@ def lines(what: str) -> list[str]:
     """The lines for tuners, simulators, systems, effects or experiments."""
     kinds: dict[str, Callable[[], list[str]]] = {
         "tuners": lambda: [f"{name:18} {tuners.describe(name)}" for name in tuners.names()],
-        "simulators": lambda: [f"{name:18} {simulators.describe(name)}" for name in simulators.names()],
+        "simulators": lambda: [
+            f"{name:18} {simulators.describe(name)}" for name in simulators.names()
+        ],
         "systems": _systems,
         "effects": _effects,
-        "experiments": lambda: [f"{name:22} {experiment.load(name).says}" for name in experiment.names()],
+        "experiments": lambda: [
+            f"{name:22} {experiment.load(name).says}" for name in experiment.names()
+        ],
     }
     return kinds[what]()
 
 
 def _systems() -> list[str]:
-    """Every simulator's declaration: parameters, constants, inputs, states and channels with units and ranges."""
+    """Every simulator's declaration: parameters, constants, inputs, states and channels with units
+    and ranges.
+    """
     result = []
     for name in simulators.names():
         try:
@@ -53,7 +59,9 @@ def _channels(what: str, channels: Iterable[Channel]) -> list[str]:
 
 
 def _effects() -> list[str]:
-    """Every effect: its sentence, then each coefficient with unit and plausible range on each kind of system."""
+    """Every effect: its sentence, then each coefficient with unit and plausible range on each kind
+    of system.
+    """
     result = []
     for name in effects.names():
         try:

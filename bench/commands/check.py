@@ -7,8 +7,12 @@ import argparse
 
 def add_check(check: argparse.ArgumentParser) -> None:
     """The options of `simgap check`."""
-    check.add_argument("name", metavar="NAME", help="registered name, e.g. cma_es, pendulum or drag.linear")
-    check.add_argument("--plugin", action="append", default=[], metavar="FILE", help="Python file that defines it")
+    check.add_argument(
+        "name", metavar="NAME", help="registered name, e.g. cma_es, pendulum or drag.linear"
+    )
+    check.add_argument(
+        "--plugin", action="append", default=[], metavar="FILE", help="Python file that defines it"
+    )
     check.set_defaults(command=_check)
 
 

@@ -18,23 +18,50 @@ INTERRUPTED = 130
 def add_compare(compare: argparse.ArgumentParser) -> None:
     """The options of `simgap compare`."""
     compare.add_argument(
-        "experiment", metavar="EXPERIMENT", nargs="?", help="name (see `simgap list experiments`) or TOML file"
+        "experiment",
+        metavar="EXPERIMENT",
+        nargs="?",
+        help="name (see `simgap list experiments`) or TOML file",
     )
-    compare.add_argument("--tuners", metavar="A,B,...", help="only these tuners, by label or registered name")
+    compare.add_argument(
+        "--tuners", metavar="A,B,...", help="only these tuners, by label or registered name"
+    )
     compare.add_argument("--targets", type=positive, metavar="N", help="targets in each range")
-    compare.add_argument("--seeds", type=positive, metavar="N", help="seeds of each tuner that uses chance")
+    compare.add_argument(
+        "--seeds", type=positive, metavar="N", help="seeds of each tuner that uses chance"
+    )
     compare.add_argument("--budget", type=positive, metavar="N", help="simulations on one target")
     compare.add_argument(
-        "--training-budget", type=positive, metavar="N", help="simulations that a tuner may learn from"
+        "--training-budget",
+        type=positive,
+        metavar="N",
+        help="simulations that a tuner may learn from",
     )
-    compare.add_argument("--jobs", type=positive, metavar="N", default=2, help="worker processes (default: 2)")
-    compare.add_argument("--out", metavar="DIR", help="folder to write (default: a new one below results/)")
+    compare.add_argument(
+        "--jobs", type=positive, metavar="N", default=2, help="worker processes (default: 2)"
+    )
+    compare.add_argument(
+        "--out", metavar="DIR", help="folder to write (default: a new one below results/)"
+    )
     add_plugin(compare, "tuners")
-    compare.add_argument("--resume", metavar="DIR", type=Path, help="finish what is missing in this folder instead")
-    compare.add_argument("--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler")
-    compare.add_argument("--timeout", type=seconds, metavar="S", help="seconds that a run may take, then it is killed")
-    compare.add_argument("--memory", type=positive, metavar="MIB", help="memory that a run may take")
-    compare.add_argument("--allow-failures", action="store_true", help="exit with 0 although runs failed")
+    compare.add_argument(
+        "--resume", metavar="DIR", type=Path, help="finish what is missing in this folder instead"
+    )
+    compare.add_argument(
+        "--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler"
+    )
+    compare.add_argument(
+        "--timeout",
+        type=seconds,
+        metavar="S",
+        help="seconds that a run may take, then it is killed",
+    )
+    compare.add_argument(
+        "--memory", type=positive, metavar="MIB", help="memory that a run may take"
+    )
+    compare.add_argument(
+        "--allow-failures", action="store_true", help="exit with 0 although runs failed"
+    )
     compare.set_defaults(command=_compare)
 
 
@@ -47,8 +74,12 @@ def add_status(status: argparse.ArgumentParser) -> None:
 
 def add_plot(plot: argparse.ArgumentParser) -> None:
     """The options of `simgap plot`."""
-    plot.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="a comparison's folder; several: ranks")
-    plot.add_argument("--out", metavar="DIR", type=Path, help="folder for what several comparisons give together")
+    plot.add_argument(
+        "runs", metavar="RUN", type=Path, nargs="+", help="a comparison's folder; several: ranks"
+    )
+    plot.add_argument(
+        "--out", metavar="DIR", type=Path, help="folder for what several comparisons give together"
+    )
     add_plugin(plot, "simulators")
     plot.set_defaults(command=_plot)
 
@@ -62,7 +93,10 @@ def _chosen(options: argparse.Namespace) -> Experiment:
     if options.experiment is None:
         raise InputError("expected an experiment (see `simgap list experiments`), or --resume DIR")
     load_plugins(options.plugin)
-    changes = {name: getattr(options, name) for name in ("targets", "budget", "training_budget", "timeout", "memory")}
+    changes = {
+        name: getattr(options, name)
+        for name in ("targets", "budget", "training_budget", "timeout", "memory")
+    }
     experiment = load(options.experiment).chosen(**changes)
     if options.seeds:
         experiment = experiment.with_seeds(options.seeds)
@@ -143,7 +177,9 @@ def _plot(options: argparse.Namespace) -> int:
         from bench.across import across
 
         if not options.out:
-            raise InputError("several comparisons give one result: name a folder for it with --out DIR")
+            raise InputError(
+                "several comparisons give one result: name a folder for it with --out DIR"
+            )
         across(options.runs, options.out, print)
         return 0
     finish(options.runs[0], Problem(configuration(options.runs[0]).experiment), print)

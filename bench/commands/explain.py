@@ -14,14 +14,37 @@ from bench.commands.options import add_plugin
 
 def add_explain(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap explain`."""
-    parser.add_argument("recording", metavar="RECORDING.csv", type=Path, help="the table; its .toml stands beside it")
-    parser.add_argument("--system", metavar="NAME", help="take it for this system, whatever the .toml says")
-    parser.add_argument("--engine", metavar="NAME", default="batch", help="pybullet, mujoco or batch (default: batch)")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="folder to write (default: a new one below results/)")
-    parser.add_argument("--seed", type=int, metavar="K", default=0, help="of all that is drawn (default: 0)")
-    parser.add_argument("--free", metavar="A,B,...", default="", help="constants to estimate with the parameters")
     parser.add_argument(
-        "--tuner", metavar="NAME", help="a tuner that finds where the base fit begins (default: a grid)"
+        "recording",
+        metavar="RECORDING.csv",
+        type=Path,
+        help="the table; its .toml stands beside it",
+    )
+    parser.add_argument(
+        "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
+    )
+    parser.add_argument(
+        "--engine",
+        metavar="NAME",
+        default="batch",
+        help="pybullet, mujoco or batch (default: batch)",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="folder to write (default: a new one below results/)",
+    )
+    parser.add_argument(
+        "--seed", type=int, metavar="K", default=0, help="of all that is drawn (default: 0)"
+    )
+    parser.add_argument(
+        "--free", metavar="A,B,...", default="", help="constants to estimate with the parameters"
+    )
+    parser.add_argument(
+        "--tuner",
+        metavar="NAME",
+        help="a tuner that finds where the base fit begins (default: a grid)",
     )
     add_plugin(parser, "systems")
     parser.set_defaults(command=explain)
@@ -29,9 +52,18 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
 
 def add_score(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap score`."""
-    parser.add_argument("model", metavar="extended.toml", type=Path, help="as `simgap explain` writes it")
-    parser.add_argument("recording", metavar="OTHER.csv", type=Path, help="the recording; its .toml stands beside it")
-    parser.add_argument("--held-out", action="store_true", help="only the runs that are marked held_out")
+    parser.add_argument(
+        "model", metavar="extended.toml", type=Path, help="as `simgap explain` writes it"
+    )
+    parser.add_argument(
+        "recording",
+        metavar="OTHER.csv",
+        type=Path,
+        help="the recording; its .toml stands beside it",
+    )
+    parser.add_argument(
+        "--held-out", action="store_true", help="only the runs that are marked held_out"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_plugin(parser, "systems")
     parser.set_defaults(command=score)
@@ -79,7 +111,9 @@ def score(options: argparse.Namespace) -> int:
         return 0
     for channel, error in result["rmse"].items():
         print(f"{channel}: RMSE {error:.4g} {units[channel]}")
-    print(f"{result['normalised_rmse']:.4g} times the noise; {result['runs']} runs, {result['samples']} samples")
+    print(
+        f"{result['normalised_rmse']:.4g} times the noise; {result['runs']} runs, {result['samples']} samples"
+    )
     return 0
 
 
@@ -88,7 +122,9 @@ def refuse_full(folder: Path) -> None:
     from sims.base import InputError
 
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"--out {folder}: exists and is not empty; results are never overwritten, name another folder")
+        raise InputError(
+            f"--out {folder}: exists and is not empty; results are never overwritten, name another folder"
+        )
 
 
 def _new(recording: Path) -> Path:

@@ -9,24 +9,51 @@ from pathlib import Path
 
 def add_film(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap film`."""
-    parser.add_argument("recording", metavar="RECORDING.csv", type=Path, help="a recording of a ball, with channel z")
-    parser.add_argument("--out", metavar="FILM.mp4", type=Path, required=True, help="video to write, a new one")
+    parser.add_argument(
+        "recording",
+        metavar="RECORDING.csv",
+        type=Path,
+        help="a recording of a ball, with channel z",
+    )
+    parser.add_argument(
+        "--out", metavar="FILM.mp4", type=Path, required=True, help="video to write, a new one"
+    )
     parser.add_argument("--run", metavar="NAME", help="which run (default: the first)")
-    parser.add_argument("--size", metavar="PX", type=int, default=100, help="width and height (default: 100)")
-    parser.add_argument("--camera-seed", metavar="K", type=int, default=0, help="camera, light, colours (default: 0)")
+    parser.add_argument(
+        "--size", metavar="PX", type=int, default=100, help="width and height (default: 100)"
+    )
+    parser.add_argument(
+        "--camera-seed",
+        metavar="K",
+        type=int,
+        default=0,
+        help="camera, light, colours (default: 0)",
+    )
     parser.set_defaults(command=film)
 
 
 def add_track(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap track`."""
-    parser.add_argument("video", metavar="VIDEO", type=Path, help="a film of one dropped ball by a camera that stands")
-    parser.add_argument("--out", metavar="NAME.csv", type=Path, required=True, help="recording to write, a new one")
-    parser.add_argument("--ball-diameter", metavar="M", type=float, help="the ball's diameter in metres")
-    parser.add_argument("--fps", metavar="F", type=float, help="frames a second (default: the file's time stamps)")
     parser.add_argument(
-        "--scale", choices=("camera", "diameter", "fall"),
+        "video",
+        metavar="VIDEO",
+        type=Path,
+        help="a film of one dropped ball by a camera that stands",
+    )
+    parser.add_argument(
+        "--out", metavar="NAME.csv", type=Path, required=True, help="recording to write, a new one"
+    )
+    parser.add_argument(
+        "--ball-diameter", metavar="M", type=float, help="the ball's diameter in metres"
+    )
+    parser.add_argument(
+        "--fps", metavar="F", type=float, help="frames a second (default: the file's time stamps)"
+    )
+    parser.add_argument(
+        "--scale",
+        choices=("camera", "diameter", "fall"),
         help="where metres come from (default: VIDEO.camera.toml if there, else the diameter if given, else the fall)",
-    )  # fmt: skip
+    )
     parser.set_defaults(command=track)
 
 
@@ -34,7 +61,9 @@ def film(options: argparse.Namespace) -> int:
     """Film a recorded ball."""
     from bench.recordings.film import write
 
-    frames, seconds = write(options.recording, options.out, options.run, options.size, options.camera_seed)
+    frames, seconds = write(
+        options.recording, options.out, options.run, options.size, options.camera_seed
+    )
     print(f"{options.out}: {frames} frames, {seconds:.4g} s, {options.size} x {options.size} px")
     print(f"{options.out.with_suffix('.camera.toml')}: the camera")
     return 0

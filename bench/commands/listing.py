@@ -9,7 +9,9 @@ from bench.commands.options import add_plugin
 
 def add_list(listing: argparse.ArgumentParser) -> None:
     """The options of `simgap list`."""
-    listing.add_argument("what", choices=("tuners", "simulators", "systems", "effects", "experiments"))
+    listing.add_argument(
+        "what", choices=("tuners", "simulators", "systems", "effects", "experiments")
+    )
     add_plugin(listing, "of them")
     listing.set_defaults(command=_list)
 

@@ -7,7 +7,13 @@ import argparse
 
 def add_plugin(parser: argparse.ArgumentParser, more: str) -> None:
     """The option ``--plugin FILE``; `more` says what such a file adds."""
-    parser.add_argument("--plugin", action="append", default=[], metavar="FILE", help=f"Python file with more {more}")
+    parser.add_argument(
+        "--plugin",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help=f"Python file with more {more}",
+    )
 
 
 def positive(text: str) -> int:

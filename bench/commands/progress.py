@@ -22,7 +22,14 @@ class Bars:
 
         self._close()
         pause = 0.5 if sys.stderr.isatty() else 30.0  # a log wants few lines
-        bar = tqdm(total=total, desc=title, unit="run", file=sys.stderr, dynamic_ncols=True, mininterval=pause)
+        bar = tqdm(
+            total=total,
+            desc=title,
+            unit="run",
+            file=sys.stderr,
+            dynamic_ncols=True,
+            mininterval=pause,
+        )
         self._close = bar.close
 
         def step() -> None:

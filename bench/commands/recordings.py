@@ -12,31 +12,63 @@ def add_simulate(simulate: argparse.ArgumentParser) -> None:
     """The options of `simgap simulate`."""
     simulate.add_argument("system", metavar="SYSTEM", help="see `simgap list systems`")
     for name, metavar, text in (
-        ("theta", "NAME=VALUE", "parameters, or all values in order with commas between (default: nominal)"),
+        (
+            "theta",
+            "NAME=VALUE",
+            "parameters, or all values in order with commas between (default: nominal)",
+        ),
         ("effect", "NAME=VALUE[,VALUE]", "effects that act, with their coefficients"),
         ("constant", "NAME=VALUE", "constants other than the system's defaults"),
         ("noise", "S", "sensor noise, 1 sigma: of every channel, or NAME=S (default: none)"),
-        ("input", "NAME=SIGNAL", "a number, sine:AMPLITUDE:HERTZ, square:A:HZ, steps:A:SECONDS, chirp:A:HZ:HZ"),
+        (
+            "input",
+            "NAME=SIGNAL",
+            "a number, sine:AMPLITUDE:HERTZ, square:A:HZ, steps:A:SECONDS, chirp:A:HZ:HZ",
+        ),
         ("initial", "NAME=VALUE", "initial states, or NAME=LOW:HIGH to draw each run's"),
     ):
-        simulate.add_argument(f"--{name}", action="extend", nargs="+", default=[], metavar=metavar, help=text)
-    simulate.add_argument("--observe", metavar="A,B,...", help="channels to record (default: the system's usual ones)")
-    simulate.add_argument("--runs", type=positive, metavar="N", default=4, help="number of runs (default: 4)")
-    simulate.add_argument("--seconds", type=float, metavar="T", default=4.0, help="length of a run (default: 4)")
-    simulate.add_argument("--rate", type=float, metavar="HZ", default=100.0, help="samples a second (default: 100)")
-    simulate.add_argument("--engine", metavar="NAME", help="pybullet, mujoco or batch (default: batch)")
-    simulate.add_argument("--seed", type=int, metavar="K", default=0, help="of all that is drawn (default: 0)")
-    simulate.add_argument("--held-out", type=int, metavar="M", help="mark the last M runs (default: a third)")
-    simulate.add_argument("--out", type=Path, metavar="FILE.csv", required=True, help="file to write, a new one")
+        simulate.add_argument(
+            f"--{name}", action="extend", nargs="+", default=[], metavar=metavar, help=text
+        )
+    simulate.add_argument(
+        "--observe", metavar="A,B,...", help="channels to record (default: the system's usual ones)"
+    )
+    simulate.add_argument(
+        "--runs", type=positive, metavar="N", default=4, help="number of runs (default: 4)"
+    )
+    simulate.add_argument(
+        "--seconds", type=float, metavar="T", default=4.0, help="length of a run (default: 4)"
+    )
+    simulate.add_argument(
+        "--rate", type=float, metavar="HZ", default=100.0, help="samples a second (default: 100)"
+    )
+    simulate.add_argument(
+        "--engine", metavar="NAME", help="pybullet, mujoco or batch (default: batch)"
+    )
+    simulate.add_argument(
+        "--seed", type=int, metavar="K", default=0, help="of all that is drawn (default: 0)"
+    )
+    simulate.add_argument(
+        "--held-out", type=int, metavar="M", help="mark the last M runs (default: a third)"
+    )
+    simulate.add_argument(
+        "--out", type=Path, metavar="FILE.csv", required=True, help="file to write, a new one"
+    )
     add_plugin(simulate, "systems")
     simulate.set_defaults(command=_simulate)
 
 
 def add_inspect(inspect: argparse.ArgumentParser) -> None:
     """The options of `simgap inspect`."""
-    inspect.add_argument("recording", metavar="FILE.csv", type=Path, help="the table; its .toml stands beside it")
-    inspect.add_argument("--system", metavar="NAME", help="take it for this system, whatever the .toml says")
-    inspect.add_argument("--out", metavar="DIR", type=Path, help="folder for the figure (default: results/inspect)")
+    inspect.add_argument(
+        "recording", metavar="FILE.csv", type=Path, help="the table; its .toml stands beside it"
+    )
+    inspect.add_argument(
+        "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
+    )
+    inspect.add_argument(
+        "--out", metavar="DIR", type=Path, help="folder for the figure (default: results/inspect)"
+    )
     add_plugin(inspect, "systems")
     inspect.set_defaults(command=_inspect)
 
@@ -47,14 +79,27 @@ def _simulate(options: argparse.Namespace) -> int:
 
     load_plugins(options.plugin)
     wish = Wish(
-        options.system, options.theta, options.effect, options.constant, options.noise, options.input, options.initial,
-        [name.strip() for name in options.observe.split(",")] if options.observe else [], options.runs,
-        options.seconds, options.rate, options.engine, options.seed, options.held_out,
-    )  # fmt: skip
+        options.system,
+        options.theta,
+        options.effect,
+        options.constant,
+        options.noise,
+        options.input,
+        options.initial,
+        [name.strip() for name in options.observe.split(",")] if options.observe else [],
+        options.runs,
+        options.seconds,
+        options.rate,
+        options.engine,
+        options.seed,
+        options.held_out,
+    )
     made = write(wish, options.out)
     channels = ", ".join(made.recording.runs[0].channels)
     runs = f"{options.runs} run{'s' * (options.runs > 1)}"
-    print(f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels {channels}")
+    print(
+        f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels {channels}"
+    )
     print(f"{options.out.with_suffix('.truth.toml')}: what made it")
     return 0
 
@@ -68,6 +113,10 @@ def _inspect(options: argparse.Namespace) -> int:
     recording, kind = load(options.recording, options.system)
     for line in summary(recording, kind):
         print(line)
-    for path in draw(recording, kind, options.out or Path("results/inspect", options.recording.resolve().parent.name)):
+    for path in draw(
+        recording,
+        kind,
+        options.out or Path("results/inspect", options.recording.resolve().parent.name),
+    ):
         print(path)
     return 0

@@ -24,15 +24,29 @@ _HELD_OUT = 160
 
 def add_train(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap train`."""
-    parser.add_argument("tuner", metavar="TUNER", help="a learned tuner, by registered name or the experiment's label")
+    parser.add_argument(
+        "tuner",
+        metavar="TUNER",
+        help="a learned tuner, by registered name or the experiment's label",
+    )
     parser.add_argument("simulator", metavar="SIMULATOR", help="see `simgap list simulators`")
     parser.add_argument(
-        "--experiment", metavar="NAME", help="whose settings to train in: a name or TOML file (default: the only one)"
+        "--experiment",
+        metavar="NAME",
+        help="whose settings to train in: a name or TOML file (default: the only one)",
     )
-    parser.add_argument("--budget", type=int, metavar="N", help="simulations to learn from (default: its own)")
-    parser.add_argument("--seeds", type=int, metavar="N", help="trainings, each from its own seed (default: all)")
-    parser.add_argument("--again", action="store_true", help="train although there are weights, and replace them")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="folder of losses (default: below results/train)")
+    parser.add_argument(
+        "--budget", type=int, metavar="N", help="simulations to learn from (default: its own)"
+    )
+    parser.add_argument(
+        "--seeds", type=int, metavar="N", help="trainings, each from its own seed (default: all)"
+    )
+    parser.add_argument(
+        "--again", action="store_true", help="train although there are weights, and replace them"
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, help="folder of losses (default: below results/train)"
+    )
     add_plugin(parser, "of them")
     parser.set_defaults(command=_train)
 
@@ -52,7 +66,9 @@ def _train(options: argparse.Namespace) -> int:
         print(f"{made.path}: {how} {made.simulations} simulations in {made.seconds:.1f} s")
     if told.rows:
         folder = options.out or Path("results", "train", f"{entry.label}-{experiment.name}")
-        for path in told.write(folder, f"{entry.label} on {experiment.name}, {made.simulations} simulations"):
+        for path in told.write(
+            folder, f"{entry.label} on {experiment.name}, {made.simulations} simulations"
+        ):
             print(path)
     print(f"found by: simgap compare {options.experiment or experiment.name}{_budget(options)}")
     return 0
@@ -79,7 +95,11 @@ def chosen(options: argparse.Namespace) -> tuple[Experiment, Entry]:
     if options.experiment is None:
         fitting = [name for name in names() if load(name).simulator == options.simulator]
         if len(fitting) != 1:
-            there = f"there are: {', '.join(fitting)}" if fitting else "none of the project's fits; give a TOML file"
+            there = (
+                f"there are: {', '.join(fitting)}"
+                if fitting
+                else "none of the project's fits; give a TOML file"
+            )
             raise InputError(f"expected --experiment with simulator {options.simulator}; {there}")
         options.experiment = fitting[0]
     experiment = load(options.experiment).chosen(training_budget=options.budget)
@@ -131,7 +151,14 @@ class _Told:
             self._stage = stage
             pause = 0.2 if sys.stderr.isatty() else 30.0  # a log wants few lines
             title = f"{self._title}, {stage}"
-            bar = tqdm(total=epochs, desc=title, unit="epoch", file=sys.stderr, dynamic_ncols=True, mininterval=pause)
+            bar = tqdm(
+                total=epochs,
+                desc=title,
+                unit="epoch",
+                file=sys.stderr,
+                dynamic_ncols=True,
+                mininterval=pause,
+            )
             self._step, self._close = bar.update, bar.close
         self.rows.append((self._seed, stage, epoch, loss, held_out))
         self._step()

@@ -1,7 +1,9 @@
-"""The figures of a comparison: error against number of simulations, and against distance from the training range.
+"""The figures of a comparison: error against number of simulations, and against distance from the
+training range.
 
-Made for print: every tuner has its own marker and line style beside its colour, colours differ in lightness, bands are
-95 % bootstrap intervals of the median over targets. Each figure is written as PNG and PDF.
+Made for print: every tuner has its own marker and line style beside its colour, colours differ in
+lightness, bands are 95 % bootstrap intervals of the median over targets. Each figure is written as
+PNG and PDF.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ if TYPE_CHECKING:
 _RESAMPLES = 500
 
 
-def draw(folder: Path, experiment: Experiment, runs: pd.DataFrame, channel_unit: str, parameter: str) -> list[Path]:
+def draw(
+    folder: Path, experiment: Experiment, runs: pd.DataFrame, channel_unit: str, parameter: str
+) -> list[Path]:
     """Draw every figure that the runs allow into `folder`/figures; returns the PNG files.
 
     Args:
@@ -31,20 +35,33 @@ def draw(folder: Path, experiment: Experiment, runs: pd.DataFrame, channel_unit:
         experiment: what was compared.
         runs: rows of runs.parquet.
         channel_unit: the error channel with its unit, for axes, e.g. ``q [rad]``.
-        parameter: the parameter with its unit where there is one, e.g. ``restitution``; empty for several.
+        parameter: the parameter with its unit where there is one, e.g. ``restitution``; empty for
+            several.
     """
     import matplotlib
 
     matplotlib.use("Agg")
-    made = [save(folder, "error-vs-simulations", _samples_figure(experiment, runs, channel_unit, parameter))]
+    made = [
+        save(
+            folder,
+            "error-vs-simulations",
+            _samples_figure(experiment, runs, channel_unit, parameter),
+        )
+    ]
     if experiment.world:
-        made.append(save(folder, "misfit-vs-simulations", _misfit_figure(experiment, runs, channel_unit)))
+        made.append(
+            save(folder, "misfit-vs-simulations", _misfit_figure(experiment, runs, channel_unit))
+        )
     if "wide" in experiment.ranges and runs.loc[runs["range"] == "wide", "outside"].gt(0).any():
-        made.append(save(folder, "error-vs-distance", _distance_figure(experiment, runs, parameter)))
+        made.append(
+            save(folder, "error-vs-distance", _distance_figure(experiment, runs, parameter))
+        )
     return made
 
 
-def _samples_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: str, parameter: str) -> Figure:
+def _samples_figure(
+    experiment: Experiment, runs: pd.DataFrame, channel_unit: str, parameter: str
+) -> Figure:
     """One panel a range (or, for a recording, held-out runs beside the runs tuned on)."""
     if "real" in experiment.ranges:
         metrics = [m for m in ("heldout_error", "obs_error") if runs[m].notna().any()]
@@ -67,7 +84,9 @@ def _samples_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: st
 
 
 def _misfit_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: str) -> Figure:
-    """What tuning leaves where the targets come from another simulator: the floor that no parameter removes."""
+    """What tuning leaves where the targets come from another simulator: the floor that no parameter
+    removes.
+    """
     ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
     figure, axes = canvas(len(ranges))
     style = Styles(experiment, runs, "obs_error")
@@ -77,9 +96,12 @@ def _misfit_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: str
         floor = float(part.groupby("target")["obs_error"].min().median())
         axis.axhline(floor, color="#444444", linewidth=0.8, linestyle=(0, (2, 2)))
         axis.annotate(
-            f"least that any tuner reached: {floor:.2g} (median)", (0, floor), xytext=(4, -10),
-            textcoords="offset points", fontsize=7.5,
-        )  # fmt: skip
+            f"least that any tuner reached: {floor:.2g} (median)",
+            (0, floor),
+            xytext=(4, -10),
+            textcoords="offset points",
+            fontsize=7.5,
+        )
         axis.set_title(f"{TITLES[kind]} ({part['target'].nunique()} targets)", fontsize=10)
         axis.set_ylabel(f"RMSE of {channel_unit}, median")
     finish(figure, axes, style, experiment)
@@ -88,7 +110,9 @@ def _misfit_figure(experiment: Experiment, runs: pd.DataFrame, channel_unit: str
 
 def samples_panel(axis: Axes, runs: pd.DataFrame, metric: str, budget: int, style: Styles) -> None:
     """Each tuner's median of a metric over targets against simulations, with its interval."""
-    points = sorted({*checkpoints(budget), *np.unique(np.geomspace(1, budget, 40).astype(int)).tolist()})
+    points = sorted(
+        {*checkpoints(budget), *np.unique(np.geomspace(1, budget, 40).astype(int)).tolist()}
+    )
     for tuner, group in runs.groupby("tuner", sort=False):
         curves = np.maximum(target_curves(group, metric, points).to_numpy(dtype=np.float64), FLOOR)
         curves = curves[np.isfinite(curves).all(axis=1)]
@@ -109,7 +133,9 @@ def samples_panel(axis: Axes, runs: pd.DataFrame, metric: str, budget: int, styl
 
 
 def _distance_figure(experiment: Experiment, runs: pd.DataFrame, parameter: str) -> Figure:
-    """Median error after few, some and all simulations, by how far the target lies outside the training range."""
+    """Median error after few, some and all simulations, by how far the target lies outside the
+    training range.
+    """
     metric = _parameter_metric(runs)
     wide = runs[runs["range"] == "wide"]
     moments = [k for k in (3, 10) if k < experiment.budget] + [experiment.budget]
@@ -124,11 +150,17 @@ def _distance_figure(experiment: Experiment, runs: pd.DataFrame, parameter: str)
     for axis, k in zip(axes, moments, strict=True):
         for tuner, group in wide.groupby("tuner", sort=False):
             values = target_curves(group, metric, [k])[k].dropna().clip(lower=FLOOR)
-            _distance_line(axis, values.to_numpy(), bins[values.index].to_numpy(), str(tuner), style)
-        axis.set_xticks(range(5), [f"{n}\nn={c}" for n, c in zip(names, counts, strict=True)], fontsize=7)
+            _distance_line(
+                axis, values.to_numpy(), bins[values.index].to_numpy(), str(tuner), style
+            )
+        axis.set_xticks(
+            range(5), [f"{n}\nn={c}" for n, c in zip(names, counts, strict=True)], fontsize=7
+        )
         axis.set_yscale("log")
         axis.set_title(f"After {k} simulations", fontsize=10)
-        axis.set_xlabel("distance of the target from the training range,\nin widths of that range; n targets")
+        axis.set_xlabel(
+            "distance of the target from the training range,\nin widths of that range; n targets"
+        )
         axis.set_ylabel(f"{_parameter_label(parameter)}, median")
     finish(figure, axes, style, experiment)
     return figure
@@ -139,13 +171,17 @@ def _distance_line(axis: Axes, values: Any, bins: Any, tuner: str, style: Styles
     for b in range(-1, 4):
         part = values[bins == b]
         if len(part):
-            below, above = interval(part[:, None], np.median, "distance", tuner, str(b), resamples=_RESAMPLES)
+            below, above = interval(
+                part[:, None], np.median, "distance", tuner, str(b), resamples=_RESAMPLES
+            )
             places.append(b + 1 + style.offset(tuner))
             middle.append(np.median(part))
             low.append(np.median(part) - below[0] if len(part) > 1 else 0.0)
             high.append(above[0] - np.median(part) if len(part) > 1 else 0.0)
     bars = np.maximum([low, high], 0.0)
-    axis.errorbar(places, middle, yerr=bars, markersize=4.5, elinewidth=0.8, capsize=1.5, **style.of(tuner))
+    axis.errorbar(
+        places, middle, yerr=bars, markersize=4.5, elinewidth=0.8, capsize=1.5, **style.of(tuner)
+    )
 
 
 def _parameter_metric(runs: pd.DataFrame) -> str:
@@ -153,4 +189,6 @@ def _parameter_metric(runs: pd.DataFrame) -> str:
 
 
 def _parameter_label(parameter: str) -> str:
-    return f"absolute error of {parameter}" if parameter else "mean parameter error [training widths]"
+    return (
+        f"absolute error of {parameter}" if parameter else "mean parameter error [training widths]"
+    )

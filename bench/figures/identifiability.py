@@ -18,7 +18,10 @@ from bench.problem.identifiability import STIFF
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_FLOOR, _CEILING = 1e-6, 1e4  # 1 sigma in training ranges, beyond which a figure shows no difference
+_FLOOR, _CEILING = (
+    1e-6,
+    1e4,
+)  # 1 sigma in training ranges, beyond which a figure shows no difference
 _WHERE = {"in": "truth in training range", "wide": "truth in bounds"}
 _ROWS = {
     "stiff_error": "along stiff directions\n[training widths]",
@@ -27,8 +30,11 @@ _ROWS = {
 }
 
 
-def identifiability_figures(folder: Path, experiment: Experiment, runs: pd.DataFrame, channel: str) -> list[Path]:
-    """Draw what there is: the spectra of identifiability.csv, and the errors along directions and of prediction.
+def identifiability_figures(
+    folder: Path, experiment: Experiment, runs: pd.DataFrame, channel: str
+) -> list[Path]:
+    """Draw what there is: the spectra of identifiability.csv, and the errors along directions and
+    of prediction.
 
     Args:
         folder: the comparison's.
@@ -42,7 +48,9 @@ def identifiability_figures(folder: Path, experiment: Experiment, runs: pd.DataF
 
 
 def spectra_figure(folder: Path, experiment: Experiment, table: pd.DataFrame) -> Path:
-    """Left: 1 sigma of every direction, a mark a target. Right: which parameters make up each direction."""
+    """Left: 1 sigma of every direction, a mark a target. Right: which parameters make up each
+    direction.
+    """
     from matplotlib import pyplot as plt
 
     names = [c for c in table.columns if c not in COLUMNS]
@@ -57,24 +65,44 @@ def spectra_figure(folder: Path, experiment: Experiment, table: pd.DataFrame) ->
         f"Stiff: 1 sigma below {STIFF:g} of the training width (dashed). Right: mean over targets of the squared "
         "component."
     )
-    figure.supxlabel(textwrap.fill(caption, int(15 * figure.get_figwidth())), fontsize=7.5, color="#444444")
+    figure.supxlabel(
+        textwrap.fill(caption, int(15 * figure.get_figwidth())), fontsize=7.5, color="#444444"
+    )
     return save(folder, "identifiability", figure)
 
 
 def _spectra(axis: Axes, table: pd.DataFrame, dim: int) -> None:
     """Every target's 1 sigma along each direction, the ranges beside each other."""
     ranges = list(dict.fromkeys(table["range"]))
-    for place, (kind, look) in enumerate(zip(ranges, (("o", "#0072B2"), ("^", "#D55E00")), strict=False)):
+    for place, (kind, look) in enumerate(
+        zip(ranges, (("o", "#0072B2"), ("^", "#D55E00")), strict=False)
+    ):
         part = table[table["range"] == kind]
-        spread = (part.groupby("direction").cumcount() / max(part["target"].nunique() - 1, 1) - 0.5) * 0.3
+        spread = (
+            part.groupby("direction").cumcount() / max(part["target"].nunique() - 1, 1) - 0.5
+        ) * 0.3
         sigma = part["sigma"].clip(_FLOOR, _CEILING)
         label = f"{_WHERE.get(kind, kind)} (n = {part['target'].nunique()})"
         across = part["direction"] + spread + (place - 0.5 * (len(ranges) - 1)) * 0.4
-        axis.plot(across, sigma, look[0], color=look[1], markersize=3.5, alpha=0.75, linestyle="none", label=label)
+        axis.plot(
+            across,
+            sigma,
+            look[0],
+            color=look[1],
+            markersize=3.5,
+            alpha=0.75,
+            linestyle="none",
+            label=label,
+        )
     axis.axhline(STIFF, color="#444444", linewidth=0.8, linestyle="--")
     for name, above in (("sloppy", 3), ("stiff", -9)):
         axis.annotate(
-            name, (0.01, STIFF), (0, above), xycoords=("axes fraction", "data"), textcoords="offset points", fontsize=8
+            name,
+            (0.01, STIFF),
+            (0, above),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            fontsize=8,
         )
     axis.set_yscale("log")
     axis.set_ylim(bottom=axis.get_ylim()[0] / 10)  # room for the legend
@@ -107,10 +135,14 @@ def _directions(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
     axis.set_title("share of each parameter", fontsize=9)
 
 
-def errors_figure(folder: Path, experiment: Experiment, runs: pd.DataFrame, channel: str) -> list[Path]:
-    """Errors along stiff and along sloppy directions, and of prediction, against simulations; a column a range.
+def errors_figure(
+    folder: Path, experiment: Experiment, runs: pd.DataFrame, channel: str
+) -> list[Path]:
+    """Errors along stiff and along sloppy directions, and of prediction, against simulations; a
+    column a range.
 
-    Nothing where the runs have none of them, or are those of a recording, which has a figure of its own.
+    Nothing where the runs have none of them, or are those of a recording, which has a figure of its
+    own.
     """
     from matplotlib import pyplot as plt
 
@@ -119,9 +151,13 @@ def errors_figure(folder: Path, experiment: Experiment, runs: pd.DataFrame, chan
         return []
     ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
     figure, axes = plt.subplots(
-        len(present), len(ranges), figsize=(1.8 + 4.0 * len(ranges), 1.2 + 2.3 * len(present)), squeeze=False,
-        sharey="row", sharex=True,
-    )  # fmt: skip
+        len(present),
+        len(ranges),
+        figsize=(1.8 + 4.0 * len(ranges), 1.2 + 2.3 * len(present)),
+        squeeze=False,
+        sharey="row",
+        sharex=True,
+    )
     style = Styles(experiment, runs, present[0])
     for row, metric in zip(axes, present, strict=True):
         for axis, kind in zip(row, ranges, strict=True):
@@ -129,12 +165,17 @@ def errors_figure(folder: Path, experiment: Experiment, runs: pd.DataFrame, chan
             axis.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
             axis.spines[["top", "right"]].set_visible(False)
             if part.empty:
-                axis.text(0.5, 0.5, "no target has any", ha="center", transform=axis.transAxes, fontsize=8)
+                axis.text(
+                    0.5, 0.5, "no target has any", ha="center", transform=axis.transAxes, fontsize=8
+                )
                 continue
             samples_panel(axis, part, metric, experiment.budget, style)
             axis.set_title(f"{TITLES[kind]} ({part['target'].nunique()} targets)", fontsize=9)
             axis.set_ylabel(
-                "error " + _ROWS[metric].format(channel=channel) + "\nmedian" if axis is row[0] else "", fontsize=9
+                "error " + _ROWS[metric].format(channel=channel) + "\nmedian"
+                if axis is row[0]
+                else "",
+                fontsize=9,
             )
             if metric != present[-1]:
                 axis.set_xlabel("")

@@ -1,4 +1,6 @@
-"""A recording drawn: every input and channel over time, the runs end to end, held-out runs on grey ground."""
+"""A recording drawn: every input and channel over time, the runs end to end, held-out runs on grey
+ground.
+"""
 
 from __future__ import annotations
 
@@ -49,13 +51,20 @@ def draw(recording: Recording, kind: type[Simulator], folder: Path) -> list[Path
     placed = _placed(recording.runs)
     width = float(np.clip(3 + 0.8 * len(placed), 9, 16))
     figure, axes = plt.subplots(
-        len(signals), 1, figsize=(width, 1.2 + 2.0 * len(signals)), sharex=True, squeeze=False, layout="constrained"
+        len(signals),
+        1,
+        figsize=(width, 1.2 + 2.0 * len(signals)),
+        sharex=True,
+        squeeze=False,
+        layout="constrained",
     )
     for axis, (channel, what) in zip(axes[:, 0], signals, strict=True):
         unit = "" if channel.unit == "1" else f" [{_pretty(channel.unit)}]"
         axis.set_ylabel(f"{channel.name}{unit}\n({what})")
         for part in placed:
-            _panel(axis, part, part.run.channels.get(channel.name, part.run.inputs.get(channel.name)))
+            _panel(
+                axis, part, part.run.channels.get(channel.name, part.run.inputs.get(channel.name))
+            )
     _finish(list(axes[:, 0]), recording, placed)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -94,12 +103,20 @@ def _panel(axis: Axes, part: _Placed, values: Array | None) -> None:
     colour = _HELD_OUT if part.run.held_out else _FITTING
     axis.plot(t, y, color=colour, linewidth=0.9, marker=marker, markersize=3, linestyle="-")
     if missing.any():
-        axis.plot(times[missing], np.full(missing.sum(), 0.02), "|", color="black", markersize=5,
-                  transform=axis.get_xaxis_transform())  # fmt: skip
+        axis.plot(
+            times[missing],
+            np.full(missing.sum(), 0.02),
+            "|",
+            color="black",
+            markersize=5,
+            transform=axis.get_xaxis_transform(),
+        )
 
 
 def _thinned(times: Array, values: Array) -> tuple[Array, Array]:
-    """At most about `_MOST_POINTS` points that look the same: the least and the largest of each stretch."""
+    """At most about `_MOST_POINTS` points that look the same: the least and the largest of each
+    stretch.
+    """
     if values.size <= _MOST_POINTS:
         return times, values
     size = -(-values.size // (_MOST_POINTS // 2))
@@ -127,9 +144,16 @@ def _finish(axes: Sequence[Axes], recording: Recording, placed: Sequence[_Placed
     for part in placed:
         middle = float(part.times[[0, -1]].mean())
         axes[0].annotate(
-            part.run.name, (middle, 1.0), (0, 2), xycoords=axes[0].get_xaxis_transform(), textcoords="offset points",
-            ha="center", va="bottom", fontsize=8 if len(placed) <= 20 else 6, annotation_clip=False,
-        )  # fmt: skip
+            part.run.name,
+            (middle, 1.0),
+            (0, 2),
+            xycoords=axes[0].get_xaxis_transform(),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            fontsize=8 if len(placed) <= 20 else 6,
+            annotation_clip=False,
+        )
     axes[-1].set_xlabel("time, runs end to end [s]; above: their names")
     total = len(recording.runs)
     some = f", {len(placed)} of {total} runs" if len(placed) < total else ""
@@ -138,5 +162,9 @@ def _finish(axes: Sequence[Axes], recording: Recording, placed: Sequence[_Placed
     if recording.held_out():
         marks.append(Line2D([], [], color=_HELD_OUT, label="held out (grey ground)"))
     if any(np.isnan(v).any() for part in placed for v in part.run.channels.values()):
-        marks.append(Line2D([], [], color="black", marker="|", linestyle="", label="missing sample"))
-    axes[0].figure.legend(handles=marks, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+        marks.append(
+            Line2D([], [], color="black", marker="|", linestyle="", label="missing sample")
+        )
+    axes[0].figure.legend(
+        handles=marks, loc="outside lower center", ncols=3, fontsize=8, frameon=False
+    )

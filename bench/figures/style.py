@@ -1,6 +1,7 @@
 """How figures of comparisons look: palette, markers, canvas, legend, and how they are saved.
 
-Made for print: every tuner has its own marker and line style beside its colour, colours differ in lightness.
+Made for print: every tuner has its own marker and line style beside its colour, colours differ in
+lightness.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Okabe and Ito's colours, safe for colour-blind readers, in an order that alternates dark and light.
+# Okabe and Ito's colours, safe for colour-blind readers, in an order that alternates dark and
+# light.
 _COLOURS = (
     "#000000",
     "#E69F00",
@@ -38,7 +40,16 @@ _COLOURS = (
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
 
 
-_LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (6, 1, 1, 1, 1, 1)), (0, (8, 2)))
+_LINES = (
+    "-",
+    "--",
+    "-.",
+    (0, (1, 1)),
+    (0, (5, 1)),
+    (0, (3, 1, 1, 1)),
+    (0, (6, 1, 1, 1, 1, 1)),
+    (0, (8, 2)),
+)
 
 
 FLOOR = 1e-9
@@ -60,13 +71,19 @@ TITLES = {
 
 
 class Styles:
-    """Colour, marker and line of each tuner: fixed by its place in the experiment, listed by its final error."""
+    """Colour, marker and line of each tuner: fixed by its place in the experiment, listed by its
+    final error.
+    """
 
     def __init__(self, experiment: Experiment, runs: pd.DataFrame, metric: str) -> None:
         present = set(runs["tuner"].unique())
         self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
-        last = runs.drop_duplicates("run", keep="last").groupby("tuner")[metric].median()  # rows stand in order of k
-        self.order: Sequence[str] = sorted(self._places, key=lambda label: float(last.get(label, np.inf)))
+        last = (
+            runs.drop_duplicates("run", keep="last").groupby("tuner")[metric].median()
+        )  # rows stand in order of k
+        self.order: Sequence[str] = sorted(
+            self._places, key=lambda label: float(last.get(label, np.inf))
+        )
 
     def of(self, tuner: str) -> dict[str, Any]:
         """Keyword arguments for plotting `tuner`."""
@@ -88,7 +105,9 @@ def canvas(panels: int) -> tuple[Figure, list[Axes]]:
     """A figure with so many panels side by side, which share their vertical axis."""
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(1, panels, figsize=(1.2 + 4.3 * panels, 4.6), squeeze=False, sharey=True)
+    figure, axes = plt.subplots(
+        1, panels, figsize=(1.2 + 4.3 * panels, 4.6), squeeze=False, sharey=True
+    )
     for axis in axes[0]:
         axis.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
         axis.spines[["top", "right"]].set_visible(False)
@@ -96,9 +115,13 @@ def canvas(panels: int) -> tuple[Figure, list[Axes]]:
 
 
 def finish(
-    figure: Figure, axes: list[Axes], style: Styles, experiment: Experiment, caption: str = CAPTION,
+    figure: Figure,
+    axes: list[Axes],
+    style: Styles,
+    experiment: Experiment,
+    caption: str = CAPTION,
     heading: str = "best at the end first",
-) -> None:  # fmt: skip
+) -> None:
     """Legend, title and caption."""
     handles: dict[str, Any] = {}
     for axis in reversed(axes):  # a panel may lack a tuner that another has
@@ -118,7 +141,9 @@ def finish(
         if axis.get_ylabel() == axes[0].get_ylabel():
             axis.set_ylabel("")
     figure.suptitle(experiment.title or experiment.name, fontsize=11)
-    figure.supxlabel(textwrap.fill(caption, int(17 * figure.get_figwidth())), fontsize=7.5, color="#444444")
+    figure.supxlabel(
+        textwrap.fill(caption, int(17 * figure.get_figwidth())), fontsize=7.5, color="#444444"
+    )
 
 
 def save(folder: Path, name: str, figure: Figure) -> Path:

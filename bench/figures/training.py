@@ -28,16 +28,38 @@ def draw(folder: Path, title: str, rows: Sequence[Row]) -> Path:
 
     stages = list(dict.fromkeys(row[1] for row in rows))
     seeds = sorted({row[0] for row in rows})
-    figure, axes = plt.subplots(1, len(stages), figsize=(1.0 + 4.0 * len(stages), 3.4), sharey=True, squeeze=False)
+    figure, axes = plt.subplots(
+        1, len(stages), figsize=(1.0 + 4.0 * len(stages), 3.4), sharey=True, squeeze=False
+    )
     for ax, stage in zip(axes[0], stages, strict=True):
         for seed in seeds:
             values = np.array([row[2:] for row in rows if row[:2] == (seed, stage)])
             first = seed == seeds[0]
-            ax.plot(values[:, 0], values[:, 1], "-", color="#0072B2", lw=1.2, label="training" if first else None)
-            ax.plot(values[:, 0], values[:, 2], "--", color="#E69F00", lw=1.2, label="held out" if first else None)
-        ax.set(title=_STAGES.get(stage, stage), xlabel="epoch (pass over the training data)", yscale="log")
+            ax.plot(
+                values[:, 0],
+                values[:, 1],
+                "-",
+                color="#0072B2",
+                lw=1.2,
+                label="training" if first else None,
+            )
+            ax.plot(
+                values[:, 0],
+                values[:, 2],
+                "--",
+                color="#E69F00",
+                lw=1.2,
+                label="held out" if first else None,
+            )
+        ax.set(
+            title=_STAGES.get(stage, stage),
+            xlabel="epoch (pass over the training data)",
+            yscale="log",
+        )
         ax.grid(alpha=0.3)
     axes[0, 0].set_ylabel("loss (weighted squared error of\nthe estimated difference)")
     axes[0, 0].legend()
-    figure.suptitle(f"{title} (held out: others); {len(seeds)} training{'s' * (len(seeds) > 1)}", fontsize=11)
+    figure.suptitle(
+        f"{title} (held out: others); {len(seeds)} training{'s' * (len(seeds) > 1)}", fontsize=11
+    )
     return save(folder, "loss", figure)

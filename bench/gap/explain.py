@@ -1,4 +1,6 @@
-"""`simgap explain`: a recording in, a verdict, an extended simulator and a report out. The four steps in order."""
+"""`simgap explain`: a recording in, a verdict, an extended simulator and a report out. The four
+steps in order.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,9 @@ class Explanation:
         from bench.gap.report.pictures import draw
 
         paths = [folder / "verdict.json", folder / "extended.toml"]
-        paths[0].write_text(json.dumps(self.verdict, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        paths[0].write_text(
+            json.dumps(self.verdict, indent=1, allow_nan=False) + "\n", encoding="utf-8"
+        )
         extend.write(self.extended, paths[1])
         figures = draw(self.story, folder)
         return [*paths, *figures, write_report(self.story, folder, figures)]
@@ -95,9 +99,22 @@ def explain(
 
 class _Explainer:
     def __init__(
-        self, path: Path, system: str | None, engine: str, seed: int, free: tuple[str, ...], tuner: str | None, say: Say
+        self,
+        path: Path,
+        system: str | None,
+        engine: str,
+        seed: int,
+        free: tuple[str, ...],
+        tuner: str | None,
+        say: Say,
     ) -> None:
-        self.started, self.path, self.seed, self.tuner, self.say = time.perf_counter(), path, seed, tuner, say
+        self.started, self.path, self.seed, self.tuner, self.say = (
+            time.perf_counter(),
+            path,
+            seed,
+            tuner,
+            say,
+        )
         self.recording, kind = load(path, system)
         if not issubclass(kind, Simulated):
             raise InputError(
@@ -106,9 +123,13 @@ class _Explainer:
         extend.refuse_extended(kind)
         self.kind: type[Simulated] = kind
         self.engine = None if issubclass(kind, OwnSimulator) else engine
-        self.fitting = World(kind, self.recording, self.recording.training(), self.engine, [Hat], free)
+        self.fitting = World(
+            kind, self.recording, self.recording.training(), self.engine, [Hat], free
+        )
         held_out = self.recording.held_out()
-        self.measuring = World(kind, self.recording, held_out, self.engine, [Hat], free) if held_out else None
+        self.measuring = (
+            World(kind, self.recording, held_out, self.engine, [Hat], free) if held_out else None
+        )
         self.floor: Floor = noise_floor(self.fitting, self.recording)
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
         self.answer = Answer(self.recording, self.fitting, self.measuring, self.floor, self.engine)
@@ -129,7 +150,9 @@ class _Explainer:
             largest = max(float(np.nanmax(np.abs(part[..., c]), initial=0.0)) for part in parts)
             if largest >= HUGE * channel.scale:
                 expected = f"expected values of about {channel.scale:g} {channel.unit}, found {largest:.3g}"
-                raise InputError(f"{self.path}: column {channel.name}: {expected}; is the unit right?")
+                raise InputError(
+                    f"{self.path}: column {channel.name}: {expected}; is the unit right?"
+                )
 
     def run(self) -> Explanation:
         self.say("fitting the base model")
@@ -162,32 +185,61 @@ class _Explainer:
         world, model = self.fitting, search.models[frozenset()]
         ranges = np.nanmax(world.observed, axis=(0, 1)) - np.nanmin(world.observed, axis=(0, 1))
         small = model.likelihood.sigma < 3.0 * self.floor.sigma
-        still = (ranges < STILL * self.floor.sigma).all() and small.all() and len(base.untouched) == world.base.size
+        still = (
+            (ranges < STILL * self.floor.sigma).all()
+            and small.all()
+            and len(base.untouched) == world.base.size
+        )
         if still or not ranges.any():
             vague = tuple(world.parameters[i].name for i in world.base)
             nothing = Remains(1.0, "", model.likelihood.sigma / self.floor.sigma, ())
             return Finding("unidentifiable", model, model, (), nothing, vague)
         return None
 
-    def _story(self, search: Search, base: Base, finding: Finding, verdict: dict[str, Any]) -> Story:
+    def _story(
+        self, search: Search, base: Base, finding: Finding, verdict: dict[str, Any]
+    ) -> Story:
         world, sigma = self.fitting, self.answer.sigma(finding)
         before, after = finding.base.fit.simulated, finding.model.fit.simulated
         places = show.places(world, before, after, sigma)
         held_out = None
-        if self.measuring is not None and finding.measured is not None and finding.model.names in finding.measured:
+        if (
+            self.measuring is not None
+            and finding.measured is not None
+            and finding.model.names in finding.measured
+        ):
             first, last = (finding.measured[names].simulated for names in ((), finding.model.names))
             held_out = show.side(self.measuring, first, last)
-            places += [p for p in show.places(self.measuring, first, last, sigma, " (held out)") if p.kind == "run"]
+            places += [
+                p
+                for p in show.places(self.measuring, first, last, sigma, " (held out)")
+                if p.kind == "run"
+            ]
         channels = tuple(
-            Shown(c.name, c.unit, float(sigma[i]), bool(self.floor.stated[i]), float(self.floor.step[i]))
+            Shown(
+                c.name,
+                c.unit,
+                float(sigma[i]),
+                bool(self.floor.stated[i]),
+                float(self.floor.step[i]),
+            )
             for i, c in enumerate(world.simulator.channels)
         )
         title = self.recording.title or self.path.stem
         return Story(
-            title, self.path, verdict, channels, show.side(world, before, after), held_out, tuple(places),
-            tuple(show.profiles(world, before, after, sigma)), self._tuned(search, base, finding),
-            tuple(self._remains(base, finding)), tuple(self._why(finding)), finding.vague,
-        )  # fmt: skip
+            title,
+            self.path,
+            verdict,
+            channels,
+            show.side(world, before, after),
+            held_out,
+            tuple(places),
+            tuple(show.profiles(world, before, after, sigma)),
+            self._tuned(search, base, finding),
+            tuple(self._remains(base, finding)),
+            tuple(self._why(finding)),
+            finding.vague,
+        )
 
     def _tuned(self, search: Search, base: Base, finding: Finding) -> tuple[Tuned, ...]:
         sides = [self.answer.numbers(search, model) for model in (finding.base, finding.model)]
@@ -195,7 +247,9 @@ class _Explainer:
         for i in self.fitting.base.tolist():
             before, after = (_triple(side[i]) for side in sides)
             parameter = self.fitting.parameters[i]
-            result.append(Tuned(parameter.name, parameter.unit, before, after, i not in base.untouched))
+            result.append(
+                Tuned(parameter.name, parameter.unit, before, after, i not in base.untouched)
+            )
         return tuple(result)
 
     def _remains(self, base: Base, finding: Finding) -> list[str]:
@@ -204,20 +258,30 @@ class _Explainer:
             times = finding.remains.excess[self.fitting.channels.index(channel)]
             lines.append(f"channel {channel} still misses by {times:.3g} times its noise")
         if finding.remains.structure and finding.remains.where:
-            lines.append(f"what is left behaves like a force that depends on {finding.remains.where}")
+            lines.append(
+                f"what is left behaves like a force that depends on {finding.remains.where}"
+            )
         untouched = [self.fitting.parameters[i].name for i in sorted(base.untouched)]
         if untouched:
-            lines.append(f"the recording does not touch {', '.join(untouched)}: kept at the nominal value")
+            lines.append(
+                f"the recording does not touch {', '.join(untouched)}: kept at the nominal value"
+            )
         return lines
 
     def _why(self, finding: Finding) -> list[str]:
         lines = []
         if finding.verdict == "unknown" and finding.causes:
-            lines.append("the effects that help most do not close enough of the gap to be its explanation")
+            lines.append(
+                "the effects that help most do not close enough of the gap to be its explanation"
+            )
         if finding.verdict in ("partial", "unknown") and finding.remains.structure:
             chance = finding.remains.p_value
             told = f"structure is left over (chance {chance:.2g}) that the sensor's noise does not have"
-            lines.append(told if chance < CHANCE else "what is left over exceeds the stated noise of the sensors")
+            lines.append(
+                told
+                if chance < CHANCE
+                else "what is left over exceeds the stated noise of the sensors"
+            )
         for cause in finding.causes:
             if cause.alternatives:
                 others = ", ".join(cause.alternatives)
@@ -237,9 +301,15 @@ class _Explainer:
             names = [c.name for c in library.get(effect).on(world.simulator.system)]
             added[effect] = {n: numbers[i] for n, i in zip(names, places, strict=True)}
         return Extended(
-            f"{self.recording.system}_extended", self.recording.system, self.engine, self.recording.title, own, added,
-            {**self.recording.constants, **freed}, world.channels,
-        )  # fmt: skip
+            f"{self.recording.system}_extended",
+            self.recording.system,
+            self.engine,
+            self.recording.title,
+            own,
+            added,
+            {**self.recording.constants, **freed},
+            world.channels,
+        )
 
 
 def _triple(number: Number) -> tuple[float, float, float]:

@@ -1,7 +1,9 @@
-"""Proposes the experiment that would tell two explanations apart: where their predictions differ most.
+"""Proposes the experiment that would tell two explanations apart: where their predictions differ
+most.
 
-A T-optimal design over a few changes that an experimenter can make (A. C. Atkinson, V. V. Fedorov, Biometrika 62(1),
-57, 1975, doi:10.1093/biomet/62.1.57), the rival's parameters held at what these data made of them.
+A T-optimal design over a few changes that an experimenter can make (A. C. Atkinson, V. V. Fedorov,
+Biometrika 62(1), 57, 1975, doi:10.1093/biomet/62.1.57), the rival's parameters held at what these
+data made of them.
 """
 
 from __future__ import annotations
@@ -19,18 +21,24 @@ from methods.base import Array
 from sims.base import Scenario
 
 TELLING = 2.0
-"""Two models that differ by less than this many sigmas, RMS, would not be told apart by one more run."""
+"""Two models that differ by less than this many sigmas, RMS, would not be told apart by one more
+run.
+"""
 
 
 def next_experiment(search: Search, model: Model, rival: Model) -> dict[str, Any]:
-    """What to record next: a sentence, the change, and how far apart the two models then are in units of the noise."""
+    """What to record next: a sentence, the change, and how far apart the two models then are in
+    units of the noise.
+    """
     world = search.world
     best: tuple[float, str, dict[str, Any]] = (0.0, "", {})
     for says, change, scenario, states in _changes(world):
         apart = _apart(world, scenario, states, model, rival, search.noise.sigma)
         if np.isfinite(apart) and apart > best[0]:
             best = apart, says, change
-    added = [" and ".join(sorted({*m.names} - {*o.names})) for m, o in ((model, rival), (rival, model))]
+    added = [
+        " and ".join(sorted({*m.names} - {*o.names})) for m, o in ((model, rival), (rival, model))
+    ]
     if best[0] < TELLING:
         shown = ", ".join(c.name for c in world.kind.channels if c.name not in world.channels)
         other = f"record {shown} besides" if shown else "measure one of the causes directly"
@@ -57,7 +65,10 @@ def _changes(world: World) -> Iterator[tuple[str, dict[str, Any], Scenario, Arra
         for share in (0.3, 2.0, -1.0):
             states = track.guess.copy()
             states[place] = share * states[place] if abs(states[place]) > 0.05 else share
-            if world.simulator.system.bounces and place == len(world.simulator.system.coordinates) - 1:
+            if (
+                world.simulator.system.bounces
+                and place == len(world.simulator.system.coordinates) - 1
+            ):
                 if share < 0:
                     continue
                 states[place] = max(states[place], 1.0)
@@ -83,14 +94,18 @@ def _units(world: World) -> list[str]:
     return [*lengths, *rates]
 
 
-def _apart(world: World, scenario: Scenario, states: Array, model: Model, rival: Model, sigma: Array) -> float:
+def _apart(
+    world: World, scenario: Scenario, states: Array, model: Model, rival: Model, sigma: Array
+) -> float:
     theta = np.delete(np.stack([model.fit.theta, rival.fit.theta]), world.base[world.own :], axis=1)
     freed = [p.name for p in world.freed]
     scenarios = [
         replace(scenario, constants={**scenario.constants, **dict(zip(freed, fitted, strict=True))})
         for fitted in (m.fit.theta[world.own : world.base.size].tolist() for m in (model, rival))
     ]
-    initial = {name: np.full(2, value) for name, value in zip(world.states, states.tolist(), strict=True)}
+    initial = {
+        name: np.full(2, value) for name, value in zip(world.states, states.tolist(), strict=True)
+    }
     seen = world.simulator.simulate_lanes(theta, scenarios, initial)
     world.simulations += 2
     return float(np.sqrt(np.square((seen[0] - seen[1]) / sigma).mean()))

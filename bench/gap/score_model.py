@@ -1,4 +1,6 @@
-"""The error of an extended simulator on another recording: initial states are estimated there, nothing else."""
+"""The error of an extended simulator on another recording: initial states are estimated there,
+nothing else.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ from sims.recording.recording import read_recording, system_of
 
 
 def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, Any]:
-    """RMSE by channel in its unit, in units of the noise over all channels, runs and samples counted.
+    """RMSE by channel in its unit, in units of the noise over all channels, runs and samples
+    counted.
 
     Args:
         model: extended.toml.
@@ -32,7 +35,9 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
     """
     extended, kind, _ = opened(model, simulators.get)
     if (other := system_of(recording)) not in (extended.system, extended.name):
-        raise InputError(f"{recording}: expected a recording of {extended.system}, as {model} is; found one of {other}")
+        raise InputError(
+            f"{recording}: expected a recording of {extended.system}, as {model} is; found one of {other}"
+        )
     data = read_recording(recording, kind, whole=True)
     data = replace(data, constants={**extended.constants, **data.constants})
     runs = data.held_out() if held_out else data.runs
@@ -59,7 +64,9 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
     if not np.isfinite(squares).all():
         raise InputError(f"{recording}: the simulation failed with the parameters of {model}")
     rmse = {
-        name: float(np.sqrt(squares[:, :, c].sum() / counts[c])) for c, name in enumerate(world.channels) if counts[c]
+        name: float(np.sqrt(squares[:, :, c].sum() / counts[c]))
+        for c, name in enumerate(world.channels)
+        if counts[c]
     }
     return {
         "rmse": rmse,

@@ -1,4 +1,6 @@
-"""What verdict.json says: the causes, the numbers and their intervals, the held-out gain, the ranked candidates."""
+"""What verdict.json says: the causes, the numbers and their intervals, the held-out gain, the
+ranked candidates.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ class Answer:
     floor: Floor
     engine: str | None
 
-    def verdict(self, search: Search, finding: Finding, rng: np.random.Generator, started: float) -> dict[str, Any]:
+    def verdict(
+        self, search: Search, finding: Finding, rng: np.random.Generator, started: float
+    ) -> dict[str, Any]:
         """What verdict.json says; `started` is `time.perf_counter` at the beginning."""
         world = self.fitting
         numbers = self.numbers(search, finding.model)
@@ -53,7 +57,9 @@ class Answer:
                     "effect": cause.effect,
                     "alternatives": list(cause.alternatives),
                     "says": effect.says,
-                    "coefficients": {n: _estimate(numbers[i]) for n, i in zip(names, places, strict=True)},
+                    "coefficients": {
+                        n: _estimate(numbers[i]) for n, i in zip(names, places, strict=True)
+                    },
                     "p_value": cause.p_value,
                 }
             )
@@ -63,7 +69,9 @@ class Answer:
             "system": self.recording.system,
             "engine": self.engine or "its own",
             "causes": causes,
-            "parameters": {world.parameters[i].name: _estimate(numbers[i]) for i in world.base.tolist()},
+            "parameters": {
+                world.parameters[i].name: _estimate(numbers[i]) for i in world.base.tolist()
+            },
             "heldout": self._heldout(finding, rng),
             "candidates": self._candidates(search, finding),
             "next_experiment": self._next(search, finding),
@@ -74,14 +82,18 @@ class Answer:
         return result
 
     def numbers(self, search: Search, model: Model) -> dict[int, Number]:
-        """Every parameter and coefficient by its place; without an interval where it was not fitted."""
+        """Every parameter and coefficient by its place; without an interval where it was not
+        fitted.
+        """
         world = self.fitting
         known = intervals(search, model)
         result = {}
         for place, parameter in enumerate(world.parameters):
             value, low, high = known.get(place, (float(model.fit.theta[place]), np.nan, np.nan))
             bounded = np.isfinite(low) and np.isfinite(high)
-            result[place] = Number(value, parameter.unit, low if bounded else None, high if bounded else None)
+            result[place] = Number(
+                value, parameter.unit, low if bounded else None, high if bounded else None
+            )
         return result
 
     def _counted(self) -> list[int]:
@@ -98,7 +110,11 @@ class Answer:
         return np.where(usable & (not finding.remains.structure), left, self.floor.sigma)
 
     def _heldout(self, finding: Finding, rng: np.random.Generator) -> dict[str, Any] | None:
-        if self.measuring is None or finding.measured is None or finding.model.names not in finding.measured:
+        if (
+            self.measuring is None
+            or finding.measured is None
+            or finding.model.names not in finding.measured
+        ):
             return None
         counted = self._counted()
         floor = float(np.sqrt(np.square(self.sigma(finding)[counted]).mean()))
@@ -121,10 +137,14 @@ class Answer:
             if alone is not None:
                 score = max(score, float(alone.likelihood.value - base))
             p_value = tail(scores.by_chance, np.array([score - scores.chance[i]]))
-            rows.append({
-                "effect": effect, "score": max(score, 0.0), "p_value": float(np.clip(p_value, 0.0, 1.0)),
-                "heldout_gain": self._share(finding, (effect,)),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "effect": effect,
+                    "score": max(score, 0.0),
+                    "p_value": float(np.clip(p_value, 0.0, 1.0)),
+                    "heldout_gain": self._share(finding, (effect,)),
+                }
+            )
         return sorted(rows, key=lambda row: -row["score"])
 
     def _share(self, finding: Finding, names: tuple[str, ...]) -> float | None:
@@ -134,7 +154,13 @@ class Answer:
         counted, seen = self._counted(), np.isfinite(self.measuring.observed)
         floor = float(np.sqrt(np.square(self.sigma(finding)[counted]).mean()))
         before, after = (
-            float(np.sqrt(np.square((self.measuring.observed - s)[..., counted][seen[..., counted]]).mean()))
+            float(
+                np.sqrt(
+                    np.square(
+                        (self.measuring.observed - s)[..., counted][seen[..., counted]]
+                    ).mean()
+                )
+            )
             for s in (finding.measured[()].simulated, finding.measured[names].simulated)
         )
         share = (before - max(after, floor)) / (before - floor) if before > floor * 1.001 else 0.0
@@ -143,7 +169,11 @@ class Answer:
     def _next(self, search: Search, finding: Finding) -> dict[str, Any] | None:
         if finding.verdict == "unidentifiable":
             names = " and ".join(finding.vague)
-            differently = "they act differently from each other" if len(finding.vague) > 1 else "it makes a difference"
+            differently = (
+                "they act differently from each other"
+                if len(finding.vague) > 1
+                else "it makes a difference"
+            )
             return {"says": f"Measure {names} apart, or record runs in which {differently}"}
         for cause in finding.causes:
             for other in cause.alternatives:
@@ -161,7 +191,11 @@ def _estimate(number: Number) -> dict[str, Any]:
 def _heldout(found: Gain, unit: str) -> dict[str, Any] | None:
     """As in verdict.json; an interval that the data do not give is null."""
     values = {
-        "rmse_base": found.base, "rmse_extended": found.extended, "noise_floor": found.floor,
-        "gap_closed": found.closed, "low": found.low, "high": found.high,
-    }  # fmt: skip
+        "rmse_base": found.base,
+        "rmse_extended": found.extended,
+        "noise_floor": found.floor,
+        "gap_closed": found.closed,
+        "low": found.low,
+        "high": found.high,
+    }
     return {**{k: v if np.isfinite(v) else None for k, v in values.items()}, "unit": unit}

@@ -1,7 +1,8 @@
 """An experiment as a data file: which tuners, on which simulator and targets, with what budget.
 
-The file's keys are the fields of `Experiment`; everything else is derived. `Experiment.document` gives the exact
-configuration back, defaults filled in and command-line changes applied, and is what a run stores.
+The file's keys are the fields of `Experiment`; everything else is derived. `Experiment.document`
+gives the exact configuration back, defaults filled in and command-line changes applied, and is what
+a run stores.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ RANGES = ("in", "wide", "real")
 
 @dataclass(frozen=True)
 class Entry:
-    """One tuner of a comparison: its registered name, options, and seeds or budget where they differ."""
+    """One tuner of a comparison: its registered name, options, and seeds or budget where they
+    differ.
+    """
 
     label: str
     tuner: str
@@ -40,7 +43,9 @@ class Sampling:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Unseen scenarios of a simulated target; initial states and inputs are the experiment's where not given."""
+    """Unseen scenarios of a simulated target; initial states and inputs are the experiment's where
+    not given.
+    """
 
     scenarios: int = 3
     initial: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
@@ -49,7 +54,9 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Source:
-    """The recording that an experiment on real data tunes to; `path` is relative to the folder of recordings."""
+    """The recording that an experiment on real data tunes to; `path` is relative to the folder of
+    recordings.
+    """
 
     path: str = ""
 
@@ -64,7 +71,8 @@ class Experiment:
         says: a sentence on what it is.
         simulator: registered name.
         observe: channels the tuner sees; all where empty.
-        error_channel: the channel in which `obs_error` and `heldout_error` are reported; the first where empty.
+        error_channel: the channel in which `obs_error` and `heldout_error` are reported; the first
+            where empty.
         ranges: in, wide (simulated targets), or real (a recording).
         targets: number of targets in each range; for a recording, number of starting points.
         seeds: runs of each stochastic tuner on each target, and trainings of each learned one.
@@ -75,19 +83,24 @@ class Experiment:
         memory: MiB that a run may take beside what its worker holds; 0 is no limit.
         noise: standard deviation of the sensor noise added to simulated targets, by channel.
         settings: the simulator's own settings, e.g. its time step.
-        world: settings of the simulator that makes the targets, where it is another: another engine, effects with
-            fixed coefficients. Empty: the same simulator. Its parameters are the first of the tuned ones.
-        constants: constants other than the simulator's defaults: a number, or [low, high] for uniform between in each
-            scenario, known to whoever simulates it.
+        world: settings of the simulator that makes the targets, where it is another: another
+            engine, effects with fixed coefficients. Empty: the same simulator. Its parameters are
+            the first of the tuned ones.
+        constants: constants other than the simulator's defaults: a number, or [low, high] for
+            uniform between in each scenario, known to whoever simulates it.
         parameters: changes to parameters' nominal, bounds, training range.
         initial: initial state: a number, or [low, high] for uniform between.
-        inputs: input signals by name, as `simgap simulate` writes them, e.g. ``sine:2:0.5`` (`bench.problem.signals`).
+        inputs: input signals by name, as `simgap simulate` writes them, e.g. ``sine:2:0.5``
+            (`bench.problem.signals`).
         sampling: sample times of simulated targets.
-        held_out: unseen scenarios on which the tuned simulator's prediction is measured; for simulated targets.
-        identifiability: whether to find what the data of each simulated target identify, where there are several
-            parameters (`bench.problem.identifiability`): two simulations a parameter and target, beside all budgets.
+        held_out: unseen scenarios on which the tuned simulator's prediction is measured; for
+            simulated targets.
+        identifiability: whether to find what the data of each simulated target identify, where
+            there are several parameters (`bench.problem.identifiability`): two simulations a
+            parameter and target, beside all budgets.
         recording: the measured data, for range real.
-        shot: where the experiment is a bounce shot, its scene (`bench.shot.settings`); targets are then shots a ball.
+        shot: where the experiment is a bounce shot, its scene (`bench.shot.settings`); targets are
+            then shots a ball.
         tuners: the entries.
     """
 
@@ -122,27 +135,39 @@ class Experiment:
     def __post_init__(self) -> None:
         for what in ("targets", "seeds", "budget"):
             if getattr(self, what) < 1:
-                raise InputError(f"experiment {self.name}: {what} must be at least 1, found {getattr(self, what)}")
+                raise InputError(
+                    f"experiment {self.name}: {what} must be at least 1, found {getattr(self, what)}"
+                )
         if self.memory < 0 or not self.timeout > 0:
             raise InputError(f"experiment {self.name}: expected timeout > 0 and memory >= 0")
         for name in self.ranges:
             if name not in RANGES:
                 raise unknown("range", name, RANGES)
-        if ("real" in self.ranges) != (self.recording is not None) or (self.recording and len(self.ranges) != 1):
-            raise InputError(f"experiment {self.name}: range 'real' and a [recording] go together, and alone")
+        if ("real" in self.ranges) != (self.recording is not None) or (
+            self.recording and len(self.ranges) != 1
+        ):
+            raise InputError(
+                f"experiment {self.name}: range 'real' and a [recording] go together, and alone"
+            )
         if self.held_out and (self.recording or self.held_out.scenarios < 1):
-            raise InputError(f"experiment {self.name}: [held_out] needs simulated targets and scenarios of at least 1")
+            raise InputError(
+                f"experiment {self.name}: [held_out] needs simulated targets and scenarios of at least 1"
+            )
 
     def document(self) -> dict[str, Any]:
         """The whole configuration as TOML tables; `parse` of it gives an equal experiment."""
-        document = {k: v for k, v in asdict(self).items() if k not in ("name", "tuners") and v is not None}
+        document = {
+            k: v for k, v in asdict(self).items() if k not in ("name", "tuners") and v is not None
+        }
         document["tuners"] = {e.label: _without_none(e) for e in self.tuners}
         return document
 
     @property
     def fixed(self) -> dict[str, float]:
         """The constants that are the same in every scenario."""
-        return {name: value for name, value in self.constants.items() if not isinstance(value, tuple)}
+        return {
+            name: value for name, value in self.constants.items() if not isinstance(value, tuple)
+        }
 
     def chosen(self, **changes: Any) -> Experiment:
         """This experiment with the given fields replaced where they are not None."""
@@ -150,13 +175,19 @@ class Experiment:
 
     def with_seeds(self, seeds: int) -> Experiment:
         """The same number of seeds for every tuner whose entry does not ask for fewer."""
-        entries = tuple(replace(e, seeds=min(e.seeds, seeds) if e.seeds else None) for e in self.tuners)
+        entries = tuple(
+            replace(e, seeds=min(e.seeds, seeds) if e.seeds else None) for e in self.tuners
+        )
         return replace(self, seeds=seeds, tuners=entries)
 
     def with_tuners(self, labels: Sequence[str]) -> Experiment:
-        """Only the tuners of these labels, in this order; a registered name that has no entry gets one."""
+        """Only the tuners of these labels, in this order; a registered name that has no entry gets
+        one.
+        """
         entries = {entry.label: entry for entry in self.tuners}
-        return replace(self, tuners=tuple(entries.get(label, Entry(label, label)) for label in labels))
+        return replace(
+            self, tuners=tuple(entries.get(label, Entry(label, label)) for label in labels)
+        )
 
 
 def _without_none(entry: Entry) -> dict[str, Any]:
@@ -165,7 +196,11 @@ def _without_none(entry: Entry) -> dict[str, Any]:
 
 def names() -> list[str]:
     """The experiments that come with the project."""
-    return sorted(f.name[:-5] for f in resources.files("bench.experiments").iterdir() if f.name.endswith(".toml"))
+    return sorted(
+        f.name[:-5]
+        for f in resources.files("bench.experiments").iterdir()
+        if f.name.endswith(".toml")
+    )
 
 
 def load(name_or_path: str) -> Experiment:
@@ -179,7 +214,9 @@ def load(name_or_path: str) -> Experiment:
     elif name_or_path.endswith(".toml"):
         path = Path(name_or_path)
     else:
-        raise InputError(f"{unknown('experiment', name_or_path, names())} (or give the path of a .toml file)")
+        raise InputError(
+            f"{unknown('experiment', name_or_path, names())} (or give the path of a .toml file)"
+        )
     return parse(path.stem, read_toml(path), path)
 
 
@@ -254,9 +291,12 @@ def _field(path: Path, key: str, value: Any) -> Any:
 
 
 def _parameter(path: Path, name: str, table: Any) -> dict[str, Any]:
-    changes = table_of(path, f"parameters.{name}", table, {
-        "nominal": (int, float), "bounds": list, "training": list, "log": bool
-    })  # fmt: skip
+    changes = table_of(
+        path,
+        f"parameters.{name}",
+        table,
+        {"nominal": (int, float), "bounds": list, "training": list, "log": bool},
+    )
     for key in ("bounds", "training"):
         if key in changes:
             changes[key] = pair(path, f"parameters.{name}.{key}", changes[key])
@@ -279,12 +319,16 @@ def _inputs(path: Path, where: str, value: Any) -> dict[str, str]:
 def _held_out(path: Path, value: Any) -> HeldOut:
     given = table_of(path, "held_out", value, {"scenarios": int, "initial": dict, "inputs": dict})
     initial = _initial(path, "held_out.initial", given.pop("initial", {}))
-    return HeldOut(initial=initial, inputs=_inputs(path, "held_out.inputs", given.pop("inputs", {})), **given)
+    return HeldOut(
+        initial=initial, inputs=_inputs(path, "held_out.inputs", given.pop("inputs", {})), **given
+    )
 
 
 def _entry(path: Path, label: str, table: Any) -> Entry:
     where = f"tuners.{label}"
-    fields = table_of(path, where, table, {"tuner": str, "options": dict, "seeds": int, "budget": int})
+    fields = table_of(
+        path, where, table, {"tuner": str, "options": dict, "seeds": int, "budget": int}
+    )
     for key in ("seeds", "budget"):
         if fields.get(key, 1) < 1:
             raise InputError(f"{path}: {where}.{key}: expected at least 1, found {fields[key]}")

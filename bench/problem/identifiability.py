@@ -1,9 +1,11 @@
-"""Which combinations of parameters a target's data can identify, and a recommendation's error along them.
+"""Which combinations of parameters a target's data can identify, and a recommendation's error along
+them.
 
-The Fisher information at the truth, in units of the training ranges, has eigenvectors along which the data tell much
-(stiff) or next to nothing (sloppy): R. N. Gutenkunst et al., PLoS Comput. Biol. 3(10), e189 (2007),
-doi:10.1371/journal.pcbi.0030189; M. K. Transtrum et al., J. Chem. Phys. 143, 010901 (2015), doi:10.1063/1.4923066. An
-error along a sloppy direction is no fault of the tuner: nobody could have known better.
+The Fisher information at the truth, in units of the training ranges, has eigenvectors along which
+the data tell much (stiff) or next to nothing (sloppy): R. N. Gutenkunst et al., PLoS Comput. Biol.
+3(10), e189 (2007), doi:10.1371/journal.pcbi.0030189; M. K. Transtrum et al., J. Chem. Phys. 143,
+010901 (2015), doi:10.1063/1.4923066. An error along a sloppy direction is no fault of the tuner:
+nobody could have known better.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from methods.base import Array
 from sims.base import Parameter
 
 STIFF = 0.1
-"""A direction is stiff where its 1 sigma (Cramer-Rao bound) is below this share of the training range."""
+"""A direction is stiff where its 1 sigma (Cramer-Rao bound) is below this share of the training
+range.
+"""
 STEP = 1e-4
 """Step of the central differences, in training ranges."""
 
@@ -29,8 +33,8 @@ class Spectrum:
 
     Attributes:
         values: (dim,) eigenvalues of the Fisher information, per squared training range, falling.
-        vectors: (dim, dim) their directions as columns, of length one, components in training ranges; the largest
-            component is positive.
+        vectors: (dim, dim) their directions as columns, of length one, components in training
+            ranges; the largest component is positive.
     """
 
     values: Array
@@ -38,7 +42,9 @@ class Spectrum:
 
     @property
     def sigmas(self) -> Array:
-        """(dim,) the least 1 sigma of any unbiased estimate along each direction, in training ranges; may be inf."""
+        """(dim,) the least 1 sigma of any unbiased estimate along each direction, in training
+        ranges; may be inf.
+        """
         with np.errstate(divide="ignore"):
             sigmas: Array = 1.0 / np.sqrt(self.values)
         return sigmas
@@ -50,14 +56,16 @@ class Spectrum:
         return known
 
     def errors(self, errors: Array) -> tuple[Array, Array]:
-        """Root mean squares (k,) of the components along stiff and along sloppy directions; NaN where there is none.
+        """Root mean squares (k,) of the components along stiff and along sloppy directions; NaN
+        where there is none.
 
         Args:
             errors: (k, dim) recommended minus true parameters, in training ranges.
         """
         squares, stiff = (errors @ self.vectors) ** 2, self.stiff
         rms = [
-            np.sqrt(squares[:, s].mean(axis=1)) if s.any() else np.full(len(errors), np.nan) for s in (stiff, ~stiff)
+            np.sqrt(squares[:, s].mean(axis=1)) if s.any() else np.full(len(errors), np.nan)
+            for s in (stiff, ~stiff)
         ]
         return rms[0], rms[1]
 
@@ -67,13 +75,15 @@ def spectrum(
 ) -> Spectrum:
     """The spectrum at `truth`, by central differences that stay within the bounds.
 
-    A sample that a simulation near the truth does not give (NaN) tells nothing of the parameter moved.
+    A sample that a simulation near the truth does not give (NaN) tells nothing of the parameter
+    moved.
 
     Args:
         simulate: parameters (n, dim), physical -> observations (n, T, C).
         truth: (dim,), physical.
         parameters: with their bounds and training ranges.
-        scale: (C,) 1 sigma of each channel's white noise, or its typical magnitude where no noise is known.
+        scale: (C,) 1 sigma of each channel's white noise, or its typical magnitude where no noise
+            is known.
     """
     low, high = np.array([p.bounds for p in parameters]).T
     ranges = np.array([p.training_range for p in parameters])
@@ -86,9 +96,11 @@ def spectrum(
 
 
 def of_jacobian(jacobian: Array) -> Spectrum:
-    """The spectrum of the information J^T J of a Jacobian (N, dim) of observations over their noise.
+    """The spectrum of the information J^T J of a Jacobian (N, dim) of observations over their
+    noise.
 
-    From the singular values of J, which keeps the small eigenvalues that rounding in J^T J would drown.
+    From the singular values of J, which keeps the small eigenvalues that rounding in J^T J would
+    drown.
     """
     dim = jacobian.shape[1]
     _, sizes, rows = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))

@@ -1,4 +1,6 @@
-"""Checks of the tables of a user's TOML file: each fault is one line that names file, key, expected and found."""
+"""Checks of the tables of a user's TOML file: each fault is one line that names file, key, expected
+and found.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ def pair(path: Path, where: str, value: Any) -> tuple[float, float]:
     return low, high
 
 
-def table_of(path: Path, where: str, value: Any, types: Mapping[str, type | tuple[type, ...]]) -> dict[str, Any]:
+def table_of(
+    path: Path, where: str, value: Any, types: Mapping[str, type | tuple[type, ...]]
+) -> dict[str, Any]:
     """`value` as a table whose entries are among `types`, and of these types."""
     for key, found in checked(path, where, value, dict).items():
         if key not in types:

@@ -1,4 +1,6 @@
-"""A recording as scenarios and observations: what an experiment on real data fits, and what it measures on."""
+"""A recording as scenarios and observations: what an experiment on real data fits, and what it
+measures on.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from sims.recording.recording import Recording, Run, read_recording
 
 
 class Side(NamedTuple):
-    """Runs with what was observed in them: scenarios, one a run, and (T, C) all runs' samples one after another."""
+    """Runs with what was observed in them: scenarios, one a run, and (T, C) all runs' samples one
+    after another.
+    """
 
     scenarios: tuple[Scenario, ...]
     observed: Array
@@ -38,7 +42,9 @@ def measured(path: str, simulator: Simulator) -> Measured:
     recording = read_recording(find_recording(path), type(simulator))
     for channel in simulator.channels:
         if channel.name not in recording.runs[0].channels:
-            raise unknown(f"channel of {recording.path}", channel.name, list(recording.runs[0].channels))
+            raise unknown(
+                f"channel of {recording.path}", channel.name, list(recording.runs[0].channels)
+            )
     return Measured(
         _side(recording, recording.training(), simulator),
         _side(recording, recording.held_out(), simulator),
@@ -47,15 +53,23 @@ def measured(path: str, simulator: Simulator) -> Measured:
 
 
 def _side(recording: Recording, runs: tuple[Run, ...], simulator: Simulator) -> Side:
-    observed = [np.stack([run.channels[c.name] for c in simulator.channels], axis=1) for run in runs]
+    observed = [
+        np.stack([run.channels[c.name] for c in simulator.channels], axis=1) for run in runs
+    ]
     nothing = np.empty((0, len(simulator.channels)))
     scenarios = tuple(scenario_of(run, simulator, recording.constants) for run in runs)
     return Side(scenarios, np.concatenate([nothing, *observed]))
 
 
 def scenario_of(run: Run, simulator: Simulator, constants: Mapping[str, float]) -> Scenario:
-    """The scenario of a recorded run: it starts in the measured state where the run does not state its own."""
-    start = {n: float(v[0]) for n, v in run.channels.items() if n in simulator.states and np.isfinite(v[0])}
+    """The scenario of a recorded run: it starts in the measured state where the run does not state
+    its own.
+    """
+    start = {
+        n: float(v[0])
+        for n, v in run.channels.items()
+        if n in simulator.states and np.isfinite(v[0])
+    }
     return Scenario(run.times, {**start, **run.initial}, run.inputs, {**constants, **run.constants})
 
 
@@ -73,4 +87,6 @@ def find_recording(path: str) -> Path:
         if candidate.is_file():
             return candidate
     places = ", ".join(map(str, folders))
-    raise InputError(f"recording {path}: not found in {places}; set SIMGAP_DATA to the folder of recordings")
+    raise InputError(
+        f"recording {path}: not found in {places}; set SIMGAP_DATA to the folder of recordings"
+    )

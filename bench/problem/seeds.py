@@ -10,8 +10,8 @@ import numpy as np
 def rng_for(*names: str | int) -> np.random.Generator:
     """The generator that belongs to `names`, the same in every process and on every machine.
 
-    A caller names what its stream depends on and nothing else: a target's stream has no tuner in it, so all tuners
-    meet the same target.
+    A caller names what its stream depends on and nothing else: a target's stream has no tuner in
+    it, so all tuners meet the same target.
     """
     digest = hashlib.sha256("\x1f".join(str(name) for name in names).encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))

@@ -26,7 +26,9 @@ def _square(t: Array, rng: np.random.Generator, amplitude: float, frequency: flo
 
 
 def _steps(t: Array, rng: np.random.Generator, amplitude: float, seconds: float) -> Array:
-    place = np.floor(t / seconds + 1e-9).astype(int)  # a sample at the edge belongs to the new level
+    place = np.floor(t / seconds + 1e-9).astype(
+        int
+    )  # a sample at the edge belongs to the new level
     levels: Array = rng.uniform(-amplitude, amplitude, size=place[-1] + 1)
     held: Array = levels[place]
     return held
@@ -49,9 +51,11 @@ HELP = ", ".join(f"{name}:{form}" for name, (_, form) in _FORMS.items())
 
 
 def signal(text: str, times: Array, rng: np.random.Generator) -> Array:
-    """The values (T,) at `times` (T,) of the signal that `text` describes; a plain number is constant.
+    """The values (T,) at `times` (T,) of the signal that `text` describes; a plain number is
+    constant.
 
-    `steps` holds levels drawn by `rng` evenly within the amplitude, `chirp` sweeps from one frequency to the other.
+    `steps` holds levels drawn by `rng` evenly within the amplitude, `chirp` sweeps from one
+    frequency to the other.
 
     Raises:
         InputError: no such form, or not its numbers.
@@ -67,6 +71,12 @@ def signal(text: str, times: Array, rng: np.random.Generator) -> Array:
     except ValueError:
         numbers = []
     # All behind the first are frequencies or durations.
-    if len(numbers) != len(form.split(":")) or not np.isfinite(numbers).all() or min([1.0, *numbers[1:]]) <= 0:
-        raise InputError(f"signal '{text}': expected {name}:{form} with numbers, all but the first > 0")
+    if (
+        len(numbers) != len(form.split(":"))
+        or not np.isfinite(numbers).all()
+        or min([1.0, *numbers[1:]]) <= 0
+    ):
+        raise InputError(
+            f"signal '{text}': expected {name}:{form} with numbers, all but the first > 0"
+        )
     return make(times, rng, *numbers)

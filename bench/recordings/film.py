@@ -19,7 +19,8 @@ from sims.recording.write import refuse_existing
 
 
 def write(recording: Path, out: Path, run: str | None, pixels: int, seed: int) -> tuple[int, float]:
-    """Film one run with a published camera of this seed; returns the number of frames and the seconds.
+    """Film one run with a published camera of this seed; returns the number of frames and the
+    seconds.
 
     Raises:
         InputError: the recording is of no ball or has no heights, or the video cannot be written.
@@ -39,12 +40,18 @@ def write(recording: Path, out: Path, run: str | None, pixels: int, seed: int) -
     zero = np.zeros(chosen.times.size)
     positions = np.stack([chosen.channels.get(name, zero) for name in ("x", "y", "z")], axis=1)
     if not np.isfinite(positions).all():
-        raise InputError(f"{recording}: run {chosen.name}: has missing samples; a film shows the ball in every frame")
+        raise InputError(
+            f"{recording}: run {chosen.name}: has missing samples; a film shows the ball in every frame"
+        )
     radius = {**data.constants, **chosen.constants}.get("radius", _default("radius"))
     rng = rng_for("film", seed)
     camera, look = Camera.published(rng, pixels), Look.drawn(rng)
     stage = Stage(camera, look, radius, rng)
-    told = {beside(out): described(Filmed(camera, radius, float(positions[0, 0]), float(positions[0, 1])))}
+    told = {
+        beside(out): described(
+            Filmed(camera, radius, float(positions[0, 0]), float(positions[0, 1]))
+        )
+    }
     write_video(out, stage.film(positions), chosen.times, look.crf, told)
     return len(positions), float(chosen.times[-1] - chosen.times[0])
 

@@ -56,7 +56,18 @@ def summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
     yield from _constants(recording, kind)
 
 
-_RUN_HEAD = ("run", "use", "samples", "seconds", "rate [Hz]", "intervals [ms]: min", "median", "max", "gaps", "missing")
+_RUN_HEAD = (
+    "run",
+    "use",
+    "samples",
+    "seconds",
+    "rate [Hz]",
+    "intervals [ms]: min",
+    "median",
+    "max",
+    "gaps",
+    "missing",
+)
 
 
 def _run_row(run: Run) -> tuple[str, ...]:
@@ -64,9 +75,17 @@ def _run_row(run: Run) -> tuple[str, ...]:
     low, median, high = float(intervals.min()), float(np.median(intervals)), float(intervals.max())
     missing = sum(int(np.isnan(v).sum()) for v in run.channels.values())
     return (
-        run.name, "held out" if run.held_out else "fitting", str(run.times.size), f"{run.times[-1] - run.times[0]:.4g}",
-        f"{1e3 / median:.4g}", f"{low:.4g}", f"{median:.4g}", f"{high:.4g}", str(gaps(run.times)), str(missing),
-    )  # fmt: skip
+        run.name,
+        "held out" if run.held_out else "fitting",
+        str(run.times.size),
+        f"{run.times[-1] - run.times[0]:.4g}",
+        f"{1e3 / median:.4g}",
+        f"{low:.4g}",
+        f"{median:.4g}",
+        f"{high:.4g}",
+        str(gaps(run.times)),
+        str(missing),
+    )
 
 
 _SIGNAL_HEAD = ("signal", "kind", "unit", "min", "max", "missing", "noise: stated", "estimated", "")
@@ -79,12 +98,16 @@ def _signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[
         noise = estimated(signals) if what == "channel" else Noise(np.nan, 0.0)
         stated = recording.noise.get(channel.name)
         yield (
-            channel.name, what, channel.unit, f"{np.nanmin(values):.4g}", f"{np.nanmax(values):.4g}",
+            channel.name,
+            what,
+            channel.unit,
+            f"{np.nanmin(values):.4g}",
+            f"{np.nanmax(values):.4g}",
             f"{np.isnan(values).mean():.1%}" if np.isnan(values).any() else "0",
             ("-" if what == "channel" else "") if stated is None else f"{stated:.3g}",
             f"{noise.sigma:.3g}" if np.isfinite(noise.sigma) else "",
             f"in steps of {noise.step:.3g}" if noise.step else "",
-        )  # fmt: skip
+        )
 
 
 def declared(recording: Recording, kind: type[Simulator]) -> list[tuple[Channel, str]]:
@@ -124,7 +147,9 @@ def _constants(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
 
 def _named(names: Sequence[str]) -> str:
     shown = ", ".join(names[:12])
-    return f"run{'s' * (len(names) > 1)} {shown}" + (f" and {len(names) - 12} more" if len(names) > 12 else "")
+    return f"run{'s' * (len(names) > 1)} {shown}" + (
+        f" and {len(names) - 12} more" if len(names) > 12 else ""
+    )
 
 
 def _count(number: int, what: str) -> str:
@@ -135,5 +160,8 @@ def _aligned(rows: Sequence[Sequence[str]], left: int) -> Iterator[str]:
     """Columns, the first `left` of them to the left."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        cells = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
+        cells = [
+            c.ljust(w) if i < left else c.rjust(w)
+            for i, (c, w) in enumerate(zip(row, widths, strict=True))
+        ]
         yield "  ".join(cells).rstrip()

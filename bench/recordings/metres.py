@@ -1,13 +1,14 @@
 """Heights in metres from a tracked ball.
 
-With the camera known they follow exactly. Without it: along the straight line of a vertical fall the inverse depth, and
-so the ball's radius r in pixels, is linear in the place s on the picture, and height is a projective function of s.
-Both together leave one unknown factor S:
+With the camera known they follow exactly. Without it: along the straight line of a vertical fall
+the inverse depth, and so the ball's radius r in pixels, is linear in the place s on the picture,
+and height is a projective function of s. Both together leave one unknown factor S:
 
     z = radius + S (s_ground - s) / r(s)
 
-For a camera that looks level S is the ball's radius in metres. A camera that looks down sees heights shortened and not
-the ball, so S is larger; then the fall itself tells it, since the second derivative of z must be -g.
+For a camera that looks level S is the ball's radius in metres. A camera that looks down sees
+heights shortened and not the ball, so S is larger; then the fall itself tells it, since the second
+derivative of z must be -g.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ _DIFFER = 0.05
 
 @dataclass(frozen=True)
 class Heights:
-    """Heights z (n,) of the ball's centre in metres, its radius in metres, how they were found, and what to know."""
+    """Heights z (n,) of the ball's centre in metres, its radius in metres, how they were found, and
+    what to know.
+    """
 
     z: Array
     radius: float
@@ -40,7 +43,9 @@ class Heights:
 
 
 class _Arc(NamedTuple):
-    """A flight between bounces: its coefficients (curvature first), from when to when, and how firmly it tells."""
+    """A flight between bounces: its coefficients (curvature first), from when to when, and how
+    firmly it tells.
+    """
 
     curve: Array
     begin: float
@@ -56,14 +61,17 @@ def by_camera(track: Track, filmed: Filmed) -> Heights:
     """
     camera = filmed.camera
     if camera.size[0] * track.size[1] != camera.size[1] * track.size[0]:
-        raise InputError(f"the camera's picture has {camera.size} px, the film {track.size}; expected the same shape")
+        raise InputError(
+            f"the camera's picture has {camera.size} px, the film {track.size}; expected the same shape"
+        )
     camera = camera.resized(*track.size)
     z = camera.heights(np.stack([track.u, track.v], axis=1), filmed.x, filmed.y, filmed.radius)
     return Heights(z, filmed.radius, "through the known camera")
 
 
 def by_scale(track: Track, diameter: float | None, scale: str | None) -> Heights:
-    """Heights from the ball's diameter [m], or from the fall where `scale` is "fall" or no diameter is given.
+    """Heights from the ball's diameter [m], or from the fall where `scale` is "fall" or no diameter
+    is given.
 
     Raises:
         InputError: the film does not show what that needs.
@@ -79,7 +87,10 @@ def by_scale(track: Track, diameter: float | None, scale: str | None) -> Heights
             raise InputError(
                 "the scale is unknown: no flight of this film shows gravity clearly; give --ball-diameter METRES"
             )
-        factor, how = fallen, f"scaled by the fall (gravity {GRAVITY:g} m/s^2; a drag would be taken for scale)"
+        factor, how = (
+            fallen,
+            f"scaled by the fall (gravity {GRAVITY:g} m/s^2; a drag would be taken for scale)",
+        )
         ball = diameter / 2 if diameter else factor
     else:
         factor, how, ball = (
@@ -96,14 +107,18 @@ def by_scale(track: Track, diameter: float | None, scale: str | None) -> Heights
 
 
 def _place(track: Track) -> Array:
-    """Place along the line of the fall, down positive, px, such that the line's own perspective is in `_radius`."""
+    """Place along the line of the fall, down positive, px, such that the line's own perspective is
+    in `_radius`.
+    """
     seen = track.seen
     points = np.stack([track.u[seen], track.v[seen]], axis=1)
     middle = points.mean(axis=0)
     _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
     axis = axes[0] * (1.0 if axes[0][1] >= 0 else -1.0)
     if abs(axis[1]) < 0.5:
-        raise InputError("the ball moves across the picture rather than down; expected a drop filmed upright")
+        raise InputError(
+            "the ball moves across the picture rather than down; expected a drop filmed upright"
+        )
     result: Array = (np.stack([track.u, track.v], axis=1) - middle) @ axis
     return result
 
@@ -114,13 +129,20 @@ def _radius(track: Track) -> Array:
     line = np.polyfit(s[seen], track.radius[seen], 1)
     for _ in range(3):
         rest = np.abs(track.radius[seen] - np.polyval(line, s[seen]))
-        line = np.polyfit(s[seen], track.radius[seen], 1, w=1 / (1 + (rest / max(float(np.median(rest)), 1e-9)) ** 2))
+        line = np.polyfit(
+            s[seen],
+            track.radius[seen],
+            1,
+            w=1 / (1 + (rest / max(float(np.median(rest)), 1e-9)) ** 2),
+        )
     result: Array = np.maximum(np.polyval(line, s), 0.3 * float(np.median(track.radius[seen])))
     return result
 
 
 def _arcs(times: Array, q: Array) -> list[_Arc]:
-    """Flights: stretches between places where the ball turns from down to up, each with its parabola."""
+    """Flights: stretches between places where the ball turns from down to up, each with its
+    parabola.
+    """
     seen = np.flatnonzero(np.isfinite(q))
     lowest = [i for i in range(1, len(seen) - 1) if q[seen[i - 1]] < q[seen[i]] >= q[seen[i + 1]]]
     edges = [0, *lowest, len(seen) - 1]
@@ -142,7 +164,9 @@ def _factor(arcs: list[_Arc]) -> float | None:
     falling = [arc for arc in arcs if arc.curve[0] > 0]
     if not falling:
         return None
-    mean = np.average([2 * arc.curve[0] for arc in falling], weights=[arc.weight for arc in falling])
+    mean = np.average(
+        [2 * arc.curve[0] for arc in falling], weights=[arc.weight for arc in falling]
+    )
     return float(GRAVITY / mean)
 
 
@@ -151,7 +175,11 @@ def _ground(track: Track, q: Array, arcs: list[_Arc]) -> float:
     meets = []
     for before, after in pairwise(arcs):
         roots = np.roots(before.curve - after.curve)
-        real = [r.real for r in roots if abs(r.imag) < 1e-9 and before.end - 0.1 < r.real < after.begin + 0.1]
+        real = [
+            r.real
+            for r in roots
+            if abs(r.imag) < 1e-9 and before.end - 0.1 < r.real < after.begin + 0.1
+        ]
         meets += [float(np.polyval(before.curve, r)) for r in real[:1]]
     if meets:
         return float(np.median(meets))
@@ -159,10 +187,11 @@ def _ground(track: Track, q: Array, arcs: list[_Arc]) -> float:
 
 
 def scatter(times: Array, z: Array) -> float:
-    """1 sigma of what a cubic leaves of each flight, m: also errors that last for several samples; NaN without flight.
+    """1 sigma of what a cubic leaves of each flight, m: also errors that last for several samples;
+    NaN without flight.
 
-    A cubic has room for gravity and a drag. White noise estimated from neighbouring samples alone would pass over the
-    errors that a slowly changing outline makes.
+    A cubic has room for gravity and a drag. White noise estimated from neighbouring samples alone
+    would pass over the errors that a slowly changing outline makes.
     """
     squares, freedom = 0.0, 0
     for arc in _arcs(times, -z):

@@ -12,24 +12,30 @@ from methods.base import Array
 
 _MAD = 1.4826  # times the median magnitude of a normal variable is its standard deviation
 _GAP = 1.75
-"""An interval longer than this many times the median one is a gap: a lost sample makes it twice as long."""
+"""An interval longer than this many times the median one is a gap: a lost sample makes it twice as
+long.
+"""
 
 
 class Noise(NamedTuple):
-    """An estimate of 1 sigma, and the step by which a quantised signal changes (0 where it is not); NaN if unknown."""
+    """An estimate of 1 sigma, and the step by which a quantised signal changes (0 where it is not);
+    NaN if unknown.
+    """
 
     sigma: float
     step: float
 
 
 def estimated(signals: Iterable[tuple[Array, Array]]) -> Noise:
-    """Noise from what is left of samples when a parabola or a line through their neighbours is taken off.
+    """Noise from what is left of samples when a parabola or a line through their neighbours is
+    taken off.
 
-    For even sampling these are third and second differences (von Neumann et al., Ann. Math. Stat. 12, 153, 1941,
-    doi:10.1214/aoms/1177731746), made robust by their median and generalised to uneven sampling by divided differences.
-    The smaller of the two counts: what is left of the motion only adds. It assumes white noise; noise that is alike
-    from one sample to the next looks smaller, motion that is fast against the sampling looks like noise. A quantised
-    signal has at least the noise of its rounding.
+    For even sampling these are third and second differences (von Neumann et al., Ann. Math. Stat.
+    12, 153, 1941, doi:10.1214/aoms/1177731746), made robust by their median and generalised to
+    uneven sampling by divided differences. The smaller of the two counts: what is left of the
+    motion only adds. It assumes white noise; noise that is alike from one sample to the next looks
+    smaller, motion that is fast against the sampling looks like noise. A quantised signal has at
+    least the noise of its rounding.
 
     Args:
         signals: (times (T,), values (T,)) of each run; NaN values are missing.
@@ -48,7 +54,9 @@ def _sigma(runs: list[tuple[Array, Array]], order: int) -> float:
 
 
 def _rests(times: Array, values: Array, order: int) -> Array:
-    """Divided differences of the given order, scaled to the variance of one sample; none across gaps."""
+    """Divided differences of the given order, scaled to the variance of one sample; none across
+    gaps.
+    """
     t, y = sliding_window_view(times, order + 1), sliding_window_view(values, order + 1)
     near = t[:, -1] - t[:, 0] <= _GAP * order * np.median(np.diff(times))
     t, y = t[near], y[near]

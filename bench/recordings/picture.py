@@ -29,21 +29,40 @@ def drawn(track: Track, heights: Heights, part: slice, title: str) -> tuple[byte
     scene.plot(track.u, track.v, "-", color="white", linewidth=2.4)
     scene.plot(track.u, track.v, ".-", color=_SEEN, linewidth=0.8, markersize=2.5)
     for k in _some(track):
-        scene.add_patch(Circle((track.u[k], track.v[k]), track.radius[k], fill=False, color="black", linewidth=1.6))
-        scene.add_patch(Circle((track.u[k], track.v[k]), track.radius[k], fill=False, color="white", linewidth=0.8))
+        scene.add_patch(
+            Circle(
+                (track.u[k], track.v[k]), track.radius[k], fill=False, color="black", linewidth=1.6
+            )
+        )
+        scene.add_patch(
+            Circle(
+                (track.u[k], track.v[k]), track.radius[k], fill=False, color="white", linewidth=0.8
+            )
+        )
     scene.set(xlabel="u [px]", ylabel="v [px]", title="the track; circles: outlines found")
     t, gone = track.times, ~np.isfinite(track.u)
-    for axis, values, label in ((above, heights.z, "height of the centre z [m]"), (below, track.radius, "radius [px]")):
+    for axis, values, label in (
+        (above, heights.z, "height of the centre z [m]"),
+        (below, track.radius, "radius [px]"),
+    ):
         axis.axvspan(t[part][0], t[part][-1], color="#EEEEEE", linewidth=0)
         axis.plot(t, values, ".-", color=_SEEN, markersize=3, linewidth=0.7)
-        axis.plot(t[gone], np.full(gone.sum(), 0.02), "|", color=_MISSING, markersize=7,
-                  transform=axis.get_xaxis_transform())  # fmt: skip
+        axis.plot(
+            t[gone],
+            np.full(gone.sum(), 0.02),
+            "|",
+            color=_MISSING,
+            markersize=7,
+            transform=axis.get_xaxis_transform(),
+        )
         axis.set(xlabel="time [s]", ylabel=label)
         axis.spines[["top", "right"]].set_visible(False)
     above.axhline(heights.radius, color="black", linewidth=0.6, linestyle=":")
     above.set_title("dotted: ball on the ground", fontsize=9)
     below.set_title("grey: recorded; marks at the foot: no ball seen", fontsize=9)
-    figure.suptitle(f"{title}\n{int((~gone).sum())} of {len(t)} frames", parse_math=False, fontsize=10)
+    figure.suptitle(
+        f"{title}\n{int((~gone).sum())} of {len(t)} frames", parse_math=False, fontsize=10
+    )
     png, pdf = io.BytesIO(), io.BytesIO()
     figure.savefig(png, format="png", dpi=140)
     figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
@@ -54,8 +73,15 @@ def drawn(track: Track, heights: Heights, part: slice, title: str) -> tuple[byte
 def _some(track: Track) -> list[int]:
     """Numbers of a few kept frames with the ball, spread over its way."""
     seen = [k for k in track.seen.tolist() if k % 1 == 0]
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(track.u[seen]), np.diff(track.v[seen])))])
-    return [seen[i] for i in np.unique(np.searchsorted(way, np.linspace(0, way[-1], _SHOWN)).clip(0, len(seen) - 1))]
+    way = np.concatenate(
+        [[0.0], np.cumsum(np.hypot(np.diff(track.u[seen]), np.diff(track.v[seen])))]
+    )
+    return [
+        seen[i]
+        for i in np.unique(
+            np.searchsorted(way, np.linspace(0, way[-1], _SHOWN)).clip(0, len(seen) - 1)
+        )
+    ]
 
 
 def _overlaid(track: Track) -> Image:

@@ -1,6 +1,7 @@
 """Recordings made by simulation: data whose truth is known, to try things out on.
 
-The recording tells what a real one would; the truth goes to a file of its own, so that a blind test stays blind.
+The recording tells what a real one would; the truth goes to a file of its own, so that a blind test
+stays blind.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ class Wish:
 
     Attributes:
         system: registered name.
-        theta: parameters other than their nominal values, or all of them in order with commas between.
+        theta: parameters other than their nominal values, or all of them in order with commas
+            between.
         effects: coefficients, several with commas between.
         constants: other than the defaults.
         noise: 1 sigma, of every channel or by name.
@@ -60,7 +62,8 @@ class Wish:
         rate: samples a second.
         engine: None for the batch engine where there is a choice.
         seed: of all that is drawn.
-        held_out: how many of the last runs are marked; None for a third of them, at least one of several.
+        held_out: how many of the last runs are marked; None for a third of them, at least one of
+            several.
     """
 
     system: str
@@ -124,18 +127,28 @@ class _Maker:
         if wish.held_out is None and wish.runs == 1:
             self.held_out = 0
         if not 0 <= self.held_out < wish.runs:
-            raise InputError(f"--held-out {self.held_out}: expected fewer than the {wish.runs} runs")
+            raise InputError(
+                f"--held-out {self.held_out}: expected fewer than the {wish.runs} runs"
+            )
         self.theta = _theta(wish.theta, kind)
-        self.effects = {n: _list("--effect", n, text) for n, text in _pairs("--effect", wish.effects).items()}
+        self.effects = {
+            n: _list("--effect", n, text) for n, text in _pairs("--effect", wish.effects).items()
+        }
         self.engine = wish.engine
         if not self.engine and issubclass(kind, Simulated) and not issubclass(kind, OwnSimulator):
             self.engine = "batch"
         self.simulator = self._simulator()
         self.noise = _noise(wish.noise, [c.name for c in self.simulator.channels])
-        initial = {**_pairs("", self.usual.initial), **_pairs("--initial", wish.initial, kind.states, "initial state")}
+        initial = {
+            **_pairs("", self.usual.initial),
+            **_pairs("--initial", wish.initial, kind.states, "initial state"),
+        }
         self.ranges = {name: _range(name, text) for name, text in initial.items()}
         known = [c.name for c in kind.inputs]
-        self.inputs = {**_pairs("", self.usual.inputs), **_pairs("--input", wish.inputs, known, "input")}
+        self.inputs = {
+            **_pairs("", self.usual.inputs),
+            **_pairs("--input", wish.inputs, known, "input"),
+        }
         self.times = _times(wish)
 
     def make(self) -> Made:
@@ -159,7 +172,9 @@ class _Maker:
         return Made(recording, truth, self.simulator)
 
     def _simulator(self) -> Simulator:
-        constants = _pairs("--constant", self.wish.constants, [c.name for c in self.kind.constants], "constant")
+        constants = _pairs(
+            "--constant", self.wish.constants, [c.name for c in self.kind.constants], "constant"
+        )
         values = {name: _number("--constant", name, text) for name, text in constants.items()}
         observe = list(self.wish.observe) or list(self.usual.observe) or None
         if issubclass(self.kind, Simulated):
@@ -169,21 +184,30 @@ class _Maker:
         return self.kind(values, observe)
 
     def _scenario(self, number: int) -> Scenario:
-        """Run `number`; each of its draws has a stream of its own, so that none depends on what else there is."""
+        """Run `number`; each of its draws has a stream of its own, so that none depends on what
+        else there is.
+        """
         initial = {
             name: low if low == high else self._rng("initial", name, number).uniform(low, high)
             for name, (low, high) in self.ranges.items()
         }
-        inputs = {n: signal(text, self.times, self._rng("input", n, number)) for n, text in self.inputs.items()}
+        inputs = {
+            n: signal(text, self.times, self._rng("input", n, number))
+            for n, text in self.inputs.items()
+        }
         return Scenario(self.times, initial, inputs)
 
     def _run(self, number: int, scenario: Scenario) -> Run:
         observed = self.simulator.simulate(np.array([list(self.theta.values())]), scenario)[0]
         if not np.isfinite(observed).all():
-            raise InputError(f"run {number}: the simulation failed; check --theta, --effect and --initial")
+            raise InputError(
+                f"run {number}: the simulation failed; check --theta, --effect and --initial"
+            )
         channels = {}
         for name, values in zip(self.noise, observed.T, strict=True):
-            channels[name] = values + self.noise[name] * self._rng("noise", name, number).standard_normal(values.size)
+            channels[name] = values + self.noise[name] * self._rng(
+                "noise", name, number
+            ).standard_normal(values.size)
         held_out = number > self.wish.runs - self.held_out
         return Run(str(number), self.times, channels, scenario.inputs, {}, {}, held_out)
 
@@ -194,7 +218,9 @@ class _Maker:
 def _times(wish: Wish) -> Array:
     samples = round(wish.seconds * wish.rate) if 0 < wish.seconds * wish.rate < 1e8 else 0
     if samples < 2:
-        raise InputError(f"--seconds {wish.seconds:g} --rate {wish.rate:g}: expected at least 2 samples and below 1e8")
+        raise InputError(
+            f"--seconds {wish.seconds:g} --rate {wish.rate:g}: expected at least 2 samples and below 1e8"
+        )
     return np.array([float(f"{t:.{_DIGITS}g}") for t in (np.arange(samples) / wish.rate).tolist()])
 
 
@@ -209,20 +235,29 @@ def _theta(texts: Sequence[str], kind: type[Simulator]) -> dict[str, float]:
         given = dict(zip(names, cells, strict=True))
     else:
         given = _pairs("--theta", texts, names, "parameter")
-    theta = {p.name: _number("--theta", p.name, given.get(p.name, str(p.nominal))) for p in kind.parameters}
+    theta = {
+        p.name: _number("--theta", p.name, given.get(p.name, str(p.nominal)))
+        for p in kind.parameters
+    }
     for p in kind.parameters:
         low, high = p.bounds
         if not low <= theta[p.name] <= high:
-            raise InputError(f"--theta {p.name}={theta[p.name]:g}: expected {low:g} to {high:g} {p.unit}")
+            raise InputError(
+                f"--theta {p.name}={theta[p.name]:g}: expected {low:g} to {high:g} {p.unit}"
+            )
     return theta
 
 
 def _noise(texts: Sequence[str], channels: Sequence[str]) -> dict[str, float]:
     plain = [text for text in texts if "=" not in text]
     if len(plain) > 1:
-        raise InputError(f"--noise {' '.join(plain)}: expected one number for all channels, or NAME=VALUE")
+        raise InputError(
+            f"--noise {' '.join(plain)}: expected one number for all channels, or NAME=VALUE"
+        )
     named = _pairs("--noise", [text for text in texts if "=" in text], channels, "recorded channel")
-    values = {name: _number("--noise", name, named.get(name, (plain or ["0"])[0])) for name in channels}
+    values = {
+        name: _number("--noise", name, named.get(name, (plain or ["0"])[0])) for name in channels
+    }
     for name, value in values.items():
         if value < 0:
             raise InputError(f"--noise {name}={value:g}: expected at least 0")

@@ -27,7 +27,9 @@ class Found(NamedTuple):
     lines: tuple[str, ...]
 
 
-def write(video: Path, out: Path, diameter: float | None, fps: float | None, scale: str | None) -> Found:
+def write(
+    video: Path, out: Path, diameter: float | None, fps: float | None, scale: str | None
+) -> Found:
     """Track `video`; write `out`, its description, and the track's picture beside it.
 
     Args:
@@ -56,14 +58,20 @@ def write(video: Path, out: Path, diameter: float | None, fps: float | None, sca
     first, last = metres.released(seen), int(seen.seen[-1])
     notes = [*film.notes, *seen.notes, *heights.notes]
     if first > seen.seen[0]:
-        notes.append(f"the ball is held until {seen.times[first]:.2f} s; what is before that is left out")
+        notes.append(
+            f"the ball is held until {seen.times[first]:.2f} s; what is before that is left out"
+        )
     part = slice(first, last + 1)
     z = heights.z[part]
     noise = float(np.nanmax([rough(z), metres.scatter(seen.times[part], z), 0.0]))
     if not noise > 0:
         noise = seen.noise * heights.radius / float(np.nanmedian(seen.radius))
-    shown = dict(zip(pictures, drawn(seen, heights, part, f"{video.name}: {heights.how}"), strict=True))
-    write_recording(out, _recording(seen, heights, noise, part, video), BallSystem, digits=_DIGITS, beside=shown)
+    shown = dict(
+        zip(pictures, drawn(seen, heights, part, f"{video.name}: {heights.how}"), strict=True)
+    )
+    write_recording(
+        out, _recording(seen, heights, noise, part, video), BallSystem, digits=_DIGITS, beside=shown
+    )
     count = int(np.isfinite(heights.z[part]).sum())
     lines = (
         f"{out}: {count} of {part.stop - part.start} frames with the ball, z in metres {heights.how}",
@@ -82,12 +90,22 @@ def _heights(seen: Track, video: Path, diameter: float | None, scale: str | None
     return metres.by_scale(seen, diameter, scale)
 
 
-def _recording(seen: Track, heights: metres.Heights, noise: float, part: slice, video: Path) -> Recording:
+def _recording(
+    seen: Track, heights: metres.Heights, noise: float, part: slice, video: Path
+) -> Recording:
     pixels = {"u": seen.u, "v": seen.v, "radius_px": seen.radius}
     run = Run(
-        "1", frozen(seen.times[part]), {"z": frozen(heights.z[part])}, {}, {}, {}, False,
+        "1",
+        frozen(seen.times[part]),
+        {"z": frozen(heights.z[part])},
+        {},
+        {},
+        {},
+        False,
         {name: frozen(values[part]) for name, values in pixels.items()},
-    )  # fmt: skip
+    )
     title = f"{video.name}, tracked; z {heights.how}"
     constants = {"radius": heights.radius, "gravity": metres.GRAVITY}
-    return Recording(Path(), BallSystem.name, title, constants, {"z": noise}, (run,), dict.fromkeys(pixels, "px"))
+    return Recording(
+        Path(), BallSystem.name, title, constants, {"z": noise}, (run,), dict.fromkeys(pixels, "px")
+    )

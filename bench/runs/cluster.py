@@ -1,9 +1,11 @@
-"""Makes runs on a Dask cluster: each in a process of its own on the worker's machine, as `bench.runs.pools` makes them here.
+"""Makes runs on a Dask cluster: each in a process of its own on the worker's machine, as
+`bench.runs.pools` makes them here.
 
-A cluster's worker is never asked to run a method itself: it keeps one isolated process and hands the run on, so that a
-method that hangs, dies or fills memory costs its own run and no worker. A worker that is lost costs nothing: what it
-was at is sent to another. Plugin files and trained weights travel with the calls; recordings and environment variables
-(SIMGAP_DATA) must be there on the workers' machines.
+A cluster's worker is never asked to run a method itself: it keeps one isolated process and hands
+the run on, so that a method that hangs, dies or fills memory costs its own run and no worker. A
+worker that is lost costs nothing: what it was at is sent to another. Plugin files and trained
+weights travel with the calls; recordings and environment variables (SIMGAP_DATA) must be there on
+the workers' machines.
 """
 
 from __future__ import annotations
@@ -39,22 +41,30 @@ class ClusterPool:
     """The cluster with the scheduler at `address`, e.g. ``tcp://10.0.0.5:8786``.
 
     Raises:
-        InputError: the package is not installed, nobody answers, or the workers have other code than this process.
+        InputError: the package is not installed, nobody answers, or the workers have other code
+            than this process.
     """
 
     def __init__(self, address: str) -> None:
         try:
             from distributed import Client
         except ImportError:
-            raise InputError("--cluster: needs the package distributed (pip install 'simgap[cluster]')") from None
-        for name in [*logging.root.manager.loggerDict, "asyncio"]:  # what is lost is said here, in one line
+            raise InputError(
+                "--cluster: needs the package distributed (pip install 'simgap[cluster]')"
+            ) from None
+        for name in [
+            *logging.root.manager.loggerDict,
+            "asyncio",
+        ]:  # what is lost is said here, in one line
             if name.split(".")[0] in ("distributed", "tornado", "asyncio"):
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         self.address = address
         try:
             self._client = Client(address, timeout=10.0, set_as_default=False)
         except (OSError, ValueError, TypeError, ImportError) as error:
-            raise InputError(f"--cluster {address}: no Dask scheduler answers there ({_line(error)})") from None
+            raise InputError(
+                f"--cluster {address}: no Dask scheduler answers there ({_line(error)})"
+            ) from None
         self._files: Files = ()
         self._weights: dict[str, Any] = {}
         self._check()
@@ -62,12 +72,16 @@ class ClusterPool:
     def _check(self) -> None:
         threads = self._client.nthreads()
         if not threads:
-            raise InputError(f"--cluster {self.address}: has no workers; start some: dask worker {self.address}")
+            raise InputError(
+                f"--cluster {self.address}: has no workers; start some: dask worker {self.address}"
+            )
         here = (code(), versions())
         try:
             others = [w for w, there in self._client.run(_identity).items() if there != here]
         except Exception as error:
-            raise InputError(f"--cluster {self.address}: its workers lack simgap ({_line(error)})") from None
+            raise InputError(
+                f"--cluster {self.address}: its workers lack simgap ({_line(error)})"
+            ) from None
         if others:
             raise InputError(
                 f"--cluster {self.address}: worker {others[0]} has other code or package versions than this process; "
@@ -87,7 +101,8 @@ class ClusterPool:
         closing.join(timeout=10)
 
     def results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
-        """Place and result (or exception) of each call, as they end; see `bench.runs.pools.LocalPool`.
+        """Place and result (or exception) of each call, as they end; see
+        `bench.runs.pools.LocalPool`.
 
         Raises:
             LostError: the scheduler is gone; what had no end by then is not made.
@@ -101,34 +116,49 @@ class ClusterPool:
         try:
             while True:
                 ahead = _AHEAD * max(sum(self._client.nthreads().values()), 1)
-                while len(waiting) < ahead and (place := again.pop() if again else next(following, None)) is not None:
+                while (
+                    len(waiting) < ahead
+                    and (place := again.pop() if again else next(following, None)) is not None
+                ):
                     waiting[self._submit(calls[place], seconds)] = place
                 if not waiting:
                     return
                 for future in self._done(list(waiting)):
                     place = waiting.pop(future)
                     error = future.exception() if future.status in ("error", "cancelled") else None
-                    if isinstance(error, KilledWorker | CancelledError) or future.status in ("lost", "cancelled"):
+                    if isinstance(error, KilledWorker | CancelledError) or future.status in (
+                        "lost",
+                        "cancelled",
+                    ):
                         losses[place] = losses.get(place, 0) + 1
                         if losses[place] > _LOSSES:
-                            raise LostError(f"cluster {self.address}: lost {_LOSSES} workers on one run")
+                            raise LostError(
+                                f"cluster {self.address}: lost {_LOSSES} workers on one run"
+                            )
                         again.append(place)
                         continue
                     result = error if error is not None else self._received(future.result())
                     future.release()
                     yield place, result
         except (OSError, TimeoutError, CancelledError) as error:
-            raise LostError(f"cluster {self.address}: the scheduler is gone ({type(error).__name__})") from None
+            raise LostError(
+                f"cluster {self.address}: the scheduler is gone ({type(error).__name__})"
+            ) from None
 
     def _done(self, futures: list[Any]) -> list[Any]:
-        """The futures that are done, at least one of them; asks now and then whether the scheduler is still there."""
+        """The futures that are done, at least one of them; asks now and then whether the scheduler
+        is still there.
+        """
         from distributed import CancelledError, wait
 
         while True:
             try:
                 with self._client.as_current():
                     wait(futures, timeout=2.0, return_when="FIRST_COMPLETED")
-            except (TimeoutError, CancelledError):  # a cancelled one is done, and made again if the scheduler lives
+            except (
+                TimeoutError,
+                CancelledError,
+            ):  # a cancelled one is done, and made again if the scheduler lives
                 self._there()
             if done := [future for future in futures if future.done()]:
                 self._there()
@@ -143,15 +173,22 @@ class ClusterPool:
     def _submit(self, call: Call, seconds: float) -> Any:
         function, arguments = call
         weights = None
-        if len(arguments) == 2 and isinstance(order := arguments[1], Order) and order.weights is not None:
+        if (
+            len(arguments) == 2
+            and isinstance(order := arguments[1], Order)
+            and order.weights is not None
+        ):
             weights = self._sent(order.weights)
             arguments = (arguments[0], replace(order, weights=Path(order.weights.name)))
-        return self._client.submit(on_worker, function, arguments, seconds, self._files, weights, pure=False)
+        return self._client.submit(
+            on_worker, function, arguments, seconds, self._files, weights, pure=False
+        )
 
     def _sent(self, path: Path) -> Any:
         """The content of a file of weights, held by the cluster once, whoever needs it.
 
-        A task gives it, since scattered data are gone with the worker that held them, and a task is made again.
+        A task gives it, since scattered data are gone with the worker that held them, and a task is
+        made again.
         """
         if path.name not in self._weights:
             content = (path.name, path.read_bytes())
@@ -203,7 +240,8 @@ def on_worker(
     """Runs on a cluster's worker: makes the call in an isolated process of this machine.
 
     Returns:
-        What the call gave ("value") or the error that ended it, or a training and the content of its file ("weights").
+        What the call gave ("value") or the error that ended it, or a training and the content of
+        its file ("weights").
     """
     if weights is not None:
         path = folder() / weights[0]
@@ -211,7 +249,8 @@ def on_worker(
         arguments = (arguments[0], replace(arguments[1], weights=path))
     key = (threading.get_ident(), plugins)
     if key not in _pools:
-        # Dask's workers are daemons, which may not have children for fear that these outlive them; ours do not.
+        # Dask's workers are daemons, which may not have children for fear that these outlive them;
+        # ours do not.
         multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
         _pools[key] = LocalPool(1)
         _pools[key].load([str(_unpacked(name, content)) for name, content in plugins])

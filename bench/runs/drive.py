@@ -1,7 +1,7 @@
 """The loop around one tuner on one target: exact budget, statuses, recommendations.
 
-Nothing in here knows the truth. The loop gets a sealed task and a function that simulates; scoring against the truth
-happens later, in another process (`bench.runs.runner`).
+Nothing in here knows the truth. The loop gets a sealed task and a function that simulates; scoring
+against the truth happens later, in another process (`bench.runs.runner`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ class Trace:
         proposals: (k, dim) what was simulated, unit cube.
         losses: (k,).
         recommendations: (k + 1, dim) what the tuner would deliver after 0, 1, ... k simulations.
-        tuner_seconds: (k,) time in the tuner before each simulation, shared out evenly over a batch.
+        tuner_seconds: (k,) time in the tuner before each simulation, shared out evenly over a
+            batch.
         simulator_seconds: (k,) time in the simulator.
     """
 
@@ -50,7 +51,9 @@ def _points(asked: object, dim: int, what: str) -> Array:
     """The proposals as a fresh (n, dim) array inside the unit cube."""
     points = np.array(asked, dtype=np.float64, ndmin=2)
     if points.ndim != 2 or points.shape[1] != dim or not len(points):
-        raise ValueError(f"the tuner gave {what} of shape {points.shape}; expected (n, {dim}) with n >= 1")
+        raise ValueError(
+            f"the tuner gave {what} of shape {points.shape}; expected (n, {dim}) with n >= 1"
+        )
     if not _inside(points):
         if not np.isfinite(points).all():
             first = points[~np.isfinite(points).all(axis=1)][0]
@@ -60,7 +63,9 @@ def _points(asked: object, dim: int, what: str) -> Array:
 
 
 def _inside(points: Array) -> bool:
-    """Whether all lies in 0..1; for the few numbers of one point a plain loop is three times quicker than numpy."""
+    """Whether all lies in 0..1; for the few numbers of one point a plain loop is three times
+    quicker than numpy.
+    """
     if points.size <= 32:
         return all(0.0 <= x <= 1.0 for x in points.ravel().tolist())
     return bool((points >= 0.0).all() and (points <= 1.0).all())
@@ -75,9 +80,9 @@ def drive(
 ) -> Trace:
     """Run `tuner` on `task` until its budget is used, it stops, or it fails.
 
-    Proposals outside the unit cube are moved to its border; a batch that would overshoot the budget is cut. The
-    `recommendations` follow `methods.base.Ask`; k = 0 is the start unless the tuner recommends something else before
-    its first simulation.
+    Proposals outside the unit cube are moved to its border; a batch that would overshoot the budget
+    is cut. The `recommendations` follow `methods.base.Ask`; k = 0 is the start unless the tuner
+    recommends something else before its first simulation.
 
     Args:
         tuner: fitted where it needs to be.
@@ -123,7 +128,9 @@ def drive(
             used += n
             tuner_time.append((n, now - before))
             simulator_time.append((n, after - now))
-            points.setflags(write=False)  # the tuner gets these very arrays: sorting them would spoil the record
+            points.setflags(
+                write=False
+            )  # the tuner gets these very arrays: sorting them would spoil the record
             loss.setflags(write=False)
             proposals.append(points)
             losses.append(loss)
@@ -132,7 +139,10 @@ def drive(
                     best_loss, best = value, points[i]
                 recommended.append(best if recommendation is None else recommended[-1])
             if after - started > seconds:
-                status, reason = "timeout", f"stopped after {after - started:.1f} s, limit {seconds:g} s"
+                status, reason = (
+                    "timeout",
+                    f"stopped after {after - started:.1f} s, limit {seconds:g} s",
+                )
                 break
             if cut:
                 break

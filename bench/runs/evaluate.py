@@ -15,9 +15,11 @@ if TYPE_CHECKING:
 
 
 class Evaluator:
-    """Unit-cube points -> observations and losses; remembers the squared errors of what it simulated.
+    """Unit-cube points -> observations and losses; remembers the squared errors of what it
+    simulated.
 
-    The loss is the root mean square over channels and present samples of (simulated - observed) / scale.
+    The loss is the root mean square over channels and present samples of (simulated - observed) /
+    scale.
     """
 
     def __init__(self, problem: Problem, side: Side) -> None:
@@ -33,7 +35,9 @@ class Evaluator:
         self._seen: list[Array] = []
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Observations (n, T, C) and losses (n,) of `points` (n, dim); NaN and infinite where the simulation failed."""
+        """Observations (n, T, C) and losses (n,) of `points` (n, dim); NaN and infinite where the
+        simulation failed.
+        """
         observations = self._problem.simulate(points, self._scenarios)
         if observations.shape[0] == observations.shape[2] == 1 and self._missing is None:
             return observations, self._one_loss(observations)
@@ -45,7 +49,9 @@ class Evaluator:
         return observations, losses
 
     def _one_loss(self, observations: Array) -> Array:
-        """The loss (1,) of one observation of one channel: most evaluations, so worth a third of the general way."""
+        """The loss (1,) of one observation of one channel: most evaluations, so worth a third of
+        the general way.
+        """
         difference = (observations - self._observed).ravel()
         square = float(difference.dot(difference))
         self._seen.append(np.array([[square]]))
@@ -64,8 +70,8 @@ class Evaluator:
     def rmse(self, proposals: Array, recommendations: Array) -> Array:
         """Root-mean-square errors (k, C), in channel units, of recommended points (k, dim).
 
-        Points among `proposals`, the points simulated so far in their order, are looked up; the others are simulated,
-        outside the tuner's budget, since they only measure it.
+        Points among `proposals`, the points simulated so far in their order, are looked up; the
+        others are simulated, outside the tuner's budget, since they only measure it.
         """
         known = {point.tobytes(): row for point, row in zip(proposals, self._rows(), strict=True)}
         result = np.empty((len(recommendations), len(self._per_sample)))

@@ -14,7 +14,8 @@ from sims.base import InputError
 
 
 def initialise(plugins: Sequence[str], births: Any) -> None:
-    """Prepare a worker: interrupts are the parent's to handle, output goes nowhere, no worker outlives its parent.
+    """Prepare a worker: interrupts are the parent's to handle, output goes nowhere, no worker
+    outlives its parent.
 
     Args:
         plugins: plugin files to load.
@@ -53,8 +54,8 @@ def _end_with_parent() -> None:
 def memory_limit(mebibytes: int) -> Iterator[None]:
     """Within the block this process may take so much memory more than it has; 0 is no limit.
 
-    What is asked for beyond it fails (`MemoryError`). Linux counts private writable memory (RLIMIT_DATA), so that
-    mapped files and libraries are free.
+    What is asked for beyond it fails (`MemoryError`). Linux counts private writable memory
+    (RLIMIT_DATA), so that mapped files and libraries are free.
 
     Raises:
         InputError: this system has no such limit.

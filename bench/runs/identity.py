@@ -1,7 +1,9 @@
-"""Names for runs: a readable id that changes with everything that determines a run, and with nothing else.
+"""Names for runs: a readable id that changes with everything that determines a run, and with
+nothing else.
 
-``cma_es/wide-017/0/3f9ac2d15b`` is tuner, target and seed, and a hash of the tuner's options, the simulator with its
-settings, the target's scenario and observation, budget, limits, code and package versions.
+``cma_es/wide-017/0/3f9ac2d15b`` is tuner, target and seed, and a hash of the tuner's options, the
+simulator with its settings, the target's scenario and observation, budget, limits, code and package
+versions.
 """
 
 from __future__ import annotations
@@ -21,14 +23,46 @@ from bench.registry import simulators, tuners
 from bench.runs.training import package_version, recording_digest, source
 
 _WORLD = (
-    "simulator", "observe", "error_channel", "timeout", "memory", "noise", "settings", "world", "constants",
-    "parameters", "initial", "inputs", "sampling",
-)  # fmt: skip
+    "simulator",
+    "observe",
+    "error_channel",
+    "timeout",
+    "memory",
+    "noise",
+    "settings",
+    "world",
+    "constants",
+    "parameters",
+    "initial",
+    "inputs",
+    "sampling",
+)
 _RUN_MAKING = (
-    "drive", "evaluate", "experiment", "guard", "identifiability", "measured", "problem", "scores", "seeds", "signals",
-    "tables", "training", "worker",
-)  # fmt: skip
-_PACKAGES = ("cma", "mujoco", "nlopt", "numpy", "pybullet", "scikit-learn", "scikit-optimize", "scipy", "torch")
+    "drive",
+    "evaluate",
+    "experiment",
+    "guard",
+    "identifiability",
+    "measured",
+    "problem",
+    "scores",
+    "seeds",
+    "signals",
+    "tables",
+    "training",
+    "worker",
+)
+_PACKAGES = (
+    "cma",
+    "mujoco",
+    "nlopt",
+    "numpy",
+    "pybullet",
+    "scikit-learn",
+    "scikit-optimize",
+    "scipy",
+    "torch",
+)
 
 
 def digest(*parts: Any, length: int = 10) -> str:
@@ -45,10 +79,14 @@ def _plainly(value: Any) -> Any:
 
 @cache
 def code() -> str:
-    """Hash of the code that makes runs: methods, worlds, and the part of the harness that drives and scores them."""
+    """Hash of the code that makes runs: methods, worlds, and the part of the harness that drives
+    and scores them.
+    """
     project = Path(__file__).resolve().parents[2]
     files = [project / "bench" / f"{name}.py" for name in _RUN_MAKING]
-    files += [file for part in ("methods", "sims") for file in sorted((project / part).rglob("*.py"))]
+    files += [
+        file for part in ("methods", "sims") for file in sorted((project / part).rglob("*.py"))
+    ]
     return digest(__version__, [[str(f.relative_to(project)), f.read_bytes()] for f in files])
 
 
@@ -59,7 +97,9 @@ def versions() -> str:
 
 
 def fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
-    """Hashes of everything that must not change while an experiment is under way, by what a person would call it."""
+    """Hashes of everything that must not change while an experiment is under way, by what a person
+    would call it.
+    """
     return {
         "configuration": digest(experiment.name, experiment.document()),
         "recording": digest(recording_digest(experiment)),
@@ -76,9 +116,12 @@ class Identities:
         document = experiment.document()
         self._experiment = experiment
         self._world = digest(
-            experiment.name, {name: document[name] for name in _WORLD}, source(simulators.get(experiment.simulator)),
-            code(), versions(),
-        )  # fmt: skip
+            experiment.name,
+            {name: document[name] for name in _WORLD},
+            source(simulators.get(experiment.simulator)),
+            code(),
+            versions(),
+        )
         self._entries: dict[str, str] = {}
         self._targets: dict[str, str] = {}
 
@@ -87,10 +130,14 @@ class Identities:
         if entry.label not in self._entries:
             kind = tuners.get(entry.tuner)
             training = self._experiment.training_budget if kind.learned else 0
-            self._entries[entry.label] = digest(entry.tuner, dict(entry.options), training, source(kind))
+            self._entries[entry.label] = digest(
+                entry.tuner, dict(entry.options), training, source(kind)
+            )
         if target.name not in self._targets:
             self._targets[target.name] = _target(target)
-        what = digest(self._world, self._entries[entry.label], self._targets[target.name], seed, budget)
+        what = digest(
+            self._world, self._entries[entry.label], self._targets[target.name], seed, budget
+        )
         return f"{entry.label}/{target.name}/{seed}/{what}"
 
 

@@ -1,7 +1,9 @@
-"""Worker processes that can be killed: one run at a time in each, a hard limit, and a death costs no more than a run.
+"""Worker processes that can be killed: one run at a time in each, a hard limit, and a death costs
+no more than a run.
 
-Every worker is a pebble pool of its own with a single process. pebble shares one channel, guarded by two locks, among
-the workers of a pool: a worker that is killed while it holds them would stop all of them, and here stops only itself.
+Every worker is a pebble pool of its own with a single process. pebble shares one channel, guarded
+by two locks, among the workers of a pool: a worker that is killed while it holds them would stop
+all of them, and here stops only itself.
 """
 
 from __future__ import annotations
@@ -22,11 +24,17 @@ from bench.runs.guard import initialise
 from sims.base import InputError
 
 GRACE = 30.0
-"""Seconds by which the hard limit, which kills, exceeds the soft one, which a cooperative run meets by itself."""
+"""Seconds by which the hard limit, which kills, exceeds the soft one, which a cooperative run meets
+by itself.
+"""
 RETRIES = 3
-"""How often a call is made again whose worker was killed from outside, which says nothing about the call."""
+"""How often a call is made again whose worker was killed from outside, which says nothing about the
+call.
+"""
 _OUTSIDE = (-9, -15, 15)
-"""Exit codes of a worker that was told to end: SIGKILL (also the kernel's, short of memory), SIGTERM."""
+"""Exit codes of a worker that was told to end: SIGKILL (also the kernel's, short of memory),
+SIGTERM.
+"""
 _FUTILE = 10
 """Workers that may die one after another before they do anything; then it is not chance."""
 _SHORT = 1.0
@@ -40,7 +48,9 @@ class DeathError(RuntimeError):
 
 
 class LostError(RuntimeError):
-    """What makes the calls is gone, and with it the calls that had no end; the message says what is."""
+    """What makes the calls is gone, and with it the calls that had no end; the message says what
+    is.
+    """
 
 
 class Pool(Protocol):
@@ -51,7 +61,9 @@ class Pool(Protocol):
         ...
 
     def results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
-        """Place and result (or exception) of each call, as they end; `seconds` is the soft limit of one."""
+        """Place and result (or exception) of each call, as they end; `seconds` is the soft limit of
+        one.
+        """
         ...
 
     def __enter__(self) -> Pool: ...
@@ -98,8 +110,8 @@ class LocalPool:
     def results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
         """Place and result (or exception) of each call, as they end.
 
-        A call past its limit ends in `TimeoutError`, one whose worker dies in `DeathError`; after `RETRIES` deaths
-        from outside (the kernel's, an operator's) too.
+        A call past its limit ends in `TimeoutError`, one whose worker dies in `DeathError`; after
+        `RETRIES` deaths from outside (the kernel's, an operator's) too.
 
         Raises:
             InputError: workers die before they do anything.
@@ -126,7 +138,9 @@ class LocalPool:
 
 
 class _Slot:
-    """One worker process, made anew whenever it is lost: what a dying process leaves in its pipe is never read."""
+    """One worker process, made anew whenever it is lost: what a dying process leaves in its pipe is
+    never read.
+    """
 
     def __init__(self, plugins: list[str]) -> None:
         self._plugins = plugins
@@ -138,11 +152,14 @@ class _Slot:
         from pebble import ProcessPool
 
         context = multiprocessing.get_context("spawn")
-        # Each process that the pool starts tells of its birth here: a second one means that the first is dead, which
-        # pebble does not notice where it exited with code 0.
+        # Each process that the pool starts tells of its birth here: a second one means that the
+        # first is dead, which pebble does not notice where it exited with code 0.
         self._births, telling = context.Pipe(duplex=False)
         arguments = (self._plugins, telling)
-        self._born, self._pool = 0, ProcessPool(1, initializer=initialise, initargs=arguments, context=context)
+        self._born, self._pool = (
+            0,
+            ProcessPool(1, initializer=initialise, initargs=arguments, context=context),
+        )
 
     def stop(self) -> None:
         """End the process, and whatever it is at."""
@@ -151,7 +168,8 @@ class _Slot:
             pool.stop()
             pool.join()
 
-        # In a thread, since pebble would wait for ever for the rest of a message whose sender was killed.
+        # In a thread, since pebble would wait for ever for the rest of a message whose sender was
+        # killed.
         ending = threading.Thread(target=end, daemon=True, name="ending-a-worker")
         ending.start()
         ending.join(timeout=5.0)
@@ -174,7 +192,9 @@ class _Slot:
         for future in [future for future in self.given if future.done()]:
             one, error = self.given.pop(future), future.exception()
             code = getattr(error, "exitcode", None)
-            lost = lost or code is not None or isinstance(error, BrokenExecutor | FutureTimeoutError)
+            lost = (
+                lost or code is not None or isinstance(error, BrokenExecutor | FutureTimeoutError)
+            )
             if error is None:
                 self._futile = 0
                 ended.append((one, future.result()))
@@ -182,7 +202,9 @@ class _Slot:
                 one.deaths += code is not None
                 again.appendleft(one)
             elif isinstance(error, FutureTimeoutError):
-                ended.append((one, TimeoutError(str(error))))  # before Python 3.11 the two are different classes
+                ended.append(
+                    (one, TimeoutError(str(error)))
+                )  # before Python 3.11 the two are different classes
             else:
                 ended.append((one, error if code is None else DeathError(_says(code))))
         if not lost and self._died_quietly():
@@ -205,7 +227,9 @@ class _Slot:
     def _renew(self) -> None:
         self._futile += 1
         if self._futile > _FUTILE:
-            raise InputError("worker processes die as soon as they start; what they say stands above, if anything")
+            raise InputError(
+                "worker processes die as soon as they start; what they say stands above, if anything"
+            )
         self.given.clear()
         self.stop()
         self._births.close()

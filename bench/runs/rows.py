@@ -14,7 +14,9 @@ from bench.store.status import Status
 
 
 def unfinished(problem: Problem, target: Target, status: str, reason: str) -> Outcome:
-    """The outcome of a run of which nothing but its end is known: it stands where it started, with no simulation."""
+    """The outcome of a run of which nothing but its end is known: it stands where it started, with
+    no simulation.
+    """
     nothing, start = np.empty(0), target.sealed.start[None]
     trace = Trace(status, reason, start[:0], nothing, start, nothing, nothing)
     return Outcome(trace, np.full((1, len(problem.channels)), np.nan), None, 0.0)
@@ -37,7 +39,11 @@ def status_of(problem: Problem, order: Order, outcome: Outcome) -> Status:
 
 
 def rows(
-    problem: Problem, order: Order, target: Target, outcome: Outcome, spectrum: Spectrum | None = None
+    problem: Problem,
+    order: Order,
+    target: Target,
+    outcome: Outcome,
+    spectrum: Spectrum | None = None,
 ) -> dict[str, Any]:
     """Columns of runs.parquet for one run, one entry for each k = 0..simulations.
 
@@ -59,7 +65,9 @@ def rows(
     columns |= _parameter_columns(problem, target, outcome)
     if spectrum is not None and target.truth is not None:
         away = problem.cube.physical(trace.recommendations) - target.truth
-        columns["stiff_error"], columns["sloppy_error"] = spectrum.errors(away / problem.cube.training_widths())
+        columns["stiff_error"], columns["sloppy_error"] = spectrum.errors(
+            away / problem.cube.training_widths()
+        )
     columns["obs_error"] = outcome.obs_rmse[:, problem.error_channel]
     nothing = np.full((k + 1, len(problem.channels)), np.nan)
     heldout = nothing if outcome.heldout_rmse is None else outcome.heldout_rmse
@@ -67,7 +75,9 @@ def rows(
     for i, channel in enumerate(problem.channels):
         columns[f"obs_error_{channel.name}"] = outcome.obs_rmse[:, i]
         noise = problem.noise[i]
-        columns[f"obs_error_{channel.name}_in_noise"] = outcome.obs_rmse[:, i] / (noise if noise > 0 else np.nan)
+        columns[f"obs_error_{channel.name}_in_noise"] = outcome.obs_rmse[:, i] / (
+            noise if noise > 0 else np.nan
+        )
         columns[f"heldout_error_{channel.name}"] = heldout[:, i]
     columns["tuner_seconds"] = _after_start(trace.tuner_seconds)
     columns["simulator_seconds"] = _after_start(trace.simulator_seconds)
@@ -84,7 +94,9 @@ def _parameter_columns(problem: Problem, target: Target, outcome: Outcome) -> di
     columns: dict[str, Any] = {"param_error": (errors / cube.training_widths()).mean(axis=1)}
     if cube.dim == 1:
         columns["param_abs_error"] = errors[:, 0]
-    columns["outside"] = np.full(len(errors), np.nan if target.truth is None else problem.outside(target.truth))
+    columns["outside"] = np.full(
+        len(errors), np.nan if target.truth is None else problem.outside(target.truth)
+    )
     for i, parameter in enumerate(cube.parameters):
         columns[f"proposal_{parameter.name}"] = _after_start(proposed[:, i])
         columns[f"recommendation_{parameter.name}"] = recommended[:, i]

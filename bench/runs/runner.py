@@ -1,4 +1,6 @@
-"""Runs an experiment: tuners x targets x seeds in worker processes; every finished run is kept the moment it ends."""
+"""Runs an experiment: tuners x targets x seeds in worker processes; every finished run is kept the
+moment it ends.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,8 @@ class Memory:
 
 @dataclass
 class Results:
-    """A comparison: its problem, its plan once there is one, where its runs are kept, and what training cost.
+    """A comparison: its problem, its plan once there is one, where its runs are kept, and what
+    training cost.
 
     `spectra` says what each target's data identify, by its name, where that can be asked.
     """
@@ -69,7 +72,9 @@ class Results:
 
     def training_rows(self) -> list[tuple[str, int, int, float]]:
         """Rows of training.csv: tuner, seed, simulations, seconds."""
-        return [(label, seed, t.simulations, t.seconds) for (label, seed), t in self.trainings.items()]
+        return [
+            (label, seed, t.simulations, t.seconds) for (label, seed), t in self.trainings.items()
+        ]
 
     def skipped_rows(self) -> list[dict[str, Any]]:
         """Rows of status.csv for tuners that could not be used."""
@@ -90,7 +95,9 @@ class Job:
 
 
 def seeds_of(experiment: Experiment, entry: Entry) -> int:
-    """How many seeds an entry runs: its own number, the experiment's, or one where nothing is random."""
+    """How many seeds an entry runs: its own number, the experiment's, or one where nothing is
+    random.
+    """
     kind = tuners.get(entry.tuner)
     if not (kind.stochastic or kind.learned):
         return 1
@@ -98,7 +105,9 @@ def seeds_of(experiment: Experiment, entry: Entry) -> int:
 
 
 def check(experiment: Experiment) -> dict[str, str]:
-    """Build every tuner once, so that a fault shows before the work; returns the skipped entries with their reason."""
+    """Build every tuner once, so that a fault shows before the work; returns the skipped entries
+    with their reason.
+    """
     skipped = {}
     for entry in experiment.tuners:
         try:
@@ -109,13 +118,16 @@ def check(experiment: Experiment) -> dict[str, str]:
 
 
 def prepare(experiment: Experiment) -> Results:
-    """Check an experiment whole before any work: its simulator, recording, tuners and their options; plan its runs.
+    """Check an experiment whole before any work: its simulator, recording, tuners and their
+    options; plan its runs.
 
     Raises:
         InputError: a fault in it.
     """
     if not experiment.tuners:
-        raise InputError(f"experiment {experiment.name}: names no tuner; add a [tuners.NAME] table or use --tuners")
+        raise InputError(
+            f"experiment {experiment.name}: names no tuner; add a [tuners.NAME] table or use --tuners"
+        )
     if experiment.memory:
         limits()
     results = Results(Problem(experiment), skipped=check(experiment))
@@ -143,7 +155,8 @@ def run(
     progress: Progress = _silent,
     pool: Pool | None = None,
 ) -> None:
-    """Make every run of a prepared experiment that is not kept already; `results.kept` gets each as it ends.
+    """Make every run of a prepared experiment that is not kept already; `results.kept` gets each as
+    it ends.
 
     Args:
         results: from `prepare`.
@@ -197,7 +210,9 @@ def _identify(results: Results, progress: Progress) -> None:
 
 
 class _Calls(Sequence[Call]):
-    """The calls for these places of the plan, each made when it is asked for: a million of them would fill memory."""
+    """The calls for these places of the plan, each made when it is asked for: a million of them
+    would fill memory.
+    """
 
     def __init__(self, results: Results, places: list[int]) -> None:
         self._results, self._places = results, places
@@ -216,7 +231,11 @@ class _Calls(Sequence[Call]):
 def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, int], Exception]:
     """Train every learned entry with each of its seeds; returns the reasons of those that failed."""
     experiment = results.problem.experiment
-    usable = [e for e in experiment.tuners if e.label not in results.skipped and tuners.get(e.tuner).learned]
+    usable = [
+        e
+        for e in experiment.tuners
+        if e.label not in results.skipped and tuners.get(e.tuner).learned
+    ]
     wanted = [(e, seed) for e in usable for seed in range(seeds_of(experiment, e))]
     failures: dict[tuple[str, int], Exception] = {}
     if wanted:
@@ -226,7 +245,9 @@ def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, 
             entry, seed = wanted[place]
             if isinstance(trained, Training):
                 results.trainings[entry.label, seed] = trained
-            elif isinstance(trained, WeightsError):  # a fault of the user's: nothing has been run yet
+            elif isinstance(
+                trained, WeightsError
+            ):  # a fault of the user's: nothing has been run yet
                 raise trained
             else:
                 failures[entry.label, seed] = trained
@@ -245,5 +266,7 @@ def _file(results: Results, place: int, outcome: Outcome | Exception) -> None:
     elif isinstance(outcome, Exception):
         reason = "".join(traceback.format_exception(outcome))
         outcome = unfinished(problem, job.target, "crashed", reason)
-    columns = rows(problem, job.order, job.target, outcome, results.spectra.get(job.target.sealed.name))
+    columns = rows(
+        problem, job.order, job.target, outcome, results.spectra.get(job.target.sealed.name)
+    )
     results.kept.add(place, columns, status_of(problem, job.order, outcome))

@@ -1,8 +1,10 @@
-"""Trains learned tuners once for each simulator and seed, and keeps what they learned as plain tensors.
+"""Trains learned tuners once for each simulator and seed, and keeps what they learned as plain
+tensors.
 
-The file's name is a hash of everything that went in: the tuner's and simulator's source and options, the training range
-and scenarios, budget, seed, the versions of the packages that compute and the device. The file holds the same hash, so
-that one which was put in another's place is noticed. Nothing is ever unpickled.
+The file's name is a hash of everything that went in: the tuner's and simulator's source and
+options, the training range and scenarios, budget, seed, the versions of the packages that compute
+and the device. The file holds the same hash, so that one which was put in another's place is
+noticed. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -43,7 +45,9 @@ class WeightsError(InputError):
 
 @dataclass(frozen=True)
 class Training:
-    """What one training cost when it was done, and where its tensors lie; `found` where that was earlier."""
+    """What one training cost when it was done, and where its tensors lie; `found` where that was
+    earlier.
+    """
 
     path: Path
     simulations: int
@@ -74,7 +78,17 @@ def folder() -> Path:
 def key(experiment: Experiment, entry: Entry, seed: int) -> str:
     """The hash of everything that determines the trained weights."""
     document = experiment.document()
-    training = ("simulator", "observe", "noise", "settings", "constants", "parameters", "initial", "inputs", "sampling")
+    training = (
+        "simulator",
+        "observe",
+        "noise",
+        "settings",
+        "constants",
+        "parameters",
+        "initial",
+        "inputs",
+        "sampling",
+    )
     what = {name: document[name] for name in training} | {
         "experiment": experiment.name,  # the seed's stream depends on it
         "recording": recording_digest(experiment),
@@ -114,7 +128,11 @@ def recording_digest(experiment: Experiment) -> str:
 def source(kind: type) -> str:
     """Digest of the source of the package folder (or plugin file) that a class comes from."""
     path = Path(inspect.getfile(kind))
-    files = sorted(path.parent.glob("*.py")) if kind.__module__.split(".")[0] in ("methods", "sims") else [path]
+    files = (
+        sorted(path.parent.glob("*.py"))
+        if kind.__module__.split(".")[0] in ("methods", "sims")
+        else [path]
+    )
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
@@ -126,7 +144,9 @@ def package_version(name: str) -> str:
         return f"{name} absent"
 
 
-def train(experiment: Experiment, entry: Entry, seed: int, watch: Watch | None = None, anew: bool = False) -> Training:
+def train(
+    experiment: Experiment, entry: Entry, seed: int, watch: Watch | None = None, anew: bool = False
+) -> Training:
     """Train, or find trained: the tensors' file and what the training cost when it was done.
 
     Args:
@@ -154,7 +174,10 @@ def train(experiment: Experiment, entry: Entry, seed: int, watch: Watch | None =
     tuner.fit(practice, rng, experiment.training_budget)
     seconds = perf_counter() - started
     problem.close()
-    about = {_COUNTS: np.array([practice.used, seconds]), _KEY: np.frombuffer(name.encode(), dtype=np.uint8)}
+    about = {
+        _COUNTS: np.array([practice.used, seconds]),
+        _KEY: np.frombuffer(name.encode(), dtype=np.uint8),
+    }
     _write(path, {**tuner.state(), **about})
     return Training(path, practice.used, seconds)
 
@@ -162,7 +185,9 @@ def train(experiment: Experiment, entry: Entry, seed: int, watch: Watch | None =
 def _write(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
     """Write a whole file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.stem}.{os.getpid()}.partial")  # so that a reader never meets half a file
+    partial = path.with_name(
+        f"{path.stem}.{os.getpid()}.partial"
+    )  # so that a reader never meets half a file
     try:
         with partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
@@ -183,7 +208,9 @@ def trained(entry: Entry, path: Path) -> Tuner:
     try:
         tuner.restore(state)
     except ValueError as error:
-        raise WeightsError(f"{path}: not the weights of {entry.label}: {error}; {_REMEDY}") from None
+        raise WeightsError(
+            f"{path}: not the weights of {entry.label}: {error}; {_REMEDY}"
+        ) from None
     return tuner
 
 
@@ -199,12 +226,31 @@ def _checked(path: Path, name: str) -> dict[str, Array]:
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = {member: file[member] for member in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, AttributeError):
-        raise WeightsError(f"{path}: expected trained weights, found none or a damaged file; {_REMEDY}") from None
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        zipfile.BadZipFile,
+        zlib.error,
+        KeyError,
+        AttributeError,
+    ):
+        raise WeightsError(
+            f"{path}: expected trained weights, found none or a damaged file; {_REMEDY}"
+        ) from None
     counts, held = arrays.get(_COUNTS, np.empty(0)), arrays.get(_KEY, np.empty(0))
-    if counts.shape != (2,) or counts.dtype != np.float64 or held.dtype != np.uint8 or held.ndim != 1:
-        raise WeightsError(f"{path}: expected trained weights, found arrays {sorted(arrays)[:4]}; {_REMEDY}")
+    if (
+        counts.shape != (2,)
+        or counts.dtype != np.float64
+        or held.dtype != np.uint8
+        or held.ndim != 1
+    ):
+        raise WeightsError(
+            f"{path}: expected trained weights, found arrays {sorted(arrays)[:4]}; {_REMEDY}"
+        )
     found = held.tobytes().decode("utf-8", "replace")
     if found != name:
-        raise WeightsError(f"{path}: expected the weights of {name}, found those of {found:.80}; {_REMEDY}")
+        raise WeightsError(
+            f"{path}: expected the weights of {name}, found those of {found:.80}; {_REMEDY}"
+        )
     return arrays

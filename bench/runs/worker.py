@@ -1,6 +1,8 @@
-"""What a worker process does: make one run on one sealed target (training is `bench.runs.training.train`).
+"""What a worker process does: make one run on one sealed target (training is
+`bench.runs.training.train`).
 
-No true parameter ever enters a worker: it gets `SealedTarget`s and returns traces, which the parent scores.
+No true parameter ever enters a worker: it gets `SealedTarget`s and returns traces, which the parent
+scores.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ from methods.base import Array, Task
 
 @dataclass(frozen=True)
 class Order:
-    """One run to make: its id, a tuner on a target with a seed; `weights` is the file of a learned tuner's tensors."""
+    """One run to make: its id, a tuner on a target with a seed; `weights` is the file of a learned
+    tuner's tensors.
+    """
 
     run: str
     entry: Entry
@@ -92,9 +96,13 @@ def perform(experiment: Experiment, order: Order) -> Outcome:
         trace = drive(tuner, task, evaluator, rng, experiment.timeout)
     seconds = perf_counter() - started
     beside = problem.simulated - before - len(trace.losses)
-    if beside > 0 and trace.status != "crashed":  # a simulator that raises has simulated, and nothing came of it
+    if (
+        beside > 0 and trace.status != "crashed"
+    ):  # a simulator that raises has simulated, and nothing came of it
         raise CheatError(f"{beside} simulations beside the budget")
     heldout = None
     if target.held_out.scenarios:
-        heldout = Evaluator(problem, target.held_out).rmse(trace.proposals[:0], trace.recommendations)
+        heldout = Evaluator(problem, target.held_out).rmse(
+            trace.proposals[:0], trace.recommendations
+        )
     return Outcome(trace, evaluator.rmse(trace.proposals, trace.recommendations), heldout, seconds)

@@ -1,4 +1,6 @@
-"""A shot as a short animation: the filmed drop as it was tracked, then every method's plan and what the ball did."""
+"""A shot as a short animation: the filmed drop as it was tracked, then every method's plan and what
+the ball did.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +28,19 @@ _HOLD = 9  # frames at the end
 
 
 class Film(NamedTuple):
-    """Pictures of a drop, as many a second as the animation has, and the middles (n, 2) tracked until each, pixels."""
+    """Pictures of a drop, as many a second as the animation has, and the middles (n, 2) tracked
+    until each, pixels.
+    """
 
     pictures: list[Image]
     tracks: list[Array]
 
 
-def animate(folder: Path, settings: Settings, example: tuple[Deal, list[str]], kept: Mapping[str, Any]) -> Path:
-    """Write figures/shot.gif: the drop at its own speed, where it was filmed, and the shots at half of it.
+def animate(
+    folder: Path, settings: Settings, example: tuple[Deal, list[str]], kept: Mapping[str, Any]
+) -> Path:
+    """Write figures/shot.gif: the drop at its own speed, where it was filmed, and the shots at half
+    of it.
 
     Returns:
         The file.
@@ -48,16 +55,28 @@ def animate(folder: Path, settings: Settings, example: tuple[Deal, list[str]], k
     film = _film(folder / RECORDINGS / f"{dealt.name}.mp4")
     beside = int(bool(film.pictures))
     figure, axes = plt.subplots(
-        1, len(methods) + beside, figsize=(2.9 * len(methods) + 1.5 * beside, 3.2), squeeze=False,
+        1,
+        len(methods) + beside,
+        figsize=(2.9 * len(methods) + 1.5 * beside, 3.2),
+        squeeze=False,
         gridspec_kw={"width_ratios": [0.5] * beside + [1] * len(methods)},
-    )  # fmt: skip
+    )
     moving = []
     for axis, method in zip(axes[0, beside:], methods, strict=True):
         shot_panel(axis, dealt, label_of(method), models[method], throws[method], top)
         line = axis.lines[-1]
         line.set_data([], [])
-        (ball,) = axis.plot([], [], marker="o", color="#D55E00", markeredgecolor="black", markersize=7)
-        moving.append((throws[method].flown, end_of(throws[method].flown, dealt.scene.hoop_z - 0.12), line, ball))
+        (ball,) = axis.plot(
+            [], [], marker="o", color="#D55E00", markeredgecolor="black", markersize=7
+        )
+        moving.append(
+            (
+                throws[method].flown,
+                end_of(throws[method].flown, dealt.scene.hoop_z - 0.12),
+                line,
+                ball,
+            )
+        )
     seen = _film_panel(axes[0, 0], film) if beside else []
     step = RATE / _FRAMES_PER_SECOND / _SLOWER
     shots = int(np.ceil(max(end for _, end, _, _ in moving) / step)) + 1
@@ -86,14 +105,18 @@ def animate(folder: Path, settings: Settings, example: tuple[Deal, list[str]], k
 def _film_panel(axis: Any, film: Film) -> list[Any]:
     picture = axis.imshow(film.pictures[0])
     (track,) = axis.plot([], [], color="#0072B2", linewidth=0.7)
-    (ring,) = axis.plot([], [], "o", markersize=9, markerfacecolor="none", markeredgecolor="#D55E00")
+    (ring,) = axis.plot(
+        [], [], "o", markersize=9, markerfacecolor="none", markeredgecolor="#D55E00"
+    )
     axis.set_title("one drop,\nfilmed and tracked", fontsize=9)
     axis.set(xticks=[], yticks=[])
     return [picture, track, ring]
 
 
 def _film(path: Path) -> Film:
-    """What there is of a film and its track; nothing where drops were not filmed, or the film is gone."""
+    """What there is of a film and its track; nothing where drops were not filmed, or the film is
+    gone.
+    """
     try:
         frames = list(Video(path))
         run = read_recording(path.with_suffix(".csv"), Ball, whole=True).runs[0]

@@ -1,7 +1,7 @@
 """Draws what each shot is made with, the same for every method, and records the ball's drop.
 
-The recorded drop is filmed and tracked, or heights of the centre at the sampling rate with noise. Either is a recording
-like any other.
+The recorded drop is filmed and tracked, or heights of the centre at the sampling rate with noise.
+Either is a recording like any other.
 """
 
 from __future__ import annotations
@@ -45,18 +45,28 @@ class Deal:
 
 
 def deal(experiment: Experiment, settings: Settings, kind: str, index: int) -> Deal:
-    """Shot `index` of a kind of ball; it depends on the experiment's name, not on methods or numbers of shots."""
+    """Shot `index` of a kind of ball; it depends on the experiment's name, not on methods or
+    numbers of shots.
+    """
     rng = rng_for(experiment.name, "shot", kind, index)
     ball = ball_named(kind).one(rng)
-    angle, x, drop = (float(rng.uniform(*pair)) for pair in (settings.angle, settings.hoop_x, settings.hoop_drop))
+    angle, x, drop = (
+        float(rng.uniform(*pair)) for pair in (settings.angle, settings.hoop_x, settings.hoop_drop)
+    )
     dx, dz = (settings.release * rng.standard_normal(2)).tolist()
     scene = Scene(angle, x, ball.radius / math.cos(angle) - drop, settings.hoop_radius)
     return Deal(f"{kind}-{index:03d}", ball, scene, (dx, dz))
 
 
 def deals(experiment: Experiment, settings: Settings) -> list[Deal]:
-    """All shots of an experiment; the balls take turns, so that a part of the work is a part of each."""
-    return [deal(experiment, settings, kind, i) for i in range(experiment.targets) for kind in settings.balls]
+    """All shots of an experiment; the balls take turns, so that a part of the work is a part of
+    each.
+    """
+    return [
+        deal(experiment, settings, kind, i)
+        for i in range(experiment.targets)
+        for kind in settings.balls
+    ]
 
 
 def in_view(path: Path, experiment: Experiment) -> float:
@@ -66,7 +76,9 @@ def in_view(path: Path, experiment: Experiment) -> float:
 
 
 def record(experiment: Experiment, dealt: Deal, settings: Settings, path: Path) -> None:
-    """Record a drop of the ball on level ground; nothing is done where there is a recording already."""
+    """Record a drop of the ball on level ground; nothing is done where there is a recording
+    already.
+    """
     if path.exists() and path.with_suffix(".toml").exists():
         return
     for left in (path, path.with_suffix(".toml")):

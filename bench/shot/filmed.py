@@ -1,4 +1,6 @@
-"""A drop on film: what a camera that stands three metres away sees of it, and the recording that the tracker makes."""
+"""A drop on film: what a camera that stands three metres away sees of it, and the recording that
+the tracker makes.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,18 @@ from sims.camera.render import Stage
 from sims.camera.video import write_video
 
 DISTANCE, HEIGHT, AIM = (2.8, 3.4), (0.8, 1.4), 0.9
-"""Ranges of the camera's distance and height, and the height at which it looks, m: the whole drop is in the picture."""
+"""Ranges of the camera's distance and height, and the height at which it looks, m: the whole drop
+is in the picture.
+"""
 NARROW = 0.4
 """Width of the picture over its height: what falls needs no more."""
 
 
-def filmed(path: Path, heights: Array, times: Array, radius: float, pixels: int, rng: np.random.Generator) -> None:
-    """Film a drop and write what the tracker sees of it: `path` (.csv), its description, film and camera beside it.
+def filmed(
+    path: Path, heights: Array, times: Array, radius: float, pixels: int, rng: np.random.Generator
+) -> None:
+    """Film a drop and write what the tracker sees of it: `path` (.csv), its description, film and
+    camera beside it.
 
     Args:
         path: of the recording.
@@ -35,14 +42,22 @@ def filmed(path: Path, heights: Array, times: Array, radius: float, pixels: int,
     Raises:
         InputError: the packages for films are missing, or the ball cannot be found in the film.
     """
-    azimuth, distance, height = (float(rng.uniform(*pair)) for pair in ((0.0, 2.0 * math.pi), DISTANCE, HEIGHT))
+    azimuth, distance, height = (
+        float(rng.uniform(*pair)) for pair in ((0.0, 2.0 * math.pi), DISTANCE, HEIGHT)
+    )
     size = (2 * round(NARROW * pixels / 2), pixels)
     camera, look = Camera(azimuth, distance, height, (0.0, 0.0, AIM), size=size), Look.drawn(rng)
     film = path.with_suffix(".mp4")
-    for left in (film, beside(film), *(path.with_suffix(end) for end in (".csv", ".toml", ".png", ".pdf"))):
+    for left in (
+        film,
+        beside(film),
+        *(path.with_suffix(end) for end in (".csv", ".toml", ".png", ".pdf")),
+    ):
         left.unlink(missing_ok=True)
     stage = Stage(camera, look, radius, rng)
     places = np.stack([np.zeros_like(heights), np.zeros_like(heights), heights], axis=1)
-    write_video(film, stage.film(places), times, look.crf, {beside(film): described(Filmed(camera, radius))})
+    write_video(
+        film, stage.film(places), times, look.crf, {beside(film): described(Filmed(camera, radius))}
+    )
     stage.close()
     tracking.write(film, path, None, None, "camera")

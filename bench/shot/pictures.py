@@ -1,4 +1,6 @@
-"""The figures of a bounce shot: success by ball and method, how far shots were off, and shots as planned and flown."""
+"""The figures of a bounce shot: success by ball and method, how far shots were off, and shots as
+planned and flown.
+"""
 
 from __future__ import annotations
 
@@ -32,14 +34,22 @@ _WORDS = {
 
 
 def draw(
-    folder: Path, experiment: Experiment, settings: Settings, dealt: Sequence[Deal], kept: Mapping[str, Any],
-    rows: pd.DataFrame, lines: pd.DataFrame,
-) -> list[Path]:  # fmt: skip
+    folder: Path,
+    experiment: Experiment,
+    settings: Settings,
+    dealt: Sequence[Deal],
+    kept: Mapping[str, Any],
+    rows: pd.DataFrame,
+    lines: pd.DataFrame,
+) -> list[Path]:
     """Draw all into `folder`/figures; returns the PNG files."""
     import matplotlib
 
     matplotlib.use("Agg")
-    made = [save(folder, "success", _success(experiment, lines)), save(folder, "off", _off(settings, rows))]
+    made = [
+        save(folder, "success", _success(experiment, lines)),
+        save(folder, "off", _off(settings, rows)),
+    ]
     found = examples(dealt, kept, rows)
     if found:
         made.append(save(folder, "shots", _shots(settings, found, kept)))
@@ -58,7 +68,9 @@ def label_of(method: str) -> str:
     return "explain's own fit" if method == EXPLAINED else method
 
 
-def _canvas(width: float, height: float, rows: int, columns: int, **more: Any) -> tuple[Figure, Any]:
+def _canvas(
+    width: float, height: float, rows: int, columns: int, **more: Any
+) -> tuple[Figure, Any]:
     from matplotlib import pyplot as plt
 
     return plt.subplots(rows, columns, figsize=(width, height), squeeze=False, **more)
@@ -79,7 +91,9 @@ def _success(experiment: Experiment, lines: pd.DataFrame) -> Figure:
         left.plot(rate, place, marker=marker, color=colour, markersize=7)
         near = 0 < rate < 0.5 or 99.5 <= rate < 100  # not rounded to none or all
         told = f"{rate:.{1 if near else 0}f}"
-        left.annotate(told, (rate, place), xytext=(0, 6), textcoords="offset points", ha="center", fontsize=8)
+        left.annotate(
+            told, (rate, place), xytext=(0, 6), textcoords="offset points", ha="center", fontsize=8
+        )
     left.set(xlim=(-2, 104), xlabel="shots through the hoop, all balls [%]")
     left.set_yticks(range(len(methods)), [label_of(m) for m in methods])
     left.invert_yaxis()
@@ -88,8 +102,18 @@ def _success(experiment: Experiment, lines: pd.DataFrame) -> Figure:
     for line in lines[lines["ball"] != ALL].to_dict("records"):
         x, y, rate = balls.index(line["ball"]), methods.index(line["method"]), float(line["rate"])
         right.add_patch(_cell(x, y, rate))
-        told = f"{line['hits']}/{line['shots']}   {100 * line['low']:.0f}–{100 * line['high']:.0f} %"
-        right.text(x, y, told, ha="center", va="center", fontsize=7.5, color="white" if rate < 0.45 else "black")
+        told = (
+            f"{line['hits']}/{line['shots']}   {100 * line['low']:.0f}–{100 * line['high']:.0f} %"
+        )
+        right.text(
+            x,
+            y,
+            told,
+            ha="center",
+            va="center",
+            fontsize=7.5,
+            color="white" if rate < 0.45 else "black",
+        )
     right.set(xlim=(-0.5, len(balls) - 0.5), ylim=(len(methods) - 0.5, -0.5))
     right.set_xticks(range(len(balls)), balls, fontsize=9)
     right.xaxis.tick_top()
@@ -99,7 +123,10 @@ def _success(experiment: Experiment, lines: pd.DataFrame) -> Figure:
     counts = sorted(set(lines.loc[lines["ball"] != ALL, "shots"].tolist()))
     shots = "–".join(str(n) for n in (counts if len(counts) == 1 else (counts[0], counts[-1])))
     told = f"shots of each ball: {shots}, each with a ball and a recorded drop of its own"
-    figure.suptitle(f"{experiment.title or experiment.name}\n{told}; bars and ranges: 95 % (Wilson)", fontsize=10)
+    figure.suptitle(
+        f"{experiment.title or experiment.name}\n{told}; bars and ranges: 95 % (Wilson)",
+        fontsize=10,
+    )
     return figure
 
 
@@ -113,12 +140,18 @@ def _cell(x: int, y: int, rate: float) -> Any:
 def _legend(figure: Figure, groups: Sequence[str]) -> None:
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], color=_GROUPS[g][0], marker=_GROUPS[g][1], label=_WORDS[g]) for g in groups]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(groups), fontsize=8, frameon=False)
+    handles = [
+        Line2D([], [], color=_GROUPS[g][0], marker=_GROUPS[g][1], label=_WORDS[g]) for g in groups
+    ]
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=len(groups), fontsize=8, frameon=False
+    )
 
 
 def _off(settings: Settings, rows: pd.DataFrame) -> Figure:
-    """Left where shots met the hoop's plane; right the distance between planned and flown path. Boxes: quartiles."""
+    """Left where shots met the hoop's plane; right the distance between planned and flown path.
+    Boxes: quartiles.
+    """
     methods = list(rows["method"].unique())
     figure, ((left, right),) = _canvas(11.5, 1.6 + 0.42 * len(methods), 1, 2, sharey=True)
     for place, method in enumerate(methods):
@@ -145,7 +178,9 @@ def _off(settings: Settings, rows: pd.DataFrame) -> Figure:
     _legend(figure, [m for m in _GROUPS if m in {group_of(x) for x in methods}])
     shots, balls = rows["shot"].nunique(), rows["ball"].nunique()
     told = "box: quartiles and median, whiskers: 5 % and 95 %, dots: shots outside"
-    figure.suptitle(f"How far off: {shots} shots of {balls} kinds of ball by every method\n{told}", fontsize=10)
+    figure.suptitle(
+        f"How far off: {shots} shots of {balls} kinds of ball by every method\n{told}", fontsize=10
+    )
     return figure
 
 
@@ -153,15 +188,26 @@ def _box(axis: Axes, values: Array, place: int, colour: str) -> None:
     if not values.size:
         return
     axis.boxplot(
-        values, positions=[place], orientation="horizontal", whis=(5, 95), widths=0.55, patch_artist=True,
-        boxprops={"facecolor": colour, "alpha": 0.45, "edgecolor": colour}, medianprops={"color": "black"},
+        values,
+        positions=[place],
+        orientation="horizontal",
+        whis=(5, 95),
+        widths=0.55,
+        patch_artist=True,
+        boxprops={"facecolor": colour, "alpha": 0.45, "edgecolor": colour},
+        medianprops={"color": "black"},
         flierprops={"marker": ".", "markersize": 3, "markeredgecolor": colour},
-        whiskerprops={"color": colour}, capprops={"color": colour},
-    )  # fmt: skip
+        whiskerprops={"color": colour},
+        capprops={"color": colour},
+    )
 
 
-def examples(dealt: Sequence[Deal], kept: Mapping[str, Any], rows: pd.DataFrame) -> list[tuple[Deal, list[str]]]:
-    """A usual shot, if there is one that the untuned simulator missed, and the worst; and which methods to show."""
+def examples(
+    dealt: Sequence[Deal], kept: Mapping[str, Any], rows: pd.DataFrame
+) -> list[tuple[Deal, list[str]]]:
+    """A usual shot, if there is one that the untuned simulator missed, and the worst; and which
+    methods to show.
+    """
     by = {one.name: one for one in dealt}
     tuned = [m for m in rows["method"].unique() if group_of(m) == "tuned"]
     if not tuned:
@@ -179,7 +225,9 @@ def examples(dealt: Sequence[Deal], kept: Mapping[str, Any], rows: pd.DataFrame)
     return [(by[str(name)], shown) for name in dict.fromkeys((typical, worst)) if name in kept]
 
 
-def _shots(settings: Settings, found: list[tuple[Deal, list[str]]], kept: Mapping[str, Any]) -> Figure:
+def _shots(
+    settings: Settings, found: list[tuple[Deal, list[str]]], kept: Mapping[str, Any]
+) -> Figure:
     columns = max(len(shown) for _, shown in found)
     figure, axes = _canvas(4.1 * columns, 0.9 + 3.1 * len(found), len(found), columns)
     for row, (dealt, shown) in enumerate(found):
@@ -187,7 +235,9 @@ def _shots(settings: Settings, found: list[tuple[Deal, list[str]]], kept: Mappin
         throws = {method: throw(dealt, settings, models[method]) for method in shown}
         top = max(float(np.nanmax(t.flown[:, 2])) for t in throws.values()) + 0.1
         for column, method in enumerate(shown):
-            shot_panel(axes[row, column], dealt, label_of(method), models[method], throws[method], top)
+            shot_panel(
+                axes[row, column], dealt, label_of(method), models[method], throws[method], top
+            )
         axes[row, 0].set_ylabel(f"{dealt.name}\nheight [m]")
     for axis in axes[-1]:
         axis.set_xlabel("distance [m]")
@@ -204,7 +254,9 @@ def shot_panel(axis: Axes, dealt: Deal, method: str, model: Model, made: Throw, 
     slope = np.array([-0.25, min(0.55 * scene.hoop_x, 0.45)])
     axis.fill_between(slope, -slope * np.tan(scene.angle), -0.35, color="#BBBBBB", linewidth=0)
     rim = [scene.hoop_x - scene.hoop_radius, scene.hoop_x + scene.hoop_radius]
-    axis.plot(rim, [scene.hoop_z] * 2, color="black", linewidth=3, solid_capstyle="butt", label="hoop")
+    axis.plot(
+        rim, [scene.hoop_z] * 2, color="black", linewidth=3, solid_capstyle="butt", label="hoop"
+    )
     for path, style, name in (
         (made.planned, {"color": "#0072B2", "linestyle": (0, (4, 2))}, "planned"),
         (made.flown, {"color": "#D55E00", "linestyle": "-"}, "flown"),
@@ -212,7 +264,10 @@ def shot_panel(axis: Axes, dealt: Deal, method: str, model: Model, made: Throw, 
         shown = path[: end_of(path, scene.hoop_z - 0.12)]
         axis.plot(shown[:, 0], shown[:, 2], linewidth=1.7, label=name, **style)
     result = "hit" if made.hit else "miss"
-    axis.set_title(f"{method}: {result}, {100 * made.off:+.0f} cm\nrestitution {model.restitution:.2f}", fontsize=9)
+    axis.set_title(
+        f"{method}: {result}, {100 * made.off:+.0f} cm\nrestitution {model.restitution:.2f}",
+        fontsize=9,
+    )
     axis.set(xlim=(-0.25, reach), ylim=(-0.35, top), aspect="equal")
     axis.spines[["top", "right"]].set_visible(False)
 

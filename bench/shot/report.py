@@ -19,20 +19,38 @@ from bench.store.status import STATUS_COLUMNS
 
 
 def finish(
-    folder: Path, experiment: Experiment, settings: Settings, skipped: Mapping[str, str], say: Callable[[str], None]
+    folder: Path,
+    experiment: Experiment,
+    settings: Settings,
+    skipped: Mapping[str, str],
+    say: Callable[[str], None],
 ) -> int:
-    """Write and say what the shots in `folder` came to; returns the exit code: 1 where a method failed or died."""
+    """Write and say what the shots in `folder` came to; returns the exit code: 1 where a method
+    failed or died.
+    """
     dealt = deals(experiment, settings)
     kept = {one.name: made for one in dealt if (made := read(folder, one)) is not None}
     rows = pd.DataFrame([row for made in kept.values() for row in made["rows"]])
-    for name in ("off", "margin", "planned_margin", "prediction_error", "drop_height", "restitution", "seconds"):
+    for name in (
+        "off",
+        "margin",
+        "planned_margin",
+        "prediction_error",
+        "drop_height",
+        "restitution",
+        "seconds",
+    ):
         rows[name] = pd.to_numeric(rows[name])
     lines = table(rows)
     replace_text(folder / "table.csv", lines.to_csv(index=False, float_format="%.6g"))
     replace_text(folder / "shots.csv", rows.to_csv(index=False, float_format="%.6g"))
-    replace_text(folder / "status.csv", _statuses(rows, skipped).to_csv(index=False, float_format="%.6g"))
+    replace_text(
+        folder / "status.csv", _statuses(rows, skipped).to_csv(index=False, float_format="%.6g")
+    )
     figures = draw(folder, experiment, settings, dealt, kept, rows, lines)
-    figures += [animate(folder, settings, example, kept) for example in examples(dealt, kept, rows)[:1]]
+    figures += [
+        animate(folder, settings, example, kept) for example in examples(dealt, kept, rows)[:1]
+    ]
     journal = folder / FOLDER
     if journal.is_dir() and not any(journal.iterdir()):
         journal.rmdir()
@@ -49,10 +67,21 @@ def finish(
 
 
 def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
-    made = pd.DataFrame({
-        "run": rows["method"] + "/" + rows["shot"], "tuner": rows["method"], "simulator": "bounce-shot",
-        "target": rows["shot"], "seed": 0, "status": rows["status"], "reason": rows["reason"],
-        "simulations": rows["simulations"], "seconds": rows["seconds"],
-    })  # fmt: skip
-    left = [(label, label, "bounce-shot", "", 0, "skipped", reason, 0, 0.0) for label, reason in skipped.items()]
+    made = pd.DataFrame(
+        {
+            "run": rows["method"] + "/" + rows["shot"],
+            "tuner": rows["method"],
+            "simulator": "bounce-shot",
+            "target": rows["shot"],
+            "seed": 0,
+            "status": rows["status"],
+            "reason": rows["reason"],
+            "simulations": rows["simulations"],
+            "seconds": rows["seconds"],
+        }
+    )
+    left = [
+        (label, label, "bounce-shot", "", 0, "skipped", reason, 0, 0.0)
+        for label, reason in skipped.items()
+    ]
     return pd.concat([made, pd.DataFrame(left, columns=STATUS_COLUMNS)]) if left else made

@@ -1,7 +1,8 @@
-"""A recorded drop for tuners that get the film's pixel rows and not metres: they never learn where the camera stood.
+"""A recorded drop for tuners that get the film's pixel rows and not metres: they never learn where
+the camera stood.
 
-They tune simulator `ball-filmed`. It is given what the scene of a drop tells: how large the ball is and how high it was
-let go; cameras and balls of all the kinds that are shot are drawn for training.
+They tune simulator `ball-filmed`. It is given what the scene of a drop tells: how large the ball is
+and how high it was let go; cameras and balls of all the kinds that are shot are drawn for training.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ def before_a_camera(experiment: Experiment, settings: Settings) -> Experiment:
 
 
 def rows_of(recording: Recording, experiment: Experiment, radius: float) -> Side:
-    """The tracker's rows on the experiment's sample times, empty where it saw nothing, and the drop they show.
+    """The tracker's rows on the experiment's sample times, empty where it saw nothing, and the drop
+    they show.
 
     Args:
         recording: a tracked drop, with the rows as extra column `v`.

@@ -21,17 +21,19 @@ class Settings:
         balls: kinds.
         angle: of the incline, radians.
         hoop_x: distance of the hoop's centre from the release, m.
-        hoop_drop: how far the hoop's plane lies below the height at which a ball's centre touches the incline, m.
+        hoop_drop: how far the hoop's plane lies below the height at which a ball's centre touches
+            the incline, m.
         hoop_radius: m.
         heights: drop heights that the planner may choose, m.
         release: 1 sigma of the height and of the horizontal place of release, m.
-        planned_friction: what the planner takes for the friction of ball and incline, all balls alike.
+        planned_friction: what the planner takes for the friction of ball and incline, all balls
+            alike.
         planned_inertia: what it takes for their moment of inertia over mass x radius^2.
         friction: the world's.
-        filmed: height in pixels of the film from which the recorded drop is tracked (`bench.shot.filmed`);
-            0 for heights with the experiment's noise instead of a film.
-        rows: tuners that get the pixel rows of the film instead of heights in metres, and not the camera: those that
-            compare simulated heights with rows, such as tunenet-vision.
+        filmed: height in pixels of the film from which the recorded drop is tracked
+            (`bench.shot.filmed`); 0 for heights with the experiment's noise instead of a film.
+        rows: tuners that get the pixel rows of the film instead of heights in metres, and not the
+            camera: those that compare simulated heights with rows, such as tunenet-vision.
     """
 
     balls: tuple[str, ...] = tuple(BALLS)
@@ -62,7 +64,9 @@ def settings_of(experiment: Experiment) -> Settings:
         values[key] = _value(f"experiment {experiment.name}: shot.{key}", key, value)
     made = Settings(**values)
     if made.rows and not made.filmed:
-        raise InputError(f"experiment {experiment.name}: shot.rows: only a film has pixel rows; set shot.filmed too")
+        raise InputError(
+            f"experiment {experiment.name}: shot.rows: only a film has pixel rows; set shot.filmed too"
+        )
     known = sorted({*(e.label for e in experiment.tuners), *tuners.names()})
     for name in made.rows:
         if name not in known:
@@ -79,7 +83,11 @@ def _value(where: str, key: str, value: Any) -> Any:
             raise InputError(f"{where}: expected at least one ball")
         return balls
     if isinstance(getattr(Settings, key), tuple):
-        if not isinstance(value, list | tuple) or len(value) != 2 or not all(_number(v) for v in value):
+        if (
+            not isinstance(value, list | tuple)
+            or len(value) != 2
+            or not all(_number(v) for v in value)
+        ):
             raise InputError(f"{where}: expected [low, high], found {value!r}")
         low, high = (float(v) for v in value)
         if not 0 <= low <= high:

@@ -1,4 +1,6 @@
-"""Runs a bounce-shot experiment: records drops, has every method plan, makes the shots, keeps what is finished."""
+"""Runs a bounce-shot experiment: records drops, has every method plan, makes the shots, keeps what
+is finished.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def begin(experiment: Experiment, plugins: Sequence[str], out: str | None, jobs:
     if settings_of(experiment).filmed:
         packages.require("; or set shot.filmed = 0")
     if experiment.simulator != "ball" or experiment.observe != ("z",):
-        raise InputError(f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]')
+        raise InputError(
+            f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'
+        )
     folder = free_folder(experiment, out)
     create(folder, Configuration(experiment, list(plugins), fingerprint(experiment, plugins)), jobs)
     return folder
@@ -54,7 +58,9 @@ def status(folder: Path, say: Say) -> bool:
     dealt = deals(experiment, settings_of(experiment))
     made = sum(_path(folder, one).exists() for one in dealt)
     complete = made == len(dealt)
-    say(f"{experiment.name}: {made} of {len(dealt)} shots made" + (", complete" if complete else ""))
+    say(
+        f"{experiment.name}: {made} of {len(dealt)} shots made" + (", complete" if complete else "")
+    )
     if not complete:
         say(f"to finish it: simgap compare --resume {folder}")
     return complete
@@ -69,7 +75,9 @@ def make(folder: Path, plugins: Sequence[str], jobs: int, bar: Progress, say: Sa
         say(f"skipped: {reason}")
         return 0
     skipped = check(experiment)
-    experiment = experiment.with_tuners([e.label for e in experiment.tuners if e.label not in skipped])
+    experiment = experiment.with_tuners(
+        [e.label for e in experiment.tuners if e.label not in skipped]
+    )
     settings = settings_of(experiment)
     missing = [one for one in deals(experiment, settings) if not _path(folder, one).exists()]
     if missing:
@@ -90,21 +98,31 @@ def _unchanged(folder: Path, plugins: Sequence[str]) -> None:
     from bench.runs.identity import fingerprint
 
     held = configuration(folder)
-    everything = held.plugins + sorted({str(Path(p).resolve()) for p in plugins} - set(held.plugins))
+    everything = held.plugins + sorted(
+        {str(Path(p).resolve()) for p in plugins} - set(held.plugins)
+    )
     refuse_changes(folder, held.fingerprint, fingerprint(held.experiment, everything))
 
 
 def _shoot(
-    folder: Path, experiment: Experiment, settings: Settings, missing: list[Deal], plugins: Sequence[str], jobs: int,
+    folder: Path,
+    experiment: Experiment,
+    settings: Settings,
+    missing: list[Deal],
+    plugins: Sequence[str],
+    jobs: int,
     bar: Progress,
-) -> None:  # fmt: skip
+) -> None:
     if not missing:
         return
     weights = _trained(experiment, settings, bar)
     for name in (SHOTS, RECORDINGS):
         (folder / name).mkdir(exist_ok=True)
     paths = [folder / RECORDINGS / f"{one.name}.csv" for one in missing]
-    drops: list[Call] = [(record, (experiment, one, settings, path)) for one, path in zip(missing, paths, strict=True)]
+    drops: list[Call] = [
+        (record, (experiment, one, settings, path))
+        for one, path in zip(missing, paths, strict=True)
+    ]
     step = bar("dropping", len(missing))
     unseen: dict[int, BaseException] = {}
     with LocalPool(jobs) as pool:  # these workers know the balls, and tune nothing
@@ -113,7 +131,10 @@ def _shoot(
                 unseen[place] = fault
             step()
     seen = [place for place in range(len(missing)) if place not in unseen]
-    known = {place: tune.Known(missing[place].name, paths[place], missing[place].scene, weights) for place in seen}
+    known = {
+        place: tune.Known(missing[place].name, paths[place], missing[place].scene, weights)
+        for place in seen
+    }
     step = bar("shooting", len(missing))
     for place, fault in unseen.items():
         status = "no recording" if isinstance(fault, InputError) else "crashed"
@@ -129,8 +150,13 @@ def _shoot(
             step()
 
 
-def _keep(folder: Path, dealt: Deal, settings: Settings, models: list[dict[str, Any]], seen: float) -> None:
-    kept = {"models": models, "rows": [{**row, "seen": seen} for row in thrown(dealt, settings, models)]}
+def _keep(
+    folder: Path, dealt: Deal, settings: Settings, models: list[dict[str, Any]], seen: float
+) -> None:
+    kept = {
+        "models": models,
+        "rows": [{**row, "seen": seen} for row in thrown(dealt, settings, models)],
+    }
     replace_text(_path(folder, dealt), json.dumps(_plain(kept), indent=1, allow_nan=False) + "\n")
 
 
@@ -147,11 +173,17 @@ def _trained(experiment: Experiment, settings: Settings, bar: Progress) -> dict[
     return weights
 
 
-def _failed(experiment: Experiment, error: BaseException, status: str = "crashed") -> list[dict[str, Any]]:
-    """The models of a shot whose drop could not be recorded, or whose worker died or took too long: none has a plan."""
+def _failed(
+    experiment: Experiment, error: BaseException, status: str = "crashed"
+) -> list[dict[str, Any]]:
+    """The models of a shot whose drop could not be recorded, or whose worker died or took too long:
+    none has a plan.
+    """
     if isinstance(error, TimeoutError):
         status = "timeout"
-    nothing = partial(tune.Model, effects={}, simulations=0, seconds=math.nan, status=status, reason=str(error))
+    nothing = partial(
+        tune.Model, effects={}, simulations=0, seconds=math.nan, status=status, reason=str(error)
+    )
     labels = [e.label for e in experiment.tuners]
     methods = [tune.NOMINAL, *labels, tune.EXPLAINED, *(label + tune.AFTER for label in labels)]
     return [vars(nothing(method=method, restitution=math.nan)) for method in methods]
@@ -165,7 +197,13 @@ def read(folder: Path, dealt: Deal) -> dict[str, Any] | None:
     try:
         kept: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         for model in kept["models"]:
-            model.update({k: math.nan for k in ("height", "margin", "restitution", "seconds") if model[k] is None})
+            model.update(
+                {
+                    k: math.nan
+                    for k in ("height", "margin", "restitution", "seconds")
+                    if model[k] is None
+                }
+            )
         return kept
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path}: damaged; delete it and finish with --resume {folder}") from None

@@ -1,4 +1,6 @@
-"""What came of the shots: hits by ball and method with Wilson's interval, and how near the plans were."""
+"""What came of the shots: hits by ball and method with Wilson's interval, and how near the plans
+were.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +10,28 @@ import pandas as pd
 
 ALL = "all"
 COLUMNS = [
-    "method", "ball", "shots", "hits", "rate", "low", "high", "off_median", "off_90", "prediction_error_median",
-    "prediction_error_mean", "simulations", "seconds", "failures",
-]  # fmt: skip
+    "method",
+    "ball",
+    "shots",
+    "hits",
+    "rate",
+    "low",
+    "high",
+    "off_median",
+    "off_90",
+    "prediction_error_median",
+    "prediction_error_mean",
+    "simulations",
+    "seconds",
+    "failures",
+]
 FAILED = ("crashed", "timeout", "diverged", "no plan", "no recording")
 
 
 def wilson(hits: int, shots: int, z: float = 1.959963984540054) -> tuple[float, float]:
-    """95 % score interval of a share (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927, doi:10.2307/2276774)."""
+    """95 % score interval of a share (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927,
+    doi:10.2307/2276774).
+    """
     if shots < 1:
         return float("nan"), float("nan")
     share, n = hits / shots, float(shots)
@@ -27,7 +43,8 @@ def wilson(hits: int, shots: int, z: float = 1.959963984540054) -> tuple[float, 
 def table(rows: pd.DataFrame) -> pd.DataFrame:
     """One line a method and ball, and a method and all balls; distances in m.
 
-    `off` is the distance from the hoop's centre, where its plane was met; a shot that never met it is infinitely far.
+    `off` is the distance from the hoop's centre, where its plane was met; a shot that never met it
+    is infinitely far.
     """
     lines = []
     for method, part in rows.groupby("method", sort=False):
@@ -43,20 +60,38 @@ def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
     failures = int(part["status"].isin(FAILED).sum())
     near = off.quantile([0.5, 0.9], interpolation="higher").tolist()
     return [
-        method, ball, shots, hits, hits / shots, *wilson(hits, shots), *near, errors.median(), errors.mean(),
-        part["simulations"].mean(), part["seconds"].mean(), failures,
-    ]  # fmt: skip
+        method,
+        ball,
+        shots,
+        hits,
+        hits / shots,
+        *wilson(hits, shots),
+        *near,
+        errors.median(),
+        errors.mean(),
+        part["simulations"].mean(),
+        part["seconds"].mean(),
+        failures,
+    ]
 
 
 def text(lines: pd.DataFrame) -> str:
     """The table for the terminal: hits by ball, the share with its interval, the prediction error."""
     balls = [ball for ball in lines["ball"].unique() if ball != ALL]
     width = max(len(m) for m in lines["method"])
-    head = f"{'hits of shots':{width}}  " + "  ".join(f"{b:>12}" for b in balls) + "   all (95 %, Wilson)   path off by"
+    head = (
+        f"{'hits of shots':{width}}  "
+        + "  ".join(f"{b:>12}" for b in balls)
+        + "   all (95 %, Wilson)   path off by"
+    )
     told = [head]
     for method, part in lines.groupby("method", sort=False):
         by = part.set_index("ball")
         cells = [f"{f'{by.hits[b]}/{by.shots[b]}':>12}" for b in balls]
         share = f"{by.rate[ALL]:6.1%} ({by.low[ALL]:.0%}–{by.high[ALL]:.0%})"
-        told.append(f"{method:{width}}  " + "  ".join(cells) + f"   {share:18}   {by.prediction_error_mean[ALL]:.3f} m")
+        told.append(
+            f"{method:{width}}  "
+            + "  ".join(cells)
+            + f"   {share:18}   {by.prediction_error_mean[ALL]:.3f} m"
+        )
     return "\n".join(told)

@@ -26,9 +26,11 @@ class Throw:
 
     Attributes:
         hit: the centre came through the hoop.
-        off: where it came through the hoop's plane, m from the centre along x, > 0 beyond it; NaN for never.
-        prediction_error: mean distance in m between the planned and the flown centre at the same instants, from the
-            release until the plan or the ball has come through the hoop's plane, whichever is first.
+        off: where it came through the hoop's plane, m from the centre along x, > 0 beyond it; NaN
+            for never.
+        prediction_error: mean distance in m between the planned and the flown centre at the same
+            instants, from the release until the plan or the ball has come through the hoop's plane,
+            whichever is first.
         times: (T,) seconds.
         planned: (T, 3), NaN where there was no plan.
         flown: (T, 3).
@@ -52,7 +54,11 @@ def throw(dealt: Deal, settings: Settings, model: Model) -> Throw:
     known = constants_of(settings, dealt.ball.radius)
     planned = flights(simulator_of(model), theta_of(model), dealt.scene, known, heights, times)[0]
     ground = Ground(dealt.scene.angle, settings.friction)
-    start = (dealt.release[0], 0.0, dealt.scene.touching(dealt.ball.radius) + model.height + dealt.release[1])
+    start = (
+        dealt.release[0],
+        0.0,
+        dealt.scene.touching(dealt.ball.radius) + model.height + dealt.release[1],
+    )
     flown = fly(dealt.ball, ground, start, times)
     x, y = crossings(flown[None], dealt.scene)[0].tolist()
     off = x - dealt.scene.hoop_x
@@ -63,7 +69,9 @@ def throw(dealt: Deal, settings: Settings, model: Model) -> Throw:
 
 
 def _through(path: Array, height: float) -> int:
-    """Index of the sample after which a path comes down through a height after its bounce; its end if never."""
+    """Index of the sample after which a path comes down through a height after its bounce; its end
+    if never.
+    """
     z = path[:, 2]
     risen = np.logical_or.accumulate(z[1:] > z[:-1])
     down = np.flatnonzero(risen & (z[:-1] > height) & (z[1:] <= height))
@@ -72,7 +80,10 @@ def _through(path: Array, height: float) -> int:
 
 def thrown(dealt: Deal, settings: Settings, made: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """One row a method: what was planned and what became of it."""
-    return [_row(dealt, model, throw(dealt, settings, model)) for model in (Model(**row) for row in made)]
+    return [
+        _row(dealt, model, throw(dealt, settings, model))
+        for model in (Model(**row) for row in made)
+    ]
 
 
 def _row(dealt: Deal, model: Model, made: Throw) -> dict[str, Any]:
@@ -89,7 +100,9 @@ def _row(dealt: Deal, model: Model, made: Throw) -> dict[str, Any]:
         "drop_height": model.height,
         "restitution": model.restitution,
         "true_restitution": dealt.ball.restitution,
-        "effects": "; ".join(f"{name} {', '.join(f'{v:.4g}' for v in values)}" for name, values in effects.items()),
+        "effects": "; ".join(
+            f"{name} {', '.join(f'{v:.4g}' for v in values)}" for name, values in effects.items()
+        ),
         "simulations": model.simulations,
         "seconds": model.seconds,
         "status": model.status,

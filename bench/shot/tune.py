@@ -1,8 +1,10 @@
-"""From the recording of a drop to tuned models and planned shots. Nothing in here knows the ball that was dropped.
+"""From the recording of a drop to tuned models and planned shots. Nothing in here knows the ball
+that was dropped.
 
-The models are those of the tuners, in the simulator as it is and in the one that `explain` extended from the same
-recording, and `explain`'s own fit. Heights are shifted as if every ball had the radius of the experiment, so that a
-network trained once serves all; tuners on vision get pixel rows instead (`bench.shot.rows`).
+The models are those of the tuners, in the simulator as it is and in the one that `explain` extended
+from the same recording, and `explain`'s own fit. Heights are shifted as if every ball had the
+radius of the experiment, so that a network trained once serves all; tuners on vision get pixel rows
+instead (`bench.shot.rows`).
 """
 
 from __future__ import annotations
@@ -77,12 +79,20 @@ def models(experiment: Experiment, settings: Settings, known: Known) -> list[dic
     """Every method's model and plan, as plain dictionaries."""
     recording = read_recording(known.recording, BallSimulator, whole=True)
     made = [Model(NOMINAL, _nominal(), {}, 0, 0.0, "done")]
-    made += [_tuned(experiment, settings, entry, known, recording, {}) for entry in experiment.tuners]
+    made += [
+        _tuned(experiment, settings, entry, known, recording, {}) for entry in experiment.tuners
+    ]
     explained, acting = _explained(known.recording)
     made.append(explained)
     if explained.status == "done":
-        again = [_tuned(experiment, settings, entry, known, recording, acting) for entry in experiment.tuners]
-        made += [replace(model, method=model.method + AFTER, effects=explained.effects) for model in again]
+        again = [
+            _tuned(experiment, settings, entry, known, recording, acting)
+            for entry in experiment.tuners
+        ]
+        made += [
+            replace(model, method=model.method + AFTER, effects=explained.effects)
+            for model in again
+        ]
     radius = _constants(recording)["radius"]
     return [asdict(_planned(model, settings, known.scene, radius)) for model in made]
 
@@ -92,7 +102,12 @@ def _nominal() -> float:
 
 
 def _tuned(
-    experiment: Experiment, settings: Settings, entry: Entry, known: Known, recording: Recording, effects: Effects
+    experiment: Experiment,
+    settings: Settings,
+    entry: Entry,
+    known: Known,
+    recording: Recording,
+    effects: Effects,
 ) -> Model:
     """The model of a tuner, in the simulator with these effects."""
     label, radius = entry.label, _constants(recording)["radius"]
@@ -103,10 +118,21 @@ def _tuned(
     try:
         problem = problem_of(experiment)
         start = problem.cube.inverse(np.array([p.nominal for p in problem.cube.parameters]))
-        seen = rows_of(recording, experiment, radius) if label in settings.rows else _side(recording, experiment)
+        seen = (
+            rows_of(recording, experiment, radius)
+            if label in settings.rows
+            else _side(recording, experiment)
+        )
         nothing = Side((), np.empty((0, seen.observed.shape[1])))
         target = SealedTarget(known.name, "real", start, seen, nothing)
-        order = Order(label, entry, 0, target, entry.budget or experiment.budget, known.weights.get(entry.label))
+        order = Order(
+            label,
+            entry,
+            0,
+            target,
+            entry.budget or experiment.budget,
+            known.weights.get(entry.label),
+        )
         outcome = perform(experiment, order)
     except InputError as error:
         return Model(label, _nominal(), {}, 0, 0.0, "crashed", str(error))
@@ -121,14 +147,18 @@ def tuned_in(experiment: Experiment, settings: Settings, entry: Entry) -> Experi
 
 
 def _side(recording: Recording, experiment: Experiment) -> Side:
-    """The recorded run as the experiment's simulator sees it: let go at rest at time 0, whenever it is seen first."""
+    """The recorded run as the experiment's simulator sees it: let go at rest at time 0, whenever it
+    is seen first.
+    """
     (run,) = recording.runs
     scenario = scenario_of(run, BallSimulator(observe=["z"]), recording.constants)
     radius = experiment.fixed["radius"]
     shift = radius - _constants(recording)["radius"]
     z = run.channels["z"] + shift
     seen = run.channels["z"][np.isfinite(run.channels["z"])]
-    fallen = scenario.constants.get("gravity", _constants(recording)["gravity"]) * float(run.times[0])
+    fallen = scenario.constants.get("gravity", _constants(recording)["gravity"]) * float(
+        run.times[0]
+    )
     first = {"z": float(seen[0]), "vz": -fallen, **scenario.initial}
     initial = {**first, "z": first["z"] + shift}
     moved = Scenario(scenario.times, initial, {}, {**scenario.constants, "radius": radius})
@@ -151,19 +181,23 @@ def _explained(recording: Path) -> tuple[Model, Effects]:
         last = traceback.format_exc()
         return Model(EXPLAINED, _nominal(), {}, 0, perf_counter() - started, "crashed", last), {}
     acting = {
-        name: tuple(number.value for number in numbers.values()) for name, numbers in found.extended.effects.items()
+        name: tuple(number.value for number in numbers.values())
+        for name, numbers in found.extended.effects.items()
     }
     carried = carry(acting, found.extended.constants.get("gravity", 9.81))
     verdict = found.verdict
     reason = f"{verdict['verdict']}: {', '.join(acting) or 'nothing'}"
     restitution = found.extended.parameters["restitution"].value
     seconds = perf_counter() - started
-    model = Model(EXPLAINED, restitution, carried, int(verdict["simulations"]), seconds, "done", reason)
+    model = Model(
+        EXPLAINED, restitution, carried, int(verdict["simulations"]), seconds, "done", reason
+    )
     return model, acting
 
 
 def carry(effects: Effects, gravity: float) -> dict[str, tuple[float, ...]]:
-    """The effects of a drop that act on a shot: what belongs to the ball and the air, not to the camera.
+    """The effects of a drop that act on a shot: what belongs to the ball and the air, not to the
+    camera.
 
     A constant force along the vertical is a change of gravity, and goes over as that.
     """
@@ -186,7 +220,11 @@ def simulator_of(model: Model) -> BounceShot:
 
 def constants_of(settings: Settings, radius: float) -> dict[str, float]:
     """What the planner takes for known of a ball."""
-    return {"radius": radius, "friction": settings.planned_friction, "inertia_ratio": settings.planned_inertia}
+    return {
+        "radius": radius,
+        "friction": settings.planned_friction,
+        "inertia_ratio": settings.planned_inertia,
+    }
 
 
 def theta_of(model: Model) -> Array:
@@ -205,5 +243,7 @@ def _planned(model: Model, settings: Settings, scene: Scene, radius: float) -> M
         return model
     made = planned_in(model, settings, scene, radius)
     if not made.found and model.status in ("done", "converged"):
-        return replace(model, status="no plan", reason="the model reaches the hoop's plane from no height")
+        return replace(
+            model, status="no plan", reason="the model reaches the hoop's plane from no height"
+        )
     return replace(model, height=made.height, margin=made.margin)

@@ -1,4 +1,6 @@
-"""The folder of a comparison: exact configuration, versions and machine, a row a simulation, a status a run."""
+"""The folder of a comparison: exact configuration, versions and machine, a row a simulation, a
+status a run.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ if TYPE_CHECKING:
 
 
 def free_folder(experiment: Experiment, out: str | None, results: Path = Path("results")) -> Path:
-    """Where a new run may be written: `out`, or a folder below results/ named for the experiment and the time.
+    """Where a new run may be written: `out`, or a folder below results/ named for the experiment
+    and the time.
 
     Raises:
         InputError: `out` exists and has something in it.
@@ -80,7 +83,9 @@ def create(folder: Path, configuration: Configuration, jobs: int) -> None:
         partial.mkdir(parents=True)
         text = tomli_w.dumps(_plain(experiment.document()))
         (partial / "experiment.toml").write_text(text, encoding="utf-8")
-        (partial / "environment.json").write_text(json.dumps(environment, indent=1) + "\n", encoding="utf-8")
+        (partial / "environment.json").write_text(
+            json.dumps(environment, indent=1) + "\n", encoding="utf-8"
+        )
         (partial / FOLDER).mkdir()
         partial.replace(folder)
     except OSError as error:
@@ -105,11 +110,19 @@ def configuration(folder: Path) -> Configuration:
     """
     path = folder / "experiment.toml"
     if not path.is_file():
-        raise InputError(f"{folder}: expected the folder of a comparison with experiment.toml in it, found none")
+        raise InputError(
+            f"{folder}: expected the folder of a comparison with experiment.toml in it, found none"
+        )
     environment = _environment(folder)
     plugins, fingerprint = environment.get("plugins", []), environment.get("fingerprint", {})
-    if not _texts(plugins) or not isinstance(fingerprint, dict) or not _texts(list(fingerprint.values())):
-        raise InputError(f"{folder / 'environment.json'}: expected lists of plugins and hashes, found something else")
+    if (
+        not _texts(plugins)
+        or not isinstance(fingerprint, dict)
+        or not _texts(list(fingerprint.values()))
+    ):
+        raise InputError(
+            f"{folder / 'environment.json'}: expected lists of plugins and hashes, found something else"
+        )
     experiment = parse(str(environment["experiment"]), read_toml(path), path)
     return Configuration(experiment, plugins, fingerprint)
 
@@ -123,9 +136,13 @@ def _environment(folder: Path) -> dict[str, Any]:
     try:
         environment = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{folder}: not a complete comparison: {path.name}: {_line(error)}") from None
+        raise InputError(
+            f"{folder}: not a complete comparison: {path.name}: {_line(error)}"
+        ) from None
     if not isinstance(environment, dict) or not isinstance(environment.get("experiment"), str):
-        raise InputError(f"{folder}: not a complete comparison: {path.name} does not name the experiment")
+        raise InputError(
+            f"{folder}: not a complete comparison: {path.name} does not name the experiment"
+        )
     return environment
 
 
@@ -139,7 +156,8 @@ def write_results(
     trainings: Iterable[tuple[str, int, int, float]],
     skipped: Iterable[Mapping[str, Any]],
 ) -> None:
-    """Write runs.parquet, training.csv and status.csv in the order of the plan, each whole or not at all.
+    """Write runs.parquet, training.csv and status.csv in the order of the plan, each whole or not
+    at all.
 
     Args:
         folder: the comparison's.
@@ -163,13 +181,17 @@ def write_results(
     partial.replace(folder / "runs.parquet")
     training = pd.DataFrame(sorted(trainings), columns=["tuner", "seed", "simulations", "seconds"])
     replace_text(folder / "training.csv", training.to_csv(index=False))
-    rows_of_statuses = [asdict(journal.statuses[place]) for place in sorted(journal.statuses)] + list(skipped)
+    rows_of_statuses = [
+        asdict(journal.statuses[place]) for place in sorted(journal.statuses)
+    ] + list(skipped)
     statuses = pd.DataFrame(rows_of_statuses, columns=STATUS_COLUMNS)
     replace_text(folder / "status.csv", statuses.to_csv(index=False))
 
 
 class Stored(NamedTuple):
-    """A comparison read back: experiment, runs, statuses, and (simulations, seconds) of one training by tuner."""
+    """A comparison read back: experiment, runs, statuses, and (simulations, seconds) of one
+    training by tuner.
+    """
 
     experiment: Experiment
     runs: pd.DataFrame
@@ -193,16 +215,22 @@ def read(folder: Path, columns: Sequence[str] | None = None) -> Stored:
     experiment = configuration(folder).experiment
     path = folder / "runs.parquet"
     if not path.exists() and (folder / FOLDER).exists():
-        raise InputError(f"{folder}: not finished, and nothing written yet; simgap compare --resume {folder}")
+        raise InputError(
+            f"{folder}: not finished, and nothing written yet; simgap compare --resume {folder}"
+        )
     try:
         there = parquet.read_schema(path).names
-        runs = parquet.read_table(path, columns=[c for c in there if columns is None or c in columns]).to_pandas()
+        runs = parquet.read_table(
+            path, columns=[c for c in there if columns is None or c in columns]
+        ).to_pandas()
         statuses = pd.read_csv(folder / "status.csv", keep_default_na=False)
         training = pd.read_csv(folder / "training.csv")
         missing = {"run", "tuner", "k"} - set(runs.columns) if len(runs.columns) else set()
         missing |= {"run", "tuner", "status", "reason"} - set(statuses.columns)
         if missing:
-            raise InputError(f"{folder}: not a complete comparison: no column {', '.join(sorted(missing))}")
+            raise InputError(
+                f"{folder}: not a complete comparison: no column {', '.join(sorted(missing))}"
+            )
         costs = _costs(training)
     except (OSError, ValueError, KeyError, ArrowException) as error:
         if isinstance(error, InputError):
@@ -215,4 +243,7 @@ def _costs(training: pd.DataFrame) -> dict[str, tuple[float, float]]:
     """Simulations and seconds of one training, the mean over seeds, by tuner."""
     means = training.groupby("tuner")[["simulations", "seconds"]].mean()
     values = means.to_numpy(dtype=float)
-    return {str(name): (float(row[0]), float(row[1])) for name, row in zip(means.index, values, strict=True)}
+    return {
+        str(name): (float(row[0]), float(row[1]))
+        for name, row in zip(means.index, values, strict=True)
+    }

@@ -1,10 +1,12 @@
-"""Finished runs on disk the moment they end: a record each, appended; many records become one Parquet part.
+"""Finished runs on disk the moment they end: a record each, appended; many records become one
+Parquet part.
 
-The folder ``segments`` of a comparison that is under way holds ``plan.txt`` (the id of every run, in order),
-``NNNNNN.journal`` (records that are being appended) and ``NNNNNN.parquet`` (parts). A part is written beside its
-journal, renamed, and only then is the journal deleted; where both are found, the part holds everything. A record that
-was cut off by a kill fails its checksum and is dropped: its run was not finished. What is appended survives the end of
-any process; the end of the machine may cost the runs since the last part.
+The folder ``segments`` of a comparison that is under way holds ``plan.txt`` (the id of every run,
+in order), ``NNNNNN.journal`` (records that are being appended) and ``NNNNNN.parquet`` (parts). A
+part is written beside its journal, renamed, and only then is the journal deleted; where both are
+found, the part holds everything. A record that was cut off by a kill fails its checksum and is
+dropped: its run was not finished. What is appended survives the end of any process; the end of the
+machine may cost the runs since the last part.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ PART_RUNS = 1000
 
 
 class Journal:
-    """The finished runs of a comparison in `folder`; opening it recovers whatever an earlier process left.
+    """The finished runs of a comparison in `folder`; opening it recovers whatever an earlier
+    process left.
 
     Attributes:
         statuses: of every finished run, by its place in the plan.
@@ -131,7 +134,9 @@ class Journal:
                     between = (compute.field("place") >= low) & (compute.field("place") <= high)
                     parts.append(parquet.read_table(path, filters=between))
             whole = pa.concat_tables([part.replace_schema_metadata() for part in parts])
-            order = compute.sort_indices(whole, sort_keys=[("place", "ascending"), ("k", "ascending")])
+            order = compute.sort_indices(
+                whole, sort_keys=[("place", "ascending"), ("k", "ascending")]
+            )
             yield whole.take(order).drop_columns(["place"])
 
     def close(self) -> None:
@@ -140,7 +145,9 @@ class Journal:
         self._lock.close()
 
     def discard(self) -> None:
-        """Delete the segments; their content stands elsewhere. Renamed first, so that no half of them is ever met."""
+        """Delete the segments; their content stands elsewhere. Renamed first, so that no half of
+        them is ever met.
+        """
         self.close()
         gone = self.folder.with_name(f".{FOLDER}.gone")
         shutil.rmtree(gone, ignore_errors=True)
@@ -196,7 +203,9 @@ def part_statuses(path: Path) -> dict[int, Status]:
         held = json.loads(parquet.read_schema(path).metadata[b"statuses"])
         return {int(place): Status(**status) for place, status in held}
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
-        raise InputError(f"{path}: expected a part of a comparison, found damage: {_first_line(error)}") from None
+        raise InputError(
+            f"{path}: expected a part of a comparison, found damage: {_first_line(error)}"
+        ) from None
 
 
 def _first_line(error: BaseException) -> str:
@@ -204,7 +213,9 @@ def _first_line(error: BaseException) -> str:
 
 
 def finished(folder: Path) -> dict[int, Status]:
-    """Statuses of the finished runs below `folder`, by place, while another process may be at work there."""
+    """Statuses of the finished runs below `folder`, by place, while another process may be at work
+    there.
+    """
     found: dict[int, Status] = {}
     for path in sorted((folder / FOLDER).glob("*.journal")):
         with suppress(FileNotFoundError):  # it became a part a moment ago, which is listed below
@@ -229,7 +240,9 @@ def read_plan(folder: Path) -> list[str] | None:
     try:
         return path.read_text(encoding="utf-8").splitlines() if path.is_file() else None
     except ValueError:
-        raise InputError(f"{path}: expected the ids of the runs as UTF-8 text, found other bytes") from None
+        raise InputError(
+            f"{path}: expected the ids of the runs as UTF-8 text, found other bytes"
+        ) from None
 
 
 def replace_text(path: Path, text: str) -> None:
@@ -256,5 +269,7 @@ def _locked(path: Path) -> IO[str]:
         pass
     except OSError:
         file.close()
-        raise InputError(f"{path.parent.parent}: another simgap is at work there; wait for it, or end it") from None
+        raise InputError(
+            f"{path.parent.parent}: another simgap is at work there; wait for it, or end it"
+        ) from None
     return file

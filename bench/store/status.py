@@ -20,4 +20,14 @@ class Status:
     seconds: float
 
 
-STATUS_COLUMNS = ["run", "tuner", "simulator", "target", "seed", "status", "reason", "simulations", "seconds"]
+STATUS_COLUMNS = [
+    "run",
+    "tuner",
+    "simulator",
+    "target",
+    "seed",
+    "status",
+    "reason",
+    "simulations",
+    "seconds",
+]

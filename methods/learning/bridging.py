@@ -14,10 +14,10 @@ _LEAST = 8
 def bridged(seen: Array, shown: Array) -> Array:
     """Fill the gaps of a sensor's channel from a simulation, through the map from one to the other.
 
-    A camera that stands still shows a motion along a line as (a + b x) / (1 + c x) (Hartley and Zisserman, Multiple
-    View Geometry, 2004, chapter 2). The three numbers are fitted to the samples that are there, each equation
-    multiplied by its denominator and weighed by Cauchy's weights: a model that is not yet right agrees with the sensor
-    only at times.
+    A camera that stands still shows a motion along a line as (a + b x) / (1 + c x) (Hartley and
+    Zisserman, Multiple View Geometry, 2004, chapter 2). The three numbers are fitted to the samples
+    that are there, each equation multiplied by its denominator and weighed by Cauchy's weights: a
+    model that is not yet right agrees with the sensor only at times.
 
     Args:
         seen: (T,) the channel, NaN where it shows nothing.
@@ -41,7 +41,9 @@ def bridged(seen: Array, shown: Array) -> Array:
     below = 1 + numbers[2] * x
     if not (below > 0.1).all():  # the other side of the camera
         return seen
-    told = (numbers[0] + numbers[1] * x) / below * float(seen[there].std()) + float(seen[there].mean())
+    told = (numbers[0] + numbers[1] * x) / below * float(seen[there].std()) + float(
+        seen[there].mean()
+    )
     result: Array = np.where(there, seen, told)
     return result
 

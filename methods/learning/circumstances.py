@@ -1,9 +1,11 @@
-"""What networks are told of a scenario beside what its observation shows, where training scenarios differ in it.
+"""What networks are told of a scenario beside what its observation shows, where training scenarios
+differ in it.
 
-Initial values that no channel shows are inputs as they are. Input signals are not: appended to the observation they
-were measured to be worth next to nothing, since what a sample means depends on all inputs before it (docs/tunenet.md).
-The network reads how the observation responds to them (`methods.learning.responses`), much the same whatever they were; and then
-that alone, since samples whose meaning changes from scenario to scenario only mislead.
+Initial values that no channel shows are inputs as they are. Input signals are not: appended to the
+observation they were measured to be worth next to nothing, since what a sample means depends on all
+inputs before it (docs/tunenet.md). The network reads how the observation responds to them
+(`methods.learning.responses`), much the same whatever they were; and then that alone, since samples
+whose meaning changes from scenario to scenario only mislead.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ class Circumstances:
     """A map from scenes and observations to network inputs.
 
     Attributes:
-        centre: (K,) medians in training: of the initial values, then of the responses' coefficients where inputs vary.
+        centre: (K,) medians in training: of the initial values, then of the responses' coefficients
+            where inputs vary.
         spread: (K,) median distances from them; 0 where a number says nothing.
         initial: how many of the K are initial values.
     """
@@ -35,7 +38,9 @@ class Circumstances:
     initial: int
 
     @classmethod
-    def learned(cls, scenes: Sequence[Scene], observations: Array, lengths: tuple[int, ...]) -> Circumstances | None:
+    def learned(
+        cls, scenes: Sequence[Scene], observations: Array, lengths: tuple[int, ...]
+    ) -> Circumstances | None:
         """The map for training scenarios, or None where they are alike.
 
         Args:
@@ -48,7 +53,9 @@ class Circumstances:
         if not driven and not _vary(initial):
             return None
         untold = cls(np.empty(initial.shape[1] + driven), np.empty(0), initial.shape[1])
-        numbers = [untold.numbers(o, lengths, scene) for o, scene in zip(observations, scenes, strict=True)]
+        numbers = [
+            untold.numbers(o, lengths, scene) for o, scene in zip(observations, scenes, strict=True)
+        ]
         table = np.concatenate(numbers)
         centre = np.median(table, axis=0)
         return cls(centre, 1.4826 * np.median(np.abs(table - centre), axis=0), initial.shape[1])
@@ -66,7 +73,8 @@ class Circumstances:
         return np.concatenate([told, responses(observations, scene.inputs, lengths)], axis=1)
 
     def __call__(self, observations: Array, lengths: tuple[int, ...], scene: Scene) -> Array:
-        """Network inputs (n, K) of observations (n, T, C); far from what training saw they grow as a logarithm.
+        """Network inputs (n, K) of observations (n, T, C); far from what training saw they grow as
+        a logarithm.
 
         Raises:
             ValueError: a scene of another kind than the network was trained in.
@@ -83,4 +91,8 @@ class Circumstances:
 
 def _vary(numbers: Array) -> bool:
     """Whether any number (scenarios, ...) differs between scenarios."""
-    return bool(np.any(np.ptp(numbers, axis=0) > _ROUNDING * np.abs(numbers).max(axis=0))) if numbers.size else False
+    return (
+        bool(np.any(np.ptp(numbers, axis=0) > _ROUNDING * np.abs(numbers).max(axis=0)))
+        if numbers.size
+        else False
+    )

@@ -48,14 +48,22 @@ class Fitted:
 
     @classmethod
     def train(
-        cls, design: Design, data: Rehearsal, rng: np.random.Generator, reading: Reading, alone: bool, look: Look | None
+        cls,
+        design: Design,
+        data: Rehearsal,
+        rng: np.random.Generator,
+        reading: Reading,
+        alone: bool,
+        look: Look | None,
     ) -> Fitted:
         """Choose the inputs and train the network on them; `alone` as in `pair_network.train`."""
         read = Reader.learned(data, reading)
         proposed = Reader.learned(data.pure, reading.proposed) if reading.proposed else read
         seen = None
         if look is not None:
-            seen = Watched(_sides(proposed, read, look.held_out), look.held_out.parameters, look.epoch)
+            seen = Watched(
+                _sides(proposed, read, look.held_out), look.held_out.parameters, look.epoch
+            )
         weights = train(_sides(proposed, read, data), data.parameters, design, rng, alone, seen)
         return cls(design, read, weights, proposed)
 
@@ -65,7 +73,11 @@ class Fitted:
 
     def state(self) -> dict[str, Array]:
         """Everything as plain arrays."""
-        own = {} if self.proposed is self.read else {f"own-{k}": v for k, v in self.proposed.state().items()}
+        own = (
+            {}
+            if self.proposed is self.read
+            else {f"own-{k}": v for k, v in self.proposed.state().items()}
+        )
         return own | self.read.state() | self.weights
 
     @classmethod
@@ -85,7 +97,9 @@ class Fitted:
             raise ValueError(f"expected arrays {sorted(expected)}, found {sorted(arrays)}")
         for name, shape in expected.items():
             if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
-                raise ValueError(f"array {name}: expected finite numbers of shape {shape}, found {arrays[name].shape}")
+                raise ValueError(
+                    f"array {name}: expected finite numbers of shape {shape}, found {arrays[name].shape}"
+                )
         return cls(design, read, {name: arrays[name] for name in expected}, proposed)
 
 
@@ -99,12 +113,15 @@ def _sides(proposed: Reader, target: Reader, data: Rehearsal) -> Sides:
 class Prepared:
     """A network for targets as clean as the simulations, and one for targets from a sensor.
 
-    The two read different things of an observation: without noise, single samples that follow the parameters exactly
-    even far outside the training range; with noise, what many samples say together.
+    The two read different things of an observation: without noise, single samples that follow the
+    parameters exactly even far outside the training range; with noise, what many samples say
+    together.
 
     Attributes:
-        clean: trained on the simulations as they are; the noisy one again where no target is as clean.
-        noisy: trained on the same simulations with noise added; the clean one again where there is none.
+        clean: trained on the simulations as they are; the noisy one again where no target is as
+            clean.
+        noisy: trained on the same simulations with noise added; the clean one again where there is
+            none.
         limit: (C,) roughness above which a target counts as noisy, SI units.
     """
 
@@ -122,15 +139,22 @@ class Prepared:
         alone: bool = False,
         look: Callable[[str], Look] | None = None,
     ) -> Prepared:
-        """Train both networks on the same simulations; only one where `reading` prepares for one kind of target."""
+        """Train both networks on the same simulations; only one where `reading` prepares for one
+        kind of target.
+        """
         spread = data.flat.std(axis=(0, 1))
         limit = 2.0 * roughness(data.flat, data.lengths).max(axis=0) + reading.noise / 50.0 * spread
 
         def noisy() -> Fitted:
             seen = look and look("noisy")
             if seen:
-                seen = replace(seen, held_out=seen.held_out.spoilt(reading.noise * spread, np.random.default_rng(0)))
-            return Fitted.train(design, data.spoilt(reading.noise * spread, rng), rng, reading, alone, seen)
+                seen = replace(
+                    seen,
+                    held_out=seen.held_out.spoilt(reading.noise * spread, np.random.default_rng(0)),
+                )
+            return Fitted.train(
+                design, data.spoilt(reading.noise * spread, rng), rng, reading, alone, seen
+            )
 
         if reading.noise and not reading.clean:
             network = noisy()
@@ -144,11 +168,17 @@ class Prepared:
         return self.noisy if (rough > self.limit).any() else self.clean
 
     def estimator(self, task: Task) -> Callable[[Array], Array]:
-        """From one simulation (1, T, C) to h(simulation, target), (dim,); NaN where the simulation failed."""
+        """From one simulation (1, T, C) to h(simulation, target), (dim,); NaN where the simulation
+        failed.
+        """
         network, missing = self.suited(task), np.isnan(task.observed)
         alike = network.proposed is network.read
         hidden = missing if alike else None
-        known = network.read(task.observed[None], task.lengths, task.scene, hidden)[0] if alike else None
+        known = (
+            network.read(task.observed[None], task.lengths, task.scene, hidden)[0]
+            if alike
+            else None
+        )
 
         def difference(observations: Array) -> Array:
             if not np.isfinite(observations).all():  # nothing was seen
@@ -184,17 +214,23 @@ class Prepared:
             parts[part][rest] = array
         limit = np.array(parts["limit"].get("", np.nan), dtype=np.float64)
         if limit.ndim != 1 or not np.isfinite(limit).all():
-            raise ValueError(f"array limit: expected finite numbers of shape (channels,), found shape {limit.shape}")
+            raise ValueError(
+                f"array limit: expected finite numbers of shape (channels,), found shape {limit.shape}"
+            )
         two = bool(reading.noise) and reading.clean
         if two != bool(parts["noisy"]):
-            raise ValueError(f"expected {'two networks' if two else 'one network'}, found another number of them")
+            raise ValueError(
+                f"expected {'two networks' if two else 'one network'}, found another number of them"
+            )
         clean = Fitted.restored(parts["clean"], design, reading)
         noisy = Fitted.restored(parts["noisy"], design, reading) if two else clean
         return cls(clean, noisy, limit)
 
 
 def _bridged(task: Task, shown: Array, network: Fitted) -> Array:
-    """The target (T, C) with its gaps bridged by a simulation (T, C), run by run, where one channel is compared."""
+    """The target (T, C) with its gaps bridged by a simulation (T, C), run by run, where one channel
+    is compared.
+    """
     sensor = network.proposed.reading.part(shown)
     whole = task.observed.copy()
     if sensor.shape[-1] != 1:
@@ -207,7 +243,9 @@ def _bridged(task: Task, shown: Array, network: Fitted) -> Array:
 
 
 class PairTuner(Tuner):
-    """What the tuners on TuneNet's network share; subclasses say how it is built and what it reads, and tune."""
+    """What the tuners on TuneNet's network share; subclasses say how it is built and what it reads,
+    and tune.
+    """
 
     requires: ClassVar[tuple[str, ...]] = ("torch",)
     stochastic: ClassVar[bool] = False
@@ -239,7 +277,9 @@ class PairTuner(Tuner):
         data = rehearse(simulator, rng, budget, scenarios, each)
         look = None
         if (watch := self.watch) is not None:
-            apart = rehearse(watch.ground, np.random.default_rng(0), watch.ground.budget, scenarios, max(each, 2))
+            apart = rehearse(
+                watch.ground, np.random.default_rng(0), watch.ground.budget, scenarios, max(each, 2)
+            )
 
             def look(stage: str) -> Look:
                 return Look(apart, partial(watch.epoch, stage))

@@ -1,8 +1,9 @@
 """What the networks of TuneNet and its regressor see of an observation.
 
-Pure numpy, so that tuning needs no torch. An observation (T, C) becomes a row of numbers in three steps: each run is
-resampled to a fixed number of points (RESAMPLE in Algorithm 1, arXiv 1907.11200); rates of change and sorted copies are
-added; each number is centred, and weighed by how faithfully it followed the parameters in training.
+Pure numpy, so that tuning needs no torch. An observation (T, C) becomes a row of numbers in three
+steps: each run is resampled to a fixed number of points (RESAMPLE in Algorithm 1, arXiv
+1907.11200); rates of change and sorted copies are added; each number is centred, and weighed by how
+faithfully it followed the parameters in training.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ from methods.learning.rehearsal import Rehearsal
 
 
 def resample(observations: Array, lengths: tuple[int, ...], points: int) -> Array:
-    """Bring every run to the same number of points, by linear interpolation; missing samples are bridged.
+    """Bring every run to the same number of points, by linear interpolation; missing samples are
+    bridged.
 
     Args:
-        observations: (n, T, C), the runs following one another along T; NaN where a sample is missing.
+        observations: (n, T, C), the runs following one another along T; NaN where a sample is
+            missing.
         lengths: samples of each run; they add up to T.
         points: number of points of each run afterwards, spread evenly over its samples.
 
@@ -31,7 +34,9 @@ def resample(observations: Array, lengths: tuple[int, ...], points: int) -> Arra
     """
     n, samples, channels = observations.shape
     if sum(lengths) != samples:
-        raise ValueError(f"runs of {lengths} samples add up to {sum(lengths)}, the observation has {samples}")
+        raise ValueError(
+            f"runs of {lengths} samples add up to {sum(lengths)}, the observation has {samples}"
+        )
     out = np.empty((n, len(lengths), channels, points))
     first = 0
     for run, length in enumerate(lengths):
@@ -44,14 +49,18 @@ def resample(observations: Array, lengths: tuple[int, ...], points: int) -> Arra
         for i in range(n):
             for c in range(channels):
                 there = ~np.isnan(series[i, c])
-                out[i, run, c] = np.interp(at, here[there], series[i, c, there]) if there.any() else np.nan
+                out[i, run, c] = (
+                    np.interp(at, here[there], series[i, c, there]) if there.any() else np.nan
+                )
     return out.reshape(n, len(lengths) * channels, points)
 
 
 def described(series: Array) -> Array:
-    """Describe each series by values and rates of change, both in the order of time and sorted by size.
+    """Describe each series by values and rates of change, both in the order of time and sorted by
+    size.
 
-    Sorted, a series says how large and how fast, whatever the moment: a statement that shifts in time leave alone.
+    Sorted, a series says how large and how fast, whatever the moment: a statement that shifts in
+    time leave alone.
 
     Args:
         series: (n, series, points).
@@ -65,17 +74,19 @@ def described(series: Array) -> Array:
 
 
 def roughness(observations: Array, lengths: tuple[int, ...]) -> Array:
-    """Standard deviation of white noise that would explain the median third difference of a run's calmest part.
+    """Standard deviation of white noise that would explain the median third difference of a run's
+    calmest part.
 
-    Smooth motion has hardly any. A run is looked at in up to eight parts, of sixteen differences at least, so that
-    impacts and rattling elsewhere do not count.
+    Smooth motion has hardly any. A run is looked at in up to eight parts, of sixteen differences at
+    least, so that impacts and rattling elsewhere do not count.
 
     Args:
         observations: (n, T, C); NaN where a sample is missing.
         lengths: samples of each run.
 
     Returns:
-        (n, C), SI units; of each channel the roughest run, 0 where no run has four samples in a row.
+        (n, C), SI units; of each channel the roughest run, 0 where no run has four samples in a
+        row.
     """
     out = np.zeros((observations.shape[0], observations.shape[2]))
     for run in np.split(observations, np.cumsum(lengths)[:-1], axis=1):
@@ -143,13 +154,14 @@ def raw_inputs(observations: Array, lengths: tuple[int, ...], points: int) -> In
 def weighed_inputs(data: Rehearsal, points: int, most: int, strictness: float) -> Inputs:
     """Choose and scale inputs by how faithfully they follow the parameters.
 
-    Within each scenario every candidate number is fitted as a linear function of the parameters. What the fit leaves
-    over (jumps, curvature, noise) makes a number a poor guide, above all outside the training range, where it jumps and
-    bends on. The weight is (e / (e + strictness * left over))^2 per unit of standard deviation within a scenario, where
-    e is what one parameter explains; the largest over the parameters counts, each parameter's weights being scaled to
-    the same maximum, so that one that is seen easily does not hide the others.
-    A number that no parameter touches but that differs between scenarios tells the circumstances; it weighs
-    (b / (b + strictness * w))^2, with b and w its standard deviations between and within scenarios.
+    Within each scenario every candidate number is fitted as a linear function of the parameters.
+    What the fit leaves over (jumps, curvature, noise) makes a number a poor guide, above all
+    outside the training range, where it jumps and bends on. The weight is (e / (e + strictness *
+    left over))^2 per unit of standard deviation within a scenario, where e is what one parameter
+    explains; the largest over the parameters counts, each parameter's weights being scaled to the
+    same maximum, so that one that is seen easily does not hide the others. A number that no
+    parameter touches but that differs between scenarios tells the circumstances; it weighs (b / (b
+    + strictness * w))^2, with b and w its standard deviations between and within scenarios.
 
     Args:
         data: the training simulations.
@@ -172,7 +184,13 @@ def weighed_inputs(data: Rehearsal, points: int, most: int, strictness: float) -
     kept = np.sort(np.argsort(-np.maximum(following, context), kind="stable")[:most])
     gain = np.maximum(_per(following[kept], spread[kept]), _per(context[kept], deviation[kept]))
     size = np.sqrt(np.mean((gain * deviation[kept]) ** 2)) if most else 1.0
-    return Inputs(points, False, kept.astype(np.float64), rows[:, kept].mean(axis=0), gain / size if size > 0 else gain)
+    return Inputs(
+        points,
+        False,
+        kept.astype(np.float64),
+        rows[:, kept].mean(axis=0),
+        gain / size if size > 0 else gain,
+    )
 
 
 def _per(weight: Array, deviation: Array) -> Array:
@@ -182,7 +200,9 @@ def _per(weight: Array, deviation: Array) -> Array:
 
 
 def _followed(parameters: Array, rows: Array) -> tuple[Array, Array, Array]:
-    """Root mean squares within scenarios of each number (D,), what each parameter explains (dim, D), the rest (D,)."""
+    """Root mean squares within scenarios of each number (D,), what each parameter explains (dim,
+    D), the rest (D,).
+    """
     scenarios, each, dim = parameters.shape
     offsets = parameters - parameters.mean(axis=1, keepdims=True)
     free = max(each - 1 - dim, 1) / each  # the fit itself takes this share of the rest away

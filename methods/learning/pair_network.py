@@ -1,7 +1,8 @@
 """The network of TuneNet: one branch for each of two observations, concatenated, fully connected.
 
-Training uses torch (imported where it is needed); the forward pass used in tuning is plain numpy in double precision.
-Source: arXiv 1907.11200, section III and Eq. 1; layer sizes and training from the authors' released code.
+Training uses torch (imported where it is needed); the forward pass used in tuning is plain numpy in
+double precision. Source: arXiv 1907.11200, section III and Eq. 1; layer sizes and training from the
+authors' released code.
 """
 
 from __future__ import annotations
@@ -27,19 +28,23 @@ _LOG_2 = float(np.log(2.0))
 
 @dataclass(frozen=True)
 class Design:
-    """How a network is built and trained; the defaults are this project's, `PUBLISHED` the authors'.
+    """How a network is built and trained; the defaults are this project's, `PUBLISHED` the
+    authors'.
 
     Attributes:
         width: units of each branch and of the joined layer.
         smooth: softplus units (shifted through the origin) in place of rectified linear ones.
         antisymmetric: h(a, b) = (n(a, b) - n(b, a)) / 2, hence h(o, o) = 0 exactly; else h = n.
         bounded: tanh at the output.
-        relative: weigh each pair's squared error by 1 / (|difference|^2 + relative^2), unit cube; 0 weighs all alike.
-        adam: Adam and a rate falling along a cosine; else SGD without momentum and a rate x 0.99 an epoch.
+        relative: weigh each pair's squared error by 1 / (|difference|^2 + relative^2), unit cube; 0
+            weighs all alike.
+        adam: Adam and a rate falling along a cosine; else SGD without momentum and a rate x 0.99 an
+            epoch.
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1, per mean squared error.
         epochs: passes over the training data.
-        batch: scenarios, all of whose pairs are used (published: one pair each, the first member proposed).
+        batch: scenarios, all of whose pairs are used (published: one pair each, the first member
+            proposed).
     """
 
     width: int = 32
@@ -68,7 +73,9 @@ PUBLISHED = Design(
 
 
 def shapes(inputs: tuple[int, int], width: int, dim: int) -> dict[str, tuple[int, ...]]:
-    """Shape of every weight array by name, in the order of the network; inputs of the proposed and the target side."""
+    """Shape of every weight array by name, in the order of the network; inputs of the proposed and
+    the target side.
+    """
     sizes = ((inputs[0], width), (inputs[1], width), (2 * width, width), (width, dim))
     named: dict[str, tuple[int, ...]] = {}
     for layer, (fan_in, fan_out) in zip(LAYERS, sizes, strict=True):
@@ -98,7 +105,10 @@ def estimate(weights: dict[str, Array], design: Design, proposed: Array, target:
 
     def joined(a: Array, b: Array) -> Array:
         both = np.concatenate([branch(a, "proposed"), branch(b, "target")], axis=-1)
-        out: Array = unit(both @ w["joined.weight"] + w["joined.bias"]) @ w["output.weight"] + w["output.bias"]
+        out: Array = (
+            unit(both @ w["joined.weight"] + w["joined.bias"]) @ w["output.weight"]
+            + w["output.bias"]
+        )
         return np.tanh(out) if design.bounded else out
 
     if design.antisymmetric:
@@ -119,7 +129,9 @@ class Sides(NamedTuple):
 
 
 class Watched(NamedTuple):
-    """Held-out data, and who is told of the losses: epoch from 1, number of epochs, training and held-out loss."""
+    """Held-out data, and who is told of the losses: epoch from 1, number of epochs, training and
+    held-out loss.
+    """
 
     rows: Sides
     parameters: Array
@@ -134,27 +146,40 @@ def train(
     alone: bool = False,
     watched: Watched | None = None,
 ) -> dict[str, Array]:
-    """Fit the weights by Eq. 1; the same generator gives the same weights bit for bit on the same device.
+    """Fit the weights by Eq. 1; the same generator gives the same weights bit for bit on the same
+    device.
 
     Args:
         rows: input rows of both sides.
         parameters: (scenarios, m, dim), unit cube.
         design: how the network is built and trained.
         rng: seeds the initial weights and the order; no global random state is touched.
-        alone: learn parameters from the target alone, the proposed input being zero (the direct regressor).
-        watched: told of the losses, without the penalty on the weights; the weights do not depend on it.
+        alone: learn parameters from the target alone, the proposed input being zero (the direct
+            regressor).
+        watched: told of the losses, without the penalty on the weights; the weights do not depend
+            on it.
 
     Returns:
         Weights as in `shapes`.
     """
     import torch
 
-    with reproducible(device := "cuda" if torch.cuda.is_available() else "cpu"), torch.enable_grad():
+    with (
+        reproducible(device := "cuda" if torch.cuda.is_available() else "cpu"),
+        torch.enable_grad(),
+    ):
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         inputs = (rows.proposed.shape[-1], rows.target.shape[-1])
         weights = _initial(inputs, parameters.shape[-1], design, generator, device)
         loss = _loss(design, weights, alone)
-        _descend(loss, list(weights.values()), _data(rows, parameters, device), design, generator, watched)
+        _descend(
+            loss,
+            list(weights.values()),
+            _data(rows, parameters, device),
+            design,
+            generator,
+            watched,
+        )
         return {name: w.detach().cpu().numpy().astype(np.float64) for name, w in weights.items()}
 
 
@@ -166,7 +191,9 @@ def reproducible(device: str) -> Iterator[None]:
     threads, deterministic = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     torch.set_num_threads(1)
     if device == "cuda":
-        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS's condition for a fixed order
+        os.environ.setdefault(
+            "CUBLAS_WORKSPACE_CONFIG", ":4096:8"
+        )  # cuBLAS's condition for a fixed order
         torch.use_deterministic_algorithms(True)
     try:
         yield
@@ -178,7 +205,10 @@ def reproducible(device: str) -> Iterator[None]:
 def _data(rows: Sides, parameters: Array, device: str) -> tuple[Any, Any, Any]:
     import torch
 
-    x, y = (torch.as_tensor(array, dtype=torch.float32, device=device) for array in (rows.proposed, parameters))
+    x, y = (
+        torch.as_tensor(array, dtype=torch.float32, device=device)
+        for array in (rows.proposed, parameters)
+    )
     same = rows.target is rows.proposed
     return x, x if same else torch.as_tensor(rows.target, dtype=torch.float32, device=device), y
 
@@ -194,7 +224,9 @@ def _initial(
     for name, shape in shapes(inputs, design.width, dim).items():
         fan_in = shape[0] if name.endswith("weight") else fan_in
         limit = (1.0 if not design.adam else 1.7 if name.endswith("weight") else 0.0) / fan_in**0.5
-        weights[name] = ((torch.rand(shape, generator=generator) * 2 - 1) * limit).to(device).requires_grad_()
+        weights[name] = (
+            ((torch.rand(shape, generator=generator) * 2 - 1) * limit).to(device).requires_grad_()
+        )
     return weights
 
 
@@ -211,7 +243,10 @@ def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any,
 
     def joined(a: Any, b: Any) -> Any:
         both = torch.cat([a, b], dim=-1)
-        out = unit(both @ w["joined.weight"] + w["joined.bias"]) @ w["output.weight"] + w["output.bias"]
+        out = (
+            unit(both @ w["joined.weight"] + w["joined.bias"]) @ w["output.weight"]
+            + w["output.bias"]
+        )
         return torch.tanh(out) if design.bounded else out
 
     def objective(x: Any, seen: Any, y: Any) -> Any:
@@ -263,4 +298,9 @@ def _descend(
             losses.append(error.detach())
         if watched and held_out:
             with torch.no_grad():
-                watched.epoch(epoch + 1, design.epochs, float(torch.stack(losses).mean()), float(loss(*held_out)))
+                watched.epoch(
+                    epoch + 1,
+                    design.epochs,
+                    float(torch.stack(losses).mean()),
+                    float(loss(*held_out)),
+                )

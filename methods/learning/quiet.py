@@ -14,7 +14,9 @@ from methods.learning.pair_network import reproducible
 
 @contextmanager
 def quietly(rng: np.random.Generator) -> Iterator[None]:
-    """Global generators seeded from `rng` inside and as they were outside; one thread, no warnings, nothing printed."""
+    """Global generators seeded from `rng` inside and as they were outside; one thread, no warnings,
+    nothing printed.
+    """
     import torch
 
     legacy, seed = np.random.get_state(), int(rng.integers(2**62))  # noqa: NPY002 - packages may draw from it

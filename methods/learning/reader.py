@@ -1,4 +1,6 @@
-"""What learned tuners read: from observations, and what is known of their scenarios, to a network's input rows."""
+"""What learned tuners read: from observations, and what is known of their scenarios, to a network's
+input rows.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +25,15 @@ class Reading:
         points: points to which each run is resampled; L in Algorithm 1.
         inputs: inputs kept of those an observation offers.
         strictness: see `methods.learning.pair_inputs.weighed_inputs`.
-        noise: sensor noise that a second network is trained with, 1 sigma, in units of each channel's standard
-            deviation in training; 0 for no second network.
-        raw: the resampled series in SI units as they are, as published; the other settings say nothing then.
-        told: read what is known of a scenario too, where scenarios differ in it (`methods.learning.circumstances`).
+        noise: sensor noise that a second network is trained with, 1 sigma, in units of each
+            channel's standard deviation in training; 0 for no second network.
+        raw: the resampled series in SI units as they are, as published; the other settings say
+            nothing then.
+        told: read what is known of a scenario too, where scenarios differ in it
+            (`methods.learning.circumstances`).
         channels: the first and the last of the channels that are read, by number; None for all.
-        clean: whether targets may be as clean as simulations; else one network is trained, with the noise.
+        clean: whether targets may be as clean as simulations; else one network is trained, with the
+            noise.
         proposed: what the network's proposed side reads, where that is something else.
     """
 
@@ -43,7 +48,9 @@ class Reading:
     proposed: Reading | None = None
 
     def part(self, observations: Array) -> Array:
-        """The channels (..., c) that are read of observations (..., C); the last one if there are too few."""
+        """The channels (..., c) that are read of observations (..., C); the last one if there are
+        too few.
+        """
         if self.channels is None:
             return observations
         first, last = (min(c, observations.shape[-1] - 1) for c in self.channels)
@@ -70,7 +77,11 @@ class Reader:
         data = data._replace(observations=reading.part(data.observations))
         if reading.raw:
             return cls(reading, raw_inputs(data.flat, data.lengths, reading.points))
-        told = Circumstances.learned(data.scenes, data.observations, data.lengths) if reading.told else None
+        told = (
+            Circumstances.learned(data.scenes, data.observations, data.lengths)
+            if reading.told
+            else None
+        )
         most = reading.inputs if told is None or not told.driven else 0
         return cls(reading, weighed_inputs(data, reading.points, most, reading.strictness), told)
 
@@ -80,7 +91,11 @@ class Reader:
         return self.seen.chosen.size + (0 if self.told is None else self.told.centre.size)
 
     def __call__(
-        self, observations: Array, lengths: tuple[int, ...], scene: Scene, missing: Array | None = None
+        self,
+        observations: Array,
+        lengths: tuple[int, ...],
+        scene: Scene,
+        missing: Array | None = None,
     ) -> Array:
         """Input rows (n, D) of observations (n, T, C) made in one scene.
 
@@ -88,8 +103,8 @@ class Reader:
             observations: SI units; NaN where a sample is missing.
             lengths: samples of each run.
             scene: what is known of the scenario.
-            missing: (T, C) samples to be treated as missing as well: those of the target, so that a simulation of the
-                true parameters gives the target's own row.
+            missing: (T, C) samples to be treated as missing as well: those of the target, so that a
+                simulation of the true parameters gives the target's own row.
 
         Raises:
             ValueError: the observation or the scene is of another kind than in training.
@@ -105,7 +120,9 @@ class Reader:
     def table(self, data: Rehearsal) -> Array:
         """Input rows (scenarios, each, D) of training simulations."""
         if self.told is None:
-            return self.seen(self.reading.part(data.flat), data.lengths).reshape(*data.parameters.shape[:2], -1)
+            return self.seen(self.reading.part(data.flat), data.lengths).reshape(
+                *data.parameters.shape[:2], -1
+            )
         each = zip(data.observations, data.scenes, strict=True)
         return np.array([self(observations, data.lengths, scene) for observations, scene in each])
 
@@ -113,7 +130,10 @@ class Reader:
         """Everything as plain arrays."""
         state = {f"inputs.{name}": np.asarray(getattr(self.seen, name)) for name in _SEEN}
         if self.told is not None:
-            state |= {f"told.{name}": np.asarray(getattr(self.told, name), dtype=np.float64) for name in _TOLD}
+            state |= {
+                f"told.{name}": np.asarray(getattr(self.told, name), dtype=np.float64)
+                for name in _TOLD
+            }
         return state
 
     @classmethod
@@ -125,16 +145,24 @@ class Reader:
         """
         rest = {name: np.array(array, dtype=np.float64) for name, array in state.items()}
         kept = [f"inputs.{name}" for name in _SEEN]
-        kept += [f"told.{name}" for name in _TOLD] if any(name.startswith("told.") for name in rest) else []
+        kept += (
+            [f"told.{name}" for name in _TOLD]
+            if any(name.startswith("told.") for name in rest)
+            else []
+        )
         sizes = {part: rest.get(f"{part}.centre", _NONE).shape for part in ("inputs", "told")}
         for name in kept:
             shape = () if name == "told.initial" else sizes[name.partition(".")[0]]
             if name not in rest:
                 raise ValueError(f"expected array {name}, found {sorted(state)[:4]}")
             if rest[name].shape != shape or len(shape) > 1 or not np.isfinite(rest[name]).all():
-                raise ValueError(f"array {name}: expected finite numbers of shape {shape}, found {rest[name].shape}")
+                raise ValueError(
+                    f"array {name}: expected finite numbers of shape {shape}, found {rest[name].shape}"
+                )
         if not sizes["inputs"][0] + sum(sizes["told"]):
             raise ValueError("expected a network that reads something, found one without inputs")
         read = [rest.pop(name) for name in kept]
         told = Circumstances(read[3], read[4], int(read[5])) if read[3:] else None
-        return cls(reading, Inputs(reading.points, reading.raw, read[0], read[1], read[2]), told), rest
+        return cls(
+            reading, Inputs(reading.points, reading.raw, read[0], read[1], read[2]), told
+        ), rest

@@ -42,15 +42,20 @@ class Rehearsal(NamedTuple):
         return self._replace(observations=noisy, unspoilt=self.pure)
 
 
-def rehearse(simulator: Practice, rng: np.random.Generator, budget: int, scenarios: int, each: int) -> Rehearsal:
-    """Simulate `each` uniformly drawn points in each of `scenarios` scenarios, fewer scenarios if the budget is small.
+def rehearse(
+    simulator: Practice, rng: np.random.Generator, budget: int, scenarios: int, each: int
+) -> Rehearsal:
+    """Simulate `each` uniformly drawn points in each of `scenarios` scenarios, fewer scenarios if
+    the budget is small.
 
     Raises:
         ValueError: the budget does not last for two scenarios.
     """
     count = min(scenarios, budget // each)
     if count < 2:
-        raise ValueError(f"{budget} training simulations are fewer than two scenarios of {each} need")
+        raise ValueError(
+            f"{budget} training simulations are fewer than two scenarios of {each} need"
+        )
     parameters, observations, scenes = [], [], []
     for _ in range(count):
         points = simulator.sample(rng, each)
@@ -61,6 +66,8 @@ def rehearse(simulator: Practice, rng: np.random.Generator, budget: int, scenari
             observations.append(seen)
             scenes.append(simulator.scene)
     if len(parameters) < 2:
-        raise ValueError(f"of {count} training scenarios, {len(parameters)} could be simulated; at least 2 are needed")
+        raise ValueError(
+            f"of {count} training scenarios, {len(parameters)} could be simulated; at least 2 are needed"
+        )
     lengths = tuple(simulator.lengths)
     return Rehearsal(np.array(parameters), np.array(observations), lengths, tuple(scenes))

@@ -1,8 +1,10 @@
-"""How an observation responds to the inputs of its scenario: coefficients of a fitted equation of motion.
+"""How an observation responds to the inputs of its scenario: coefficients of a fitted equation of
+motion.
 
-Each channel's acceleration is fitted by what the channels and inputs do at the time. The fit is in weak form
-(D. Messenger, D. Bortz, Weak SINDy, Multiscale Model. Simul. 19, 2021, doi:10.1137/20M1343166): both sides are
-multiplied by bumps and integrated by parts, so that no noisy signal is differentiated twice.
+Each channel's acceleration is fitted by what the channels and inputs do at the time. The fit is in
+weak form (D. Messenger, D. Bortz, Weak SINDy, Multiscale Model. Simul. 19, 2021,
+doi:10.1137/20M1343166): both sides are multiplied by bumps and integrated by parts, so that no
+noisy signal is differentiated twice.
 """
 
 from __future__ import annotations
@@ -16,14 +18,17 @@ from methods.learning.pair_inputs import resample
 _SIDE_BY_SIDE = 12
 """Bumps that would fill a run; they overlap, each moved by an eighth of its width."""
 _RIDGE = 1e-6
-"""Per mean square of a regressor: two that say the same, a constant input and 1, share a coefficient."""
+"""Per mean square of a regressor: two that say the same, a constant input and 1, share a
+coefficient.
+"""
 
 
 def responses(observations: Array, inputs: Array, lengths: tuple[int, ...]) -> Array:
     """Coefficients of each run's channels, time being counted in samples.
 
     Args:
-        observations: (n, T, C), the runs following one another along T; NaN where a sample is missing.
+        observations: (n, T, C), the runs following one another along T; NaN where a sample is
+            missing.
         inputs: (T, U) of the scenario in which all were made.
         lengths: samples of each run; one of fewer than seven gives none.
 
@@ -34,7 +39,9 @@ def responses(observations: Array, inputs: Array, lengths: tuple[int, ...]) -> A
     for length in lengths:
         part = slice(first, first := first + length)
         if length >= 7:
-            series = np.nan_to_num(resample(observations[:, part], (length,), length)).transpose(0, 2, 1)
+            series = np.nan_to_num(resample(observations[:, part], (length,), length)).transpose(
+                0, 2, 1
+            )
             found.append(_response(series, inputs[part]))
     return np.concatenate(found, axis=1)
 
@@ -50,9 +57,13 @@ def _response(series: Array, inputs: Array) -> Array:
         windows = sliding_window_view(signal, len(s), axis=1)[:, :: max(1, half // 4)]
         return np.asarray(windows @ kernel, dtype=np.float64)
 
-    held = (inputs + np.concatenate([inputs[:1], inputs[:-1]])) / 2.0  # an input is held until the next sample
+    held = (
+        inputs + np.concatenate([inputs[:1], inputs[:-1]])
+    ) / 2.0  # an input is held until the next sample
     told = np.broadcast_to(held, (len(series), *inputs.shape))
-    beside = np.concatenate([np.ones_like(told[..., :1]), series, series**3, _sense(series), told], axis=2)
+    beside = np.concatenate(
+        [np.ones_like(told[..., :1]), series, series**3, _sense(series), told], axis=2
+    )
     regressors = np.concatenate([integral(beside, bump), -integral(series, slope)], axis=2)
     return _fitted(regressors, integral(series, bend)).reshape(len(series), -1)
 

@@ -1,13 +1,15 @@
 """A two-link arm in a vertical plane, on PyBullet.
 
-With both angles measured from the vertical of the link before (0 hanging straight), M(q) q'' + c(q, q') + g(q) =
-u - damping q' - friction sign(q'); the equations are those of M. W. Spong, S. Hutchinson, M. Vidyasagar, Robot Modeling
-and Control (2006), section 7.4, with gravity along the arm at rest. Bullet's articulated-body algorithm solves them.
+With both angles measured from the vertical of the link before (0 hanging straight), M(q) q'' + c(q,
+q') + g(q) = u - damping q' - friction sign(q'); the equations are those of M. W. Spong, S.
+Hutchinson, M. Vidyasagar, Robot Modeling and Control (2006), section 7.4, with gravity along the
+arm at rest. Bullet's articulated-body algorithm solves them.
 
-Bullet steps by semi-implicit Euler, which is of first order. Here each step is two of Bullet's, whose mean is taken as
-in Heun's method: that makes it of second order. Dry friction is Bullet's joint motor with the friction as its limit and
-standstill as its goal: a constraint of both joints at once, which holds what pulls less. It cannot change sides within
-a step, so a step in which a joint that rubs comes to rest or turns round is taken again in small parts.
+Bullet steps by semi-implicit Euler, which is of first order. Here each step is two of Bullet's,
+whose mean is taken as in Heun's method: that makes it of second order. Dry friction is Bullet's
+joint motor with the friction as its limit and standstill as its goal: a constraint of both joints
+at once, which holds what pulls less. It cannot change sides within a step, so a step in which a
+joint that rubs comes to rest or turns round is taken again in small parts.
 """
 
 from __future__ import annotations
@@ -28,9 +30,16 @@ _STILL = 1e-6  # rad/s: a joint that is slower is at rest
 
 
 def _of_link(
-    name: str, unit: str, nominal: float, bounds: tuple[float, float], training: tuple[float, float], says: str
+    name: str,
+    unit: str,
+    nominal: float,
+    bounds: tuple[float, float],
+    training: tuple[float, float],
+    says: str,
 ) -> tuple[Parameter, Parameter]:
-    first, second = (Parameter(f"{name}{i}", unit, nominal, bounds, training, says=f"{says} {i}") for i in (1, 2))
+    first, second = (
+        Parameter(f"{name}{i}", unit, nominal, bounds, training, says=f"{says} {i}") for i in (1, 2)
+    )
     return first, second
 
 
@@ -43,8 +52,17 @@ class Arm(OwnSimulator):
     time_step = 1 / 250
     parameters = (
         *_of_link("mass", "kg", 1.0, (0.2, 3.0), (0.5, 1.5), says="mass of link"),
-        *_of_link("centre", "m", 0.2, (0.05, 0.35), (0.12, 0.28), says="from the joint to the centre of mass of link"),
-        *_of_link("damping", "N*m*s/rad", 0.1, (0.0, 0.5), (0.0, 0.2), says="viscous damping of joint"),
+        *_of_link(
+            "centre",
+            "m",
+            0.2,
+            (0.05, 0.35),
+            (0.12, 0.28),
+            says="from the joint to the centre of mass of link",
+        ),
+        *_of_link(
+            "damping", "N*m*s/rad", 0.1, (0.0, 0.5), (0.0, 0.2), says="viscous damping of joint"
+        ),
         *_of_link("friction", "N*m", 0.1, (0.0, 0.5), (0.0, 0.2), says="dry friction of joint"),
     )
     constants = (
@@ -53,7 +71,10 @@ class Arm(OwnSimulator):
         Constant("inertia2", "kg*m^2", 0.012, "of link 2 about its centre of mass", positive=True),
         Constant("gravity", "m/s^2", 9.81, "downward"),
     )
-    inputs = (Channel("u1", "N*m", says="torque at joint 1"), Channel("u2", "N*m", says="torque at joint 2"))
+    inputs = (
+        Channel("u1", "N*m", says="torque at joint 1"),
+        Channel("u2", "N*m", says="torque at joint 2"),
+    )
     channels = (
         Channel("q1", "rad", says="angle of joint 1, 0 when link 1 hangs"),
         Channel("q2", "rad", says="angle of joint 2, 0 when the arm is straight"),
@@ -65,8 +86,15 @@ class Arm(OwnSimulator):
 
     _world: BulletWorld
 
-    def reset(self, theta: Mapping[str, float], constants: Mapping[str, float], initial: Mapping[str, float]) -> None:
-        """A new arm in an empty world: Bullet has no way to move a centre of mass, and building takes 0.3 ms."""
+    def reset(
+        self,
+        theta: Mapping[str, float],
+        constants: Mapping[str, float],
+        initial: Mapping[str, float],
+    ) -> None:
+        """A new arm in an empty world: Bullet has no way to move a centre of mass, and building
+        takes 0.3 ms.
+        """
         if "_world" not in self.__dict__:
             self._world = BulletWorld()
         p = self._world
@@ -79,22 +107,36 @@ class Arm(OwnSimulator):
             linkVisualShapeIndices=[-1, -1],
             linkPositions=[(0.0, 0.0, 0.0), (0.0, 0.0, -constants["length"])],
             linkOrientations=[_HERE, _HERE],
-            linkInertialFramePositions=[(0.0, 0.0, -theta["centre1"]), (0.0, 0.0, -theta["centre2"])],
+            linkInertialFramePositions=[
+                (0.0, 0.0, -theta["centre1"]),
+                (0.0, 0.0, -theta["centre2"]),
+            ],
             linkInertialFrameOrientations=[_HERE, _HERE],
             linkParentIndices=[0, 1],
             linkJointTypes=[p.JOINT_REVOLUTE, p.JOINT_REVOLUTE],
             linkJointAxis=[_AXIS, _AXIS],
         )
         # By default Bullet adds air resistance, sleep when nothing moves, and a speed limit.
-        p.changeDynamics(self._arm, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=NO_LIMIT)
+        p.changeDynamics(
+            self._arm, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=NO_LIMIT
+        )
         p.changeDynamics(self._arm, -1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING)
         for joint in (0, 1):
             inertia, damping = constants[f"inertia{joint + 1}"], theta[f"damping{joint + 1}"]
-            p.changeDynamics(self._arm, joint, localInertiaDiagonal=(inertia,) * 3, jointDamping=damping)
+            p.changeDynamics(
+                self._arm, joint, localInertiaDiagonal=(inertia,) * 3, jointDamping=damping
+            )
         self._friction = [theta["friction1"], theta["friction2"]]
         self._step = 0.0
-        self._place, self._push, self._state = p.resetJointState, p.setJointMotorControl2, p.getJointState
-        self._go, self._torque = p.stepSimulation, p.TORQUE_CONTROL  # looked up once: a run has thousands of each
+        self._place, self._push, self._state = (
+            p.resetJointState,
+            p.setJointMotorControl2,
+            p.getJointState,
+        )
+        self._go, self._torque = (
+            p.stepSimulation,
+            p.TORQUE_CONTROL,
+        )  # looked up once: a run has thousands of each
         self._q, self._v = [initial["q1"], initial["q2"]], [initial["qd1"], initial["qd2"]]
 
     def step(self, inputs: Mapping[str, float], seconds: float) -> None:
@@ -106,7 +148,9 @@ class Arm(OwnSimulator):
                 self._heun(torques, seconds / _PARTS)
 
     def _heun(self, torques: tuple[float, float], seconds: float) -> bool:
-        """The mean of two of Bullet's steps; returns whether a joint that rubs came to rest or turned round."""
+        """The mean of two of Bullet's steps; returns whether a joint that rubs came to rest or
+        turned round.
+        """
         self._pace(seconds)
         q, v = self._q, self._v
         for joint in (0, 1):
@@ -115,7 +159,9 @@ class Arm(OwnSimulator):
         self._q = [q[i] + seconds * (v[i] + v1[i]) / 2 for i in (0, 1)]
         self._v = [(v[i] + v2[i]) / 2 for i in (0, 1)]
         return any(
-            self._friction[i] > 0 and abs(v[i]) > _STILL and min(v1[i] * v[i], v2[i] * v[i]) < _STILL * abs(v[i])
+            self._friction[i] > 0
+            and abs(v[i]) > _STILL
+            and min(v1[i] * v[i], v2[i] * v[i]) < _STILL * abs(v[i])
             for i in (0, 1)
         )
 
@@ -132,11 +178,15 @@ class Arm(OwnSimulator):
         return {name: value for name, value in self.__dict__.items() if name not in _OF_THE_WORLD}
 
     def _pace(self, seconds: float) -> None:
-        if seconds != self._step:  # Bullet turns a motor's force into an impulse when the motor is set
+        if (
+            seconds != self._step
+        ):  # Bullet turns a motor's force into an impulse when the motor is set
             p = self._world
             p.setTimeStep(seconds)
             for joint, friction in enumerate(self._friction):
-                p.setJointMotorControl2(self._arm, joint, p.VELOCITY_CONTROL, targetVelocity=0.0, force=friction)
+                p.setJointMotorControl2(
+                    self._arm, joint, p.VELOCITY_CONTROL, targetVelocity=0.0, force=friction
+                )
             self._step = seconds
 
     def _advance(self, torques: tuple[float, float]) -> tuple[float, float]:

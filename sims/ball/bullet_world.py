@@ -1,24 +1,27 @@
 """The ball's worlds in Bullet.
 
-What Bullet does to a free body of a multibody world (``btMultiBody``, ``btMultiBodyConstraintSolver``), measured to
-agree to rounding: with step h, gravity g, damping k and the gap d = z - radius before the step,
+What Bullet does to a free body of a multibody world (``btMultiBody``,
+``btMultiBodyConstraintSolver``), measured to agree to rounding: with step h, gravity g, damping k
+and the gap d = z - radius before the step,
 
     v' = v + h (-g ez - k v (1 + |v|)),    x' = x + h v'
 
-so "linear damping" is a linear *and* a quadratic drag with one coefficient, and the method is semi-implicit Euler, of
-first order in h. Contact acts if d <= 0.02 sqrt(3) radius: then v'_z becomes at least
+so "linear damping" is a linear *and* a quadratic drag with one coefficient, and the method is
+semi-implicit Euler, of first order in h. Contact acts if d <= 0.02 sqrt(3) radius: then v'_z
+becomes at least
 
-    e |v'_z| - (d + s) / h    above the ground (d + s > 0): only what brings the ball to the ground by the next step
-    e |v'_z| - 0.08 (d + s) / h    below it: the ball is pushed out as well
+    e |v'_z| - (d + s) / h    above the ground (d + s > 0): only what brings the ball to the ground
+    by the next step e |v'_z| - 0.08 (d + s) / h    below it: the ball is pushed out as well
 
-with e the product of both restitutions (0 for impacts below 0.2 m/s) and s = 1e-5 m. Rebounds therefore depend on where
-the last step before the impact happens to end, and the shorter the step, the more of them are swallowed from above.
-`build_native` makes that world, as in the published experiments (TuneNet, arXiv 1907.11200): 400 samples at 60 Hz with
-gravity 9.8. For a drop from 4.5 m and restitution 0.7 its first bounce reaches 0.656 (square root of the ratio of
-heights); the same air resistance without Bullet's contact and step errors gives 0.616, no air 0.7.
+with e the product of both restitutions (0 for impacts below 0.2 m/s) and s = 1e-5 m. Rebounds
+therefore depend on where the last step before the impact happens to end, and the shorter the step,
+the more of them are swallowed from above. `build_native` makes that world, as in the published
+experiments (TuneNet, arXiv 1907.11200): 400 samples at 60 Hz with gravity 9.8. For a drop from 4.5
+m and restitution 0.7 its first bounce reaches 0.656 (square root of the ratio of heights); the same
+air resistance without Bullet's contact and step errors gives 0.616, no air 0.7.
 
-`build` makes a world of physics alone: no air, a ball that cannot spin, and contact that acts at the ground, with the
-restitution asked for whatever the speed, and does not push out.
+`build` makes a world of physics alone: no air, a ball that cannot spin, and contact that acts at
+the ground, with the restitution asked for whatever the speed, and does not push out.
 """
 
 from __future__ import annotations
@@ -55,7 +58,11 @@ def build_native(client: int, constants: Mapping[str, float], settings: Mapping[
     ground, ball = _ground_and_ball(client, constants)
     friction = settings["lateral_friction"]
     p.changeDynamics(
-        ground, -1, restitution=settings["plane_restitution"], lateralFriction=friction, physicsClientId=client
+        ground,
+        -1,
+        restitution=settings["plane_restitution"],
+        lateralFriction=friction,
+        physicsClientId=client,
     )
     p.changeDynamics(
         ball,
@@ -73,6 +80,8 @@ def _ground_and_ball(client: int, constants: Mapping[str, float]) -> tuple[int, 
     p.setGravity(0.0, 0.0, -constants["gravity"], physicsClientId=client)
     plane = p.createCollisionShape(p.GEOM_PLANE, physicsClientId=client)
     ground: int = p.createMultiBody(0.0, plane, physicsClientId=client)
-    sphere = p.createCollisionShape(p.GEOM_SPHERE, radius=constants["radius"], physicsClientId=client)
+    sphere = p.createCollisionShape(
+        p.GEOM_SPHERE, radius=constants["radius"], physicsClientId=client
+    )
     ball: int = p.createMultiBody(constants["mass"], sphere, physicsClientId=client)
     return ground, ball

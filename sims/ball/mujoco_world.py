@@ -6,7 +6,9 @@ from collections.abc import Mapping
 
 
 def model(constants: Mapping[str, float]) -> str:
-    """The world as MJCF; the joints are x, y, z, zero at the origin; the ball states what its contact is like."""
+    """The world as MJCF; the joints are x, y, z, zero at the origin; the ball states what its
+    contact is like.
+    """
     return f"""
     <mujoco>
       <option gravity="0 0 {-constants["gravity"]!r}"/>

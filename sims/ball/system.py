@@ -13,10 +13,12 @@ from sims.system import Kind, Moment, System
 
 
 class BallSystem(System):
-    """A sphere on which gravity alone acts; it leaves level ground with restitution times its impact speed.
+    """A sphere on which gravity alone acts; it leaves level ground with restitution times its
+    impact speed.
 
-    States are the centre x, y, z [m], ground touched at z = radius, and its velocity vx, vy, vz [m/s]. It does not
-    spin, and the ground does not slow it along its plane unless an effect says so. Force is counted per unit mass.
+    States are the centre x, y, z [m], ground touched at z = radius, and its velocity vx, vy, vz
+    [m/s]. It does not spin, and the ground does not slow it along its plane unless an effect says
+    so. Force is counted per unit mass.
     """
 
     name = "ball"
@@ -24,7 +26,11 @@ class BallSystem(System):
     kind: ClassVar[Kind] = "point"
     parameters = (
         Parameter(
-            "restitution", "1", 0.5, (0.0, 1.0), says="share of the impact speed with which the ball leaves the ground"
+            "restitution",
+            "1",
+            0.5,
+            (0.0, 1.0),
+            says="share of the impact speed with which the ball leaves the ground",
         ),
     )
     constants = (
@@ -36,7 +42,12 @@ class BallSystem(System):
         Channel("x", "m", says="centre, along the ground"),
         Channel("y", "m", says="centre, along the ground, across x"),
         Channel("z", "m", says="height of the centre above the ground"),
-        Channel("accel_z", "m/s^2", 10.0, "vertical proper acceleration: 0 in free fall, gravity at rest"),
+        Channel(
+            "accel_z",
+            "m/s^2",
+            10.0,
+            "vertical proper acceleration: 0 in free fall, gravity at rest",
+        ),
     )
     coordinates = ("x", "y", "z")
     rates = ("vx", "vy", "vz")
@@ -48,7 +59,7 @@ class BallSystem(System):
     bounces = True
     uniform = True
 
-    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:  # noqa: ARG002
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """One: force is counted per unit mass."""
         return np.ones((len(theta), 1))
 
@@ -62,9 +73,16 @@ class BallSystem(System):
         unit[:, "xy".index(axis)] = 1.0
         return unit
 
-    def observe(self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]) -> dict[str, Array]:  # noqa: ARG002
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
         """Position, and what an accelerometer on the ball shows along the vertical."""
-        return {"x": x[:, :, 0], "y": x[:, :, 1], "z": x[:, :, 2], "accel_z": a[:, :, 2] + constants["gravity"]}
+        return {
+            "x": x[:, :, 0],
+            "y": x[:, :, 1],
+            "z": x[:, :, 2],
+            "accel_z": a[:, :, 2] + constants["gravity"],
+        }
 
     def floor(self, constants: Mapping[str, Array]) -> Array:
         """The ball's radius."""

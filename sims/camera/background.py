@@ -51,7 +51,9 @@ def survey(frames: Iterable[tuple[float, Image]]) -> Survey:
     size, before = (0, 0), None
     for number, (time, picture) in enumerate(frames):
         if number and picture.shape[1::-1] != size:
-            raise InputError(f"frame {number}: expected {size[0]} x {size[1]} px as before, found another size")
+            raise InputError(
+                f"frame {number}: expected {size[0]} x {size[1]} px as before, found another size"
+            )
         size = picture.shape[1], picture.shape[0]
         skip = max(1, int((picture.shape[0] * picture.shape[1] / _PIXELS) ** 0.5))
         coarse = picture[::skip, ::skip].astype(np.int16)
@@ -112,18 +114,28 @@ def without(
 
 
 def _median_of_seen(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The median over the first axis without NaN, of which not all are; numpy's own takes four times as long."""
+    """The median over the first axis without NaN, of which not all are; numpy's own takes four
+    times as long.
+    """
     ranked = np.sort(values, axis=0)  # NaN last
     count = np.isfinite(values).sum(axis=0, keepdims=True)
-    low, high = (np.take_along_axis(ranked, place, axis=0)[0] for place in ((count - 1) // 2, count // 2))
+    low, high = (
+        np.take_along_axis(ranked, place, axis=0)[0] for place in ((count - 1) // 2, count // 2)
+    )
     result: NDArray[np.float32] = (low + high) / 2
     return result
 
 
 def noise(pictures: list[Image], background: Image) -> float:
-    """1 sigma of the camera in grey levels of its worst colour, from pictures in which little differs."""
-    worst = [_difference(picture, background) for picture in pictures[:: max(1, len(pictures) // 8)]]
-    return float(1.4826 * np.median(np.stack(worst)) / 1.5)  # the largest of three magnitudes is 1.5 times one
+    """1 sigma of the camera in grey levels of its worst colour, from pictures in which little
+    differs.
+    """
+    worst = [
+        _difference(picture, background) for picture in pictures[:: max(1, len(pictures) // 8)]
+    ]
+    return float(
+        1.4826 * np.median(np.stack(worst)) / 1.5
+    )  # the largest of three magnitudes is 1.5 times one
 
 
 def _difference(picture: Image, background: Image) -> NDArray[np.int16]:

@@ -1,7 +1,7 @@
 """A pinhole camera: where a point of the world, or a ball, appears in the picture.
 
-Pixels are (u, v): u to the right, v down, (0, 0) the centre of the upper left pixel, as OpenCV counts them. World
-coordinates are metres, z up. Pixels are square and the lens does not distort.
+Pixels are (u, v): u to the right, v down, (0, 0) the centre of the upper left pixel, as OpenCV
+counts them. World coordinates are metres, z up. Pixels are square and the lens does not distort.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ class Camera:
         if self.distance <= 0:
             raise InputError(f"camera: distance: expected more than 0 m, found {self.distance:g}")
         if not 0 < self.field_of_view < 180:
-            raise InputError(f"camera: field_of_view: expected 0 to 180 degrees, found {self.field_of_view:g}")
+            raise InputError(
+                f"camera: field_of_view: expected 0 to 180 degrees, found {self.field_of_view:g}"
+            )
         if len(self.size) != 2 or min(self.size) < 2:
             raise InputError(f"camera: size: expected two numbers of pixels, found {self.size}")
 
@@ -53,8 +55,8 @@ class Camera:
     def published(cls, rng: np.random.Generator, pixels: int = 100) -> Camera:
         """A camera drawn as for the published visual tuner.
 
-        Azimuth U[0, 2 pi], distance U[5, 10] m, height U[5, 8] m, aimed at (0, 0, 2), field of view 40 degrees,
-        100 x 100 px (Allevato et al., TuneNet, arXiv 1907.11200, released code).
+        Azimuth U[0, 2 pi], distance U[5, 10] m, height U[5, 8] m, aimed at (0, 0, 2), field of view
+        40 degrees, 100 x 100 px (Allevato et al., TuneNet, arXiv 1907.11200, released code).
 
         Args:
             rng: what is drawn comes from here.
@@ -72,7 +74,11 @@ class Camera:
         """Where it stands (3,), m."""
         x, y, _ = self.target
         return frozen(
-            [x + self.distance * math.cos(self.azimuth), y + self.distance * math.sin(self.azimuth), self.height]
+            [
+                x + self.distance * math.cos(self.azimuth),
+                y + self.distance * math.sin(self.azimuth),
+                self.height,
+            ]
         )
 
     @cached_property
@@ -87,7 +93,9 @@ class Camera:
 
     @cached_property
     def axes(self) -> Array:
-        """Rows: the picture's right, its down, and the viewing direction, as unit vectors of the world (3, 3)."""
+        """Rows: the picture's right, its down, and the viewing direction, as unit vectors of the
+        world (3, 3).
+        """
         forward = np.asarray(self.target) - self.position
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, (0.0, 0.0, 1.0))
@@ -100,26 +108,33 @@ class Camera:
         return result
 
     def depth(self, points: ArrayLike) -> Array:
-        """Distance (...) of world points (..., 3) from the camera along its axis, m; negative behind it."""
+        """Distance (...) of world points (..., 3) from the camera along its axis, m; negative
+        behind it.
+        """
         result: Array = self.seen(points)[..., 2]
         return result
 
     def project(self, points: ArrayLike) -> Array:
-        """Pixels (..., 2) where world points (..., 3) appear, inside the picture or not; NaN behind the camera."""
+        """Pixels (..., 2) where world points (..., 3) appear, inside the picture or not; NaN behind
+        the camera.
+        """
         seen = self.seen(points)
         depth = np.where(seen[..., 2:] > 0, seen[..., 2:], np.nan)
         result: Array = self.middle + self.focal * seen[..., :2] / depth
         return result
 
     def outline(self, points: ArrayLike, radius: float) -> tuple[Array, Array]:
-        """The ellipse as which a sphere appears: its centre (..., 2) and semi-axes (..., 2), the longer first, px.
+        """The ellipse as which a sphere appears: its centre (..., 2) and semi-axes (..., 2), the
+        longer first, px.
 
-        The longer axis points to the middle of the picture, and the centre lies a little further out than the
-        projection of the sphere's own centre. With t the angle between optical axis and sphere, and p the angle that
-        the sphere fills, sin p = radius / distance, its ends lie at tan(t - p) and tan(t + p).
+        The longer axis points to the middle of the picture, and the centre lies a little further
+        out than the projection of the sphere's own centre. With t the angle between optical axis
+        and sphere, and p the angle that the sphere fills, sin p = radius / distance, its ends lie
+        at tan(t - p) and tan(t + p).
 
         Args:
-            points: centres (..., 3), m; NaN comes back for one that is not wholly before the camera.
+            points: centres (..., 3), m; NaN comes back for one that is not wholly before the
+                camera.
             radius: of the sphere, m.
         """
         seen = self.seen(points)
@@ -138,16 +153,19 @@ class Camera:
         return centre, self.focal * np.stack([(far_end - near_end) / 2, np.sqrt(across)], axis=-1)
 
     def apparent_radius(self, points: ArrayLike, radius: float) -> Array:
-        """Radius (...) in pixels of the circle that covers as much of the picture as the sphere does."""
+        """Radius (...) in pixels of the circle that covers as much of the picture as the sphere
+        does.
+        """
         axes = self.outline(points, radius)[1]
         result: Array = np.sqrt(axes[..., 0] * axes[..., 1])
         return result
 
     def heights(self, centres: ArrayLike, x: float, y: float, radius: float) -> Array:
-        """Heights (...) at which a ball on the vertical through (x, y) has its outline nearest to `centres` (..., 2).
+        """Heights (...) at which a ball on the vertical through (x, y) has its outline nearest to
+        `centres` (..., 2).
 
-        A point on that vertical is linear in z, so both its picture equations are; the small offset between outline and
-        projected centre is taken off in a few rounds.
+        A point on that vertical is linear in z, so both its picture equations are; the small offset
+        between outline and projected centre is taken off in a few rounds.
         """
         pixels = np.asarray(centres, dtype=np.float64)
         base, up = self.seen((x, y, 0.0)), self.axes[:, 2]

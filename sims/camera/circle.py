@@ -18,7 +18,8 @@ _EVERY = 3
 
 
 def fit(points: Array, start: tuple[float, float, float | None] | None) -> Fitted | None:
-    """The circle nearest to most of the points, by Gauss-Newton with Tukey's weights; None where there is none.
+    """The circle nearest to most of the points, by Gauss-Newton with Tukey's weights; None where
+    there is none.
 
     The normal equations are solved by hand: numpy's own solver spends its time on the call.
 
@@ -75,8 +76,9 @@ def better(one: Fitted | None, other: Fitted | None) -> Fitted | None:
 def through_an_arc(points: Array) -> Circle | None:
     """The circle through half of the points, one after another, on which most of all of them lie.
 
-    What spoils an edge, a shadow or another ball, spoils it on one side. Circles are fitted to arcs that begin all
-    around, by linear least squares (I. Kasa, IEEE Trans. Instrum. Meas. 25, 8, 1976, doi:10.1109/TIM.1976.6312298).
+    What spoils an edge, a shadow or another ball, spoils it on one side. Circles are fitted to arcs
+    that begin all around, by linear least squares (I. Kasa, IEEE Trans. Instrum. Meas. 25, 8, 1976,
+    doi:10.1109/TIM.1976.6312298).
 
     Args:
         points: (n, 2), in their order around it.
@@ -90,7 +92,9 @@ def through_an_arc(points: Array) -> Circle | None:
     normal = turned @ table
     if (np.abs(np.linalg.det(normal)) < 1e-6).any():
         return None
-    doubled_u, doubled_v, rest = np.linalg.solve(normal, turned @ (arcs**2).sum(axis=2)[..., None])[..., 0].T
+    doubled_u, doubled_v, rest = np.linalg.solve(normal, turned @ (arcs**2).sum(axis=2)[..., None])[
+        ..., 0
+    ].T
     u, v = doubled_u / 2, doubled_v / 2
     radius = np.sqrt(np.maximum(rest + u**2 + v**2, 0.0))
     x, y = (points - middle).T
@@ -103,4 +107,8 @@ def _middle(values: Array) -> float:
     """The median; numpy's own takes ten times as long for a few numbers."""
     k = len(values) // 2
     sorted_there = np.partition(values, (k - 1, k))
-    return float(sorted_there[k]) if len(values) % 2 else float(0.5 * (sorted_there[k - 1] + sorted_there[k]))
+    return (
+        float(sorted_there[k])
+        if len(values) % 2
+        else float(0.5 * (sorted_there[k - 1] + sorted_there[k]))
+    )

@@ -1,4 +1,6 @@
-"""What stands beside a film made here, `NAME.camera.toml`: the camera, and the ball and the vertical it falls along."""
+"""What stands beside a film made here, `NAME.camera.toml`: the camera, and the ball and the
+vertical it falls along.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ def described(filmed: Filmed) -> str:
     import tomli_w
 
     camera = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(filmed.camera).items()}
-    return tomli_w.dumps({"camera": camera, "ball": {"radius": filmed.radius, "x": filmed.x, "y": filmed.y}})
+    return tomli_w.dumps(
+        {"camera": camera, "ball": {"radius": filmed.radius, "x": filmed.x, "y": filmed.y}}
+    )
 
 
 def read_filmed(path: Path) -> Filmed:
@@ -42,7 +46,11 @@ def read_filmed(path: Path) -> Filmed:
     """
     meta = read_toml(path)
     camera = _numbers(
-        path, "camera", meta, ("azimuth", "distance", "height", "field_of_view"), {"target": 3, "size": 2}
+        path,
+        "camera",
+        meta,
+        ("azimuth", "distance", "height", "field_of_view"),
+        {"target": 3, "size": 2},
     )
     ball = _numbers(path, "ball", meta, ("radius", "x", "y"), {})
     if ball["radius"] <= 0:
@@ -54,7 +62,9 @@ def read_filmed(path: Path) -> Filmed:
         raise InputError(f"{path}: {error}") from None
 
 
-def _numbers(path: Path, section: str, meta: dict[str, Any], single: tuple[str, ...], rows: dict[str, int]) -> Any:
+def _numbers(
+    path: Path, section: str, meta: dict[str, Any], single: tuple[str, ...], rows: dict[str, int]
+) -> Any:
     table = meta.get(section)
     if not isinstance(table, dict):
         raise InputError(f"{path}: expected a table [{section}]")
@@ -69,6 +79,8 @@ def _numbers(path: Path, section: str, meta: dict[str, Any], single: tuple[str, 
         if len(cells) != max(1, length) or not all(
             isinstance(c, int | float) and not isinstance(c, bool) for c in cells
         ):
-            raise InputError(f"{path}: {section}.{name}: expected {length or 'a'} number{'s' * bool(length)}")
+            raise InputError(
+                f"{path}: {section}.{name}: expected {length or 'a'} number{'s' * bool(length)}"
+            )
         values[name] = tuple(map(float, cells)) if length else float(cells[0])
     return values

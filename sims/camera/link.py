@@ -17,9 +17,12 @@ _CHANCE = 0.5
 _MEMORY = 20
 """Pictures over which the colour of a path is averaged."""
 _TINGE, _SHARE = 25.0, 0.45
-"""Grey levels, and share of the contrast with the background, by which a thing's colour may vary."""
+"""Grey levels, and share of the contrast with the background, by which a thing's colour may vary.
+"""
 _BLEEDS = 1.5
-"""Pixels over which video files, which keep colours at half the resolution, mix a ball's with the background's."""
+"""Pixels over which video files, which keep colours at half the resolution, mix a ball's with the
+background's.
+"""
 
 
 @dataclass
@@ -38,19 +41,27 @@ class Path:
         self.spots.append(spot)
 
     def expected(self, frame: int) -> tuple[float, float, float]:
-        """Where it should be if it goes on straight (u, v), and how far from there it may be: a bounce turns it."""
+        """Where it should be if it goes on straight (u, v), and how far from there it may be: a
+        bounce turns it.
+        """
         last = self.spots[-1]
         if len(self.spots) < 2:
             return last.u, last.v, 4 * last.radius + 10
         gap, before = self.frames[-1] - self.frames[-2], self.spots[-2]
         du, dv = (last.u - before.u) / gap, (last.v - before.v) / gap
         wait = frame - self.frames[-1]
-        return last.u + du * wait, last.v + dv * wait, 2 * float(np.hypot(du, dv)) * wait + last.radius + 2
+        return (
+            last.u + du * wait,
+            last.v + dv * wait,
+            2 * float(np.hypot(du, dv)) * wait + last.radius + 2,
+        )
 
     def near(self, frame: int, spot: Spot) -> float:
-        """Distance of a spot from where this should be, as a share of what is allowed; infinite for another thing.
+        """Distance of a spot from where this should be, as a share of what is allowed; infinite for
+        another thing.
 
-        Where a ball meets its shadow and leaves it again, the shadow goes on as the ball went before; its colour tells.
+        Where a ball meets its shadow and leaves it again, the shadow goes on as the ball went
+        before; its colour tells.
         """
         u, v, reach = self.expected(frame)
         off = float(np.hypot(spot.u - u, spot.v - v)) / reach
@@ -60,9 +71,13 @@ class Path:
         return off + unlike if unlike <= 1 else np.inf
 
     def unlike(self, colour: Sequence[float], contrast: float) -> float:
-        """How far a colour is from this one's, as a share of what light and compression may do to it."""
+        """How far a colour is from this one's, as a share of what light and compression may do to
+        it.
+        """
         tinge = _TINGE * (1.0 + _BLEEDS / self.spots[-1].radius)
-        return float(np.abs(self.tone - colour).max()) / max(tinge, _SHARE * contrast, _SHARE * self.contrast)
+        return float(np.abs(self.tone - colour).max()) / max(
+            tinge, _SHARE * contrast, _SHARE * self.contrast
+        )
 
     @property
     def contrast(self) -> float:
@@ -86,9 +101,11 @@ class Path:
 
     @property
     def weight(self) -> float:
-        """How much speaks for it: edge, in pixels, that lies on circles beyond what chance lays there.
+        """How much speaks for it: edge, in pixels, that lies on circles beyond what chance lays
+        there.
 
-        Counted in pictures alone, a remnant of shadow that is there all the time would outweigh a ball.
+        Counted in pictures alone, a remnant of shadow that is there all the time would outweigh a
+        ball.
         """
         return sum((s.agree - _CHANCE) * s.radius for s in self.spots)
 
@@ -100,7 +117,9 @@ def linked(pictures: Sequence[Sequence[Spot]]) -> list[Path]:
     for frame, spots in enumerate(pictures):
         done += [p for p in live if frame - p.frames[-1] > _PATIENCE]
         live = [p for p in live if frame - p.frames[-1] <= _PATIENCE]
-        pairs = sorted((p.near(frame, s), i, k) for i, p in enumerate(live) for k, s in enumerate(spots))
+        pairs = sorted(
+            (p.near(frame, s), i, k) for i, p in enumerate(live) for k, s in enumerate(spots)
+        )
         paths, taken = set(), set()
         for distance, i, k in pairs:
             if not np.isfinite(distance) or i in paths or k in taken:
@@ -112,7 +131,10 @@ def linked(pictures: Sequence[Sequence[Spot]]) -> list[Path]:
             if k not in taken:
                 live.append(Path())
                 live[-1].add(frame, spot)
-    return sorted((p for p in done + live if len(p.frames) >= _LEAST), key=lambda p: -p.weight * (p.travel > p.radius))
+    return sorted(
+        (p for p in done + live if len(p.frames) >= _LEAST),
+        key=lambda p: -p.weight * (p.travel > p.radius),
+    )
 
 
 def joined(paths: Sequence[Path]) -> tuple[Path, list[Path]]:

@@ -10,7 +10,9 @@ import numpy as np
 from sims.base import Array, frozen
 
 _CONTRAST = 0.3
-"""Least difference between ball and ground in some colour, of 1; a ball like its ground cannot be seen by anyone."""
+"""Least difference between ball and ground in some colour, of 1; a ball like its ground cannot be
+seen by anyone.
+"""
 _WAVES = 6
 
 
@@ -23,10 +25,12 @@ class Look:
         ball: colour of the ball.
         ground: colour of the ground.
         sky: colour above the horizon.
-        waves: the ground's pattern, rows of (wave vector x, y in rad/m, phase, amplitude as a share of brightness).
+        waves: the ground's pattern, rows of (wave vector x, y in rad/m, phase, amplitude as a share
+            of brightness).
         shadow: share of the light that the ball's shadow takes away.
         noise: of the camera, 1 sigma in grey levels of 255.
-        crf: compression, the encoder's constant rate factor: 0 loses nothing, above 30 it is coarse.
+        crf: compression, the encoder's constant rate factor: 0 loses nothing, above 30 it is
+            coarse.
     """
 
     light: Array
@@ -40,7 +44,9 @@ class Look:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Look:
-        """A look by chance: light 30 to 80 degrees above the ground, any colours that can be told apart."""
+        """A look by chance: light 30 to 80 degrees above the ground, any colours that can be told
+        apart.
+        """
         azimuth, above = rng.uniform(0, 2 * np.pi), rng.uniform(np.pi / 6, np.pi / 2.25)
         flat = np.cos(above)
         light = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(above)]
@@ -51,9 +57,20 @@ class Look:
         sky = _colour(rng, saturation=(0.0, 0.3), value=(0.7, 1.0))
         bearing, length = rng.uniform(0, 2 * np.pi, _WAVES), rng.uniform(0.5, 6.0, _WAVES)
         phase, amplitude = rng.uniform(0, 2 * np.pi, _WAVES), rng.uniform(0.0, 0.04, _WAVES)
-        waves = np.stack([length * np.cos(bearing), length * np.sin(bearing), phase, amplitude], axis=1)
+        waves = np.stack(
+            [length * np.cos(bearing), length * np.sin(bearing), phase, amplitude], axis=1
+        )
         shadow, noise = rng.uniform(0.2, 0.6), rng.uniform(0.5, 2.5)
-        return cls(frozen(light), ball, ground, sky, frozen(waves), shadow, noise, int(rng.integers(14, 24)))
+        return cls(
+            frozen(light),
+            ball,
+            ground,
+            sky,
+            frozen(waves),
+            shadow,
+            noise,
+            int(rng.integers(14, 24)),
+        )
 
     def pattern(self, x: Array, y: Array) -> Array:
         """Brightness of the ground at (x, y), 1 on average, of the arguments' shape."""

@@ -15,12 +15,16 @@ _FACES = 3
 def sphere(divisions: int = _FACES) -> tuple[Array, tuple[int, ...]]:
     """Points (n, 3) of a unit sphere, and its triangles as indices, three after three.
 
-    Each face of an icosahedron is divided into four, again and again; with three divisions 642 points.
+    Each face of an icosahedron is divided into four, again and again; with three divisions 642
+    points.
     """
     golden = (1 + 5**0.5) / 2
     corners = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
     turned = [(c, a, b) for a, b, c in corners]
-    points = [np.array(p) / np.hypot(1, golden) for p in (*corners, *turned, *((c, a, b) for a, b, c in turned))]
+    points = [
+        np.array(p) / np.hypot(1, golden)
+        for p in (*corners, *turned, *((c, a, b) for a, b, c in turned))
+    ]
     side = min(float(np.linalg.norm(points[0] - p)) for p in points[1:])
     near = [[float(np.linalg.norm(p - q)) < 1.1 * side for q in points] for p in points]
     faces = [

@@ -1,9 +1,10 @@
 """Round things that differ from the background in one picture, measured to a fraction of a pixel.
 
-What differs is divided into connected spots. A circle is fitted to each spot's edge, found along rays from its middle
-where the difference has fallen to half of what it is inside: there half a pixel's area is the ball's, whatever its
-colour. Rays that meet something else (a shadow, the picture's edge, a patch of like colour) lie off the circle and are
-left out; a spot for which too few agree is no ball.
+What differs is divided into connected spots. A circle is fitted to each spot's edge, found along
+rays from its middle where the difference has fallen to half of what it is inside: there half a
+pixel's area is the ball's, whatever its colour. Rays that meet something else (a shadow, the
+picture's edge, a patch of like colour) lie off the circle and are left out; a spot for which too
+few agree is no ball.
 """
 
 from __future__ import annotations
@@ -36,11 +37,12 @@ _SHADE = (0.25, 0.97)
 
 
 class Spot(NamedTuple):
-    """A ball-like thing: middle and radius of its outline in pixels, the share of rays that agree, their scatter.
+    """A ball-like thing: middle and radius of its outline in pixels, the share of rays that agree,
+    their scatter.
 
-    `edges` (n, 2) are the points of its edge to which the circle was fitted; none for a ball of a few pixels. `colour`
-    is that of its middle, `contrast` how far that is from the background there, in grey levels. A `ghost` is a ball or
-    shadow in the background that the picture lacks.
+    `edges` (n, 2) are the points of its edge to which the circle was fitted; none for a ball of a
+    few pixels. `colour` is that of its middle, `contrast` how far that is from the background
+    there, in grey levels. A `ghost` is a ball or shadow in the background that the picture lacks.
     """
 
     u: float
@@ -85,8 +87,8 @@ class Finder:
     Args:
         background: the scene without the ball.
         sigma: noise, 1 sigma in grey levels.
-        shadows: whether what is merely darker than the background is taken for shadow; wrong for a ball of the
-            ground's own hue.
+        shadows: whether what is merely darker than the background is taken for shadow; wrong for a
+            ball of the ground's own hue.
     """
 
     def __init__(self, background: Image, sigma: float, shadows: bool) -> None:
@@ -113,21 +115,33 @@ class Finder:
         else:
             shade = np.zeros(mask.shape, bool)
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        large = sorted(((len(c), i) for i, c in enumerate(contours) if len(c) > 3), reverse=True)[:_MOST_SPOTS]
+        large = sorted(((len(c), i) for i, c in enumerate(contours) if len(c) > 3), reverse=True)[
+            :_MOST_SPOTS
+        ]
         found = [self._spot(contours[i], (brightness, difference), shade) for _, i in large]
         seen = [self._coloured(spot, picture) for spot in found if spot is not None]
         return seen if ghosts else [spot for spot in seen if not spot.ghost]
 
     def _coloured(self, spot: Spot, picture: Image) -> Spot:
-        """The spot with the colour of its middle, and whether it is the background that stands out against the rest."""
+        """The spot with the colour of its middle, and whether it is the background that stands out
+        against the rest.
+        """
         cv2, side = imported("cv2"), 2 * max(1, int(0.4 * spot.radius)) + 1
         here, behind = (
             cv2.getRectSubPix(part, (side, side), (spot.u, spot.v)).reshape(-1, 3).mean(axis=0)
             for part in (picture, self.background)
         )
         cos, sin = _directions()
-        rows = (spot.v + _AROUND * spot.radius * sin[:, 0] + 0.5).astype(np.intp).clip(0, picture.shape[0] - 1)
-        columns = (spot.u + _AROUND * spot.radius * cos[:, 0] + 0.5).astype(np.intp).clip(0, picture.shape[1] - 1)
+        rows = (
+            (spot.v + _AROUND * spot.radius * sin[:, 0] + 0.5)
+            .astype(np.intp)
+            .clip(0, picture.shape[0] - 1)
+        )
+        columns = (
+            (spot.u + _AROUND * spot.radius * cos[:, 0] + 0.5)
+            .astype(np.intp)
+            .clip(0, picture.shape[1] - 1)
+        )
         out, out_behind = (
             np.partition(part[rows, columns], _RAYS // 2, axis=0)[_RAYS // 2].astype(np.float64)
             for part in (picture, self.background)
@@ -160,8 +174,12 @@ class Finder:
         return gone
 
     def _is_ghost(self, here: tuple[Array, Array], behind: tuple[Array, Array]) -> bool:
-        """Whether a thing is in the background and not in the picture: colours (inside, around) of both."""
-        stands_out, stood_out = (float(np.abs(inside - around).max()) for inside, around in (here, behind))
+        """Whether a thing is in the background and not in the picture: colours (inside, around) of
+        both.
+        """
+        stands_out, stood_out = (
+            float(np.abs(inside - around).max()) for inside, around in (here, behind)
+        )
         return stood_out > stands_out + self.level / 2
 
     def _difference(self, picture: Image) -> NDArray[np.uint8]:
@@ -172,7 +190,8 @@ class Finder:
         return result
 
     def _even(self, picture: Image, mask: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The factor by which the picture is the background where that is one in all colours, else 0.
+        """The factor by which the picture is the background where that is one in all colours, else
+        0.
 
         Below 1 it is shadow, above 1 shadow gone.
         """
@@ -187,7 +206,9 @@ class Finder:
         result[rows, columns] = np.where(shade, factor, 0)
         return result
 
-    def _spot(self, contour: Any, differences: tuple[NDArray[np.uint8], ...], shade: NDArray[np.bool_]) -> Spot | None:
+    def _spot(
+        self, contour: Any, differences: tuple[NDArray[np.uint8], ...], shade: NDArray[np.bool_]
+    ) -> Spot | None:
         cv2 = imported("cv2")
         left, top, width, height = cv2.boundingRect(contour)
         if width * height < _LEAST_AREA or max(width, height) > 0.9 * min(shade.shape):
@@ -214,7 +235,9 @@ class Finder:
             return self._tiny(windows[1], u - u0, v - v0, radius, u0, v0)
         return self._circle(windows, (u - u0, v - v0, radius), u0, v0)
 
-    def _circle(self, windows: NDArray[np.float32], start: tuple[float, float, float], u0: int, v0: int) -> Spot | None:
+    def _circle(
+        self, windows: NDArray[np.float32], start: tuple[float, float, float], u0: int, v0: int
+    ) -> Spot | None:
         u, v, radius = start
         kept, rest, edges = np.empty(0, bool), np.empty(0), None
         for _ in range(_ROUNDS):
@@ -233,22 +256,34 @@ class Finder:
                 break
         agree = float(kept.sum()) / _RAYS
         height, width = windows.shape[1:]
-        if edges is None or agree < _AGREE or not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+        if (
+            edges is None
+            or agree < _AGREE
+            or not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5)
+        ):
             return None
         scatter = float(np.sqrt(np.mean(rest[kept] ** 2)))
         return Spot(u + u0, v + v0, radius, agree, scatter, edges + np.array([u0, v0]))
 
-    def _edges(self, windows: NDArray[np.float32], u: float, v: float, radius: float) -> Array | None:
-        """Points (n, 2) where the difference has fallen to half along rays from (u, v); None for too few.
+    def _edges(
+        self, windows: NDArray[np.float32], u: float, v: float, radius: float
+    ) -> Array | None:
+        """Points (n, 2) where the difference has fallen to half along rays from (u, v); None for
+        too few.
 
-        What it falls from is taken just inside the edge, since a lit ball is not the same all over. Brightness counts
-        where it differs enough: video files keep colours at half the resolution.
+        What it falls from is taken just inside the edge, since a lit ball is not the same all over.
+        Brightness counts where it differs enough: video files keep colours at half the resolution.
         """
         steps = np.arange(max(0.0, 0.7 * radius - 2), 1.5 * radius + 2, _FINE, dtype=np.float32)
         cos, sin = _directions()
-        along_u, along_v = (u + cos * steps).astype(np.float32), (v + sin * steps).astype(np.float32)
+        along_u, along_v = (
+            (u + cos * steps).astype(np.float32),
+            (v + sin * steps).astype(np.float32),
+        )
         profiles = [_along(window, along_u, along_v) for window in windows]
-        inner = (steps > min(0.5 * radius, radius - 3.5)) & (steps < max(0.7 * radius, radius - 1.3))
+        inner = (steps > min(0.5 * radius, radius - 3.5)) & (
+            steps < max(0.7 * radius, radius - 1.3)
+        )
         half_way = int(inner.sum()) // 2
         levels = [np.partition(p[:, inner], half_way, axis=1)[:, half_way] for p in profiles]
         bright = (levels[0] > 1.5 * self.level) & (levels[0] > 0.7 * levels[1])
@@ -259,14 +294,18 @@ class Finder:
         k = below.argmax(axis=1)
         lines = np.arange(_RAYS)
         a, b = values[lines, k], values[lines, k + 1]
-        has = below.any(axis=1) & (half[:, 0] > 0.4 * self.level) & (b > -500)  # far below: the picture ends there
+        has = (
+            below.any(axis=1) & (half[:, 0] > 0.4 * self.level) & (b > -500)
+        )  # far below: the picture ends there
         if has.sum() < 0.5 * _RAYS:
             return None
         share = (a - half[:, 0])[has] / np.maximum(a - b, 1e-6)[has]
         out = steps[k[has]] + _FINE * share
         return np.stack([u + cos[has, 0] * out, v + sin[has, 0] * out], axis=1).astype(np.float64)
 
-    def _tiny(self, window: NDArray[np.float32], u: float, v: float, radius: float, u0: int, v0: int) -> Spot | None:
+    def _tiny(
+        self, window: NDArray[np.float32], u: float, v: float, radius: float, u0: int, v0: int
+    ) -> Spot | None:
         """A ball of a few pixels: the middle of the difference, and a circle of its sum."""
         rows, columns = np.mgrid[: window.shape[0], : window.shape[1]]
         near = np.hypot(columns - u, rows - v) <= radius + 2.5
@@ -282,7 +321,9 @@ class Finder:
         return Spot(u + u0, v + v0, float(np.sqrt(area / np.pi)), _AGREE, 0.2)
 
 
-def _along(window: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
+def _along(
+    window: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Values of a window at places between its pixels; far below zero outside."""
     cv2 = imported("cv2")
     result: NDArray[np.float32] = cv2.remap(

@@ -72,7 +72,9 @@ def track(frames: Iterable[tuple[float, Image]]) -> Track:
     numbers = [first + k for k in background.chosen(survey.moved[first:end])]
     pictures = [picture for number, (_, picture) in enumerate(frames) if number in set(numbers)]
     finder = _finder(pictures)
-    spots = [finder.spots(p) if first <= k < end else [] for k, (_, p) in enumerate(frames)][first:end]
+    spots = [finder.spots(p) if first <= k < end else [] for k, (_, p) in enumerate(frames)][
+        first:end
+    ]
     paths = linked(spots)
     if not paths:
         raise InputError(_nothing(end - first, sum(map(bool, spots))))
@@ -91,7 +93,9 @@ def track(frames: Iterable[tuple[float, Image]]) -> Track:
 
 
 class _Kept:
-    """Frames that are read once where they are few and small, and from their source each time where not."""
+    """Frames that are read once where they are few and small, and from their source each time where
+    not.
+    """
 
     def __init__(self, source: Iterable[tuple[float, Image]]) -> None:
         self._source = source
@@ -115,9 +119,7 @@ class _Kept:
 
 def _nothing(frames: int, some: int) -> str:
     seen = f"something round in {some} of {frames} frames, but nothing" if some else "nothing"
-    return (
-        f"no ball found: {seen} that moves and stays round; film with a fixed camera and a ball unlike its background"
-    )
+    return f"no ball found: {seen} that moves and stays round; film with a fixed camera and a ball unlike its background"
 
 
 def _shot(survey: background.Survey, notes: list[str]) -> tuple[int, int]:
@@ -126,14 +128,20 @@ def _shot(survey: background.Survey, notes: list[str]) -> tuple[int, int]:
     if len(shots) > 1:
         cuts = ", ".join(f"{survey.times[c]:.2f} s" for c in survey.cuts[:5])
         span = f"{survey.times[first]:.2f} to {survey.times[end - 1]:.2f} s"
-        notes.append(f"the film is cut or the camera moves (at {cuts}); only the longest part is tracked, {span}")
+        notes.append(
+            f"the film is cut or the camera moves (at {cuts}); only the longest part is tracked, {span}"
+        )
     if end - first < _LEAST_FRAMES:
-        raise InputError(f"expected at least {_LEAST_FRAMES} frames without a cut, found {end - first}")
+        raise InputError(
+            f"expected at least {_LEAST_FRAMES} frames without a cut, found {end - first}"
+        )
     return first, end
 
 
 def _finder(pictures: list[Image]) -> Finder:
-    """A finder with the better treatment of shadows, and a background that the ball has been taken out of."""
+    """A finder with the better treatment of shadows, and a background that the ball has been taken
+    out of.
+    """
     plain = background.median(pictures)
     every = max(1, len(pictures) // _FEW)
     for _ in range(2):
@@ -141,10 +149,16 @@ def _finder(pictures: list[Image]) -> Finder:
         finders = [Finder(plain, sigma, shadows) for shadows in (True, False)]
         # a ball of the ground's own hue is itself taken for shadow; then shadow must be borne
         tried = [[finder.spots(p, ghosts=True) for p in pictures[::every]] for finder in finders]
-        good = [sum(max((s.agree for s in spots if not s.ghost), default=0.0) for spots in each) for each in tried]
+        good = [
+            sum(max((s.agree for s in spots if not s.ghost), default=0.0) for spots in each)
+            for each in tried
+        ]
         chosen = 0 if good[0] >= 0.8 * good[1] else 1
         best, known = finders[chosen], tried[chosen]
-        found = [known[i // every] if i % every == 0 else best.spots(p, ghosts=True) for i, p in enumerate(pictures)]
+        found = [
+            known[i // every] if i % every == 0 else best.spots(p, ghosts=True)
+            for i, p in enumerate(pictures)
+        ]
         hiding = _hiding(found)
         shaded = _shaded([best.unshaded(p) for p in pictures]) if best.shadows else None
         plain = background.without(pictures, hiding, plain, shaded)
@@ -154,20 +168,25 @@ def _finder(pictures: list[Image]) -> Finder:
 def _hiding(found: list[list[Spot]]) -> list[list[tuple[float, float, float]]]:
     """Where something hides the background in each picture.
 
-    A ball that rests for most of the film, or its shadow, gets into the median. Pictures that lack it there show the
-    background, and the others do not.
+    A ball that rests for most of the film, or its shadow, gets into the median. Pictures that lack
+    it there show the background, and the others do not.
     """
     balls = [[(s.u, s.v, s.radius) for s in spots if not s.ghost] for spots in found]
     ghosts = [[(s.u, s.v, s.radius) for s in spots if s.ghost] for spots in found]
     for one in [ghost for there in ghosts for ghost in there]:
         lacking = [any(_same(one, other) for other in there) for there in ghosts]
         if sum(lacking) >= _FEWEST:
-            balls = [there if lacks else [*there, one] for there, lacks in zip(balls, lacking, strict=True)]
+            balls = [
+                there if lacks else [*there, one]
+                for there, lacks in zip(balls, lacking, strict=True)
+            ]
     return balls
 
 
 def _shaded(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """Where a shadow hides the background in each picture (n, height, width), seen by those in which it is gone."""
+    """Where a shadow hides the background in each picture (n, height, width), seen by those in
+    which it is gone.
+    """
     stack = np.stack(lit)
     result: NDArray[np.bool_] = ~stack & (stack.sum(axis=0) >= _FEWEST)
     return result
@@ -179,18 +198,26 @@ def _same(a: tuple[float, float, float], b: tuple[float, float, float]) -> bool:
 
 def _others(path: Path, others: Sequence[Path], notes: list[str]) -> None:
     rivals = [
-        p for p in others
+        p
+        for p in others
         if len(set(p.frames) & set(path.frames)) >= max(8, 0.25 * len(path.frames))
         and p.travel > 2 * p.radius
         and 0.4 < p.radius / path.radius < 2.5
-    ]  # fmt: skip
+    ]
     if rivals:
         shared = len(set(rivals[0].frames) & set(path.frames))
-        notes.append(f"a second ball, or its shadow, moves in {shared} of the same frames; the clearer one is tracked")
+        notes.append(
+            f"a second ball, or its shadow, moves in {shared} of the same frames; the clearer one is tracked"
+        )
 
 
 def _made(
-    times: Array, path: Path, size: tuple[int, int], notes: list[str], finder: Finder, pictures: dict[int, Image]
+    times: Array,
+    path: Path,
+    size: tuple[int, int],
+    notes: list[str],
+    finder: Finder,
+    pictures: dict[int, Image],
 ) -> Track:
     columns = np.full((3, len(times)), np.nan)
     steady, misfits = _steadied(path.spots)
@@ -200,16 +227,28 @@ def _made(
     u, v, radius = columns
     gone = int(np.isnan(u).sum())
     if gone:
-        notes.append(f"{gone} of {len(times)} frames show no ball that could be measured; their cells are empty")
-    noise = max(rough(u), rough(v)) if len(times) > _WINDOW else float(np.median([s.scatter for s in path.spots]))
-    noise = noise if np.isfinite(noise) and noise > 0 else float(np.median([s.scatter for s in path.spots]))
+        notes.append(
+            f"{gone} of {len(times)} frames show no ball that could be measured; their cells are empty"
+        )
+    noise = (
+        max(rough(u), rough(v))
+        if len(times) > _WINDOW
+        else float(np.median([s.scatter for s in path.spots]))
+    )
+    noise = (
+        noise
+        if np.isfinite(noise) and noise > 0
+        else float(np.median([s.scatter for s in path.spots]))
+    )
     return Track(times, u, v, radius, noise, size, tuple(notes), finder.background, pictures)
 
 
 def _steadied(spots: list[Spot]) -> tuple[list[Spot], list[bool]]:
-    """Middles fitted again with radii that change evenly along the path, as perspective has it on a straight line.
+    """Middles fitted again with radii that change evenly along the path, as perspective has it on a
+    straight line.
 
-    The second list says whose own radius is too far from that: something else than the ball was measured there.
+    The second list says whose own radius is too far from that: something else than the ball was
+    measured there.
     """
     if len(spots) < _WINDOW:
         return spots, [False] * len(spots)
@@ -231,7 +270,8 @@ def _steadied(spots: list[Spot]) -> tuple[list[Spot], list[bool]]:
 
 
 def rough(values: Array) -> float:
-    """1 sigma of what a cubic through nine samples in a row leaves, where they move; NaN if they never do.
+    """1 sigma of what a cubic through nine samples in a row leaves, where they move; NaN if they
+    never do.
 
     Windows with a gap are passed over, those with a bounce do not weigh much: the median counts.
     """
@@ -239,7 +279,10 @@ def rough(values: Array) -> float:
         return float("nan")
     windows = sliding_window_view(values, _WINDOW)
     windows = windows[np.isfinite(windows).all(axis=1)]
-    windows = windows[np.ptp(windows, axis=1) > 1e-3 * max(float(np.ptp(values[np.isfinite(values)])), 1e-12) * _WINDOW]
+    windows = windows[
+        np.ptp(windows, axis=1)
+        > 1e-3 * max(float(np.ptp(values[np.isfinite(values)])), 1e-12) * _WINDOW
+    ]
     if not len(windows):
         return float("nan")
     basis = np.linalg.qr(np.vander(np.linspace(-1, 1, _WINDOW), 4))[0]

@@ -1,6 +1,7 @@
 """Ordinary video files, written and read with their true time stamps.
 
-PyAV brings its own codecs and gives every frame's time as the file states it, also where frames come unevenly.
+PyAV brings its own codecs and gives every frame's time as the file states it, also where frames
+come unevenly.
 """
 
 from __future__ import annotations
@@ -19,12 +20,18 @@ from sims.camera.render import Image
 from sims.recording.write import publish, refuse_existing
 
 _TICKS = 90_000
-"""Time stamps a second in files written here; common for video, and a whole number for the usual rates."""
+"""Time stamps a second in files written here; common for video, and a whole number for the usual
+rates.
+"""
 _DEFAULT_RATE = 30.0
 
 
 def write_video(
-    path: Path, frames: Iterable[Image], times: Array, crf: int = 18, beside: Mapping[Path, str] | None = None
+    path: Path,
+    frames: Iterable[Image],
+    times: Array,
+    crf: int = 18,
+    beside: Mapping[Path, str] | None = None,
 ) -> None:
     """Write frames as H.264 in an .mp4 file, whole or not at all.
 
@@ -36,7 +43,8 @@ def write_video(
         beside: texts of other new files that belong to it, written before it is to be seen.
 
     Raises:
-        InputError: the file exists or cannot be written, or the frames have no size that can be encoded.
+        InputError: the file exists or cannot be written, or the frames have no size that can be
+            encoded.
     """
     if path.suffix != ".mp4":
         raise InputError(f"{path}: expected a name that ends in .mp4")
@@ -56,13 +64,18 @@ def write_video(
 def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None:
     av = imported("av")
     ticks = np.rint((times - times[0]) * _TICKS).astype(int)
-    rate = Fraction(len(times) - 1, 1) / Fraction(max(1, int(ticks[-1])), _TICKS) if len(times) > 1 else Fraction(30)
+    rate = (
+        Fraction(len(times) - 1, 1) / Fraction(max(1, int(ticks[-1])), _TICKS)
+        if len(times) > 1
+        else Fraction(30)
+    )
     # the index stands first, so that a file cut short can still be read up to the cut
     with av.open(str(path), "w", options={"movflags": "faststart"}) as file:
         stream = file.add_stream("libx264", rate=rate.limit_denominator(1000))
         stream.pix_fmt = "yuv420p"
         stream.thread_count = 1
-        # the same bytes on every processor and in every run: x264's fast paths alone give another file now and then
+        # the same bytes on every processor and in every run: x264's fast paths alone give another
+        # file now and then
         exact = {"x264-params": "cpu-independent=1"}
         stream.options = {"crf": str(crf), "preset": "veryfast", "bf": "0", **exact}
         stream.codec_context.time_base = Fraction(1, _TICKS)
@@ -71,9 +84,14 @@ def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None
             if not stream.codec_context.is_open:
                 stream.height, stream.width = picture.shape[:2]
                 if stream.height % 2 or stream.width % 2:
-                    raise InputError(f"{path}: expected an even number of pixels, found {picture.shape[:2]}")
-            # one converter on one thread: PyAV's own starts as many threads as there are cores for every frame
-            frame = converter.reformat(av.VideoFrame.from_ndarray(picture, format="rgb24"), format="yuv420p", threads=1)
+                    raise InputError(
+                        f"{path}: expected an even number of pixels, found {picture.shape[:2]}"
+                    )
+            # one converter on one thread: PyAV's own starts as many threads as there are cores for
+            # every frame
+            frame = converter.reformat(
+                av.VideoFrame.from_ndarray(picture, format="rgb24"), format="yuv420p", threads=1
+            )
             frame.pts, frame.time_base = tick, Fraction(1, _TICKS)
             file.mux(stream.encode(frame))
         file.mux(stream.encode(None))
@@ -87,7 +105,8 @@ class Video:
         fps: frames a second, instead of the file's own time stamps.
 
     Attributes:
-        notes: what was wrong with the file but did not keep it from being read, in sentences; complete after a pass.
+        notes: what was wrong with the file but did not keep it from being read, in sentences;
+            complete after a pass.
 
     Raises:
         InputError: no such file, or nothing in it is video.
@@ -147,14 +166,19 @@ class Video:
         try:
             for frame in file.decode(stream):
                 seconds = frame.time if frame.time is not None else number / rate
-                yield seconds, _upright(converter.reformat(frame, format="rgb24", threads=1), frame.rotation)
+                yield (
+                    seconds,
+                    _upright(converter.reformat(frame, format="rgb24", threads=1), frame.rotation),
+                )
                 number += 1
         except av.FFmpegError:
             yield np.nan, None
 
     def _judge(self, count: int, stated: int, broken: bool, dropped: int) -> None:
         if not count:
-            raise InputError(f"{self.path}: no frame of it can be read; the file is damaged or breaks off too early")
+            raise InputError(
+                f"{self.path}: no frame of it can be read; the file is damaged or breaks off too early"
+            )
         if broken or count < stated:
             of = f" of {stated}" if stated > count else ""
             self.notes.append(f"the file is truncated or damaged: {count}{of} frames could be read")

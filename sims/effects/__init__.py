@@ -56,6 +56,8 @@ def get(name: str) -> type[Effect]:
 def library(system: type[System]) -> dict[str, type[Effect]]:
     """Every usable effect that the system can have, by name."""
     usable = {
-        name: found for name in names() if not isinstance(found := _from_files.get(name) or _registered()[name], str)
+        name: found
+        for name in names()
+        if not isinstance(found := _from_files.get(name) or _registered()[name], str)
     }
     return {name: effect for name, effect in usable.items() if effect.fits(system)}

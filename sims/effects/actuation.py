@@ -23,7 +23,9 @@ class Gain(Input):
     name = "input.gain"
     says = "the input acts more strongly or weakly than commanded"
     source = _FEEDBACK
-    coefficients = (Coefficient("coefficient", ("1", "1", "1"), ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))),)
+    coefficients = (
+        Coefficient("coefficient", ("1", "1", "1"), ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))),
+    )
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """In proportion."""
@@ -36,7 +38,9 @@ class Bias(Input):
     name = "input.bias"
     says = "a constant is added to the input"
     source = _FEEDBACK
-    coefficients = (Coefficient("coefficient", _USUAL, ((-2, 2), (-2, 2), (-0.2, 0.2)), of="input"),)
+    coefficients = (
+        Coefficient("coefficient", _USUAL, ((-2, 2), (-2, 2), (-0.2, 0.2)), of="input"),
+    )
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Shifted."""
@@ -82,7 +86,11 @@ class Deadband(Input):
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """What exceeds the half width."""
-        return np.where(c[0] > 0, signal.values - np.clip(signal.values, -np.abs(c[0]), np.abs(c[0])), signal.values)
+        return np.where(
+            c[0] > 0,
+            signal.values - np.clip(signal.values, -np.abs(c[0]), np.abs(c[0])),
+            signal.values,
+        )
 
 
 class Saturation(Input):
@@ -95,7 +103,9 @@ class Saturation(Input):
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """What stays within the limit."""
-        return np.where(c[0] > 0, np.clip(signal.values, -np.abs(c[0]), np.abs(c[0])), signal.values)
+        return np.where(
+            c[0] > 0, np.clip(signal.values, -np.abs(c[0]), np.abs(c[0])), signal.values
+        )
 
 
 class Backlash(Input):
@@ -103,7 +113,9 @@ class Backlash(Input):
 
     name = "backlash"
     says = "there is play: after a reversal the input acts only once the play is used up"
-    source = "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
+    source = (
+        "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
+    )
     coefficients = (Coefficient("coefficient", _USUAL, ((0, 2), (0, 2), (0, 0.2)), of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:

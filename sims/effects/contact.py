@@ -11,7 +11,8 @@ _SMALLEST = 1e-9  # m/s: keeps the power of an impact at no speed finite
 
 
 class Speed(Contact):
-    """Restitution that depends on the impact speed: e0 |vn|^c, vn in m/s; at most 1, so that no energy is made.
+    """Restitution that depends on the impact speed: e0 |vn|^c, vn in m/s; at most 1, so that no
+    energy is made.
 
     Yielding bodies have c near -1/4, viscoelastic ones a weaker dependence.
     """
@@ -20,7 +21,9 @@ class Speed(Contact):
     says = "how well it bounces depends on the speed of the impact"
     source = "K. L. Johnson, Contact Mechanics (1985), chapter 11, doi:10.1017/CBO9781139171731"
     needs = "ground"
-    coefficients = (Coefficient("coefficient", ("1", "1", None), ((-0.4, 0.2), (-0.4, 0.2), (0, 0))),)
+    coefficients = (
+        Coefficient("coefficient", ("1", "1", None), ((-0.4, 0.2), (-0.4, 0.2), (0, 0))),
+    )
 
     def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:
         """As much as it would be at 1 m/s, times a power of the speed."""

@@ -1,7 +1,8 @@
 """Drag: what a fluid or a bearing does to motion, in air that may move.
 
-The drag of a sphere of mass m is ``c = rho Cd A / (2 m)`` per unit mass. Wind carries that drag itself, so it stands in
-place of quadratic drag, not beside it: with drag in proportion to speed it would be one number, but the same as a tilt.
+The drag of a sphere of mass m is ``c = rho Cd A / (2 m)`` per unit mass. Wind carries that drag
+itself, so it stands in place of quadratic drag, not beside it: with drag in proportion to speed it
+would be one number, but the same as a tilt.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ class Linear(Force):
     name = "drag.linear"
     says = "motion is resisted in proportion to speed"
     source = "J. R. Taylor, Classical Mechanics (2005), section 2.2"
-    coefficients = (Coefficient("coefficient", ("1/s", "N*s/m", "N*m*s/rad"), ((0, 0.5), (0, 5), (0, 0.1))),)
+    coefficients = (
+        Coefficient("coefficient", ("1/s", "N*s/m", "N*m*s/rad"), ((0, 0.5), (0, 5), (0, 0.1))),
+    )
 
     def force(self, c: Array, moment: Moment) -> Array:
         """Against the velocity."""
@@ -31,7 +34,11 @@ class Quadratic(Force):
     name = "drag.quadratic"
     says = "motion is resisted in proportion to the square of speed"
     source = "J. R. Taylor, Classical Mechanics (2005), section 2.4"
-    coefficients = (Coefficient("coefficient", ("1/m", "N*s^2/m^2", "N*m*s^2/rad^2"), ((0, 0.3), (0, 5), (0, 0.02))),)
+    coefficients = (
+        Coefficient(
+            "coefficient", ("1/m", "N*s^2/m^2", "N*m*s^2/rad^2"), ((0, 0.3), (0, 5), (0, 0.02))
+        ),
+    )
 
     def force(self, c: Array, moment: Moment) -> Array:
         """Against the velocity."""
@@ -43,7 +50,9 @@ class Wind(Force):
 
     name = "wind"
     says = "moving air drags along what is in it"
-    source = "G. K. Batchelor, An Introduction to Fluid Dynamics (1967), doi:10.1017/CBO9780511800955"
+    source = (
+        "G. K. Batchelor, An Introduction to Fluid Dynamics (1967), doi:10.1017/CBO9780511800955"
+    )
     needs, contains = "push", ("drag.quadratic",)
     coefficients = (
         Coefficient("drag", ("1/m", "N*s^2/m^2", None), ((0, 0.3), (0, 5), (0, 0))),

@@ -1,7 +1,8 @@
-"""Forces from outside, along the primary coordinate (a ball's height): constant, periodic in position or in time.
+"""Forces from outside, along the primary coordinate (a ball's height): constant, periodic in
+position or in time.
 
-What repeats is a sine and a cosine rather than an amplitude and a phase: the motion answers to both in proportion while
-they are small, and no phase is left undetermined where the amplitude is zero.
+What repeats is a sine and a cosine rather than an amplitude and a phase: the motion answers to both
+in proportion while they are small, and no phase is left undetermined where the amplitude is zero.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ class Bias(Force):
     name = "force.bias"
     says = "a constant force pushes one way"
     source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
-    coefficients = (Coefficient("coefficient", ("m/s^2", "N", "N*m"), ((-2, 2), (-5, 5), (-0.5, 0.5))),)
+    coefficients = (
+        Coefficient("coefficient", ("m/s^2", "N", "N*m"), ((-2, 2), (-5, 5), (-0.5, 0.5))),
+    )
 
     def force(self, c: Array, moment: Moment) -> Array:
         """The coefficient."""
@@ -47,7 +50,9 @@ class Ripple(Force):
 
 
 class Periodic(Force):
-    """A force that repeats with time since the start of the run: sine and cosine of 2 pi frequency t."""
+    """A force that repeats with time since the start of the run: sine and cosine of 2 pi frequency
+    t.
+    """
 
     name = "force.periodic"
     says = "a force comes and goes with time, as of something that vibrates nearby"

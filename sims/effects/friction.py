@@ -1,7 +1,7 @@
 """Dry friction: opposes motion, and holds still at rest what pulls less than its limit.
 
-Each law gives its limit; the engine adds the limits up and applies one force, so that sticking sticks. A negative
-coefficient is none.
+Each law gives its limit; the engine adds the limits up and applies one force, so that sticking
+sticks. A negative coefficient is none.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ import numpy as np
 from sims.base import Array
 from sims.system import Coefficient, Friction, Moment
 
-_SURVEY = "B. Armstrong-Helouvry et al., Automatica 30(7), 1083 (1994), doi:10.1016/0005-1098(94)90209-7"
+_SURVEY = (
+    "B. Armstrong-Helouvry et al., Automatica 30(7), 1083 (1994), doi:10.1016/0005-1098(94)90209-7"
+)
 _SMALLEST = 1e-9  # Stribeck speed that stands for zero, so that 0 / 0 never comes up
 
 
@@ -44,11 +46,15 @@ class Stribeck(Friction):
 
     def limit(self, c: Array, moment: Moment) -> Array:
         """`coulomb` in fast motion, `coulomb` + `extra` at rest."""
-        return np.maximum(c[0] + c[1] * np.exp(-np.square(moment.speed / np.maximum(c[2], _SMALLEST))), 0.0)
+        return np.maximum(
+            c[0] + c[1] * np.exp(-np.square(moment.speed / np.maximum(c[2], _SMALLEST))), 0.0
+        )
 
 
 class Load(Friction):
-    """Friction of a loaded transmission: c times the drive from one side plus the load from the other."""
+    """Friction of a loaded transmission: c times the drive from one side plus the load from the
+    other.
+    """
 
     name = "friction.load"
     says = "friction grows with the load that the drive carries"

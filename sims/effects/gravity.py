@@ -13,7 +13,9 @@ class Scale(Force):
     says = "gravity acts more strongly or weakly than its stated value"
     source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
     needs = "gravity"
-    coefficients = (Coefficient("coefficient", ("1", "1", "1"), ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))),)
+    coefficients = (
+        Coefficient("coefficient", ("1", "1", "1"), ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))),
+    )
 
     def force(self, c: Array, moment: Moment) -> Array:
         """A share of the weight."""

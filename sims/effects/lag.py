@@ -10,7 +10,8 @@ _SMALLEST = 1e-12  # seconds; a lag this short is none on any step
 
 
 def response(steps: Array, lag: Array) -> tuple[Array, Array]:
-    """What is left of an old value at the end of each step, and in its mean: exp(-h / T) and (1 - exp(-h / T)) T / h.
+    """What is left of an old value at the end of each step, and in its mean: exp(-h / T) and (1 -
+    exp(-h / T)) T / h.
 
     Args:
         steps: (L, S) lengths h, seconds.

@@ -1,7 +1,7 @@
 """What lies between the world and its recording.
 
-Gain, bias and drift act on one channel, the system's first observed; a delay, a lag and a skewed clock on all. A
-negative delay leads; a negative lag is none.
+Gain, bias and drift act on one channel, the system's first observed; a delay, a lag and a skewed
+clock on all. A negative delay leads; a negative lag is none.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ class Gain(Sensor):
     name = "sensor.gain"
     says = "the sensor shows too much or too little, in proportion"
     source = _VOCABULARY + ", 4.12"
-    coefficients = (Coefficient("coefficient", ("1", "1", "1"), ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))),)
+    coefficients = (
+        Coefficient("coefficient", ("1", "1", "1"), ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))),
+    )
 
     def read(self, c: Array, signal: Signal) -> Array:
         """In proportion."""
@@ -35,7 +37,11 @@ class Bias(Sensor):
     name = "sensor.bias"
     says = "the sensor's zero is off"
     source = _VOCABULARY + ", 4.20"
-    coefficients = (Coefficient("coefficient", ("m", "m", "rad"), ((-1, 1), (-0.2, 0.2), (-0.2, 0.2)), of="reading"),)
+    coefficients = (
+        Coefficient(
+            "coefficient", ("m", "m", "rad"), ((-1, 1), (-0.2, 0.2), (-0.2, 0.2)), of="reading"
+        ),
+    )
 
     def read(self, c: Array, signal: Signal) -> Array:
         """Shifted."""
@@ -68,7 +74,9 @@ class Lag(Sensor):
         """Exact for a reading that is linear over each step."""
         decay, mean = response(signal.steps, c[0])
         old = before(signal.values, signal.start)
-        lagged = recur(decay, signal.values - decay * old - mean * (signal.values - old), signal.start)
+        lagged = recur(
+            decay, signal.values - decay * old - mean * (signal.values - old), signal.start
+        )
         return np.where(c[0] > 0, lagged, signal.values)
 
 
@@ -79,7 +87,12 @@ class Drift(Sensor):
     says = "the sensor's zero drifts steadily"
     source = _VOCABULARY + ", 4.21"
     coefficients = (
-        Coefficient("coefficient", ("m/s", "m/s", "rad/s"), ((-0.2, 0.2), (-0.05, 0.05), (-0.1, 0.1)), of="reading/s"),
+        Coefficient(
+            "coefficient",
+            ("m/s", "m/s", "rad/s"),
+            ((-0.2, 0.2), (-0.05, 0.05), (-0.1, 0.1)),
+            of="reading/s",
+        ),
     )
 
     def read(self, c: Array, signal: Signal) -> Array:
@@ -93,7 +106,9 @@ class Skew(Sensor):
     name = "clock.skew"
     says = "the recorder's clock runs slow or fast"
     source = "V. Paxson et al., Framework for IP Performance Metrics, RFC 2330 (1998), section 10.1"
-    coefficients = (Coefficient("coefficient", ("1", "1", "1"), ((-0.05, 0.05), (-0.05, 0.05), (-0.05, 0.05))),)
+    coefficients = (
+        Coefficient("coefficient", ("1", "1", "1"), ((-0.05, 0.05), (-0.05, 0.05), (-0.05, 0.05))),
+    )
 
     def times(self, c: Array, t: Array) -> Array:
         """Instants on the true clock."""

@@ -13,7 +13,9 @@ class Linear(Force):
     says = "a spring pulls back in proportion to the distance from zero"
     source = "J. R. Taylor, Classical Mechanics (2005), section 5.1"
     needs = "guide"
-    coefficients = (Coefficient("coefficient", ("1/s^2", "N/m", "N*m/rad"), ((0, 10), (0, 50), (0, 1))),)
+    coefficients = (
+        Coefficient("coefficient", ("1/s^2", "N/m", "N*m/rad"), ((0, 10), (0, 50), (0, 1))),
+    )
 
     def force(self, c: Array, moment: Moment) -> Array:
         """Towards zero."""
@@ -25,10 +27,14 @@ class Cubic(Force):
 
     name = "spring.cubic"
     says = "a spring pulls back in proportion to the cube of the distance from zero"
-    source = "I. Kovacic, M. J. Brennan (eds.), The Duffing Equation (2011), doi:10.1002/9780470977859"
+    source = (
+        "I. Kovacic, M. J. Brennan (eds.), The Duffing Equation (2011), doi:10.1002/9780470977859"
+    )
     needs = "guide"
     coefficients = (
-        Coefficient("coefficient", ("1/(m^2*s^2)", "N/m^3", "N*m/rad^3"), ((-5, 5), (-50, 50), (-0.5, 0.5))),
+        Coefficient(
+            "coefficient", ("1/(m^2*s^2)", "N/m^3", "N*m/rad^3"), ((-5, 5), (-50, 50), (-0.5, 0.5))
+        ),
     )
 
     def force(self, c: Array, moment: Moment) -> Array:

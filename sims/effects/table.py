@@ -1,4 +1,6 @@
-"""The table of the project's own effects in this folder's README: ``python -m sims.effects.table`` prints it."""
+"""The table of the project's own effects in this folder's README: ``python -m sims.effects.table``
+prints it.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,9 @@ from sims.system import KINDS, Coefficient, Effect
 
 
 def table() -> str:
-    """The table, in Markdown: an effect's sentence, then a row for each coefficient with its plausible ranges."""
+    """The table, in Markdown: an effect's sentence, then a row for each coefficient with its
+    plausible ranges.
+    """
     rows = ["| effect, hook | coefficient | " + " | ".join(KINDS) + " |", "|---|---|---|---|---|"]
     for name in effects.names():
         effect = effects.get(name)
@@ -22,7 +26,9 @@ def _rows(effect: type[Effect]) -> list[str]:
     head = f"`{effect.name}` ({effect.hook}): {effect.says}"
     rows = []
     for c in effect.coefficients:
-        rows.append(f"| {head} | {c.name} | " + " | ".join(_range(c, i) for i in range(len(KINDS))) + " |")
+        rows.append(
+            f"| {head} | {c.name} | " + " | ".join(_range(c, i) for i in range(len(KINDS))) + " |"
+        )
         head = ""
     return rows
 

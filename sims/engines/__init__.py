@@ -11,23 +11,33 @@ from typing import Any
 from sims.base import InputError, unknown
 from sims.system import Engine, System
 
-NAMES = {"batch": "sims.engines.batch", "mujoco": "sims.engines.mujoco", "pybullet": "sims.engines.bullet"}
+NAMES = {
+    "batch": "sims.engines.batch",
+    "mujoco": "sims.engines.mujoco",
+    "pybullet": "sims.engines.bullet",
+}
 
 
 def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -> Engine:
     """A new engine for one simulator; its module's `engine(system, **settings)` makes it.
 
     Raises:
-        InputError: no such engine, a package it needs is missing, a setting it does not have, or it cannot carry the
-            system.
+        InputError: no such engine, a package it needs is missing, a setting it does not have, or it
+            cannot carry the system.
     """
     if name not in NAMES:
         raise unknown("engine", name, list(NAMES))
     module = import_module(NAMES[name])
     missing = [package for package in module.REQUIRES if importlib.util.find_spec(package) is None]
     if missing:
-        raise InputError(f"engine {name} needs {', '.join(missing)}, not installed (pip install {' '.join(missing)})")
-    known = [key for key, p in inspect.signature(module.engine).parameters.items() if p.kind is p.KEYWORD_ONLY]
+        raise InputError(
+            f"engine {name} needs {', '.join(missing)}, not installed (pip install {' '.join(missing)})"
+        )
+    known = [
+        key
+        for key, p in inspect.signature(module.engine).parameters.items()
+        if p.kind is p.KEYWORD_ONLY
+    ]
     for setting in settings:
         if setting not in known:
             raise unknown(f"setting of engine {name}", setting, known)

@@ -1,7 +1,8 @@
-"""Bullet as an engine: forces through its torque and force interfaces, impacts through its contact solver.
+"""Bullet as an engine: forces through its torque and force interfaces, impacts through its contact
+solver.
 
-The world that carries a system is built by the module ``bullet_world`` beside the system's own: `build` makes it and,
-for a system of one coordinate, `load` gives it its inertia.
+The world that carries a system is built by the module ``bullet_world`` beside the system's own:
+`build` makes it and, for a system of one coordinate, `load` gives it its inertia.
 """
 
 from __future__ import annotations
@@ -41,12 +42,16 @@ def engine(
 
     Args:
         system: what it will integrate.
-        time_step: longest step in seconds; each sampling interval is divided into equal steps not longer than this.
-        native_contact: for a system that bounces: Bullet as it comes (`sims.ball.bullet_native`), stepped and read at
-            first order as the published experiments do, without `time_step` in one step a sample.
+        time_step: longest step in seconds; each sampling interval is divided into equal steps not
+            longer than this.
+        native_contact: for a system that bounces: Bullet as it comes (`sims.ball.bullet_native`),
+            stepped and read at first order as the published experiments do, without `time_step` in
+            one step a sample.
         linear_damping: with `native_contact`: what Bullet takes for air, 1/s (0.04).
-        lateral_friction: with `native_contact`: friction of both ball and ground (0.2); the contact has the product.
-        plane_restitution: with `native_contact`: the ground's restitution (1.0); the contact has the product.
+        lateral_friction: with `native_contact`: friction of both ball and ground (0.2); the contact
+            has the product.
+        plane_restitution: with `native_contact`: the ground's restitution (1.0); the contact has
+            the product.
 
     Raises:
         InputError: an impossible setting.
@@ -59,7 +64,9 @@ def engine(
     given = {name: value for name, value in own.items() if value is not None}
     if not native_contact:
         if given:
-            raise InputError(f"setting {next(iter(given))} belongs to Bullet's own contact: set native_contact = true")
+            raise InputError(
+                f"setting {next(iter(given))} belongs to Bullet's own contact: set native_contact = true"
+            )
         return BulletEngine(system, checked_time_step(time_step, system))
     if not system.bounces:
         raise InputError(f"system {system.name} does not bounce: leave native_contact out")
@@ -76,7 +83,9 @@ class BulletEngine:
     name: str = "pybullet"
     requires: tuple[str, ...] = REQUIRES
 
-    def __init__(self, system: type[System], largest_step: float, own: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self, system: type[System], largest_step: float, own: Mapping[str, float] | None = None
+    ) -> None:
         self.largest_step = largest_step
         module = world_module(system, "bullet_world")
         if module is None:
@@ -141,7 +150,12 @@ class Joint:
     def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
         """Steps with a force or torque at the joint."""
         p, client, body, found = bullet.engine(), self._client, self._body, []
-        step, push, torque, read = p.stepSimulation, p.setJointMotorControl2, p.TORQUE_CONTROL, p.getJointState
+        step, push, torque, read = (
+            p.stepSimulation,
+            p.setJointMotorControl2,
+            p.TORQUE_CONTROL,
+            p.getJointState,
+        )
         for count in counts:
             for _ in range(count):
                 if force:  # Bullet forgets applied torques after each step
@@ -169,7 +183,8 @@ class _Mover:
         p = bullet.engine()
         self._mass, self._contact = constants["mass"], (math.nan, math.nan)
         self._client, self._body = self._world.body(constants)
-        # Contact points outlive a reset and would be taken for old: they are dropped where the ball touches nothing.
+        # Contact points outlive a reset and would be taken for old: they are dropped where the ball
+        # touches nothing.
         far = 0.0, 0.0, 2.0 * constants["radius"] + 1.0
         p.resetBasePositionAndOrientation(self._body, far, _UPRIGHT, self._client)
         p.performCollisionDetection(self._client)
@@ -208,12 +223,18 @@ class _Mover:
         if (restitution, friction) != self._contact:
             self._contact = restitution, friction
             bullet.engine().changeDynamics(
-                self._body, -1, restitution=restitution, lateralFriction=friction, physicsClientId=self._client
+                self._body,
+                -1,
+                restitution=restitution,
+                lateralFriction=friction,
+                physicsClientId=self._client,
             )
 
 
 class Ball(_Mover):
-    """A ball that does not spin, on ground of restitution and friction 1; see `sims.engines.flight.Ball`."""
+    """A ball that does not spin, on ground of restitution and friction 1; see
+    `sims.engines.flight.Ball`.
+    """
 
     def start(self, constants: dict[str, float]) -> None:
         """As every ball's, without contact."""
@@ -224,13 +245,17 @@ class Ball(_Mover):
     def _meets(self, ground: bool) -> None:
         """Let contact act or not."""
         p = bullet.engine()
-        p.setCollisionFilterPair(p.getBodyUniqueId(0, self._client), self._body, -1, -1, ground, self._client)
+        p.setCollisionFilterPair(
+            p.getBodyUniqueId(0, self._client), self._body, -1, -1, ground, self._client
+        )
 
     def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
         """Bullet's contact solver on one short step, gravity made up for."""
         self.touch(restitution, friction)
         self.pace(_IMPACT)
-        self.place((x[0], x[1], self._floor - flight.INSIDE), (v[0], v[1], v[2] + self._gravity * _IMPACT))
+        self.place(
+            (x[0], x[1], self._floor - flight.INSIDE), (v[0], v[1], v[2] + self._gravity * _IMPACT)
+        )
         self._meets(True)
         _, after = self.glide((1,))[0]
         self._meets(False)
@@ -257,7 +282,9 @@ class NativeBall(_Mover):
         self._reach = _REACH * constants["radius"]
 
     def touch(self, restitution: float, friction: float) -> None:
-        """The ball's restitution; friction beside that of the settings, of which the contact has the product of two."""
+        """The ball's restitution; friction beside that of the settings, of which the contact has
+        the product of two.
+        """
         if (restitution, friction) == self._contact:
             return
         own, ground = self._rough, self._rough

@@ -1,13 +1,15 @@
-"""What the engines share that step one body at a time: lane after lane, forces put in through the engine's interface.
+"""What the engines share that step one body at a time: lane after lane, forces put in through the
+engine's interface.
 
 Bullet and MuJoCo (with its Euler integrator) step alike, by semi-implicit Euler: with step h,
 
     w' = w + h (G(x) + F) / M,    x' = x + h w'
 
-where G is the gravity that the engine itself applies and F is what is put in from outside. That is of first order if w
-is read as the velocity at the time of x, and of second if it is read as the one half a step before (leapfrog; Hairer,
-Lubich, Wanner, Acta Numerica 12, 2003, doi:10.1017/S0962492902000144). `sims.engines.joint` and `sims.engines.flight`
-read it so: they choose F such that the engine's velocity ends where half a step's force takes the velocity at x.
+where G is the gravity that the engine itself applies and F is what is put in from outside. That is
+of first order if w is read as the velocity at the time of x, and of second if it is read as the one
+half a step before (leapfrog; Hairer, Lubich, Wanner, Acta Numerica 12, 2003,
+doi:10.1017/S0962492902000144). `sims.engines.joint` and `sims.engines.flight` read it so: they
+choose F such that the engine's velocity ends where half a step's force takes the velocity at x.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from numpy.typing import NDArray
 from sims.base import Array, InputError
 from sims.system import Acting, Contact, Force, Friction, Lanes, Moment, Motion, System
 
-# Sample times may miss the engine's steps by this share of an interval: recordings round their time stamps.
+# Sample times may miss the engine's steps by this share of an interval: recordings round their time
+# stamps.
 TIME_TOLERANCE = 1e-6
 
 DEFAULT_STEPS = {"point": 1 / 120, "linear": 2.5e-3, "rotary": 2.5e-3}
@@ -80,7 +83,8 @@ class Lane:
 
 
 class Forces:
-    """The forces on one lane from outside the engine: the effects' and the system's own but for gravity.
+    """The forces on one lane from outside the engine: the effects' and the system's own but for
+    gravity.
 
     Args:
         lane: whose.
@@ -156,7 +160,8 @@ def integrate(lanes: Lanes, rollout: Callable[[Lane], Path], discard: Callable[[
     Args:
         lanes: the work.
         rollout: integrates one lane; its rows are those of `Lane.kept`.
-        discard: called after a rollout that failed; it may have left the engine's world in any state.
+        discard: called after a rollout that failed; it may have left the engine's world in any
+            state.
 
     Returns:
         The motion. A lane with a non-finite number or result is all NaN.
@@ -184,7 +189,9 @@ def integrate(lanes: Lanes, rollout: Callable[[Lane], Path], discard: Callable[[
 
 
 def _timing(steps: Array, every: int) -> tuple[Places, Array, Places, Places]:
-    """Which steps are taken, their lengths, how many precede the states to keep, and which of these each record is."""
+    """Which steps are taken, their lengths, how many precede the states to keep, and which of these
+    each record is.
+    """
     moving = np.flatnonzero(steps > 0)
     taken = np.concatenate([[0], np.cumsum(steps > 0)])[::every]
     kept, rows = np.unique(taken, return_inverse=True)
@@ -194,16 +201,37 @@ def _timing(steps: Array, every: int) -> tuple[Places, Array, Places, Places]:
 def _lane(lanes: Lanes, i: int, moving: Places, steps: Array, kept: Places) -> Lane:
     effects = tuple((effect, c[:, i : i + 1]) for effect, c in lanes.effects if c[:, i].any())
     constants = {name: value[i : i + 1] for name, value in lanes.constants.items()}
-    inputs = {name: value[i, moving] if moving.size else value[i, :1] for name, value in lanes.inputs.items()}
-    return Lane(lanes.system, lanes.theta[i : i + 1], constants, lanes.x[i], lanes.v[i], steps, inputs, effects, kept)
+    inputs = {
+        name: value[i, moving] if moving.size else value[i, :1]
+        for name, value in lanes.inputs.items()
+    }
+    return Lane(
+        lanes.system,
+        lanes.theta[i : i + 1],
+        constants,
+        lanes.x[i],
+        lanes.v[i],
+        steps,
+        inputs,
+        effects,
+        kept,
+    )
 
 
 def _given(lane: Lane) -> list[Array]:
-    return [lane.theta, lane.x, lane.v, *lane.constants.values(), *lane.inputs.values(), *(c for _, c in lane.effects)]
+    return [
+        lane.theta,
+        lane.x,
+        lane.v,
+        *lane.constants.values(),
+        *lane.inputs.values(),
+        *(c for _, c in lane.effects),
+    ]
 
 
 def evened(steps: Array, every: int) -> Array:
-    """`steps` (S,), made equal if they are but for rounding: each change of step costs an engine more than a step.
+    """`steps` (S,), made equal if they are but for rounding: each change of step costs an engine
+    more than a step.
 
     Args:
         steps: seconds, > 0.
@@ -220,8 +248,8 @@ def legs(lane: Lane, *signals: Array) -> list[tuple[int, list[int]]]:
     """The steps as legs in which neither the step nor any of `signals` (S,) changes.
 
     Returns:
-        The number of the first step of each leg, and how many steps it takes from one state to keep to the next, and at
-        last to its end.
+        The number of the first step of each leg, and how many steps it takes from one state to keep
+        to the next, and at last to its end.
     """
     size = lane.steps.size
     new = np.zeros(size, dtype=bool)
@@ -248,7 +276,11 @@ def checked_time_step(time_step: float | None, system: type[System]) -> float:
     """
     if time_step is None:
         return DEFAULT_STEPS[system.kind]
-    if isinstance(time_step, bool) or not isinstance(time_step, (int, float)) or not 0 < time_step < math.inf:
+    if (
+        isinstance(time_step, bool)
+        or not isinstance(time_step, (int, float))
+        or not 0 < time_step < math.inf
+    ):
         raise InputError(f"time_step must be a positive number of seconds, found {time_step}")
     return float(time_step)
 

@@ -1,10 +1,12 @@
-"""A ball stepped by an engine, read at second order in the step, its impacts solved by the engine where they happen.
+"""A ball stepped by an engine, read at second order in the step, its impacts solved by the engine
+where they happen.
 
-In flight the engine's velocity w is the one half a step before the position (see `sims.engines.external`): with
-acceleration a, a step of length h goes w = v + h a / 2, x' = x + h w, v' = w + h a' / 2. Under gravity alone that is
-the exact parabola. A step in which x + h v + h^2 a / 2 would pass the ground is cut where it meets it; there the engine
-solves the contact in a step of its own, of which only the change of velocity counts, and the rest of the step follows.
-The error of an impact is thus that of the flight, of second order in h, and none under gravity alone.
+In flight the engine's velocity w is the one half a step before the position (see
+`sims.engines.external`): with acceleration a, a step of length h goes w = v + h a / 2, x' = x + h
+w, v' = w + h a' / 2. Under gravity alone that is the exact parabola. A step in which x + h v + h^2
+a / 2 would pass the ground is cut where it meets it; there the engine solves the contact in a step
+of its own, of which only the change of velocity counts, and the rest of the step follows. The error
+of an impact is thus that of the flight, of second order in h, and none under gravity alone.
 
 When bouncing is over is agreed with the batch engine (`sims.engines.ground`).
 """
@@ -42,7 +44,9 @@ class Mover(Protocol):
         ...
 
     def glide(self, counts: Sequence[int]) -> list[State]:
-        """Take so many steps under gravity alone, and so many again, and so on; what is reached each time."""
+        """Take so many steps under gravity alone, and so many again, and so on; what is reached
+        each time.
+        """
         ...
 
 
@@ -50,7 +54,9 @@ class Ball(Mover, Protocol):
     """A ball over level ground."""
 
     def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
-        """The velocity after the engine's contact with the ground at x, all else standing still; `place` follows."""
+        """The velocity after the engine's contact with the ground at x, all else standing still;
+        `place` follows.
+        """
         ...
 
     def hold(self) -> None:
@@ -201,7 +207,9 @@ class _Flight:
         self._a = x, y, 0.0 if self._rests else z
 
     def _time_to_ground(self) -> float:
-        """Seconds until a flight with the present acceleration meets the ground; 0 on it, inf if never."""
+        """Seconds until a flight with the present acceleration meets the ground; 0 on it, inf if
+        never.
+        """
         gap, rate, lift = max(self._x[2] - self._floor, 0.0), self._v[2], self._a[2]
         inside = rate * rate - 2.0 * lift * gap
         if rate > 0.0 or (rate == 0.0 and lift < 0.0):

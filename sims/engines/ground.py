@@ -1,13 +1,14 @@
 """Impacts with level ground: what becomes of the velocity, and when bouncing has died out.
 
-The last coordinate strikes the ground at its `floor`; the others run along it. Restitution is the system's, changed by
-the contact effects in their order. The ground takes tangential speed mu (1 + e) |vn|, never more than there is (R. M.
-Brach, J. Appl. Mech. 56(1), 133, 1989, doi:10.1115/1.3176033), or less where the system says at which share of it a
-body that spins up grips. A ball that rests on the ground has no impacts and is not slowed by it.
+The last coordinate strikes the ground at its `floor`; the others run along it. Restitution is the
+system's, changed by the contact effects in their order. The ground takes tangential speed mu (1 +
+e) |vn|, never more than there is (R. M. Brach, J. Appl. Mech. 56(1), 133, 1989,
+doi:10.1115/1.3176033), or less where the system says at which share of it a body that spins up
+grips. A ball that rests on the ground has no impacts and is not slowed by it.
 
-Bounces of a ball with e < 1 die out in finite time after infinitely many. They are taken as over once a flight would
-last less than `SHORTEST`, or after `PATIENCE` flights below `SHORT` in a row; what the bounces left out would have
-taken from the tangential speed is taken at once.
+Bounces of a ball with e < 1 die out in finite time after infinitely many. They are taken as over
+once a flight would last less than `SHORTEST`, or after `PATIENCE` flights below `SHORT` in a row;
+what the bounces left out would have taken from the tangential speed is taken at once.
 """
 
 from __future__ import annotations
@@ -47,7 +48,9 @@ class Ground:
         self._restitution = lanes.system.restitution(lanes.theta)
         self._friction = lanes.system.friction(lanes.constants)
         self._grip = lanes.system.grip(lanes.constants)
-        self._effects = [(effect, c) for effect, c in lanes.effects if isinstance(effect, Contact) and c.any()]
+        self._effects = [
+            (effect, c) for effect, c in lanes.effects if isinstance(effect, Contact) and c.any()
+        ]
         self._shorts = np.zeros(len(lanes.x), dtype=np.intp)
 
     def strike(self, lanes: Indices, v: Array, a: Array) -> Outcome:
@@ -76,7 +79,9 @@ class Ground:
         if mu.any():
             along = _size(v[:, :-1])
             least = 0.0 if self._grip is None else 1.0 - self._grip[lanes]
-            kept = np.where(mu > 0, np.maximum(1.0 - lost / np.where(along > 0, along, 1.0), least), 1.0)
+            kept = np.where(
+                mu > 0, np.maximum(1.0 - lost / np.where(along > 0, along, 1.0), least), 1.0
+            )
             return Outcome(np.concatenate([v[:, :-1] * kept, up], axis=1), rests[:, 0])
         return Outcome(np.concatenate([v[:, :-1], up], axis=1), rests[:, 0])
 

@@ -1,16 +1,17 @@
 """Systems of one coordinate, stepped by an engine and read at second order in the step.
 
-The engine's velocity w is the one half a step before the position. With force f(t, x, v, u) beside the gravity G(x),
-each step of length h from (x, v) is
+The engine's velocity w is the one half a step before the position. With force f(t, x, v, u) beside
+the gravity G(x), each step of length h from (x, v) is
 
     start:  w  = v + h/2 (G(x) + f(t, x, v, u)) / M          put in as one force over the step
     engine: x' = x + h w
     end:    v' = w + h/2 (G(x') + f(t', x', v', u)) / M      solved for v' by one Newton step
 
-so that damping, however strong, is stable (the two halves together are the trapezoidal rule in v), and dry friction is
-exact in each half (`external.kick`). Where nothing acts but inputs and viscous damping c, the engine's own joint
-damping carries it, explicit in w: w' = w + h (T - c w) / J with J = M + h c / 2 is w' - w = h (T - c (w + w') / 2) / M,
-damping at the midpoint, and the engine need not be interrupted.
+so that damping, however strong, is stable (the two halves together are the trapezoidal rule in v),
+and dry friction is exact in each half (`external.kick`). Where nothing acts but inputs and viscous
+damping c, the engine's own joint damping carries it, explicit in w: w' = w + h (T - c w) / J with J
+= M + h c / 2 is w' - w = h (T - c (w + w') / 2) / M, damping at the midpoint, and the engine need
+not be interrupted.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ class Joint(Protocol):
         ...
 
     def pace(self, step: float, inertia: float, damping: float) -> bool:
-        """Set step, generalised inertia and damping; False if the engine cannot represent the inertia."""
+        """Set step, generalised inertia and damping; False if the engine cannot represent the
+        inertia.
+        """
         ...
 
     def place(self, x: float, w: float) -> None:
@@ -52,7 +55,9 @@ class Joint(Protocol):
         ...
 
     def advance(self, force: float) -> tuple[float, float]:
-        """Take one step with this generalised force beside gravity; position and the engine's velocity after it."""
+        """Take one step with this generalised force beside gravity; position and the engine's
+        velocity after it.
+        """
         ...
 
     def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
@@ -83,7 +88,9 @@ def _carried(lane: Lane) -> float | None:
 
 
 def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
-    """No feedback from the motion but viscous damping: the engine runs on its own while the input is constant."""
+    """No feedback from the motion but viscous damping: the engine runs on its own while the input
+    is constant.
+    """
     drive = _drive(lane)
     forces, steps, kept = drive.tolist(), lane.steps.tolist(), set(lane.kept.tolist())
     x, w, v = float(lane.x[0]), math.nan, float(lane.v[0])
@@ -117,7 +124,9 @@ def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
 
 
 def _whole(w: Any, force: Any, inertia: float, damping: float, step: Any) -> Any:
-    """The velocity at the time of the position, from the engine's half a step before and the force on the position."""
+    """The velocity at the time of the position, from the engine's half a step before and the force
+    on the position.
+    """
     half = 0.5 * step / inertia
     return (w + half * force) / (1.0 + half * damping)
 
@@ -179,7 +188,9 @@ class _Forces(ABC):
         return self._force + self._slope * (v - self._at)
 
     def end(self, w: float, step: float) -> float:
-        """The velocity half a step after `w`, the force being the one at its end; a growing force is taken as is."""
+        """The velocity half a step after `w`, the force being the one at its end; a growing force
+        is taken as is.
+        """
         slope = min(self._slope, 0.0)
         force = self._force + slope * (w - self._at)
         return kick(w, force, self.limit, 1.0 / (self._inertia - 0.5 * step * slope), 0.5 * step)

@@ -1,7 +1,7 @@
 """MuJoCo as an engine: forces through ``qfrc_applied``, impacts through its contact solver.
 
-The world that carries a system is written by the module ``mujoco_world`` beside the system's own: `model` gives it as
-MJCF and, for a system of one coordinate, `load` gives it its inertia.
+The world that carries a system is written by the module ``mujoco_world`` beside the system's own:
+`model` gives it as MJCF and, for a system of one coordinate, `load` gives it its inertia.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ def engine(
 
     Args:
         system: what it will integrate.
-        time_step: longest step in seconds (2 ms with `native_contact`); each sampling interval is divided into equal
-            steps not longer than this.
-        native_contact: for a system that bounces: MuJoCo's contact as a spring and damper that give way, whose damping
-            is chosen for the restitution; stepped and read at first order (`sims.engines.native`).
+        time_step: longest step in seconds (2 ms with `native_contact`); each sampling interval is
+            divided into equal steps not longer than this.
+        native_contact: for a system that bounces: MuJoCo's contact as a spring and damper that give
+            way, whose damping is chosen for the restitution; stepped and read at first order
+            (`sims.engines.native`).
         stiffness: with `native_contact`: of the contact, 1/s^2 (1e5, that is contacts of 10 ms).
 
     Raises:
@@ -48,7 +49,9 @@ def engine(
     step = checked_time_step(time_step, system)
     if not native_contact:
         if stiffness is not None:
-            raise InputError("setting stiffness belongs to MuJoCo's contact as it comes: set native_contact = true")
+            raise InputError(
+                "setting stiffness belongs to MuJoCo's contact as it comes: set native_contact = true"
+            )
         return MujocoEngine(system, step)
     if not system.bounces:
         raise InputError(f"system {system.name} does not bounce: leave native_contact out")
@@ -63,7 +66,9 @@ class MujocoEngine:
     name: str = "mujoco"
     requires: tuple[str, ...] = REQUIRES
 
-    def __init__(self, system: type[System], largest_step: float, stiffness: float | None = None) -> None:
+    def __init__(
+        self, system: type[System], largest_step: float, stiffness: float | None = None
+    ) -> None:
         self.largest_step = largest_step
         module = world_module(system, "mujoco_world")
         if module is None:
@@ -97,7 +102,9 @@ class MujocoEngine:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without MuJoCo's warnings of instability, which it would write to a file: such lanes become NaN."""
+    """Without MuJoCo's warnings of instability, which it would write to a file: such lanes become
+    NaN.
+    """
     mujoco = library()
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(_ignore)

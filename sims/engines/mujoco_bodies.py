@@ -1,17 +1,19 @@
 """Bodies in MuJoCo: on a joint, and a ball over level ground.
 
-MuJoCo's contact asks for an acceleration a_ref = -b v - k r along the normal, of which it gives the share d: with what
-would happen without contact a_0, a = (1 - d) a_0 + d a_ref, never pulling ("Solver parameters",
-https://mujoco.readthedocs.io/en/stable/modeling.html#solver-parameters). Written as ``solref = (-stiffness, -damping)``
-with constant impedance d and no stiffness, a_ref = -(damping / d) v, so that with
+MuJoCo's contact asks for an acceleration a_ref = -b v - k r along the normal, of which it gives the
+share d: with what would happen without contact a_0, a = (1 - d) a_0 + d a_ref, never pulling
+("Solver parameters", https://mujoco.readthedocs.io/en/stable/modeling.html#solver-parameters).
+Written as ``solref = (-stiffness, -damping)`` with constant impedance d and no stiffness, a_ref =
+-(damping / d) v, so that with
 
     damping = (1 + e) / h
 
-a single step of length h from the surface, other forces made up for (a_0 = 0), takes v to v - (1 + e) v = -e v: exactly
-the restitution e, for any h. A resting ball is held by damping 1 / h and stiffness 0.1 / h^2, which let it sink in by
-10 (1 - d) g h^2. MuJoCo's friction is a convex relaxation that turns slip into lift (Todorov, ICRA 2014,
-doi:10.1109/ICRA.2014.6907751), so contact is frictionless here and the tangential speed lost in an impact goes in as an
-impulse, through ``qfrc_applied`` in the step of the impact.
+a single step of length h from the surface, other forces made up for (a_0 = 0), takes v to v - (1 +
+e) v = -e v: exactly the restitution e, for any h. A resting ball is held by damping 1 / h and
+stiffness 0.1 / h^2, which let it sink in by 10 (1 - d) g h^2. MuJoCo's friction is a convex
+relaxation that turns slip into lift (Todorov, ICRA 2014, doi:10.1109/ICRA.2014.6907751), so contact
+is frictionless here and the tangential speed lost in an impact goes in as an impulse, through
+``qfrc_applied`` in the step of the impact.
 """
 
 from __future__ import annotations
@@ -32,14 +34,17 @@ _MOST_DAMPED = 2.0  # damping ratio
 
 @functools.cache
 def library() -> Any:
-    """The module ``mujoco``, imported on first use: it takes a while and most commands never simulate."""
+    """The module ``mujoco``, imported on first use: it takes a while and most commands never
+    simulate.
+    """
     import mujoco
 
     return mujoco
 
 
 class World:
-    """One MuJoCo model and its state, compiled when first needed and again when the constants change.
+    """One MuJoCo model and its state, compiled when first needed and again when the constants
+    change.
 
     Args:
         model: called with the constants; returns MJCF.
@@ -60,7 +65,9 @@ class World:
         if self._built_for != constants:
             mujoco = library()
             self._model = mujoco.MjModel.from_xml_string(self._compile(constants))
-            self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # joint damping is explicit
+            self._model.opt.disableflags |= (
+                mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+            )  # joint damping is explicit
             self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
             self._data = mujoco.MjData(self._model)
             self._built_for = dict(constants)
@@ -128,7 +135,11 @@ class _Mover:
     def start(self, constants: dict[str, float]) -> None:
         """A world for these constants, as newly made, without contact."""
         mujoco = library()
-        self._mass, self._floor, self._gravity = constants["mass"], constants["radius"], constants["gravity"]
+        self._mass, self._floor, self._gravity = (
+            constants["mass"],
+            constants["radius"],
+            constants["gravity"],
+        )
         self._model, self._data = self._world.fresh(constants)
         self._x, self._w, self._force = self._data.qpos, self._data.qvel, self._data.qfrc_applied
         self._no_contact = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -140,7 +151,9 @@ class _Mover:
     def _meets(self, ground: bool) -> None:
         """Let contact act or not."""
         flags = self._model.opt.disableflags
-        self._model.opt.disableflags = flags & ~self._no_contact if ground else flags | self._no_contact
+        self._model.opt.disableflags = (
+            flags & ~self._no_contact if ground else flags | self._no_contact
+        )
 
     def _contact(self, stiffness: float, damping: float) -> None:
         """Stiffness (1/s^2) and damping (1/s) of the contact to come."""
@@ -172,7 +185,9 @@ class _Mover:
         return found
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: self.__dict__[name] for name in ("_world", "_stiffness") if name in self.__dict__}
+        return {
+            name: self.__dict__[name] for name in ("_world", "_stiffness") if name in self.__dict__
+        }
 
 
 class Ball(_Mover):
@@ -190,13 +205,17 @@ class Ball(_Mover):
             self._contact(0.1 * self._hertz**2, self._hertz)
 
     def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
-        """MuJoCo's contact solver on one short step, gravity made up for, friction put in as an impulse."""
+        """MuJoCo's contact solver on one short step, gravity made up for, friction put in as an
+        impulse.
+        """
         self._held = False
         self.pace(_IMPACT)
         self.place((x[0], x[1], self._floor - flight.INSIDE), v)
         self._contact(0.0, (1.0 + restitution) * self._hertz)
         along = math.hypot(v[0], v[1])
-        lost = min(friction * (1.0 + restitution) * -v[2] / along, 1.0) * self._hertz if along else 0.0
+        lost = (
+            min(friction * (1.0 + restitution) * -v[2] / along, 1.0) * self._hertz if along else 0.0
+        )
         self._meets(True)
         _, after = self.advance((-lost * v[0], -lost * v[1], self._gravity))
         self._meets(False)
@@ -232,7 +251,9 @@ class SoftBall(_Mover):
         """Damping that gives this restitution if the step is short; friction."""
         if (restitution, friction) != self._touched:
             self._touched = restitution, friction
-            self._contact(self._stiffness, 2.0 * damping_ratio(restitution) * math.sqrt(self._stiffness))
+            self._contact(
+                self._stiffness, 2.0 * damping_ratio(restitution) * math.sqrt(self._stiffness)
+            )
 
     def near(self, gap: float) -> bool:
         """Touching."""
@@ -244,15 +265,21 @@ class SoftBall(_Mover):
         if friction and self._data.nefc:
             vx, vy, _ = self._w.tolist()
             slip = math.hypot(vx, vy)
-            share = min(friction * float(self._data.efc_force[0]) / self._mass / slip, self._hertz) if slip else 0.0
+            share = (
+                min(friction * float(self._data.efc_force[0]) / self._mass / slip, self._hertz)
+                if slip
+                else 0.0
+            )
             force = force[0] - share * vx, force[1] - share * vy, force[2]
         return super().advance(force)
 
 
 def damping_ratio(restitution: float) -> float:
-    """The damping ratio of a spring and damper that push but do not pull, for a restitution; at most 2, for 0.06.
+    """The damping ratio of a spring and damper that push but do not pull, for a restitution; at
+    most 2, for 0.06.
 
-    T. Schwager, T. Poeschel, Granular Matter 9, 465 (2007), doi:10.1007/s10035-007-0065-z, equation 20.
+    T. Schwager, T. Poeschel, Granular Matter 9, 465 (2007), doi:10.1007/s10035-007-0065-z, equation
+    20.
     """
     low, high = 0.0, _MOST_DAMPED
     for _ in range(60):

@@ -1,7 +1,8 @@
-"""A ball stepped by an engine as it comes: its own integrator and contact, first order in the step, nothing corrected.
+"""A ball stepped by an engine as it comes: its own integrator and contact, first order in the step,
+nothing corrected.
 
-Effects act by their force at the beginning of each step. What they make of an impact is set once the next step may
-bring the ball to the ground.
+Effects act by their force at the beginning of each step. What they make of an impact is set once
+the next step may bring the ball to the ground.
 """
 
 from __future__ import annotations
@@ -65,7 +66,11 @@ def rollout(ball: Ball, lane: Lane) -> Path:
         if not math.isfinite(sum(rows[-1])):
             break
     at, v, pulled = path_of(lane, rows)
-    a: Array = gravity(lane) + pulled - ball.damping * v * (1.0 + np.sqrt((v * v).sum(axis=1, keepdims=True)))
+    a: Array = (
+        gravity(lane)
+        + pulled
+        - ball.damping * v * (1.0 + np.sqrt((v * v).sum(axis=1, keepdims=True)))
+    )
     for i in np.flatnonzero(np.abs(v[:, 2]) < _SLOW):
         if ball.near(at[i, 2] - floor):
             a[i, 2] = 0.0

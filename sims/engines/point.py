@@ -20,7 +20,9 @@ State = tuple[Vector, Vector]
 def gravity(lane: Lane) -> Vector:
     """The acceleration of gravity, the same everywhere."""
     nothing = np.zeros((1, 3))
-    weight: list[float] = lane.system.weight(lane.moment(np.zeros((1, 1)), nothing, nothing, {}))[0].tolist()
+    weight: list[float] = lane.system.weight(lane.moment(np.zeros((1, 1)), nothing, nothing, {}))[
+        0
+    ].tolist()
     return weight
 
 
@@ -41,11 +43,19 @@ class Pull:
         self.any = self._ask.any
 
     def at(self, t: float, x: Vector, v: Vector) -> Vector:
-        """m/s^2, dry friction (which no effect of the library gives to a free ball) against the velocity."""
+        """m/s^2, dry friction (which no effect of the library gives to a free ball) against the
+        velocity.
+        """
         vx, vy, vz = v
         speed = math.sqrt(vx * vx + vy * vy + vz * vz)
         if self._opposing:
-            share, limit, fx, fy, fz = self._opposing.at(speed)[0], self._opposing.limit, 0.0, 0.0, 0.0
+            share, limit, fx, fy, fz = (
+                self._opposing.at(speed)[0],
+                self._opposing.limit,
+                0.0,
+                0.0,
+                0.0,
+            )
         else:
             moment = self._ask.moment
             moment.t.fill(t)
@@ -79,7 +89,8 @@ class Impact:
         return float(restitution[0, 0]), friction
 
     def law(self, speed: float, down: float) -> tuple[float, float, bool]:
-        """Restitution, friction, and whether bouncing is over, for a ball that falls with acceleration `down`.
+        """Restitution, friction, and whether bouncing is over, for a ball that falls with
+        acceleration `down`.
 
         The friction of the last impact includes that of all the bounces that are left out.
         """

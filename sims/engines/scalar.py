@@ -1,7 +1,8 @@
 """The commonest effects in plain numbers, for engines that go lane by lane and step by step.
 
-Asking an effect for its force takes NumPy some microseconds, as long as the engine's own step. For the laws below, and
-only as the library has them, it is worth writing them once more; tests compare both.
+Asking an effect for its force takes NumPy some microseconds, as long as the engine's own step. For
+the laws below, and only as the library has them, it is worth writing them once more; tests compare
+both.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from sims.engines.external import Lane
 from sims.system import Contact, Effect
 
 Law = Callable[[float, float], tuple[float, float]]
-"""Coefficient and speed -> resistance r in force = -r v, and by how much r times speed grows with speed."""
+"""Coefficient and speed -> resistance r in force = -r v, and by how much r times speed grows with
+speed.
+"""
 
 _LAWS: Mapping[str, Law] = {
     "drag.linear": lambda c, speed: (c, c),  # noqa: ARG005 - the same at every speed

@@ -20,18 +20,21 @@ FILMS = ("projected", "tracked")
 
 
 class FilmedBall(Simulator):
-    """A ball that falls and bounces on level ground, and its place in the picture of a fixed camera.
+    """A ball that falls and bounces on level ground, and its place in the picture of a fixed
+    camera.
 
-    The camera has a field of view of 40 degrees and looks at (0, 0, 2) m where nothing else is said, as the published
-    visual tuner's does (Allevato et al., TuneNet, arXiv 1907.11200, released code). `v` is the pixel row of the middle
-    of the ball's outline, from the top; it may lie outside the picture.
+    The camera has a field of view of 40 degrees and looks at (0, 0, 2) m where nothing else is
+    said, as the published visual tuner's does (Allevato et al., TuneNet, arXiv 1907.11200, released
+    code). `v` is the pixel row of the middle of the ball's outline, from the top; it may lie
+    outside the picture.
 
     Args:
         constants: values for `constants` other than their defaults.
         observe: channels to return, in order (default: both).
-        film: "projected" computes `v` through the camera. "tracked" renders a film of each run, its light, colours and
-            compression drawn from the run's own numbers, and lets the tracker find the ball: `v` is missing where it is
-            not seen, and `z`, which no film shows, throughout.
+        film: "projected" computes `v` through the camera. "tracked" renders a film of each run, its
+            light, colours and compression drawn from the run's own numbers, and lets the tracker
+            find the ball: `v` is missing where it is not seen, and `z`, which no film shows,
+            throughout.
         settings: those of simulator ball.
 
     Raises:
@@ -50,7 +53,9 @@ class FilmedBall(Simulator):
         Constant("camera_azimuth", "rad", 0.0, "where the camera stands around the vertical"),
         Constant("camera_distance", "m", 7.5, "of the camera from the vertical", positive=True),
         Constant("camera_height", "m", 6.5, "of the camera above the ground"),
-        Constant("camera_aim", "m", 2.0, "height of the point on the vertical at which the camera looks"),
+        Constant(
+            "camera_aim", "m", 2.0, "height of the point on the vertical at which the camera looks"
+        ),
         Constant("pixels", "px", 100.0, "width and height of the picture", positive=True),
     )
     states = BallSystem.states
@@ -65,7 +70,9 @@ class FilmedBall(Simulator):
     ) -> None:
         super().__init__(constants, observe)
         if film not in FILMS:
-            raise InputError(f"simulator {self.name}: expected film to be one of {', '.join(FILMS)}, found {film!r}")
+            raise InputError(
+                f"simulator {self.name}: expected film to be one of {', '.join(FILMS)}, found {film!r}"
+            )
         if film == "tracked":
             packages.require()
         self._tracked = film == "tracked"
@@ -79,7 +86,9 @@ class FilmedBall(Simulator):
         places = self._ball.simulate(theta, fall)
         camera, radius = _camera(constants), constants["radius"]
         if self._tracked:
-            rows = np.array([_tracked(camera, radius, way, scenario.times) for way in places]).reshape(places.shape[:2])
+            rows = np.array(
+                [_tracked(camera, radius, way, scenario.times) for way in places]
+            ).reshape(places.shape[:2])
             seen = np.stack([np.full_like(rows, np.nan), rows], axis=2)
         else:
             seen = np.stack([places[..., 2], camera.outline(places, radius)[0][..., 1]], axis=2)
@@ -102,7 +111,9 @@ def _camera(constants: Mapping[str, float]) -> Camera:
 
 
 def _tracked(camera: Camera, radius: float, places: Array, times: Array) -> Array:
-    """Pixel rows (T,) that the tracker finds in a film of the ball at `places` (T, 3); NaN where it finds none."""
+    """Pixel rows (T,) that the tracker finds in a film of the ball at `places` (T, 3); NaN where it
+    finds none.
+    """
     from sims.camera.look import Look
     from sims.camera.render import Stage
     from sims.camera.track import track
@@ -111,7 +122,14 @@ def _tracked(camera: Camera, radius: float, places: Array, times: Array) -> Arra
     rows: Array = np.full(times.size, np.nan)
     if not np.isfinite(places).all():
         return rows
-    numbers = [camera.azimuth, camera.distance, camera.height, *camera.size, radius, *places.ravel()]
+    numbers = [
+        camera.azimuth,
+        camera.distance,
+        camera.height,
+        *camera.size,
+        radius,
+        *places.ravel(),
+    ]
     digest = hashlib.sha256(np.array(numbers).tobytes()).digest()
     rng = np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
     look = Look.drawn(rng)

@@ -1,9 +1,10 @@
 """The pendulum's world in Bullet.
 
-Only mass x length and the inertia about the hinge matter to the motion. Bullet wants the inertia about the centre of
-mass, which would be negative for light inertias; a body this much heavier on an arm this much shorter has the same
-gravity torque and next to no inertia from its arm. So the inertia may be anything above mass length^2 / 1000, also what
-no rigid body with this centre of mass could have (below mass length^2).
+Only mass x length and the inertia about the hinge matter to the motion. Bullet wants the inertia
+about the centre of mass, which would be negative for light inertias; a body this much heavier on an
+arm this much shorter has the same gravity torque and next to no inertia from its arm. So the
+inertia may be anything above mass length^2 / 1000, also what no rigid body with this centre of mass
+could have (below mass length^2).
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ def build(client: int, constants: Mapping[str, float]) -> int:
     p = bullet.engine()
     p.setGravity(0.0, 0.0, -constants["gravity"], physicsClientId=client)
     hanging = (0.0, 0.0, -constants["length"] / SHORTER)
-    return bullet.joint(client, p.JOINT_REVOLUTE, (0.0, 1.0, 0.0), constants["mass"] * SHORTER, hanging)
+    return bullet.joint(
+        client, p.JOINT_REVOLUTE, (0.0, 1.0, 0.0), constants["mass"] * SHORTER, hanging
+    )
 
 
 def load(client: int, body: int, inertia: float, constants: Mapping[str, float]) -> bool:

@@ -1,4 +1,5 @@
-"""The pendulum's world in MuJoCo: gravity's torque from a body on a short arm, the inertia from the joint's armature.
+"""The pendulum's world in MuJoCo: gravity's torque from a body on a short arm, the inertia from the
+joint's armature.
 
 As in Bullet (`sims.pendulum.bullet_world`) the inertia may be anything above mass length^2 / 1000.
 """

@@ -22,7 +22,14 @@ class PendulumSystem(System):
     says = "a rigid body that swings on a hinge"
     kind: ClassVar[Kind] = "rotary"
     parameters = (
-        Parameter("inertia", "kg*m^2", 3.3e-3, (1e-3, 1e-2), (2e-3, 6e-3), says="moment of inertia about the hinge"),
+        Parameter(
+            "inertia",
+            "kg*m^2",
+            3.3e-3,
+            (1e-3, 1e-2),
+            (2e-3, 6e-3),
+            says="moment of inertia about the hinge",
+        ),
     )
     channels = (
         Channel("q", "rad", 1.0, "angle, 0 when hanging"),
@@ -39,7 +46,7 @@ class PendulumSystem(System):
     states: ClassVar[Mapping[str, float]] = MappingProxyType({"q": 0.5, "qd": 0.0})
     sensed = ("q", "qd")
 
-    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:  # noqa: ARG002
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """(L, 1) kg m^2 about the hinge."""
         return theta[:, :1]
 
@@ -54,12 +61,16 @@ class PendulumSystem(System):
         return moment.inputs["u"]
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
-        """It swings in the plane of x and the vertical; what pushes along the hinge's axis is held by it."""
+        """It swings in the plane of x and the vertical; what pushes along the hinge's axis is held
+        by it.
+        """
         if axis == "y":
             return np.zeros_like(moment.x)
         torque: Array = moment.constants["mass"] * moment.constants["length"] * np.cos(moment.x)
         return torque
 
-    def observe(self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]) -> dict[str, Array]:  # noqa: ARG002
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
         """Angle and rate."""
         return {"q": x[:, :, 0], "qd": v[:, :, 0]}

@@ -1,4 +1,6 @@
-"""The description of a recording, `NAME.toml`: what its columns are, in which units, and what is known of each run."""
+"""The description of a recording, `NAME.toml`: what its columns are, in which units, and what is
+known of each run.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +70,9 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected UTF-8 text ({error.reason} at byte {error.start})") from None
+        raise InputError(
+            f"{path}: expected UTF-8 text ({error.reason} at byte {error.start})"
+        ) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     try:
@@ -118,13 +122,27 @@ def read_description(path: Path, declared: Declared) -> Description:
     inputs = _columns(path, "input", meta, {c.name: c.unit for c in declared.inputs})
     if not channels:
         raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
-    noise = {n: abs(s.gain) * _noise(path, n, e["noise"]) for n, (s, e) in channels.items() if "noise" in e}
-    constants = _numbers(path, "constants", _section(path, meta, "constants"), [c.name for c in declared.constants])
+    noise = {
+        n: abs(s.gain) * _noise(path, n, e["noise"])
+        for n, (s, e) in channels.items()
+        if "noise" in e
+    }
+    constants = _numbers(
+        path, "constants", _section(path, meta, "constants"), [c.name for c in declared.constants]
+    )
     _positive(path, "constants", constants, declared)
-    runs = {name: _run(path, name, own, declared) for name, own in _section(path, meta, "runs").items()}
-    of_channels, of_inputs = ({n: s for n, (s, _) in columns.items()} for columns in (channels, inputs))
-    extra = _extra(path, meta, ["run", "t", *(c.name for c in (*declared.channels, *declared.inputs))])
-    return Description(_system(path, meta), title, of_channels, of_inputs, noise, constants, runs, extra)
+    runs = {
+        name: _run(path, name, own, declared) for name, own in _section(path, meta, "runs").items()
+    }
+    of_channels, of_inputs = (
+        {n: s for n, (s, _) in columns.items()} for columns in (channels, inputs)
+    )
+    extra = _extra(
+        path, meta, ["run", "t", *(c.name for c in (*declared.channels, *declared.inputs))]
+    )
+    return Description(
+        _system(path, meta), title, of_channels, of_inputs, noise, constants, runs, extra
+    )
 
 
 def check_names(path: Path, marked: Iterable[str], there: Iterable[str]) -> None:
@@ -155,7 +173,9 @@ def _columns(
             raise InputError(
                 f'{path}: {kind} {name}: expected a table with unit = "{units[name]}", found {shown(entry)}'
             )
-        _known(path, f"{kind}s.{name}", entry, ("unit", "noise") if kind == "channel" else ("unit",))
+        _known(
+            path, f"{kind}s.{name}", entry, ("unit", "noise") if kind == "channel" else ("unit",)
+        )
         unit = entry.get("unit")
         if not isinstance(unit, str):
             raise InputError(
@@ -174,10 +194,14 @@ def _extra(path: Path, meta: dict[str, Any], taken: Collection[str]) -> dict[str
     result = {}
     for name, entry in _section(path, meta, "extra").items():
         if name in taken:
-            raise InputError(f"{path}: extra.{name}: is a column of its own right; declare it as channel or input")
+            raise InputError(
+                f"{path}: extra.{name}: is a column of its own right; declare it as channel or input"
+            )
         unit = entry.get("unit") if isinstance(entry, dict) else None
         if not isinstance(unit, str):
-            raise InputError(f'{path}: extra {name}: expected a table with unit = "TEXT", found {shown(entry)}')
+            raise InputError(
+                f'{path}: extra {name}: expected a table with unit = "TEXT", found {shown(entry)}'
+            )
         _known(path, f"extra.{name}", entry, ("unit",))
         result[name] = unit
     return result
@@ -200,7 +224,9 @@ def _run(path: Path, name: str, own: Any, declared: Declared) -> RunMarks:
     _known(path, where, own, ("constants", "initial", "held_out", *allowed))
     held_out = own.get("held_out")
     if not isinstance(held_out, bool | None):
-        raise InputError(f"{path}: {where}.held_out: expected true or false, found {shown(held_out)}")
+        raise InputError(
+            f"{path}: {where}.held_out: expected true or false, found {shown(held_out)}"
+        )
     constants = _numbers(path, f"{where}.constants", own.get("constants", {}), allowed)
     direct = _numbers(path, where, {k: v for k, v in own.items() if k in allowed}, allowed)
     for twice in constants.keys() & direct.keys():
@@ -221,12 +247,20 @@ def _section(path: Path, meta: dict[str, Any], name: str) -> dict[str, Any]:
 def _known(path: Path, where: str, found: Iterable[str], allowed: Collection[str]) -> None:
     for name in found:
         if name not in allowed:
-            raise unknown(f"entry {f'in [{where}] ' if where else ''}of {path}", name, list(allowed) or ["none"])
+            raise unknown(
+                f"entry {f'in [{where}] ' if where else ''}of {path}",
+                name,
+                list(allowed) or ["none"],
+            )
 
 
 def _number(path: Path, where: str, value: Any) -> float:
     try:
-        number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
+        number = (
+            math.nan
+            if isinstance(value, bool) or not isinstance(value, int | float)
+            else float(value)
+        )
     except OverflowError:  # TOML's whole numbers have no end
         number = math.inf
     if not math.isfinite(number):
@@ -244,4 +278,6 @@ def _numbers(path: Path, where: str, values: Any, allowed: Collection[str]) -> d
 def _positive(path: Path, where: str, constants: Mapping[str, float], declared: Declared) -> None:
     for c in declared.constants:
         if c.positive and constants.get(c.name, 1.0) <= 0:
-            raise InputError(f"{path}: {where}.{c.name}: expected more than 0 {c.unit}, found {constants[c.name]:g}")
+            raise InputError(
+                f"{path}: {where}.{c.name}: expected more than 0 {c.unit}, found {constants[c.name]:g}"
+            )

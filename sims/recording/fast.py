@@ -1,4 +1,6 @@
-"""Fast reading of large faultless tables; what it hesitates over is left to the reader that looks at every cell."""
+"""Fast reading of large faultless tables; what it hesitates over is left to the reader that looks
+at every cell.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ WORTHWHILE = 1 << 20
 def read_fast(
     path: Path, header: Sequence[str], wanted: Sequence[str], gaps: Collection[str]
 ) -> tuple[list[str], dict[str, Array]] | None:
-    """Run names row by row, and the columns `wanted` as numbers; None where anything is out of the ordinary.
+    """Run names row by row, and the columns `wanted` as numbers; None where anything is out of the
+    ordinary.
 
     Args:
         path: a table whose first line is its header.

@@ -1,8 +1,9 @@
-"""Measured data: a table `NAME.csv` and its description `NAME.toml`, read and checked, never guessed, never written.
+"""Measured data: a table `NAME.csv` and its description `NAME.toml`, read and checked, never
+guessed, never written.
 
-The table has the columns `run`, `t` (seconds, increasing within a run) and one for each channel and input, in the units
-that the description states; an empty cell is a missing sample. What is read is in SI units. Every fault found gives one
-line: file, row, column, what was expected, what was found.
+The table has the columns `run`, `t` (seconds, increasing within a run) and one for each channel and
+input, in the units that the description states; an empty cell is a missing sample. What is read is
+in SI units. Every fault found gives one line: file, row, column, what was expected, what was found.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ class Run:
         constants: constants that this run states for itself.
         initial: known initial state.
         held_out: for measuring only, never for fitting.
-        extra: columns that no channel or input of the system is, each (T,), in the units they are written in.
+        extra: columns that no channel or input of the system is, each (T,), in the units they are
+            written in.
     """
 
     name: str
@@ -58,9 +60,11 @@ class Run:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording: the system it is of, its constants, each channel's noise where stated (1 sigma), its runs.
+    """A recording: the system it is of, its constants, each channel's noise where stated (1 sigma),
+    its runs.
 
-    `extra` has the units of the columns that belong to no channel or input, such as pixels of a tracked film.
+    `extra` has the units of the columns that belong to no channel or input, such as pixels of a
+    tracked film.
     """
 
     path: Path
@@ -81,11 +85,13 @@ class Recording:
 
 
 def read_recording(path: str | Path, declared: Declared, whole: bool = False) -> Recording:
-    """Read `NAME.csv` and `NAME.toml` and check them against a system's channels, inputs, constants and states.
+    """Read `NAME.csv` and `NAME.toml` and check them against a system's channels, inputs, constants
+    and states.
 
     Args:
         path: the table.
-        declared: the system, or a simulator of it; `system_of` says which system the recording states.
+        declared: the system, or a simulator of it; `system_of` says which system the recording
+            states.
         whole: hold nothing out but the runs that are marked, and do not divide a single run.
 
     Raises:
@@ -98,7 +104,9 @@ def read_recording(path: str | Path, declared: Declared, whole: bool = False) ->
     check_names(description, about.runs, [part.name for part in parts])
     runs = [_run(table, part, about) for part in parts]
     kept = tuple(runs) if whole else _split(description, runs)
-    return Recording(table, about.system, about.title, about.constants, about.noise, kept, about.extra)
+    return Recording(
+        table, about.system, about.title, about.constants, about.noise, kept, about.extra
+    )
 
 
 _UNMARKED = RunMarks({}, {}, None)
@@ -107,10 +115,20 @@ _UNMARKED = RunMarks({}, {}, None)
 def _run(table: Path, part: TableRun, about: Description) -> Run:
     marks = about.runs.get(part.name, _UNMARKED)
     channels, inputs = (
-        {n: _converted(table, part, n, s) for n, s in scales.items()} for scales in (about.channels, about.inputs)
+        {n: _converted(table, part, n, s) for n, s in scales.items()}
+        for scales in (about.channels, about.inputs)
     )
     extra = {name: part.columns[name] for name in about.extra}
-    return Run(part.name, part.times, channels, inputs, marks.constants, marks.initial, bool(marks.held_out), extra)
+    return Run(
+        part.name,
+        part.times,
+        channels,
+        inputs,
+        marks.constants,
+        marks.initial,
+        bool(marks.held_out),
+        extra,
+    )
 
 
 def _converted(table: Path, part: TableRun, name: str, scale: Scale) -> Array:
@@ -120,15 +138,21 @@ def _converted(table: Path, part: TableRun, name: str, scale: Scale) -> Array:
     with np.errstate(over="ignore"):
         result = values * scale.gain + scale.offset
     if np.isinf(result).any():
-        raise InputError(f"{table}: run {part.name!r}, column {name}: a value is too large to convert to SI units")
+        raise InputError(
+            f"{table}: run {part.name!r}, column {name}: a value is too large to convert to SI units"
+        )
     return frozen(result)
 
 
 def _split(path: Path, runs: Sequence[Run]) -> tuple[Run, ...]:
-    """The runs with some held out: those marked, else every third run, else the last third of a single run."""
+    """The runs with some held out: those marked, else every third run, else the last third of a
+    single run.
+    """
     if any(run.held_out for run in runs):
         if all(run.held_out for run in runs):
-            raise InputError(f"{path}: every run is marked held_out; expected at least one that is not, for fitting")
+            raise InputError(
+                f"{path}: every run is marked held_out; expected at least one that is not, for fitting"
+            )
         return tuple(runs)
     if len(runs) == 1:
         return _halves(path, runs[0])

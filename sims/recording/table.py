@@ -24,7 +24,9 @@ _LONGEST = 40
 
 
 class TableRun(NamedTuple):
-    """The rows of one run: its name, times (T,), and the other columns by name, each (T,); NaN where missing."""
+    """The rows of one run: its name, times (T,), and the other columns by name, each (T,); NaN
+    where missing.
+    """
 
     name: str
     times: Array
@@ -37,8 +39,11 @@ def shown(cell: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
-def read_table(path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str] = ()) -> list[TableRun]:
-    """The runs of a table in order of appearance. A channel's or extra cell may be empty; an input's may not.
+def read_table(
+    path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str] = ()
+) -> list[TableRun]:
+    """The runs of a table in order of appearance. A channel's or extra cell may be empty; an
+    input's may not.
 
     Raises:
         InputError: anything malformed, in one line.
@@ -61,12 +66,16 @@ def _not_text(path: Path) -> InputError:
         data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         row, byte = data.count(b"\n", 0, error.start) + 1, data[error.start]
-        return InputError(f"{path}, row {row}: expected UTF-8 text, found the byte 0x{byte:02x}; save it as UTF-8")
+        return InputError(
+            f"{path}, row {row}: expected UTF-8 text, found the byte 0x{byte:02x}; save it as UTF-8"
+        )
     return InputError(f"{path}: expected UTF-8 text")
 
 
 class _Table:
-    def __init__(self, path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str]) -> None:
+    def __init__(
+        self, path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str]
+    ) -> None:
         self.path = path
         self.wanted = ["run", "t", *inputs, *channels, *extra]
         self.gaps = {*channels, *extra}
@@ -86,15 +95,27 @@ class _Table:
                 raise InputError(f"{self.path}: column {name} has no sample; leave the channel out")
         return self._runs(names, columns)
 
-    def _cells(self, header: list[str], records: Iterator[list[str]]) -> tuple[list[str], dict[str, Array]]:
+    def _cells(
+        self, header: list[str], records: Iterator[list[str]]
+    ) -> tuple[list[str], dict[str, Array]]:
         """Run names row by row, and the other columns, from the rows behind the header."""
         names: list[str] = []
         parts: list[list[Array]] = []
         while rows := list(islice(records, _CHUNK)):
-            cells = dict(zip(header, zip(*self._even(rows, len(header), len(names)), strict=True), strict=True))
+            cells = dict(
+                zip(
+                    header,
+                    zip(*self._even(rows, len(header), len(names)), strict=True),
+                    strict=True,
+                )
+            )
             parts.append([self._numbers(name, cells[name], len(names)) for name in self.wanted[1:]])
             names += [name.strip() for name in cells["run"]]
-        columns = map(np.concatenate, zip(*parts, strict=True)) if parts else [np.empty(0)] * len(self.wanted[1:])
+        columns = (
+            map(np.concatenate, zip(*parts, strict=True))
+            if parts
+            else [np.empty(0)] * len(self.wanted[1:])
+        )
         return names, dict(zip(self.wanted[1:], columns, strict=True))
 
     def _records(self) -> Iterator[list[str]]:
@@ -104,7 +125,9 @@ class _Table:
             try:
                 yield from (row for row in reader if row)
             except csv.Error as error:
-                raise InputError(f"{self.path}, row {reader.line_num}: not a CSV table: {error}") from None
+                raise InputError(
+                    f"{self.path}, row {reader.line_num}: not a CSV table: {error}"
+                ) from None
 
     def _header(self, cells: list[str]) -> list[str]:
         header = [cell.strip() for cell in cells]
@@ -122,7 +145,9 @@ class _Table:
                 raise InputError(f"{self.path}, row 1: column {shown(name)} stands twice")
         for name in self.wanted:
             if name not in header:
-                raise InputError(f"{self.path}: expected column '{name}', found columns {_listed(header)}")
+                raise InputError(
+                    f"{self.path}: expected column '{name}', found columns {_listed(header)}"
+                )
         for name in header:
             if name not in self.wanted:
                 there = f"{self.path.with_suffix('.toml').name} declares {_listed(self.wanted[2:])}"
@@ -130,7 +155,9 @@ class _Table:
         return header
 
     def _even(self, rows: list[list[str]], width: int, first: int) -> list[list[str]]:
-        """The rows, each checked to have as many cells as the header; `first` is the number of the first."""
+        """The rows, each checked to have as many cells as the header; `first` is the number of the
+        first.
+        """
         if set(map(len, rows)) != {width}:
             record, row = next((i, row) for i, row in enumerate(rows) if len(row) != width)
             raise InputError(
@@ -147,7 +174,9 @@ class _Table:
             values = np.array([float(c) if _NUMBER.fullmatch(c) else math.nan for c in cells])
         suspects: Iterable[int] = np.flatnonzero(~np.isfinite(values)).tolist()
         joined = "".join(cells)
-        if "_" in joined or not joined.isascii():  # float() takes 1_000 and the digits of other scripts
+        if (
+            "_" in joined or not joined.isascii()
+        ):  # float() takes 1_000 and the digits of other scripts
             suspects = range(len(cells))
         for i in suspects:
             if cells[i].strip() or name not in self.gaps:
@@ -156,7 +185,11 @@ class _Table:
 
     def _check(self, name: str, cell: str, record: int) -> None:
         if not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
-            more = "; an input has no missing samples" if name in self.inputs and not cell.strip() else ""
+            more = (
+                "; an input has no missing samples"
+                if name in self.inputs and not cell.strip()
+                else ""
+            )
             self._fault(record, name, f"expected a finite number, found {shown(cell)}{more}")
 
     def _runs(self, names: list[str], columns: dict[str, Array]) -> list[TableRun]:
@@ -168,18 +201,26 @@ class _Table:
             if not name:
                 self._fault(begin, "run", "expected the name of a run, found none")
             if name in runs:
-                self._fault(begin, "run", f"run {shown(name)} goes on after another began; expected its rows together")
+                self._fault(
+                    begin,
+                    "run",
+                    f"run {shown(name)} goes on after another began; expected its rows together",
+                )
             part = {c: frozen(columns[c][begin:end]) for c in self.wanted[2:]}
             if end - begin < 2:
                 self._fault(begin, "run", f"run {shown(name)} has one row; expected at least two")
             if not any(np.isfinite(part[c]).any() for c in self.channels):
-                self._fault(begin, self.channels[0], f"run {shown(name)} has no sample of any channel")
+                self._fault(
+                    begin, self.channels[0], f"run {shown(name)} has no sample of any channel"
+                )
             runs[name] = TableRun(name, frozen(columns["t"][begin:end]), part)
         return list(runs.values())
 
     def _increasing(self, t: Array, edges: list[int]) -> None:
         bad = t[1:] <= t[:-1]
-        bad[np.array(edges[1:-1], dtype=int) - 1] = False  # a run may begin earlier than the one before ended
+        bad[np.array(edges[1:-1], dtype=int) - 1] = (
+            False  # a run may begin earlier than the one before ended
+        )
         if bad.any():
             i = int(np.argmax(bad))
             self._fault(i + 1, "t", f"expected more than {t[i]:.12g} s, found {t[i + 1]:.12g} s")

@@ -1,7 +1,7 @@
 """Conversion between units, so that a recording may state its own.
 
-An angle is a dimension of its own here: by the letter of the SI, hertz would pass for radians per second, and a plain
-number for an angle.
+An angle is a dimension of its own here: by the letter of the SI, hertz would pass for radians per
+second, and a plain number for an angle.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 from sims.base import InputError
 
 _LONGEST = 60
-# All that a unit needs, and nothing that could make the parser behind compute for long: names, 1, small powers.
+# All that a unit needs, and nothing that could make the parser behind compute for long: names, 1,
+# small powers.
 _TOKEN = re.compile(
     r"\s*(?:(?P<power>(?:\*\*|\^)\s*[+-]?\d{1,2}(?!\d)|⁻?[¹²³⁴])|(?P<operator>[*/·⋅])|(?P<bracket>[()])"
     r"|(?P<name>[^\W\d][\w°%]*|[°%Ω℃]\w*|1(?![\d.])))\s*"
@@ -35,8 +36,8 @@ def scale(unit: str, target: str) -> Scale:
     """How values in `unit` become values in `target`.
 
     Raises:
-        InputError: `unit` is no unit, or does not convert to `target`; the message begins with what is wrong with it
-            and names neither file nor channel.
+        InputError: `unit` is no unit, or does not convert to `target`; the message begins with what
+            is wrong with it and names neither file nor channel.
     """
     if unit == target:
         return SAME
@@ -48,10 +49,14 @@ def scale(unit: str, target: str) -> Scale:
     except Exception:  # the parser raises whatever it trips over
         raise InputError(f"unknown unit {unit!r}; expected one that converts to {target}") from None
     try:
-        zero, one, two = (float(registry.Quantity(v, parsed).to(target).magnitude) for v in (0.0, 1.0, 2.0))
+        zero, one, two = (
+            float(registry.Quantity(v, parsed).to(target).magnitude) for v in (0.0, 1.0, 2.0)
+        )
     except Exception:  # dimensions differ, or the unit is logarithmic
         hint = "; standard gravity is g_0" if unit == "g" else ""
-        raise InputError(f"expected a unit that converts to {target}, found {unit!r}{hint}") from None
+        raise InputError(
+            f"expected a unit that converts to {target}, found {unit!r}{hint}"
+        ) from None
     gain = one - zero
     if abs(two - one - gain) > 1e-9 * abs(gain):
         raise InputError(f"expected a unit that converts to {target} in proportion, found {unit!r}")

@@ -1,4 +1,6 @@
-"""Recordings written by this project: `NAME.csv` and `NAME.toml`, all of it or nothing, never over what is there."""
+"""Recordings written by this project: `NAME.csv` and `NAME.toml`, all of it or nothing, never over
+what is there.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,8 @@ def write_recording(
         beside: other files to write with it, all or none.
 
     Raises:
-        InputError: a file exists already or cannot be written, or the runs cannot stand in one table.
+        InputError: a file exists already or cannot be written, or the runs cannot stand in one
+            table.
     """
     table = Path(path)
     if table.suffix != ".csv":
@@ -93,7 +96,9 @@ def refuse_existing(paths: Iterable[Path]) -> None:
 
 
 def _exists(path: Path) -> InputError:
-    return InputError(f"{path}: exists already; recordings are never overwritten, name another file")
+    return InputError(
+        f"{path}: exists already; recordings are never overwritten, name another file"
+    )
 
 
 def _place(draft: Path, path: Path) -> None:
@@ -118,16 +123,33 @@ def _table(runs: Sequence[Run], digits: int) -> str:
         seen.add(run.name)
         for names, there, kind in _signals(run, inputs, channels, extra):
             if set(names) != set(there):
-                raise unknown(f"{kind} of run {run.name}", ", ".join(set(names) ^ set(there)), names or ["none"])
-        columns = [run.times, *(there[n] for names, there, _ in _signals(run, inputs, channels, extra) for n in names)]
-        writer.writerows(zip([run.name] * len(run.times), *(_cells(c, digits) for c in columns), strict=True))
+                raise unknown(
+                    f"{kind} of run {run.name}",
+                    ", ".join(set(names) ^ set(there)),
+                    names or ["none"],
+                )
+        columns = [
+            run.times,
+            *(
+                there[n]
+                for names, there, _ in _signals(run, inputs, channels, extra)
+                for n in names
+            ),
+        ]
+        writer.writerows(
+            zip([run.name] * len(run.times), *(_cells(c, digits) for c in columns), strict=True)
+        )
     return text.getvalue()
 
 
 def _signals(
     run: Run, inputs: list[str], channels: list[str], extra: list[str]
 ) -> tuple[tuple[list[str], Mapping[str, Array], str], ...]:
-    return (inputs, run.inputs, "input"), (channels, run.channels, "channel"), (extra, run.extra, "extra column")
+    return (
+        (inputs, run.inputs, "input"),
+        (channels, run.channels, "channel"),
+        (extra, run.extra, "extra column"),
+    )
 
 
 def _cells(values: Array, digits: int) -> list[str]:
@@ -141,7 +163,9 @@ def _description(recording: Recording, declared: Declared) -> str:
     units = {c.name: c.unit for c in (*declared.inputs, *declared.channels)}
     first = recording.runs[0]
     document: dict[str, Any] = {"system": recording.system, "title": recording.title}
-    document["channels"] = {n: {"unit": units[n], **_stated(recording.noise, n)} for n in first.channels}
+    document["channels"] = {
+        n: {"unit": units[n], **_stated(recording.noise, n)} for n in first.channels
+    }
     if first.inputs:
         document["inputs"] = {n: {"unit": units[n]} for n in first.inputs}
     if first.extra:

@@ -15,19 +15,41 @@ _KT, _RESISTANCE, _ARMATURE = (slice(i, i + 1) for i in range(3))
 
 
 class ServoSystem(System):
-    """(armature + mass length^2) q'' = torque - mass gravity length sin q, with a proportional position controller.
+    """(armature + mass length^2) q'' = torque - mass gravity length sin q, with a proportional
+    position controller.
 
-    duty = clip(kp error_gain (goal - q), -1, 1); torque = kt (duty voltage - kt q') / resistance while enabled, else 0.
-    States are the angle q [rad], 0 hanging, and its rate qd [rad/s].
+    duty = clip(kp error_gain (goal - q), -1, 1); torque = kt (duty voltage - kt q') / resistance
+    while enabled, else 0. States are the angle q [rad], 0 hanging, and its rate qd [rad/s].
     """
 
     name = "servo"
     says = "a position-controlled servo motor that carries a pendulum"
     kind: ClassVar[Kind] = "rotary"
     parameters = (
-        Parameter("torque_constant", "N*m/A", 0.5, (0.05, 3.0), (0.2, 1.0), says="torque of the motor per ampere"),
-        Parameter("resistance", "ohm", 4.0, (0.5, 20.0), (2.0, 8.0), says="resistance of the motor's winding"),
-        Parameter("armature", "kg*m^2", 2e-3, (1e-4, 0.05), (5e-4, 8e-3), says="inertia of motor and gears"),
+        Parameter(
+            "torque_constant",
+            "N*m/A",
+            0.5,
+            (0.05, 3.0),
+            (0.2, 1.0),
+            says="torque of the motor per ampere",
+        ),
+        Parameter(
+            "resistance",
+            "ohm",
+            4.0,
+            (0.5, 20.0),
+            (2.0, 8.0),
+            says="resistance of the motor's winding",
+        ),
+        Parameter(
+            "armature",
+            "kg*m^2",
+            2e-3,
+            (1e-4, 0.05),
+            (5e-4, 8e-3),
+            says="inertia of motor and gears",
+        ),
     )
     constants = (
         Constant("mass", "kg", 0.49, "load", positive=True),
@@ -60,7 +82,9 @@ class ServoSystem(System):
     def drive(self, moment: Moment) -> Array:
         """The motor's torque, with its own back electromotive force."""
         k, kt = moment.constants, moment.theta[:, _KT]
-        duty = np.minimum(np.maximum(k["kp"] * k["error_gain"] * (moment.inputs["goal"] - moment.x), -1.0), 1.0)
+        duty = np.minimum(
+            np.maximum(k["kp"] * k["error_gain"] * (moment.inputs["goal"] - moment.x), -1.0), 1.0
+        )
         torque = kt * (duty * k["voltage"] - kt * moment.v) / moment.theta[:, _RESISTANCE]
         return np.where(moment.inputs["torque_enable"] > 0.5, torque, 0.0)
 
@@ -71,6 +95,8 @@ class ServoSystem(System):
         torque: Array = moment.constants["mass"] * moment.constants["length"] * np.cos(moment.x)
         return torque
 
-    def observe(self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]) -> dict[str, Array]:  # noqa: ARG002
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
         """The encoder's angle."""
         return {"q": x[:, :, 0]}

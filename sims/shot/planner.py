@@ -47,8 +47,8 @@ def plan(
 ) -> Plan:
     """The drop height of the largest margin.
 
-    A grid over all heights, then finer ones around its best: there is one maximum as a rule, but need not be, and a
-    height from which the hoop is not reached gives no direction.
+    A grid over all heights, then finer ones around its best: there is one maximum as a rule, but
+    need not be, and a height from which the hoop is not reached gives no direction.
 
     Args:
         simulator: tuned, with channels x, y, z.
@@ -81,9 +81,18 @@ def plan(
 
 
 def flights(
-    simulator: BounceShot, theta: Array, scene: Scene, constants: Mapping[str, float], heights: Array, times: Array
+    simulator: BounceShot,
+    theta: Array,
+    scene: Scene,
+    constants: Mapping[str, float],
+    heights: Array,
+    times: Array,
 ) -> Array:
     """Simulated paths (n, T, 3) from drop heights (n,)."""
     known = {**constants, "incline_angle": scene.angle}
-    scenarios = [Scenario(times, constants={**known, "drop_height": float(height)}) for height in heights]
-    return simulator.simulate_lanes(np.repeat(np.atleast_2d(theta), len(heights), axis=0), scenarios)
+    scenarios = [
+        Scenario(times, constants={**known, "drop_height": float(height)}) for height in heights
+    ]
+    return simulator.simulate_lanes(
+        np.repeat(np.atleast_2d(theta), len(heights), axis=0), scenarios
+    )

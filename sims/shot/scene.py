@@ -12,7 +12,8 @@ from sims.base import Array, InputError
 
 @dataclass(frozen=True)
 class Scene:
-    """What is known of a shot. Heights count from the point of the incline below the release, where x = 0.
+    """What is known of a shot. Heights count from the point of the incline below the release, where
+    x = 0.
 
     Attributes:
         angle: of the incline, radians; it falls towards x.
@@ -28,17 +29,22 @@ class Scene:
 
     def __post_init__(self) -> None:
         if not (0 < self.angle < math.pi / 2 and self.hoop_x > 0 and self.hoop_radius > 0):
-            raise InputError(f"expected an incline between 0 and a right angle and a hoop in front of it, found {self}")
+            raise InputError(
+                f"expected an incline between 0 and a right angle and a hoop in front of it, found {self}"
+            )
         if self.hoop_z <= -self.hoop_x * math.tan(self.angle):
             raise InputError(f"expected a hoop above the incline, found {self}")
 
     def touching(self, radius: float) -> float:
-        """Height of the centre of a ball that touches the incline at x = 0 or would, if let fall there, m."""
+        """Height of the centre of a ball that touches the incline at x = 0 or would, if let fall
+        there, m.
+        """
         return radius / math.cos(self.angle)
 
 
 def crossings(path: Array, scene: Scene) -> Array:
-    """Where paths (n, T, 3) of centres x, y, z come down through the hoop's plane: (n, 2), NaN for never.
+    """Where paths (n, T, 3) of centres x, y, z come down through the hoop's plane: (n, 2), NaN for
+    never.
 
     The flight after the first bounce counts: from where z first rises to where it rises again.
     """
@@ -46,19 +52,25 @@ def crossings(path: Array, scene: Scene) -> Array:
     with np.errstate(invalid="ignore"):
         rises, falls = z[:, 1:] > z[:, :-1], z[:, 1:] < z[:, :-1]
         risen = np.logical_or.accumulate(rises, axis=1)
-        again = np.logical_or.accumulate(np.logical_or.accumulate(risen & falls, axis=1) & rises, axis=1)
+        again = np.logical_or.accumulate(
+            np.logical_or.accumulate(risen & falls, axis=1) & rises, axis=1
+        )
         down = risen & ~again & (z[:, :-1] > scene.hoop_z) & (z[:, 1:] <= scene.hoop_z)
     first = np.argmax(down, axis=1)
     rows = np.arange(len(z))
     high, low = z[rows, first], z[rows, first + 1]
     share = (high - scene.hoop_z) / np.where(down.any(axis=1), high - low, 1.0)
-    place = np.stack([c[rows, first] + share * (c[rows, first + 1] - c[rows, first]) for c in (x, y)], axis=1)
+    place = np.stack(
+        [c[rows, first] + share * (c[rows, first + 1] - c[rows, first]) for c in (x, y)], axis=1
+    )
     result: Array = np.where(down.any(axis=1)[:, None], place, np.nan)
     return result
 
 
 def margins(path: Array, scene: Scene) -> Array:
-    """(n,) distance in m from where a path comes through the hoop's plane to its rim: > 0 inside; NaN for never."""
+    """(n,) distance in m from where a path comes through the hoop's plane to its rim: > 0 inside;
+    NaN for never.
+    """
     place = crossings(path, scene)
     result: Array = scene.hoop_radius - np.hypot(place[:, 0] - scene.hoop_x, place[:, 1])
     return result

@@ -1,9 +1,10 @@
 """A ball dropped on an incline, seen in the incline's own frame, where the incline is level ground.
 
-The coordinates are the centre's displacement from where it is let go: down the slope, across it, and away from it. In
-that frame gravity is as uniform as ever, only tilted, so every engine, force and contact effect works as for a ball on
-level ground. The channels turn the motion back: x is horizontal and points the way the incline falls, z is up, both
-from the point of the incline below the ball.
+The coordinates are the centre's displacement from where it is let go: down the slope, across it,
+and away from it. In that frame gravity is as uniform as ever, only tilted, so every engine, force
+and contact effect works as for a ball on level ground. The channels turn the motion back: x is
+horizontal and points the way the incline falls, z is up, both from the point of the incline below
+the ball.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ _LEVEL_ONLY = ("force.bias", "force.periodic", "lift.magnus")
 class ShotSystem(System):
     """A ball that falls `drop_height` on an incline and leaves it on its way to a hoop.
 
-    At the impact the speed along the normal turns round and is multiplied by the restitution. Friction takes tangential
-    speed as from a sphere that does not spin before: up to friction (1 + e) |vn|, and no more than the share
-    k / (1 + k) at which it grips, with k its moment of inertia over mass x radius^2 (2/5: solid; 2/3: a thin shell).
-    That is right for the first impact, which is the one that counts.
+    At the impact the speed along the normal turns round and is multiplied by the restitution.
+    Friction takes tangential speed as from a sphere that does not spin before: up to friction (1 +
+    e) |vn|, and no more than the share k / (1 + k) at which it grips, with k its moment of inertia
+    over mass x radius^2 (2/5: solid; 2/3: a thin shell). That is right for the first impact, which
+    is the one that counts.
     """
 
     name = "bounce-shot"
@@ -34,22 +36,45 @@ class ShotSystem(System):
     kind: ClassVar[Kind] = "point"
     parameters = (
         Parameter(
-            "restitution", "1", 0.5, (0.0, 1.0), says="share of the normal speed with which the ball leaves the incline"
+            "restitution",
+            "1",
+            0.5,
+            (0.0, 1.0),
+            says="share of the normal speed with which the ball leaves the incline",
         ),
     )
     constants = (
-        Constant("drop_height", "m", 1.5, "how far the centre falls until the ball touches the incline", positive=True),
-        Constant("incline_angle", "rad", 0.35, "between the incline and the horizontal, falling towards x"),
+        Constant(
+            "drop_height",
+            "m",
+            1.5,
+            "how far the centre falls until the ball touches the incline",
+            positive=True,
+        ),
+        Constant(
+            "incline_angle",
+            "rad",
+            0.35,
+            "between the incline and the horizontal, falling towards x",
+        ),
         Constant("mass", "kg", 0.05, positive=True),
         Constant("radius", "m", 0.03, positive=True),
         Constant("gravity", "m/s^2", 9.81, "downward"),
         Constant("friction", "1", 0.2, "of ball and incline; 0 keeps the tangential speed"),
-        Constant("inertia_ratio", "1", 0.4, "moment of inertia over mass x radius^2; 0.4 for a solid sphere", True),
+        Constant(
+            "inertia_ratio",
+            "1",
+            0.4,
+            "moment of inertia over mass x radius^2; 0.4 for a solid sphere",
+            True,
+        ),
     )
     channels = (
         Channel("x", "m", says="centre, horizontally from where it was let go"),
         Channel("y", "m", says="centre, across x"),
-        Channel("z", "m", says="height of the centre above the point of the incline below the release"),
+        Channel(
+            "z", "m", says="height of the centre above the point of the incline below the release"
+        ),
     )
     coordinates = ("along", "across", "away")
     rates = ("v_along", "v_across", "v_away")
@@ -64,9 +89,13 @@ class ShotSystem(System):
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:
         """Effects that act along the vertical coordinate, which this frame does not have."""
-        return "it acts along the vertical, and the incline is tilted" if effect.name in _LEVEL_ONLY else ""
+        return (
+            "it acts along the vertical, and the incline is tilted"
+            if effect.name in _LEVEL_ONLY
+            else ""
+        )
 
-    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:  # noqa: ARG002
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """One: force is counted per unit mass."""
         return np.ones((len(theta), 1))
 
@@ -84,12 +113,18 @@ class ShotSystem(System):
             return np.concatenate([nothing, nothing + 1.0, nothing], axis=1)
         return np.concatenate([np.cos(angle), nothing, np.sin(angle)], axis=1)
 
-    def observe(self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]) -> dict[str, Array]:  # noqa: ARG002
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
         """The centre in the room's frame."""
         cos, sin = np.cos(constants["incline_angle"]), np.sin(constants["incline_angle"])
         along, away = x[:, :, 0], x[:, :, 2]
         height = constants["radius"] / cos + constants["drop_height"]
-        return {"x": along * cos + away * sin, "y": x[:, :, 1], "z": height - along * sin + away * cos}
+        return {
+            "x": along * cos + away * sin,
+            "y": x[:, :, 1],
+            "z": height - along * sin + away * cos,
+        }
 
     def floor(self, constants: Mapping[str, Array]) -> Array:
         """Where the ball touches, measured from its release along the normal."""

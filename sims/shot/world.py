@@ -1,12 +1,14 @@
 """The world in which shots are made: MuJoCo, with physics that the planning simulator lacks.
 
-A free rigid sphere flies through still air with quadratic drag, 1/2 rho Cd A v^2, and the lift of its spin,
-1/2 rho A r omega x v (C_L = r omega / v; G. Robinson, I. Robinson, Physica Scripta 88, 018101, 2013,
-doi:10.1088/0031-8949/88/01/018101), by MuJoCo's fourth-order integrator. Contact takes time: MuJoCo's spring and damper
-between ball and ground act for about `CONTACT` seconds, damped for the restitution at that impact's speed (T. Schwager,
-T. Poeschel, Phys. Rev. E 78, 051304, 2008, doi:10.1103/PhysRevE.78.051304: contact ends when the force does).
-MuJoCo's friction is a convex relaxation that turns slip into lift, so contact is frictionless there, and Coulomb's
-friction acts from step to step with the normal force that MuJoCo reports: the ball slides until it grips, and spins.
+A free rigid sphere flies through still air with quadratic drag, 1/2 rho Cd A v^2, and the lift of
+its spin, 1/2 rho A r omega x v (C_L = r omega / v; G. Robinson, I. Robinson, Physica Scripta 88,
+018101, 2013, doi:10.1088/0031-8949/88/01/018101), by MuJoCo's fourth-order integrator. Contact
+takes time: MuJoCo's spring and damper between ball and ground act for about `CONTACT` seconds,
+damped for the restitution at that impact's speed (T. Schwager, T. Poeschel, Phys. Rev. E 78,
+051304, 2008, doi:10.1103/PhysRevE.78.051304: contact ends when the force does). MuJoCo's friction
+is a convex relaxation that turns slip into lift, so contact is frictionless there, and Coulomb's
+friction acts from step to step with the normal force that MuJoCo reports: the ball slides until it
+grips, and spins.
 """
 
 from __future__ import annotations
@@ -30,12 +32,18 @@ _IMPEDANCE = 0.9999  # the largest MuJoCo allows
 
 def missing() -> str:
     """Why this world cannot be had here; empty if it can."""
-    return "" if importlib.util.find_spec("mujoco") else "the world needs mujoco, not installed (pip install mujoco)"
+    return (
+        ""
+        if importlib.util.find_spec("mujoco")
+        else "the world needs mujoco, not installed (pip install mujoco)"
+    )
 
 
 @dataclass(frozen=True)
 class Ground:
-    """What the ball falls on, a plane through the origin: its angle in radians, falling towards x, and friction."""
+    """What the ball falls on, a plane through the origin: its angle in radians, falling towards x,
+    and friction.
+    """
 
     angle: float = 0.0
     friction: float = 0.3
@@ -43,7 +51,7 @@ class Ground:
 
 def fly(
     ball: Ball, ground: Ground, start: tuple[float, float, float], times: Array, air: float = AIR
-) -> Array:  # fmt: skip
+) -> Array:
     """The path of a ball let go at rest.
 
     Args:
@@ -69,7 +77,9 @@ def fly(
 
 @functools.cache
 def damping_ratio(restitution: float) -> float:
-    """Damping ratio of a spring and damper that end their contact with this restitution, 0 < e <= 1."""
+    """Damping ratio of a spring and damper that end their contact with this restitution, 0 < e <=
+    1.
+    """
     low, high = 0.0, 60.0
     for _ in range(80):
         middle = 0.5 * (low + high)
@@ -119,7 +129,10 @@ class _Flight:
         """One step, short where the ball touches or soon will."""
         data = self._data
         position, velocity = data.qpos[:3].tolist(), data.qvel.tolist()
-        gap, rate = self.gap(*position), velocity[0] * self._normal[0] + velocity[2] * self._normal[1]
+        gap, rate = (
+            self.gap(*position),
+            velocity[0] * self._normal[0] + velocity[2] * self._normal[1],
+        )
         near = gap <= 0.0 or (rate < 0.0 and gap < -2.0 * _FLIGHT * rate)
         self._model.opt.timestep = _IMPACT if near else _FLIGHT
         if gap > 0.0:
@@ -138,8 +151,12 @@ class _Flight:
 
     def _push(self, velocity: list[float]) -> None:
         """Drag, lift and friction as the force and torque of the coming step."""
-        vx, vy, vz, wx, wy, wz = velocity  # spin in the ball's frame, which does not matter for a spin about y
-        vz -= 0.5 * GRAVITY * self._model.opt.timestep  # held through the step, so taken from its middle
+        vx, vy, vz, wx, wy, wz = (
+            velocity  # spin in the ball's frame, which does not matter for a spin about y
+        )
+        vz -= (
+            0.5 * GRAVITY * self._model.opt.timestep
+        )  # held through the step, so taken from its middle
         pull = -self._drag * math.sqrt(vx * vx + vy * vy + vz * vz)
         force = [
             pull * vx + self._lift * (wy * vz - wz * vy),
@@ -182,7 +199,9 @@ def _mjcf(ball: Ball, ground: Ground) -> str:
 
 
 def _sampled(rows: Array, times: Array) -> Array:
-    """Positions (T, 3) at the sample times from rows of time, position, velocity, by cubics between steps."""
+    """Positions (T, 3) at the sample times from rows of time, position, velocity, by cubics between
+    steps.
+    """
     from scipy.interpolate import CubicHermiteSpline
 
     path: Array = CubicHermiteSpline(rows[:, 0], rows[:, 1:4], rows[:, 4:7])(times)

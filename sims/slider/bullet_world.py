@@ -1,4 +1,6 @@
-"""The slider's world in Bullet: a body on a guide along x, without gravity, which the guide would carry."""
+"""The slider's world in Bullet: a body on a guide along x, without gravity, which the guide would
+carry.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ OPEN_LOOP = True  # the force is the input, whatever the motion
 
 def build(client: int, constants: Mapping[str, float]) -> int:  # noqa: ARG001
     """A guide with one body on it; returns the body's id."""
-    return bullet.joint(client, bullet.engine().JOINT_PRISMATIC, (1.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0))
+    return bullet.joint(
+        client, bullet.engine().JOINT_PRISMATIC, (1.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0)
+    )
 
 
 def load(client: int, body: int, inertia: float, constants: Mapping[str, float]) -> bool:  # noqa: ARG001

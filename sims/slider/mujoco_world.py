@@ -1,4 +1,6 @@
-"""The slider's world in MuJoCo: a body on a guide along x, without gravity, which the guide would carry."""
+"""The slider's world in MuJoCo: a body on a guide along x, without gravity, which the guide would
+carry.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,9 @@ OPEN_LOOP = True  # the force is the input, whatever the motion
 
 
 def model(constants: Mapping[str, float]) -> str:  # noqa: ARG001
-    """The world as MJCF. The body hangs below the guide, since MuJoCo keeps the mass of one at its joint's origin."""
+    """The world as MJCF. The body hangs below the guide, since MuJoCo keeps the mass of one at its
+    joint's origin.
+    """
     return """
     <mujoco>
       <option gravity="0 0 0"/>

@@ -20,13 +20,16 @@ class SliderSystem(System):
     kind: ClassVar[Kind] = "linear"
     parameters = (Parameter("mass", "kg", 1.0, (0.1, 10.0), (0.5, 2.0), says="mass that moves"),)
     inputs = (Channel("u", "N", says="force along the guide"),)
-    channels = (Channel("x", "m", says="position along the guide"), Channel("v", "m/s", says="its rate"))
+    channels = (
+        Channel("x", "m", says="position along the guide"),
+        Channel("v", "m/s", says="its rate"),
+    )
     coordinates = ("x",)
     rates = ("v",)
     states: ClassVar[Mapping[str, float]] = MappingProxyType({"x": 0.0, "v": 0.0})
     sensed = ("x", "v")
 
-    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:  # noqa: ARG002
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """(L, 1) kg."""
         return theta[:, :1]
 
@@ -42,6 +45,8 @@ class SliderSystem(System):
         """The guide runs along x; what pushes across it is held by it."""
         return moment.theta[:, :1] if axis == "x" else np.zeros_like(moment.x)
 
-    def observe(self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]) -> dict[str, Array]:  # noqa: ARG002
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
         """Position and rate."""
         return {"x": x[:, :, 0], "v": v[:, :, 0]}

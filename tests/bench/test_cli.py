@@ -36,7 +36,9 @@ def experiment(tmp_path):
 
 def simgap(*arguments, cwd=None):
     command = [sys.executable, "-m", "bench.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=300, check=False)
+    return subprocess.run(
+        command, capture_output=True, text=True, cwd=cwd, timeout=300, check=False
+    )
 
 
 def test_help_is_quick_and_imports_nothing_heavy():
@@ -54,7 +56,17 @@ def test_help_is_quick_and_imports_nothing_heavy():
     )
     imported = {line.split("|")[-1].strip().split(".")[0] for line in traced.stderr.splitlines()}
     assert "argparse" in imported
-    assert not imported & {"numpy", "pandas", "torch", "pybullet", "matplotlib", "skopt", "scipy", "cma", "nlopt"}
+    assert not imported & {
+        "numpy",
+        "pandas",
+        "torch",
+        "pybullet",
+        "matplotlib",
+        "skopt",
+        "scipy",
+        "cma",
+        "nlopt",
+    }
 
 
 def test_version(capsys):
@@ -102,7 +114,10 @@ def test_compare_writes_the_folder_it_promises_and_a_plugin_tuner_is_in_it(exper
     assert "nelder_mead" in done.stdout
     assert str(folder / "table.csv") in done.stdout
 
-    table, figure = (folder / "table.csv").read_bytes(), folder / "figures" / "error-vs-simulations.png"
+    table, figure = (
+        (folder / "table.csv").read_bytes(),
+        folder / "figures" / "error-vs-simulations.png",
+    )
     (folder / "table.csv").unlink()
     figure.unlink()
     again = simgap("plot", folder, "--plugin", SPRING_PLUGIN)
@@ -118,8 +133,24 @@ def test_compare_writes_the_folder_it_promises_and_a_plugin_tuner_is_in_it(exper
 
 @pytest.mark.slow
 def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path):
-    arguments = ["compare", experiment, "--plugin", SPRING_PLUGIN, "--tuners", "random", "--targets", 4000]
-    command = [sys.executable, "-m", "bench.cli", *map(str, arguments), "--out", str(tmp_path / "out")]
+    arguments = [
+        "compare",
+        experiment,
+        "--plugin",
+        SPRING_PLUGIN,
+        "--tuners",
+        "random",
+        "--targets",
+        4000,
+    ]
+    command = [
+        sys.executable,
+        "-m",
+        "bench.cli",
+        *map(str, arguments),
+        "--out",
+        str(tmp_path / "out"),
+    ]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
@@ -148,7 +179,10 @@ def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path)
             "unknown experiment 'bal-drop'; there are: arm-drive, arm-swing, ball-crossengine, ball-drop",
         ),
         (["compare", "none.toml"], "none.toml: no such file"),
-        (["compare", "ball-drop", "--tuners", "cma"], "unknown tuner 'cma'; there are: bayes, cma_es"),
+        (
+            ["compare", "ball-drop", "--tuners", "cma"],
+            "unknown tuner 'cma'; there are: bayes, cma_es",
+        ),
         (["compare", "ball-drop", "--plugin", "none.py"], "none.py: no such file"),
         (["compare"], "expected an experiment (see `simgap list experiments`), or --resume DIR"),
         (["compare", "--resume", "nowhere"], "nowhere: expected the folder of a comparison"),
@@ -157,7 +191,9 @@ def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path)
         (["plot", "nowhere"], "nowhere: expected the folder of a comparison"),
     ],
 )
-def test_unknown_names_are_one_line_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):
+def test_unknown_names_are_one_line_and_exit_code_2(
+    arguments, message, capsys, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 2
     captured = capsys.readouterr()
@@ -196,7 +232,10 @@ def test_faults_inside_an_experiment_show_before_any_work(experiment, tmp_path, 
         assert change != text
         path = tmp_path / "changed.toml"
         path.write_text(change)
-        assert main(["compare", str(path), "--plugin", SPRING_PLUGIN, "--out", str(tmp_path / "out")]) == 2
+        assert (
+            main(["compare", str(path), "--plugin", SPRING_PLUGIN, "--out", str(tmp_path / "out")])
+            == 2
+        )
         captured = capsys.readouterr().err
         assert message in captured
         assert captured.count("\n") == 1
@@ -226,7 +265,9 @@ def test_list_says_what_each_thing_is(capsys):
         names = [line.split()[0] for line in lines]
         assert set(expected) <= set(names)
         assert all(len(line.split()) > 3 for line in lines)
-        assert {line.split()[0] for line in lines if "skipped" in line} <= {"npe", "turbo"}, "they are extras"
+        assert {line.split()[0] for line in lines if "skipped" in line} <= {"npe", "turbo"}, (
+            "they are extras"
+        )
 
 
 def test_experiments_need_no_install_location(tmp_path):

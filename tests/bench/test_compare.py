@@ -28,7 +28,9 @@ def write(path, **changes):
 
 def simgap(*arguments, **options):
     command = [sys.executable, "-m", "bench.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, **options)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=300, check=False, **options
+    )
 
 
 def without_times(frame):
@@ -37,8 +39,12 @@ def without_times(frame):
 
 def same(a, b):
     for name in ("status.csv", "table.csv"):
-        pd.testing.assert_frame_equal(*(without_times(pd.read_csv(folder / name)) for folder in (a, b)))
-    pd.testing.assert_frame_equal(*(without_times(pd.read_parquet(folder / "runs.parquet")) for folder in (a, b)))
+        pd.testing.assert_frame_equal(
+            *(without_times(pd.read_csv(folder / name)) for folder in (a, b))
+        )
+    pd.testing.assert_frame_equal(
+        *(without_times(pd.read_parquet(folder / "runs.parquet")) for folder in (a, b))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -51,9 +57,21 @@ def finished_folder(tmp_path_factory):
 
 
 def begun(folder, experiment, enough):
-    """Starts a comparison, kills it without warning when `enough` runs are there, and gives the folder."""
-    command = [sys.executable, "-m", "bench.cli", "compare", str(experiment), "--plugin", SPRING_PLUGIN]
-    process = subprocess.Popen([*command, "--out", str(folder)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    """Starts a comparison, kills it without warning when `enough` runs are there, and gives the
+    folder.
+    """
+    command = [
+        sys.executable,
+        "-m",
+        "bench.cli",
+        "compare",
+        str(experiment),
+        "--plugin",
+        SPRING_PLUGIN,
+    ]
+    process = subprocess.Popen(
+        [*command, "--out", str(folder)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and len(finished(folder)) < enough and process.poll() is None:
         time.sleep(0.01)
@@ -63,7 +81,9 @@ def begun(folder, experiment, enough):
 
 
 @pytest.mark.slow
-def test_killed_without_warning_and_resumed_the_result_is_the_undisturbed_one(finished_folder, tmp_path, capsys):
+def test_killed_without_warning_and_resumed_the_result_is_the_undisturbed_one(
+    finished_folder, tmp_path, capsys
+):
     folder = begun(tmp_path / "out", finished_folder / "e.toml", 5)
     before = finished(folder)
     assert 5 <= len(before) < 48
@@ -76,12 +96,16 @@ def test_killed_without_warning_and_resumed_the_result_is_the_undisturbed_one(fi
     assert f"0/{48 - len(before)}" in done.stderr, "only what is missing is made"
     same(folder, finished_folder / "out")
     kept = pd.read_csv(folder / "status.csv").set_index("run")["seconds"]
-    assert all(kept[s.run] == s.seconds for s in before.values()), "what was finished was not made again"
+    assert all(kept[s.run] == s.seconds for s in before.values()), (
+        "what was finished was not made again"
+    )
     assert not (folder / "segments").exists()
     assert main(["status", str(folder)]) == 0
     assert "48 of 48 runs finished, complete" in capsys.readouterr().out
 
-    again = simgap("compare", "--resume", folder)  # there is nothing left to do, and it says so by doing nothing
+    again = simgap(
+        "compare", "--resume", folder
+    )  # there is nothing left to do, and it says so by doing nothing
     assert again.returncode == 0
     assert "running" not in again.stderr
 
@@ -136,14 +160,18 @@ def test_run_ids_change_with_everything_that_matters_and_nothing_else():
     ):  # fmt: skip
         assert not set(ids(**change).values()) & set(plain.values()), change
     options = ids(tuners={"random": {}, "cma_es": {"options": {"sigma": 0.2}}})
-    assert {k for k in plain if plain[k] != options[k]} == {k for k in plain if k.startswith("cma_es")}
+    assert {k for k in plain if plain[k] != options[k]} == {
+        k for k in plain if k.startswith("cma_es")
+    }
     assert ids(title="another", says="words") == plain
     assert plain.items() <= ids(targets=5).items()
     assert plain.items() <= ids(tuners={"random": {}, "nelder_mead": {}, "cma_es": {}}).items()
 
 
 @pytest.mark.slow
-def test_every_chaos_tuner_has_its_status_and_the_others_do_not_change_by_a_bit(finished_folder, tmp_path):
+def test_every_chaos_tuner_has_its_status_and_the_others_do_not_change_by_a_bit(
+    finished_folder, tmp_path
+):
     everyone = {"random": {}, **{name: {"seeds": 1} for name in STATUSES}, "cma_es": {}}
     experiment = write(tmp_path / "e.toml", targets=6, timeout=20, memory=400, tuners=everyone)
     plugins = ["--plugin", SPRING_PLUGIN, "--plugin", CHAOS]
@@ -154,7 +182,17 @@ def test_every_chaos_tuner_has_its_status_and_the_others_do_not_change_by_a_bit(
     )
     (tmp_path / "go.py").write_text(code)
     names = ",".join(everyone)
-    command = [sys.executable, tmp_path / "go.py", "compare", experiment, *plugins, "--targets", 2, "--tuners", names]
+    command = [
+        sys.executable,
+        tmp_path / "go.py",
+        "compare",
+        experiment,
+        *plugins,
+        "--targets",
+        2,
+        "--tuners",
+        names,
+    ]
     done = subprocess.run(
         [*map(str, command), "--out", str(tmp_path / "out")],
         capture_output=True, text=True, timeout=300, check=False, env=hang_shorter,
@@ -168,15 +206,28 @@ def test_every_chaos_tuner_has_its_status_and_the_others_do_not_change_by_a_bit(
     assert "1000 simulations beside the budget" in reasons["chaos_cheat"]
     assert "read-only" in reasons["chaos_record_spoiler"]
     assert "SIGSEGV" in reasons["chaos_segfault"]
-    assert statuses.groupby("tuner")["simulations"].max()[["chaos_over_ask", "chaos_shout"]].tolist() == [12, 12]
+    assert statuses.groupby("tuner")["simulations"].max()[
+        ["chaos_over_ask", "chaos_shout"]
+    ].tolist() == [12, 12]
     assert "RuntimeError: boom (chaos.py, line " in done.stdout
     assert "xxxx" not in done.stdout
-    columns = [c for c in pd.read_parquet(tmp_path / "out" / "runs.parquet") if c not in [*MEASURED, "experiment"]]
-    mine, theirs = (pd.read_parquet(f / "runs.parquet")[columns] for f in (tmp_path / "out", finished_folder / "out"))
-    shared = theirs[theirs["target"].str.contains("-00[01]")].drop(columns="run").reset_index(drop=True)
+    columns = [
+        c
+        for c in pd.read_parquet(tmp_path / "out" / "runs.parquet")
+        if c not in [*MEASURED, "experiment"]
+    ]
+    mine, theirs = (
+        pd.read_parquet(f / "runs.parquet")[columns]
+        for f in (tmp_path / "out", finished_folder / "out")
+    )
+    shared = (
+        theirs[theirs["target"].str.contains("-00[01]")].drop(columns="run").reset_index(drop=True)
+    )
     mine = mine[mine["tuner"].isin(["random", "cma_es"])].drop(columns="run").reset_index(drop=True)
     pd.testing.assert_frame_equal(mine, shared)
-    table, theirs = (pd.read_csv(f / "table.csv") for f in (tmp_path / "out", finished_folder / "out"))
+    table, theirs = (
+        pd.read_csv(f / "table.csv") for f in (tmp_path / "out", finished_folder / "out")
+    )
     failures = table.groupby("tuner")["failures"].max()
     assert failures["chaos_hang"] == 2
     assert failures["cma_es"] == 0
@@ -184,12 +235,25 @@ def test_every_chaos_tuner_has_its_status_and_the_others_do_not_change_by_a_bit(
 
 @pytest.mark.slow
 def test_failed_runs_make_the_exit_code_1_unless_allowed(tmp_path, capsys):
-    experiment = write(tmp_path / "e.toml", targets=1, tuners={"random": {}, "chaos_raise": {"seeds": 1}})
-    common = ["compare", str(experiment), "--plugin", SPRING_PLUGIN, "--plugin", CHAOS, "--jobs", "1", "--out"]
+    experiment = write(
+        tmp_path / "e.toml", targets=1, tuners={"random": {}, "chaos_raise": {"seeds": 1}}
+    )
+    common = [
+        "compare",
+        str(experiment),
+        "--plugin",
+        SPRING_PLUGIN,
+        "--plugin",
+        CHAOS,
+        "--jobs",
+        "1",
+        "--out",
+    ]
     assert main([*common, str(tmp_path / "a")]) == 1
     said = capsys.readouterr().out
     assert (
-        "failures\ntuner        runs  status   first reason\nchaos_raise     2  crashed  RuntimeError: boom (" in said
+        "failures\ntuner        runs  status   first reason\nchaos_raise     2  crashed  RuntimeError: boom ("
+        in said
     )
     assert main([*common, str(tmp_path / "b"), "--allow-failures"]) == 0
     assert "chaos_raise     2  crashed" in capsys.readouterr().out
@@ -207,5 +271,8 @@ def test_first_line_says_what_and_where():
         "my.package.OddError: first words\nsecond line\nthird line\n"
     )
     assert first_line(chained) == "my.package.OddError: first words (mine.py, line 12, in tune)"
-    assert first_line("the worker process exited with code 3") == "the worker process exited with code 3"
+    assert (
+        first_line("the worker process exited with code 3")
+        == "the worker process exited with code 3"
+    )
     assert first_line("") == ""

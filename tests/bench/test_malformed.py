@@ -1,4 +1,6 @@
-"""Two thousand malformed experiments, plugins and result folders: each gives one clear line, or is sound after all."""
+"""Two thousand malformed experiments, plugins and result folders: each gives one clear line, or is
+sound after all.
+"""
 
 import shutil
 from collections import Counter
@@ -23,7 +25,11 @@ SETTINGS = settings(
     deadline=None,
     derandomize=True,
     database=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
+    suppress_health_check=[
+        HealthCheck.function_scoped_fixture,
+        HealthCheck.too_slow,
+        HealthCheck.data_too_large,
+    ],
 )
 FULL = {
     **SPRING,
@@ -59,12 +65,18 @@ def spoilt_documents(draw):
     """An experiment with one to three things wrong with it, as bytes."""
     document = {k: dict(v) if isinstance(v, dict) else v for k, v in FULL.items()}
     for _ in range(draw(st.integers(1, 3))):
-        key = draw(st.sampled_from([*FULL, "memory", "settings", "world", "constants", "recording", "ranges", "oops"]))
+        key = draw(
+            st.sampled_from(
+                [*FULL, "memory", "settings", "world", "constants", "recording", "ranges", "oops"]
+            )
+        )
         act = draw(st.integers(0, 3))
         if act == 0:
             document.pop(key, None)
         elif act == 1 and isinstance(document.get(key), dict):
-            inner = draw(st.sampled_from([*map(str, document[key]), "x", "rate", "nope", "tuner", "seeds"]))
+            inner = draw(
+                st.sampled_from([*map(str, document[key]), "x", "rate", "nope", "tuner", "seeds"])
+            )
             document[key][inner] = draw(JUNK)
         else:
             document[key] = draw(JUNK)
@@ -83,7 +95,9 @@ def spoilt(draw, data, chance=8):
     if act == 1:
         return data[:place] + draw(st.binary(max_size=5)) + data[place:]
     if act == 2:
-        return data[:place] + draw(st.sampled_from([b"\x00", b"\xff\xfe", b"'", b'"""', b"\n[", b"=", b"\xef\xbb\xbf"]))
+        return data[:place] + draw(
+            st.sampled_from([b"\x00", b"\xff\xfe", b"'", b'"""', b"\n[", b"=", b"\xef\xbb\xbf"])
+        )
     return data
 
 
@@ -131,7 +145,11 @@ count = iter(range(10**9))
 
 @pytest.mark.slow
 @settings(SETTINGS, max_examples=450)
-@given(pieces=st.lists(st.sampled_from(PIECES), max_size=5), junk=st.binary(max_size=30), tail=st.integers(0, 5))
+@given(
+    pieces=st.lists(st.sampled_from(PIECES), max_size=5),
+    junk=st.binary(max_size=30),
+    tail=st.integers(0, 5),
+)
 def test_spoilt_plugins(folder, pieces, junk, tail):
     number = next(count)
     path = folder / f"plugin_{number}.py"
@@ -141,7 +159,9 @@ def test_spoilt_plugins(folder, pieces, junk, tail):
         load_plugins([path])
         seen["sound"] += 1
     except InputError as error:
-        is_one_line(error, f"plugin_{number}.py" if "exists already" not in str(error) else "exists already")
+        is_one_line(
+            error, f"plugin_{number}.py" if "exists already" not in str(error) else "exists already"
+        )
     finally:
         path.unlink()
 
@@ -167,7 +187,12 @@ def damages(draw):
     common = ["experiment.toml", "environment.json"]
     name = draw(st.sampled_from([*common, *(["segments/plan.txt", "segments/000001.journal"] if half else []),
                                  *([] if half else ["runs.parquet", "status.csv", "training.csv"])]))  # fmt: skip
-    return half, name, draw(st.sampled_from(["missing", "empty", "cut", "spoilt", "other"])), draw(st.randoms())
+    return (
+        half,
+        name,
+        draw(st.sampled_from(["missing", "empty", "cut", "spoilt", "other"])),
+        draw(st.randoms()),
+    )
 
 
 @pytest.mark.slow
@@ -185,7 +210,9 @@ def test_half_written_and_damaged_folders(folder, results, damage):
         path.unlink()
     elif how == "other":
         path.write_bytes(
-            random.choice([b"{}", b"[]", b"null", b"a,b\n1,2\n", b"PAR1PAR1", b'{"experiment": 3}', b"\xff"])
+            random.choice(
+                [b"{}", b"[]", b"null", b"a,b\n1,2\n", b"PAR1PAR1", b'{"experiment": 3}', b"\xff"]
+            )
         )
     else:
         spoiled = {
@@ -202,7 +229,11 @@ def test_half_written_and_damaged_folders(folder, results, damage):
     ):
         try:
             made = act()
-            if isinstance(made, tuple) and hasattr(made[-1], "kept") and hasattr(made[-1].kept, "close"):
+            if (
+                isinstance(made, tuple)
+                and hasattr(made[-1], "kept")
+                and hasattr(made[-1].kept, "close")
+            ):
                 made[-1].kept.close()
         except InputError as error:
             is_one_line(error)

@@ -12,7 +12,9 @@ def plugin(tmp_path, text, name="mine.py"):
 
 
 def test_plugin_registers_by_the_name_derived_from_its_class(tmp_path):
-    load_plugins([plugin(tmp_path, "from methods.base import Tuner\nclass MyGreatTuner(Tuner):\n    pass\n")])
+    load_plugins(
+        [plugin(tmp_path, "from methods.base import Tuner\nclass MyGreatTuner(Tuner):\n    pass\n")]
+    )
     assert "my_great_tuner" in tuners.names()
     assert issubclass(tuners.get("my_great_tuner"), Tuner)
 
@@ -21,10 +23,16 @@ def test_plugin_registers_by_the_name_derived_from_its_class(tmp_path):
     ("text", "message"),
     [
         ("def f(:\n", r"mine.py, line 1: "),
-        ("import nothing_of_that_name\n", "ModuleNotFoundError: No module named 'nothing_of_that_name'"),
+        (
+            "import nothing_of_that_name\n",
+            "ModuleNotFoundError: No module named 'nothing_of_that_name'",
+        ),
         ("x = 1\n", "defines neither a Tuner nor a Simulator nor an Effect"),
         ("from methods.base import Tuner\n", "defines neither"),
-        ("from methods.base import Tuner\nclass Random(Tuner): pass\n", "tuner 'random' exists already"),
+        (
+            "from methods.base import Tuner\nclass Random(Tuner): pass\n",
+            "tuner 'random' exists already",
+        ),
     ],
 )
 def test_faulty_plugin_is_one_line(tmp_path, text, message):

@@ -1,7 +1,9 @@
-"""Who is ahead of a tuner, at which number of simulations: ``python -m tests.benchmarks.behind FOLDER [TUNER]``.
+"""Who is ahead of a tuner, at which number of simulations: ``python -m tests.benchmarks.behind
+FOLDER [TUNER]``.
 
-Reads a comparison's folder; paired tests over its targets after 1, 2, 3, 5, ... simulations (`bench.analysis.paired`: Wilcoxon
-on the logarithms of errors, Holm's correction over all pairs). Writes behind.csv there and prints it as a table.
+Reads a comparison's folder; paired tests over its targets after 1, 2, 3, 5, ... simulations
+(`bench.analysis.paired`: Wilcoxon on the logarithms of errors, Holm's correction over all pairs).
+Writes behind.csv there and prints it as a table.
 """
 
 import argparse
@@ -16,7 +18,9 @@ from bench.store.folder import configuration, read
 
 
 def against(folder, tuner):
-    """One row a rival, range and number of simulations: median error of `tuner` over the rival's, and Holm's p."""
+    """One row a rival, range and number of simulations: median error of `tuner` over the rival's,
+    and Holm's p.
+    """
     stored = read(folder)
     parts = []
     metric, runs, _ = primary(stored.runs)
@@ -30,7 +34,17 @@ def against(folder, tuner):
         found["behind"] = (found["p_holm"] < 0.05) & (found["effect"] < 0.0)
         found["ahead"] = (found["p_holm"] < 0.05) & (found["effect"] > 0.0)
         parts.append(found.assign(simulations=k))
-    columns = ["range", "rival", "simulations", "targets", "error_ratio", "effect", "p_holm", "ahead", "behind"]
+    columns = [
+        "range",
+        "rival",
+        "simulations",
+        "targets",
+        "error_ratio",
+        "effect",
+        "p_holm",
+        "ahead",
+        "behind",
+    ]
     return pd.concat(parts)[columns].sort_values(["range", "rival", "simulations"])
 
 
@@ -43,7 +57,9 @@ def main():
     table.to_csv(options.folder / "behind.csv", index=False, float_format="%.3g")
     words = table["error_ratio"].map("{:.2g}".format) + table["ahead"].map({True: " +", False: ""})
     table["shown"] = words + table["behind"].map({True: " BEHIND", False: ""})
-    print(f"median error of {options.tuner} over the rival's; + significantly ahead, BEHIND significantly behind")
+    print(
+        f"median error of {options.tuner} over the rival's; + significantly ahead, BEHIND significantly behind"
+    )
     print(table.pivot(index=["range", "rival"], columns="simulations", values="shown").to_string())
 
 

@@ -1,7 +1,7 @@
 """What a rollout costs in each engine, side by side in one process on one core.
 
-Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.engines``; prints JSON. Processor time is measured, the best of
-some repetitions of each engine in turn, so that both see the same machine.
+Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.engines``; prints JSON. Processor time is
+measured, the best of some repetitions of each engine in turn, so that both see the same machine.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ def once(work):
 
 
 def ball():
-    """Seconds a rollout, 400 samples at 60 Hz: many lanes at once in batch, one after the other in PyBullet."""
+    """Seconds a rollout, 400 samples at 60 Hz: many lanes at once in batch, one after the other in
+    PyBullet.
+    """
     scenario = Scenario(np.arange(400) / 60, {"z": 4.5})
     theta = np.random.default_rng(1).uniform(0.3, 0.7, (LANES, 1))
     batch, bullet = Ball(engine="batch"), Ball(engine="pybullet")
@@ -57,7 +59,8 @@ def recording(cls, effects):
     first = next(iter(cls.states))
     runs = [Scenario(t, {("z" if cls is Ball else first): 1.0 + 0.3 * k}, inputs) for k in range(4)]
     middle = [
-        p.nominal if k < len(cls.system.parameters) else 0.3 * p.bounds[1] for k, p in enumerate(simulator.parameters)
+        p.nominal if k < len(cls.system.parameters) else 0.3 * p.bounds[1]
+        for k, p in enumerate(simulator.parameters)
     ]
     theta = np.array(middle) * rng.uniform(0.95, 1.05, (256, len(middle)))
     lanes = [runs[k % 4] for k in range(256)]
@@ -74,7 +77,9 @@ CASES = [
 def main():
     result = {
         "ball_seconds_per_rollout": ball(),
-        "recording_seconds": {" + ".join([cls.name, *effects]): recording(cls, effects) for cls, effects in CASES},
+        "recording_seconds": {
+            " + ".join([cls.name, *effects]): recording(cls, effects) for cls, effects in CASES
+        },
     }
     json.dump(result, sys.stdout, indent=1)
     print()

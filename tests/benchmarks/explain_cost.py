@@ -1,7 +1,8 @@
 """How the cost of explain grows: ``python -m tests.benchmarks.explain_cost [--out DIR]``.
 
-Seconds of processor time on one core against runs, samples and candidates, of recordings with a hidden friction; slopes
-are of a line through the logarithms, so 1 is proportional. Writes cost.csv and the figure cost.png|pdf.
+Seconds of processor time on one core against runs, samples and candidates, of recordings with a
+hidden friction; slopes are of a line through the logarithms, so 1 is proportional. Writes cost.csv
+and the figure cost.png|pdf.
 """
 
 import argparse
@@ -17,7 +18,9 @@ from bench.gap.model.world import World
 from bench.recordings.simulate import Wish, write
 from sims import effects
 
-USUAL = Wish("slider", effects=["friction.coulomb=0.3"], noise=["0.005"], observe=["x"], engine="mujoco")
+USUAL = Wish(
+    "slider", effects=["friction.coulomb=0.3"], noise=["0.005"], observe=["x"], engine="mujoco"
+)
 RUNS, SAMPLES, CANDIDATES = (3, 6, 12, 24), (100, 200, 400, 800), (6, 12, 18, 24)
 
 
@@ -61,7 +64,9 @@ def main():
     out = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
     rows = measured()
-    (out / "cost.csv").write_text("what,count,seconds\n" + "".join(f"{w},{n},{s:.3f}\n" for w, n, s in rows))
+    (out / "cost.csv").write_text(
+        "what,count,seconds\n" + "".join(f"{w},{n},{s:.3f}\n" for w, n, s in rows)
+    )
     _draw(rows, out)
     for what in dict.fromkeys(w for w, _, _ in rows):
         print(f"{what}: slope {_slope(rows, what):.2f}")

@@ -1,8 +1,9 @@
-"""What the harness costs: an evaluation through `drive` and `Evaluator` against a bare loop over the same work.
+"""What the harness costs: an evaluation through `drive` and `Evaluator` against a bare loop over
+the same work.
 
-Run with `make benchmark`. The bare loop draws the same proposals and calls the same simulator; all that is left is
-harness: budget, checks, unit cube, loss, recommendation, timing, rows. Simulators: one that costs nothing, and the
-spring in closed form.
+Run with `make benchmark`. The bare loop draws the same proposals and calls the same simulator; all
+that is left is harness: budget, checks, unit cube, loss, recommendation, timing, rows. Simulators:
+one that costs nothing, and the spring in closed form.
 """
 
 from __future__ import annotations

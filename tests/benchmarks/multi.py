@@ -29,7 +29,11 @@ def identified(folders):
         table = pd.read_csv(folder / "identifiability.csv")
         for kind, part in table.groupby("range", sort=False):
             counts = part.groupby("target")["stiff"].sum()
-            spread = f"{counts.min()} to {counts.max()}" if counts.min() < counts.max() else f"{counts.min()}"
+            spread = (
+                f"{counts.min()} to {counts.max()}"
+                if counts.min() < counts.max()
+                else f"{counts.min()}"
+            )
             middle = part.groupby("direction")["sigma"].median()
             lines.append(
                 f"| {folder.name} | {part['direction'].max()} | {kind} | {len(counts)} | {spread} "
@@ -45,11 +49,16 @@ def errors(folders, metric, simulations=None):
         table = pd.read_csv(folder / "table.csv")
         k = simulations or table["simulations"].max()
         part = table[(table["metric"] == metric) & (table["simulations"] == k)]
-        columns[folder.name] = part.pivot_table(index="tuner", columns="range", values="median", dropna=False)
+        columns[folder.name] = part.pivot_table(
+            index="tuner", columns="range", values="median", dropna=False
+        )
     tuners = sorted({t for c in columns.values() for t in c.index}, key=lambda t: _rank(columns, t))
     lines = ["| tuner | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for tuner in tuners:
-        cells = [" / ".join(_number(_of(c, tuner, kind)) for kind in ("in", "wide")) for c in columns.values()]
+        cells = [
+            " / ".join(_number(_of(c, tuner, kind)) for kind in ("in", "wide"))
+            for c in columns.values()
+        ]
         lines.append(f"| {tuner} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -72,10 +81,18 @@ def _number(value):
 
 def failures(folders):
     """How many runs there were, and how many of them failed."""
-    statuses = pd.concat([pd.read_csv(folder / "status.csv", keep_default_na=False) for folder in folders])
+    statuses = pd.concat(
+        [pd.read_csv(folder / "status.csv", keep_default_na=False) for folder in folders]
+    )
     failed = statuses[statuses["status"].isin(("crashed", "timeout", "diverged", "skipped"))]
-    named = ", ".join(f"{t} {s} {n}" for (t, s), n in failed.groupby(["tuner", "status"]).size().items())
-    return f"{len(statuses)} runs, {len(failed)} failed or skipped" + (f": {named}" if named else "") + "."
+    named = ", ".join(
+        f"{t} {s} {n}" for (t, s), n in failed.groupby(["tuner", "status"]).size().items()
+    )
+    return (
+        f"{len(statuses)} runs, {len(failed)} failed or skipped"
+        + (f": {named}" if named else "")
+        + "."
+    )
 
 
 def main():
@@ -86,7 +103,9 @@ def main():
     print(identified(folders))
     for metric, title in METRICS.items():
         for k, when in ((10, "10 simulations"), (None, "all 50")):
-            print(f"\n## {title[0].upper()}{title[1:]}, after {when}\n\n{errors(folders, metric, k)}")
+            print(
+                f"\n## {title[0].upper()}{title[1:]}, after {when}\n\n{errors(folders, metric, k)}"
+            )
     print(f"\n{failures(folders)}")
 
 

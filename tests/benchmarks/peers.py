@@ -1,11 +1,15 @@
-"""Overhead beside benchopt and nevergrad: what each harness adds to a trivial problem that costs nothing itself.
+"""Overhead beside benchopt and nevergrad: what each harness adds to a trivial problem that costs
+nothing itself.
 
-Run: `python -m tests.benchmarks.peers`. The peers are installed into a throwaway environment by this script alone.
+Run: `python -m tests.benchmarks.peers`. The peers are installed into a throwaway environment by
+this script alone.
 
-- an evaluation: random search over two numbers, the objective a sum of squares, evaluated a few thousand times, less
-  the bare loop over the same numbers; nevergrad by `RandomSearch.minimize`, simgap by `drive` and its evaluator;
-- a run: a method that does nothing, in isolation: simgap by a worker process of its pool, benchopt by `run_benchmark`
-  (its smallest benchmark: one objective, data set, solver), slope between a few and many repetitions.
+- an evaluation: random search over two numbers, the objective a sum of squares, evaluated a few
+  thousand times, less the bare loop over the same numbers; nevergrad by `RandomSearch.minimize`,
+  simgap by `drive` and its evaluator;
+- a run: a method that does nothing, in isolation: simgap by a worker process of its pool, benchopt
+  by `run_benchmark` (its smallest benchmark: one objective, data set, solver), slope between a few
+  and many repetitions.
 """
 
 from __future__ import annotations
@@ -103,14 +107,20 @@ def simgap_fresh():
 def simgap_evaluation():
     """Microseconds that `drive` and the evaluator add, from the harness's own benchmark."""
     done = subprocess.run(
-        [sys.executable, "-m", "tests.benchmarks.harness"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "tests.benchmarks.harness"],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return json.loads(done.stdout.splitlines()[0])["harness_microseconds_an_evaluation"]
 
 
 def nevergrad_evaluation(python):
     done = subprocess.run(
-        [python, "-c", NEVERGRAD.replace("{n}", str(EVALUATIONS))], capture_output=True, text=True, check=True
+        [python, "-c", NEVERGRAD.replace("{n}", str(EVALUATIONS))],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -147,20 +157,33 @@ def benchopt_run(python, folder):
 
 
 def main():
-    mine = {"evaluation_us": simgap_evaluation(), "run_ms": simgap_run(), "fresh_worker_ms": simgap_fresh()}
+    mine = {
+        "evaluation_us": simgap_evaluation(),
+        "run_ms": simgap_run(),
+        "fresh_worker_ms": simgap_fresh(),
+    }
     print(json.dumps({"simgap": {k: round(v, 2) for k, v in mine.items()}}), flush=True)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
         python = str(folder / "venv" / "bin" / "python")
         subprocess.run(
-            [python, "-m", "pip", "install", "--quiet", "benchopt", "nevergrad"], check=True, capture_output=True
+            [python, "-m", "pip", "install", "--quiet", "benchopt", "nevergrad"],
+            check=True,
+            capture_output=True,
         )
         evaluation = nevergrad_evaluation(python)
         ratio = round(evaluation / mine["evaluation_us"], 2)
-        print(json.dumps({"nevergrad": {"evaluation_us": round(evaluation, 2), "ratio": ratio}}), flush=True)
+        print(
+            json.dumps({"nevergrad": {"evaluation_us": round(evaluation, 2), "ratio": ratio}}),
+            flush=True,
+        )
         run = benchopt_run(python, folder)
-        print(json.dumps({"benchopt": {"run_ms": round(run, 1), "ratio": round(run / mine["run_ms"], 1)}}))
+        print(
+            json.dumps(
+                {"benchopt": {"run_ms": round(run, 1), "ratio": round(run / mine["run_ms"], 1)}}
+            )
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """explain on the measured recordings: ``python -m tests.benchmarks.real [NAME ...] [--out DIR]``.
 
-Writes a folder for each recording (verdict, extended simulator, report) and the table of results/reference/real. What
-is published of each, and the held-out errors of a quick independent fit, stand in the README of the recordings.
+Writes a folder for each recording (verdict, extended simulator, report) and the table of
+results/reference/real. What is published of each, and the held-out errors of a quick independent
+fit, stand in the README of the recordings.
 """
 
 import argparse
@@ -51,10 +52,14 @@ def main():
         for figure in folder.glob("*.p*"):  # they stand in the report
             figure.unlink()
         if name.startswith("pendulum"):
-            (folder / "open_loop.json").write_text(json.dumps(open_loop(folder / "extended.toml", path)) + "\n")
+            (folder / "open_loop.json").write_text(
+                json.dumps(open_loop(folder / "extended.toml", path)) + "\n"
+            )
         print(row(options.out, folder), flush=True)
     folders = sorted(found.parent for found in options.out.glob("*/*/verdict.json"))
-    (options.out / "table.md").write_text(HEAD + "\n".join(row(options.out, folder) for folder in folders) + "\n")
+    (options.out / "table.md").write_text(
+        HEAD + "\n".join(row(options.out, folder) for folder in folders) + "\n"
+    )
 
 
 def open_loop(model, path):
@@ -81,15 +86,28 @@ def row(out, folder):
     verdict = json.loads((folder / "verdict.json").read_text())
     name = str(folder.relative_to(out))
     causes = "; ".join(
-        c["effect"] + (f" ({', '.join(c['alternatives'])})" if c["alternatives"] else "") for c in verdict["causes"]
+        c["effect"] + (f" ({', '.join(c['alternatives'])})" if c["alternatives"] else "")
+        for c in verdict["causes"]
     )
     held = verdict["heldout"]
     numbers = ["–"] * 4
     if held:
         share = f"{held['gap_closed']:.0%}"
-        numbers = [*(f"{held[k]:.3g} {held['unit']}" for k in ("rmse_base", "rmse_extended", "noise_floor")), share]
+        numbers = [
+            *(
+                f"{held[k]:.3g} {held['unit']}"
+                for k in ("rmse_base", "rmse_extended", "noise_floor")
+            ),
+            share,
+        ]
     published = PUBLISHED.get(name, "air drag")
-    cells = [f"[{name}]({name}/report.html)", published, verdict["verdict"], causes or "–", *numbers]
+    cells = [
+        f"[{name}]({name}/report.html)",
+        published,
+        verdict["verdict"],
+        causes or "–",
+        *numbers,
+    ]
     return "| " + " | ".join([*cells, f"{verdict['seconds']:.0f}"]) + " |"
 
 

@@ -1,4 +1,5 @@
-"""What size costs: bytes, seconds and memory by number of runs and rows. Run: `python -m tests.benchmarks.scale`.
+"""What size costs: bytes, seconds and memory by number of runs and rows. Run: `python -m
+tests.benchmarks.scale`.
 
 Prints one JSON line a measurement; `docs/scale.md` rests on the slopes.
 """
@@ -58,7 +59,9 @@ def measure(targets, budget, figures):
         for i, job in enumerate(results.plan):
             end = outcome(job, rng, budget)
             results.kept.add(
-                i, rows(results.problem, job.order, job.target, end), status_of(results.problem, job.order, end)
+                i,
+                rows(results.problem, job.order, job.target, end),
+                status_of(results.problem, job.order, end),
             )
         kept = perf_counter() - started
         segments = sum(f.stat().st_size for f in (folder / "segments").iterdir())
@@ -90,7 +93,9 @@ def measure(targets, budget, figures):
 
 
 def nap(seconds):
-    """Stands for a run: it keeps a worker busy and no core, so that other work on the machine does not count."""
+    """Stands for a run: it keeps a worker busy and no core, so that other work on the machine does
+    not count.
+    """
     time.sleep(seconds)
 
 
@@ -103,14 +108,27 @@ def speed_up(calls=80, seconds=0.25):
             started = perf_counter()
             list(pool.results([(nap, (seconds,))] * calls, 60.0))
             took[jobs] = perf_counter() - started
-    print(json.dumps({"calls": calls, "seconds_each": seconds, "speed_up_of_2_workers": round(took[1] / took[2], 3)}))
+    print(
+        json.dumps(
+            {
+                "calls": calls,
+                "seconds_each": seconds,
+                "speed_up_of_2_workers": round(took[1] / took[2], 3),
+            }
+        )
+    )
 
 
 def main():
     speed_up()
     load_plugins([PLUGINS / "spring.py"])
     prepare(spring_experiment())
-    for targets, budget, figures in ((25, 100, True), (250, 100, True), (1000, 20, False), (2500, 20, False)):
+    for targets, budget, figures in (
+        (25, 100, True),
+        (250, 100, True),
+        (1000, 20, False),
+        (2500, 20, False),
+    ):
         measure(targets, budget, figures)
 
 

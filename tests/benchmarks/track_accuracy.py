@@ -1,8 +1,10 @@
-"""How far the tracker is off on rendered drops, by the camera's distance and by the ball's speed, and how fast it is.
+"""How far the tracker is off on rendered drops, by the camera's distance and by the ball's speed,
+and how fast it is.
 
-Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.track_accuracy --out DIR``; writes table.csv, drops.csv and a
-figure. Truth is the projection of the ball's centre through the camera model. Every drop has its own published camera,
-light, colours, noise and compression, and goes through a compressed video file.
+Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.track_accuracy --out DIR``; writes
+table.csv, drops.csv and a figure. Truth is the projection of the ball's centre through the camera
+model. Every drop has its own published camera, light, colours, noise and compression, and goes
+through a compressed video file.
 """
 
 from __future__ import annotations
@@ -29,7 +31,9 @@ BINS = {"range [m]": [5, 7, 8.5, 10, 13], "speed [px/frame]": [0, 0.5, 1, 2, 4]}
 
 
 def one(seed, folder, count):
-    """A row for each of `count` frames of the drop of this seed, and the seconds that reading and tracking took."""
+    """A row for each of `count` frames of the drop of this seed, and the seconds that reading and
+    tracking took.
+    """
     times = np.arange(count) / RATE
     rng = np.random.default_rng([7, seed])
     camera, look = Camera.published(rng), Look.drawn(rng)
@@ -52,7 +56,12 @@ def one(seed, folder, count):
         "range [m]": np.linalg.norm(points - camera.position, axis=1),
         "speed [px/frame]": np.linalg.norm(np.gradient(truth, axis=0), axis=1),
     }  # fmt: skip
-    return pd.DataFrame(frames), {"seed": seed, "crf": look.crf, "frames_per_second": len(z) / seconds, "notes": notes}
+    return pd.DataFrame(frames), {
+        "seed": seed,
+        "crf": look.crf,
+        "frames_per_second": len(z) / seconds,
+        "notes": notes,
+    }
 
 
 def rms(values):
@@ -62,21 +71,32 @@ def rms(values):
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--drops", type=int, default=24)
-    parser.add_argument("--frames", type=int, default=120, help="120 end while most balls bounce, 400 after all rest")
+    parser.add_argument(
+        "--frames",
+        type=int,
+        default=120,
+        help="120 end while most balls bounce, 400 after all rest",
+    )
     parser.add_argument("--out", type=Path, default=Path("results/tracker"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        parts, drops = zip(*(one(seed, Path(folder), options.frames) for seed in range(options.drops)), strict=True)
+        parts, drops = zip(
+            *(one(seed, Path(folder), options.frames) for seed in range(options.drops)), strict=True
+        )
     frames = pd.concat(parts)
     by_drop = frames.groupby("seed")["error"].agg(rms=rms, worst="max").reset_index()
-    by_drop["missed"] = frames[frames.whole].groupby("seed")["error"].apply(lambda e: float(e.isna().mean())).values
+    by_drop["missed"] = (
+        frames[frames.whole].groupby("seed")["error"].apply(lambda e: float(e.isna().mean())).values
+    )
     by_drop = by_drop.merge(pd.DataFrame(drops), on="seed")
     by_drop.to_csv(options.out / "drops.csv", index=False, float_format="%.4g")
     rows = [("all", "", frames)]
     for name, edges in BINS.items():
         labels = [f"{low:g} to {high:g}" for low, high in pairwise(edges)]
-        groups = frames.groupby(pd.cut(frames[name], edges, include_lowest=True, labels=labels), observed=True)
+        groups = frames.groupby(
+            pd.cut(frames[name], edges, include_lowest=True, labels=labels), observed=True
+        )
         rows += [(name, str(interval), part) for interval, part in groups]
     table = pd.DataFrame(
         {
@@ -105,9 +125,15 @@ def draw(table, drops, folder, count):
         places = np.arange(len(part))
         axis.bar(places, part.rms_px, color="#0072B2", width=0.6, label="RMS")
         axis.plot(places, part.median_px, "o", color="black", label="median")
-        axis.set_xticks(places, [f"{b}\n{n} frames" for b, n in zip(part.bin, part.frames, strict=True)], fontsize=7)
+        axis.set_xticks(
+            places,
+            [f"{b}\n{n} frames" for b, n in zip(part.bin, part.frames, strict=True)],
+            fontsize=7,
+        )
         axis.set_xlabel(name)
-    axes[2].plot(np.arange(1, len(drops) + 1), np.sort(drops.rms), "o-", color="#0072B2", markersize=4)
+    axes[2].plot(
+        np.arange(1, len(drops) + 1), np.sort(drops.rms), "o-", color="#0072B2", markersize=4
+    )
     axes[2].set_xlabel(f"{len(drops)} drops, sorted by RMS")
     for axis in axes:
         axis.axhline(0.5, color="black", linestyle="--", linewidth=0.8)

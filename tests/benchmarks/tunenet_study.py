@@ -1,9 +1,10 @@
-"""What limits the published TuneNet, step by step: ``python -m tests.benchmarks.tunenet_study [--out DIR]``.
+"""What limits the published TuneNet, step by step: ``python -m tests.benchmarks.tunenet_study
+[--out DIR]``.
 
-On the published bouncing ball (`ball-drop`): the published network and training are changed one thing at a time until
-they are this project's, and each of these things is taken away from this project's again. Then: sensor noise, an
-ensemble and its uncertainty, what training and one iteration cost. Writes tables (CSV) and figures; docs/tunenet.md
-says what they mean.
+On the published bouncing ball (`ball-drop`): the published network and training are changed one
+thing at a time until they are this project's, and each of these things is taken away from this
+project's again. Then: sensor noise, an ensemble and its uncertainty, what training and one
+iteration cost. Writes tables (CSV) and figures; docs/tunenet.md says what they mean.
 """
 
 import argparse
@@ -37,7 +38,9 @@ RAW, WEIGHED = Reading(noise=0.0, raw=True), Reading(noise=0.0)
 
 @dataclass(eq=False)
 class Variant(PairTuner):
-    """A network, what it reads, how many scenarios and simulations in each it trains on, and the step it takes."""
+    """A network, what it reads, how many scenarios and simulations in each it trains on, and the
+    step it takes.
+    """
 
     name = "variant"
     says: str = ""
@@ -99,7 +102,13 @@ def path():
 
 def without():
     """This project's network with one thing taken away."""
-    sgd = {"adam": False, "rate": 0.1, "batch": 50, "epochs": 200, "weight_decay": PUBLISHED.weight_decay}
+    sgd = {
+        "adam": False,
+        "rate": 0.1,
+        "batch": 50,
+        "epochs": 200,
+        "weight_decay": PUBLISHED.weight_decay,
+    }
     return [
         Variant("tunenet, tanh at the output", replace(OURS, bounded=True)),
         Variant("tunenet, plain SGD as published", replace(OURS, **sgd)),
@@ -135,13 +144,25 @@ class Study:
         return time.perf_counter() - begin
 
     def errors(self, tuner, budget=10, noise=0.0):
-        """Absolute errors, one row a target, a column a simulation; and seconds of the tuner for each simulation."""
+        """Absolute errors, one row a target, a column a simulation; and seconds of the tuner for
+        each simulation.
+        """
         rows, seconds = [], []
         for target in self.targets:
             sealed, side = target.sealed, target.sealed.fitting
-            observed = side.observed + noise * rng_for("noise", sealed.name).standard_normal(side.observed.shape)
+            observed = side.observed + noise * rng_for("noise", sealed.name).standard_normal(
+                side.observed.shape
+            )
             cube = self.problem.cube
-            task = Task(1, sealed.start, observed, self.problem.scale, cube.training, budget, (len(observed),))
+            task = Task(
+                1,
+                sealed.start,
+                observed,
+                self.problem.scale,
+                cube.training,
+                budget,
+                (len(observed),),
+            )
             trace = drive(tuner, task, Evaluator(self.problem, side), rng_for("study", sealed.name))
             assert trace.status in ("done", "converged"), trace.reason
             error = np.abs(cube.physical(trace.recommendations) - target.truth)[:, 0]
@@ -155,12 +176,22 @@ class Study:
         kinds = np.array([target.sealed.range for target in self.targets])
         for kind in ("in", "wide"):
             part = found[kinds == kind]
-            means = {f"mean_{k}": part[:, k].mean() for k in AT} | {"median_3": np.median(part[:, 3])}
-            yield {"variant": what, "range": kind, **means, "train_seconds": seconds, "targets": len(part)}
+            means = {f"mean_{k}": part[:, k].mean() for k in AT} | {
+                "median_3": np.median(part[:, 3])
+            }
+            yield {
+                "variant": what,
+                "range": kind,
+                **means,
+                "train_seconds": seconds,
+                "targets": len(part),
+            }
 
 
 def ablation(study):
-    """Rows of every variant, each trained with every seed; and the first seed's trained variants by name."""
+    """Rows of every variant, each trained with every seed; and the first seed's trained variants by
+    name.
+    """
     rows, kept = [], {}
     for variant in [*path(), *without()]:
         trained = [replace(variant, members=[]) for _ in range(SEEDS)]
@@ -177,11 +208,15 @@ def noisy(study, kept):
     study.train(both, 0)
     variants = [kept["published"], kept["+ Broyden's step = tunenet"], both]
     names = ["published", "tunenet, trained without noise", both.says]
-    return pd.DataFrame([r for n, v in zip(names, variants, strict=True) for r in study.rows(n, [v], noise=NOISE)])
+    return pd.DataFrame(
+        [r for n, v in zip(names, variants, strict=True) for r in study.rows(n, [v], noise=NOISE)]
+    )
 
 
 def ensemble(study):
-    """Rows of one network and of the mean of several; and how the members' spread foretells their error."""
+    """Rows of one network and of the mean of several; and how the members' spread foretells their
+    error.
+    """
     data, members = study.data((100, 8), 0), []
     for seed in range(MEMBERS):
         one = Variant(f"member {seed}")
@@ -204,7 +239,9 @@ def ensemble(study):
 
 
 def cost(study):
-    """Seconds of a whole training as `compare` makes it, and of one iteration beyond the simulation."""
+    """Seconds of a whole training as `compare` makes it, and of one iteration beyond the
+    simulation.
+    """
     rows = []
     for tuner in (TuneNet(), TuneNetPublished()):
         begin = time.perf_counter()
@@ -212,7 +249,9 @@ def cost(study):
         seconds = time.perf_counter() - begin
         each = study.errors(tuner)[1]
         rows.append((tuner.name, seconds, 1e3 * np.median(each), 1e3 * np.percentile(each, 95)))
-    return pd.DataFrame(rows, columns=["tuner", "train_seconds", "iteration_ms_median", "iteration_ms_95"])
+    return pd.DataFrame(
+        rows, columns=["tuner", "train_seconds", "iteration_ms_median", "iteration_ms_95"]
+    )
 
 
 def path_figure(table):
@@ -228,12 +267,19 @@ def path_figure(table):
             shown = np.maximum(part[f"mean_{k}"].to_numpy(), 1e-12)
             label = f"after {k} simulation{'s' * (k > 1)}"
             ax.plot(shown, range(len(names)), marker=marker, color=colour, ls=line, label=label)
-        ax.set(xscale="log", title=f"{title} ({part['targets'].iloc[0]})", xlabel="mean error of restitution [1]")
+        ax.set(
+            xscale="log",
+            title=f"{title} ({part['targets'].iloc[0]})",
+            xlabel="mean error of restitution [1]",
+        )
         ax.grid(alpha=0.3)
     axes[0].set_yticks(range(len(names)), names)
     axes[0].invert_yaxis()
     axes[0].legend(loc="upper left")
-    figure.suptitle(f"From the published TuneNet, one change added after another ({SEEDS} trainings each)", fontsize=11)
+    figure.suptitle(
+        f"From the published TuneNet, one change added after another ({SEEDS} trainings each)",
+        fontsize=11,
+    )
     return figure
 
 
@@ -241,7 +287,10 @@ def differences_figure(study, kept):
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(9.0, 4.2), sharex=True, sharey=True)
-    names = {"published": "Published network", "+ Broyden's step = tunenet": "This project's network"}
+    names = {
+        "published": "Published network",
+        "+ Broyden's step = tunenet": "This project's network",
+    }
     rng, low, high = rng_for("differences"), *study.problem.cube.training[:, 0]
     points = rng.uniform(size=(400, 2))
     (scenario,) = study.problem.scenarios(rng)
@@ -252,13 +301,24 @@ def differences_figure(study, kept):
         pairs = [network.read(seen[:, i], (seen.shape[2],), NOTHING) for i in (0, 1)]
         h, true = network.difference(*pairs)[:, 0], points[:, 1] - points[:, 0]
         ax.plot([-1, 1], [-1, 1], color="#999999", lw=1)
-        ax.plot(true[~inside], h[~inside], "x", color="#D55E00", ms=4, label="one of them outside the training range")
-        ax.plot(true[inside], h[inside], "o", color="#0072B2", ms=3, label="both in the training range")
+        ax.plot(
+            true[~inside],
+            h[~inside],
+            "x",
+            color="#D55E00",
+            ms=4,
+            label="one of them outside the training range",
+        )
+        ax.plot(
+            true[inside], h[inside], "o", color="#0072B2", ms=3, label="both in the training range"
+        )
         ax.set(title=title, xlabel="true difference of restitution [1]", ylim=(-1.5, 1.5))
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("estimated difference [1]")
     axes[0].legend(loc="upper left", fontsize=8)
-    figure.suptitle("One estimate for each of 400 pairs of simulations, one drop height", fontsize=11)
+    figure.suptitle(
+        "One estimate for each of 400 pairs of simulations, one drop height", fontsize=11
+    )
     return figure
 
 
@@ -266,14 +326,27 @@ def spread_figure(spread):
     from matplotlib import pyplot as plt
 
     figure, ax = plt.subplots(figsize=(5.2, 4.2))
-    marks = (("in", "o", "#0072B2", "targets in the training range"), ("wide", "x", "#D55E00", "targets anywhere"))
+    marks = (
+        ("in", "o", "#0072B2", "targets in the training range"),
+        ("wide", "x", "#D55E00", "targets anywhere"),
+    )
     for kind, marker, colour, label in marks:
         part = spread[spread["range"] == kind]
-        ax.plot(part["spread"], part["error"], marker, color=colour, ms=4, label=f"{label} ({len(part)})")
+        ax.plot(
+            part["spread"],
+            part["error"],
+            marker,
+            color=colour,
+            ms=4,
+            label=f"{label} ({len(part)})",
+        )
     line = np.array([spread["spread"].min(), spread["spread"].max()])
     ax.plot(line, line, color="#999999", label="error = spread")
     ax.set(
-        xscale="log", yscale="log", xlabel="standard deviation over the members [1]", ylabel="error of their mean [1]"
+        xscale="log",
+        yscale="log",
+        xlabel="standard deviation over the members [1]",
+        ylabel="error of their mean [1]",
     )
     ax.set_title(f"First estimate of {MEMBERS} networks", fontsize=11)
     ax.legend(fontsize=8)
@@ -306,7 +379,9 @@ def main():
         ranks = part[["spread", "error"]].rank().corr().iloc[0, 1]
         within = (part["error"] <= 2.0 * part["spread"]).mean()
         ratio = (part["error"] / part["spread"]).median()
-        print(f"{kind}: rank correlation {ranks:.2f}, within 2 spreads {within:.0%}, median error/spread {ratio:.2g}")
+        print(
+            f"{kind}: rank correlation {ranks:.2f}, within 2 spreads {within:.0%}, median error/spread {ratio:.2g}"
+        )
     save(options.out, "path", path_figure(table))
     save(options.out, "differences", differences_figure(study, kept))
     save(options.out, "spread", spread_figure(spread))

@@ -1,4 +1,6 @@
-"""Every check has a subject that breaks exactly what it checks, and a sound one that passes them all."""
+"""Every check has a subject that breaks exactly what it checks, and a sound one that passes them
+all.
+"""
 
 import os
 import random
@@ -6,7 +8,14 @@ import random
 import numpy as np
 import pytest
 
-from bench.checks import EFFECT_CHECKS, SIMULATOR_CHECKS, TUNER_CHECKS, CheckError, simulators, tuners
+from bench.checks import (
+    EFFECT_CHECKS,
+    SIMULATOR_CHECKS,
+    TUNER_CHECKS,
+    CheckError,
+    simulators,
+    tuners,
+)
 from methods.base import Ask, Tuner
 from sims.base import Channel, Constant, Parameter, Simulator
 from sims.system import Coefficient, Force
@@ -98,7 +107,9 @@ class ChokesOnFailures(Sound):
     def tune(self, task, rng):
         seen = yield task.start
         while True:
-            seen = yield np.clip(task.start + rng.normal(size=task.dim) * (1 + seen.losses.min() * 0), 0, 1)
+            seen = yield np.clip(
+                task.start + rng.normal(size=task.dim) * (1 + seen.losses.min() * 0), 0, 1
+            )
 
 
 class NeverBetter(Sound):
@@ -187,7 +198,10 @@ class Wave(Simulator):
     """A sound simulator."""
 
     name, says = "wave", "a wave"
-    parameters = (Parameter("rate", "rad/s", 3.0, (1.0, 5.0)), Parameter("height", "m", 1.0, (0.5, 2.0)))
+    parameters = (
+        Parameter("rate", "rad/s", 3.0, (1.0, 5.0)),
+        Parameter("height", "m", 1.0, (0.5, 2.0)),
+    )
     channels = (Channel("x", "m"), Channel("v", "m/s"))
     constants = (Constant("shift", "m", 0.0),)
 
@@ -229,7 +243,9 @@ class SpoilsNeighbours(Wave):
 
 class IgnoresHeight(Wave):
     def simulate(self, theta, scenario):
-        return super().simulate(np.column_stack([theta[:, 0], np.where(np.isnan(theta[:, 1]), np.nan, 1.0)]), scenario)
+        return super().simulate(
+            np.column_stack([theta[:, 0], np.where(np.isnan(theta[:, 1]), np.nan, 1.0)]), scenario
+        )
 
 
 class TakesAnything(Wave):
@@ -263,7 +279,9 @@ def test_simulator_check_rejects_its_broken_subject_and_no_sound_one(check):
 
 def test_the_test_simulator_conforms(spring):
     for check in SIMULATOR_CHECKS:
-        if check is not simulators.check_unknown_names_are_refused:  # it takes neither inputs nor constants
+        if (
+            check is not simulators.check_unknown_names_are_refused
+        ):  # it takes neither inputs nor constants
             check(spring)
 
 
@@ -282,7 +300,9 @@ class Breeze(Force):
     """A sound effect."""
 
     name, says, source = "breeze.sound", "a breeze pushes along the track", "any textbook"
-    coefficients = (Coefficient("coefficient", ("m/s^2", "N", "N*m"), ((-1, 2), (-1, 2), (-0.1, 0.2))),)
+    coefficients = (
+        Coefficient("coefficient", ("m/s^2", "N", "N*m"), ((-1, 2), (-1, 2), (-0.1, 0.2))),
+    )
 
     def force(self, c, moment):
         return c[0] + 0.0 * moment.x

@@ -1,9 +1,11 @@
-"""The exam of `simgap explain`: ``python -m tests.exam [--quick] [--out DIR] [--jobs 2] [--only KIND/SYSTEM]``.
+"""The exam of `simgap explain`: ``python -m tests.exam [--quick] [--out DIR] [--jobs 2] [--only
+KIND/SYSTEM]``.
 
-Recordings of independent simulators, in each a hidden cause or none; every answer is marked. One row a question is
-added to items.jsonl as it is answered, so that an exam that was interrupted goes on where it was; tables and figures
-are made from it at the end. ``--fresh`` asks everything again (what was drawn by the same code is kept); what another
-code or seed drew is asked again in any case.
+Recordings of independent simulators, in each a hidden cause or none; every answer is marked. One
+row a question is added to items.jsonl as it is answered, so that an exam that was interrupted goes
+on where it was; tables and figures are made from it at the end. ``--fresh`` asks everything again
+(what was drawn by the same code is kept); what another code or seed drew is asked again in any
+case.
 """
 
 import argparse
@@ -24,9 +26,17 @@ def main(arguments):
     given = _parser().parse_args(arguments)
     folder = given.out or Path("results/exam-quick" if given.quick else "results/reference/exam")
     folder.mkdir(parents=True, exist_ok=True)
-    asked = [q for q in (questions.quick() if given.quick else questions.sheet(given.seed_offset)) if _chosen(q, given)]
+    asked = [
+        q
+        for q in (questions.quick() if given.quick else questions.sheet(given.seed_offset))
+        if _chosen(q, given)
+    ]
     drawn = [questions.digest(), given.seed_offset]
-    rows = {name: row for name, row in _before(folder / "items.jsonl").items() if row.get("drawn") == drawn}
+    rows = {
+        name: row
+        for name, row in _before(folder / "items.jsonl").items()
+        if row.get("drawn") == drawn
+    }
     known = {name: row["item"] for name, row in rows.items() if row["item"] or not row.get("mark")}
     again = {q.name for q in asked if given.fresh or (given.again and _amiss(rows.get(q.name)))}
     rows = {name: row for name, row in rows.items() if name not in again}
@@ -40,13 +50,19 @@ def main(arguments):
 
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m tests.exam", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a few of every kind; fails unless nearly all are right")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="a few of every kind; fails unless nearly all are right",
+    )
     parser.add_argument("--out", type=Path, help="results/reference/exam, or results/exam-quick")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", default="", help="KIND, KIND/SYSTEM or KIND/SYSTEM/EFFECT")
     parser.add_argument("--seed-offset", type=int, default=0, help="another exam of the same form")
     parser.add_argument("--fresh", action="store_true", help="answer everything again")
-    parser.add_argument("--again", action="store_true", help="answer again what was not answered rightly")
+    parser.add_argument(
+        "--again", action="store_true", help="answer again what was not answered rightly"
+    )
     parser.add_argument("--explain", default=answers.EXPLAIN, help="MODULE:FUNCTION to examine")
     return parser
 
@@ -83,7 +99,9 @@ def _ask(asked, path, known, drawn, given):
     with ProcessPool(max_workers=given.jobs, context=context) as pool, path.open("a") as file:
         running = {
             pool.schedule(
-                answers.answered, [q.json(), given.seed_offset, known.get(q.name), given.explain], timeout=LIMIT
+                answers.answered,
+                [q.json(), given.seed_offset, known.get(q.name), given.explain],
+                timeout=LIMIT,
             ): q
             for q in asked
         }
@@ -92,8 +110,12 @@ def _ask(asked, path, known, drawn, given):
                 question = running[future]
                 try:
                     row = future.result()
-                except Exception as error:  # a worker that was killed or took too long costs one question
-                    row = answers.lost(question, known.get(question.name), f"{type(error).__name__}: {error}")
+                except (
+                    Exception
+                ) as error:  # a worker that was killed or took too long costs one question
+                    row = answers.lost(
+                        question, known.get(question.name), f"{type(error).__name__}: {error}"
+                    )
                 file.write(json.dumps(row | {"drawn": drawn}) + "\n")
                 file.flush()
         except BaseException:

@@ -1,4 +1,6 @@
-"""One question answered: draw the item, write its recording, have it explained, mark the answer. Runs in a worker."""
+"""One question answered: draw the item, write its recording, have it explained, mark the answer.
+Runs in a worker.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ def answered(question, offset, known=None, explain=EXPLAIN):
     Args:
         question: as JSON.
         offset: of the seeds.
-        known: the item as JSON if it was drawn before, {} if it was found not to show, None if it was not drawn.
+        known: the item as JSON if it was drawn before, {} if it was found not to show, None if it
+            was not drawn.
         explain: module:function to examine.
     """
     asked = Question(**question)
@@ -42,7 +45,9 @@ def _answer(item, explain):
         path.with_name(f"{item.name}.toml").rename(path.with_suffix(".toml"))
         begin = time.perf_counter()
         try:
-            found = getattr(importlib.import_module(module), function)(path, system=None, engine="batch").verdict
+            found = getattr(importlib.import_module(module), function)(
+                path, system=None, engine="batch"
+            ).verdict
             row["verdict"] = {name: value for name, value in found.items() if name != "candidates"}
         except Exception:
             row["error"] = traceback.format_exc(limit=-4)
@@ -56,17 +61,26 @@ def lost(question, known, error):
     """The row of a question whose worker did not come back."""
     row = {name: question.json()[name] for name in ("part", "kind", "system", "effect")}
     mark = asdict(Mark("failed", 0, 0, "", {})) | {"found": False, "found_class": False}
-    row |= {"question": question.name, "item": known or {}, "verdict": None, "seconds": None, "error": error}
+    row |= {
+        "question": question.name,
+        "item": known or {},
+        "verdict": None,
+        "seconds": None,
+        "error": error,
+    }
     return row | {"mark": mark, "rivals": {}}
 
 
 def _rivals(item, verdict, mark):
-    """By effect that was named without being hidden: what it leaves of the gap, in units of the noise, and how many
-    sigmas of evidence that is against it; few if it explains these data as well as the truth does."""
+    """By effect that was named without being hidden: what it leaves of the gap, in units of the
+    noise, and how many sigmas of evidence that is against it; few if it explains these data as well
+    as the truth does."""
     if item.kind != "single" or mark.found or not verdict or len(verdict["causes"]) != 1:
         return {}
     (cause,) = verdict["causes"]
-    names = [name for name in (cause["effect"], *cause["alternatives"]) if name not in item.effects][:MOST_RIVALS]
+    names = [
+        name for name in (cause["effect"], *cause["alternatives"]) if name not in item.effects
+    ][:MOST_RIVALS]
     setting = setting_of(item)
     observed = sizing.observed_by_batch(setting, item.effects)
     phi = setting.noise.phi if item.noise == "ar1" else 0.0

@@ -8,7 +8,9 @@ WANTED = 0.97
 
 
 def draw(folder, power, counts):
-    """Draw `figures`/power and `figures`/confusion, PNG and PDF, as far as there is something to draw."""
+    """Draw `figures`/power and `figures`/confusion, PNG and PDF, as far as there is something to
+    draw.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -23,7 +25,11 @@ def _save(path, figure):
     from matplotlib import pyplot as plt
 
     for suffix in (".png", ".pdf"):
-        figure.savefig(path.with_suffix(suffix), dpi=150, metadata={"CreationDate": None} if suffix == ".pdf" else None)
+        figure.savefig(
+            path.with_suffix(suffix),
+            dpi=150,
+            metadata={"CreationDate": None} if suffix == ".pdf" else None,
+        )
     plt.close(figure)
 
 
@@ -38,21 +44,35 @@ def _power(groups):
     ):
         parts = [group[place] for group in groups]
         middle = np.array([part["share"] for part in parts])
-        bars = np.array([[part["share"] - part["low"], part["high"] - part["share"]] for part in parts]).T
+        bars = np.array(
+            [[part["share"] - part["low"], part["high"] - part["share"]] for part in parts]
+        ).T
         axis.errorbar(
             sizes * shift, middle, yerr=np.maximum(bars, 0.0), fmt=f"{marker}-", color=colour, markersize=4.5,
             linewidth=1.1, capsize=2.5, label=label,
         )  # fmt: skip
     for size, part, _ in groups:
         axis.annotate(
-            f"{part['of']}", (size, -0.07), xytext=(0, 0), textcoords="offset points", ha="center", fontsize=7
+            f"{part['of']}",
+            (size, -0.07),
+            xytext=(0, 0),
+            textcoords="offset points",
+            ha="center",
+            fontsize=7,
         )
     axis.axhline(WANTED, color="#444444", linewidth=0.8, linestyle=(0, (2, 2)))
-    axis.set(xscale="log", ylim=(-0.09, 1.03), xlabel="size of the hidden effect [noise]", ylabel="share found")
+    axis.set(
+        xscale="log",
+        ylim=(-0.09, 1.03),
+        xlabel="size of the hidden effect [noise]",
+        ylabel="share found",
+    )
     ticks = [0.1, 0.2, 0.5, 1, 2, 5, 10]
     axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axis.minorticks_off()
-    axis.set_title("Bars: 95 % (Wilson). Numbers: recordings. Dashes: what is asked for from 1 on.", fontsize=8)
+    axis.set_title(
+        "Bars: 95 % (Wilson). Numbers: recordings. Dashes: what is asked for from 1 on.", fontsize=8
+    )
     axis.legend(loc="center right", fontsize=8, frameon=False)
     axis.grid(axis="y", color="#DDDDDD", linewidth=0.6)
     return figure

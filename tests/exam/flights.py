@@ -27,7 +27,9 @@ class Air:
         self.breaks = list(self.gust[2:]) if self.gust else []
 
     def at(self, t, y, middle):
-        """Acceleration in state y; `middle` is an instant within the stretch between two breaks that is integrated."""
+        """Acceleration in state y; `middle` is an instant within the stretch between two breaks
+        that is integrated.
+        """
         ax, ay, az = 0.0, 0.0, -self.g
         for law, c in self.laws:
             bx, by, bz = law(c, self.g, t, *y)
@@ -57,14 +59,20 @@ def _layer(c, g, t, x, y, z, u, v, w):
 
 LAWS = {
     "drag.linear": lambda c, g, t, x, y, z, u, v, w: _drag(c[0], u, v, w),
-    "drag.quadratic": lambda c, g, t, x, y, z, u, v, w: _drag(c[0], u, v, w, sqrt(u * u + v * v + w * w)),
+    "drag.quadratic": lambda c, g, t, x, y, z, u, v, w: _drag(
+        c[0], u, v, w, sqrt(u * u + v * v + w * w)
+    ),
     "wind": _wind,
     "gravity.scale": lambda c, g, *s: (0.0, 0.0, -c[0] * g),
     "gravity.tilt": lambda c, g, *s: (c[0] * g, c[1] * g, 0.0),
     "force.bias": lambda c, g, *s: (0.0, 0.0, c[0]),
     "force.periodic": _periodic,
     "lift.magnus": lambda c, g, t, x, y, z, u, v, w: (-c[0] * w - c[1] * v, c[1] * u, c[0] * u),
-    "updraft": lambda c, g, t, x, *s: (0.0, 0.0, c[0] * inside(x, c[1], c[2])),  # foreign: air that rises over a place
+    "updraft": lambda c, g, t, x, *s: (
+        0.0,
+        0.0,
+        c[0] * inside(x, c[1], c[2]),
+    ),  # foreign: air that rises over a place
     "layer": _layer,  # foreign: drag above a height only
 }
 
@@ -79,7 +87,9 @@ def move(world, scenario, number, instants):
     while now < until:
         end = min([until, *(b for b in air.breaks if b > now)], default=until)
         looks = not (rising or resting)
-        if rising:  # the rise after a bounce is integrated without looking for the ground, where it begins
+        if (
+            rising
+        ):  # the rise after a bounce is integrated without looking for the ground, where it begins
             end = min(end, now + rising)
         solved = _fly(air, now, end, state, world.constants["radius"] if looks else None, resting)
         reached, state = float(solved.t[-1]), solved.y[:, -1].copy()

@@ -1,7 +1,8 @@
-"""The exam's questions: recordings of independent simulators in which a cause is hidden, drawn from a seed.
+"""The exam's questions: recordings of independent simulators in which a cause is hidden, drawn from
+a seed.
 
-`draw` chooses what is hidden and how strongly, `realise` writes the recording and, apart from it, the truth. Whatever
-is drawn follows from the item's name; an item is a recipe, no data.
+`draw` chooses what is hidden and how strongly, `realise` writes the recording and, apart from it,
+the truth. Whatever is drawn follows from the item's name; an item is a recipe, no data.
 """
 
 from __future__ import annotations
@@ -28,7 +29,12 @@ APART = 1.0  # noise: what must be left when only one of two effects, or no fore
 TELLING = 0.4  # noise: what the simpler form of an effect must leave, or else the simpler one is the right answer
 SIMPLER = {
     "friction.stribeck": ("friction.coulomb",),
-    "wind": ("drag.linear", "drag.quadratic", "force.bias", "gravity.tilt"),  # air that moves fast is a steady push
+    "wind": (
+        "drag.linear",
+        "drag.quadratic",
+        "force.bias",
+        "gravity.tilt",
+    ),  # air that moves fast is a steady push
 }
 
 EQUIVALENT: tuple[tuple[str, bool, frozenset[str]], ...] = (
@@ -37,10 +43,14 @@ EQUIVALENT: tuple[tuple[str, bool, frozenset[str]], ...] = (
     ("pendulum", True, frozenset({"input.gain", "gravity.scale"})),  # the inertia takes up the rest
     ("pendulum", False, frozenset({"force.bias", "input.bias"})),
     ("pendulum", False, frozenset({"gravity.tilt", "sensor.bias"})),  # gravity turned and scaled
-    ("ball", False, frozenset({"force.bias", "gravity.scale", "clock.skew"})),  # for no accelerometer is recorded
+    (
+        "ball",
+        False,
+        frozenset({"force.bias", "gravity.scale", "clock.skew"}),
+    ),  # for no accelerometer is recorded
 )
-"""Effects of a system, with an input or without, that give the same motion for some parameters and initial states:
-exactly, whatever the data."""
+"""Effects of a system, with an input or without, that give the same motion for some parameters and
+initial states: exactly, whatever the data."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +61,8 @@ class Item:
         name: says kind, system, what was asked for, and seed.
         system, kind: see `SYSTEMS`, `KINDS`.
         effects: coefficients of what is hidden, by name; of a foreign cause its own numbers.
-        size: RMS of the gap that base parameters and initial states, refitted, leave in the runs for fitting, in units
-            of the noise; of two effects that of each by itself.
+        size: RMS of the gap that base parameters and initial states, refitted, leave in the runs
+            for fitting, in units of the noise; of two effects that of each by itself.
         noise: white, ar1 or quantised.
         stated: whether the recording states the noise.
         rate, seconds, runs: sampling in Hz, a run's length, how many.
@@ -61,8 +71,9 @@ class Item:
         channels: what is recorded.
         seed: what it was drawn from.
         parameters: the base parameters.
-        beyond: what is left of the gap, in units of the noise, with the best other answer: of a foreign cause the best
-            effect of the library, of two effects one of them, of an effect in `SIMPLER` those.
+        beyond: what is left of the gap, in units of the noise, with the best other answer: of a
+            foreign cause the best effect of the library, of two effects one of them, of an effect
+            in `SIMPLER` those.
     """
 
     name: str
@@ -94,12 +105,15 @@ class Item:
 
 def same_class(system, driven, effect):
     """The effect and all that are equivalent to it."""
-    classes = (names for *where, names in EQUIVALENT if where == [system, driven] and effect in names)
+    classes = (
+        names for *where, names in EQUIVALENT if where == [system, driven] and effect in names
+    )
     return frozenset({effect}).union(*classes)
 
 
 def draw(kind, system, seed, effect=None, size=None):
-    """An item, or None where the drawn sensors cannot show the effect at the drawn size (within `shapes.LARGEST`).
+    """An item, or None where the drawn sensors cannot show the effect at the drawn size (within
+    `shapes.LARGEST`).
 
     Args:
         kind: clean, single, double or foreign.
@@ -109,7 +123,15 @@ def draw(kind, system, seed, effect=None, size=None):
         size: the wanted size; drawn where it is not given.
     """
     asked = effect or "any"
-    name = "-".join([kind, system, *([asked] if kind != "clean" else []), *([f"{size:g}"] if size else []), str(seed)])
+    name = "-".join(
+        [
+            kind,
+            system,
+            *([asked] if kind != "clean" else []),
+            *([f"{size:g}"] if size else []),
+            str(seed),
+        ]
+    )
     rng = _rng(name, "cause")
     hidden = _hidden(kind, system, effect, rng)
     setting = _setting(name, system, hidden)
@@ -118,7 +140,9 @@ def draw(kind, system, seed, effect=None, size=None):
         len(setting.scenarios), str(rng.choice(["scipy", "mujoco"])), setting.driven, setting.channels, seed,
         setting.parameters,
     )  # fmt: skip
-    wanted = size or float(np.exp(rng.uniform(np.log(3.0 if kind in ("double", "foreign") else 1.0), np.log(10.0))))
+    wanted = size or float(
+        np.exp(rng.uniform(np.log(3.0 if kind in ("double", "foreign") else 1.0), np.log(10.0)))
+    )
     # What is hidden must show in the runs for fitting: nobody could learn it from those held out.
     shown = replace(setting, scenarios=setting.scenarios[: item.runs - held_out_of(item)])
     return {"clean": _clean, "single": _single, "double": _double, "foreign": _foreign}[kind](
@@ -148,7 +172,11 @@ def setting_of(item):
 def _hidden(kind, system, effect, rng):
     if kind == "clean":
         return ()
-    names = list(FOREIGN[system]) if kind == "foreign" else sorted(library.library(SIMULATORS[system].system))
+    names = (
+        list(FOREIGN[system])
+        if kind == "foreign"
+        else sorted(library.library(SIMULATORS[system].system))
+    )
     first = effect or str(rng.choice(names))
     if kind != "double":
         return (first,)
@@ -177,13 +205,17 @@ def _single(item, setting, hidden, wanted, rng):
 def coefficients(name, setting, wanted, rng):
     """Coefficients of one effect at which the gap has the wanted size; None if there are none."""
     of = shapes.shape(name, setting, rng)
-    left = sizing.gap(setting, lambda strength: sizing.observed_by_batch(setting, {name: of(strength)}))
+    left = sizing.gap(
+        setting, lambda strength: sizing.observed_by_batch(setting, {name: of(strength)})
+    )
     strength = sizing.sized(left, wanted, shapes.largest(name))
     return None if strength is None else of(strength)
 
 
 def _double(item, setting, hidden, wanted, rng):
-    """Two effects, each of the wanted size alone; neither may look like a stronger form of the other."""
+    """Two effects, each of the wanted size alone; neither may look like a stronger form of the
+    other.
+    """
     found = {name: coefficients(name, setting, wanted, rng) for name in hidden}
     if None in found.values():
         return None
@@ -207,7 +239,9 @@ def _foreign(item, setting, hidden, wanted, rng):
 
     def observed(strength):
         world = setting.world(foreign={name: of(strength)})
-        return np.array([solved(world, s, setting.channels, i) for i, s in enumerate(setting.scenarios)])
+        return np.array(
+            [solved(world, s, setting.channels, i) for i, s in enumerate(setting.scenarios)]
+        )
 
     strength = sizing.sized(sizing.gap(setting, observed), wanted, shapes.LARGEST)
     if strength is None:
@@ -218,15 +252,25 @@ def _foreign(item, setting, hidden, wanted, rng):
 
 
 def realise(item, folder, truth=True):
-    """Write NAME.csv and NAME.toml, and beside them the truth as NAME.truth.json if wanted; the path of the first."""
+    """Write NAME.csv and NAME.toml, and beside them the truth as NAME.truth.json if wanted; the
+    path of the first.
+    """
     setting = setting_of(item)
     runs = _runs(item, setting)
     system = SIMULATORS[item.system].system
     noise = setting.noise.sigma if item.stated else {}
     constants = {} if item.system == "slider" else setting.constants
     path = Path(folder) / f"{item.name}.csv"
-    beside = {path.with_suffix(".truth.json"): json.dumps(item.json(), indent=1) + "\n"} if truth else {}
-    write_recording(path, Recording(path, item.system, "", constants, noise, runs), system(), digits=9, beside=beside)
+    beside = (
+        {path.with_suffix(".truth.json"): json.dumps(item.json(), indent=1) + "\n"} if truth else {}
+    )
+    write_recording(
+        path,
+        Recording(path, item.system, "", constants, noise, runs),
+        system(),
+        digits=9,
+        beside=beside,
+    )
     return path
 
 

@@ -1,6 +1,8 @@
-"""Pendulum and slider with anything acting on them, for scipy: one coordinate, events where dry friction stops it.
+"""Pendulum and slider with anything acting on them, for scipy: one coordinate, events where dry
+friction stops it.
 
-Every law is written out here once more, in plain numbers; nothing is shared with the library that the exam is about.
+Every law is written out here once more, in plain numbers; nothing is shared with the library that
+the exam is about.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ Law = Callable[[float, float, float], float]
 
 @dataclass(frozen=True)
 class Piece:
-    """A stretch of time in which the felt input approaches `target` from `start`, at once where `lag` is zero."""
+    """A stretch of time in which the felt input approaches `target` from `start`, at once where
+    `lag` is zero.
+    """
 
     begin: float
     end: float
@@ -32,14 +36,18 @@ class Piece:
     lag: float
 
     def at(self, t):
-        return self.target + ((self.start - self.target) * exp((self.begin - t) / self.lag) if self.lag > 0 else 0.0)
+        return self.target + (
+            (self.start - self.target) * exp((self.begin - t) / self.lag) if self.lag > 0 else 0.0
+        )
 
     def cut(self, begin, end):
         return Piece(begin, end, self.at(begin), self.target, self.lag)
 
 
 def felt(scenario, effects, until) -> list[Piece]:
-    """The first input as the plant feels it, from 0 to `until`; a lag comes behind whatever is not linear."""
+    """The first input as the plant feels it, from 0 to `until`; a lag comes behind whatever is not
+    linear.
+    """
     if "u" not in scenario.inputs:
         return [Piece(0.0, until, 0.0, effects.get("input.bias", [0.0])[0], 0.0)]
     levels, edges, lag = np.array(scenario.inputs["u"]), scenario.times - scenario.times[0], 0.0
@@ -57,7 +65,9 @@ def felt(scenario, effects, until) -> list[Piece]:
     pieces, state = [], levels[0]
     for begin, end, target in zip(begins, [*begins[1:], inf], targets, strict=True):
         if begin < until:
-            pieces.append(Piece(float(begin), float(min(end, until)), float(state), float(target), lag))
+            pieces.append(
+                Piece(float(begin), float(min(end, until)), float(state), float(target), lag)
+            )
             state = pieces[-1].at(pieces[-1].end)
     return pieces
 
@@ -81,7 +91,9 @@ STEPWISE = {
 
 
 class Joint:
-    """One coordinate: generalised `inertia`, `weight` (its own force of position), laws that push, laws that rub."""
+    """One coordinate: generalised `inertia`, `weight` (its own force of position), laws that push,
+    laws that rub.
+    """
 
     def __init__(self, world, number):
         k, p = world.constants, world.parameters
@@ -89,7 +101,10 @@ class Joint:
         if world.system == "pendulum":
             arm = k["mass"] * k["length"]
             self.inertia, gravity = p["inertia"], k["gravity"]
-            self.weight, self.sideways = (lambda x: -arm * gravity * sin(x)), (lambda x: arm * cos(x))
+            self.weight, self.sideways = (
+                (lambda x: -arm * gravity * sin(x)),
+                (lambda x: arm * cos(x)),
+            )
         else:
             self.inertia, gravity = p["mass"], 9.80665
             self.weight, self.sideways = (lambda x: 0.0), (lambda x: self.inertia)
@@ -102,7 +117,9 @@ class Joint:
             push, lasting, *begins = acting["gust"]
             begin = begins[number]
             self.breaks = [begin, begin + lasting]
-            self.forces.append(lambda t, x, v: push if begin <= self.middle < begin + lasting else 0.0)
+            self.forces.append(
+                lambda t, x, v: push if begin <= self.middle < begin + lasting else 0.0
+            )
         self.restless = "force.periodic" in acting or "input.lag" in acting
 
     def enter(self, piece):
@@ -136,20 +153,26 @@ FORCES: dict[str, Callable[[Joint, list[float]], Law]] = {
     "force.ripple": lambda j, c: lambda t, x, v: _wave(c, x / c[2]),
     "force.periodic": lambda j, c: lambda t, x, v: _wave(c, t * c[2]),
     "ageing": lambda j, c: lambda t, x, v: -c[0] * t * v,  # foreign: damping that grows with time
-    "stop": lambda j, c: lambda t, x, v: -c[0] * max(x - c[1], 0.0),  # foreign: a soft stop on one side
+    "stop": lambda j, c: (
+        lambda t, x, v: -c[0] * max(x - c[1], 0.0)
+    ),  # foreign: a soft stop on one side
 }
 LIMITS: dict[str, Callable[[Joint, list[float]], Law]] = {
     "friction.coulomb": lambda j, c: lambda t, x, v: c[0],
     "friction.stribeck": lambda j, c: lambda t, x, v: c[0] + c[1] * exp(-((v / c[2]) ** 2)),
     "friction.load": lambda j, c: lambda t, x, v: c[0] * abs(j.piece.at(t) - j.weight(x)),
-    "patch": lambda j, c: lambda t, x, v: c[0] * inside(x, c[1], c[2]),  # foreign: rough from c1 - c2 to c1 + c2
+    "patch": lambda j, c: (
+        lambda t, x, v: c[0] * inside(x, c[1], c[2])
+    ),  # foreign: rough from c1 - c2 to c1 + c2
 }
 FOREIGN = ("patch", "gust", "ageing", "stop")
 
 
 def inside(x, centre, half):
     """1 inside a region, 0 outside, its borders soft; the integral over x is the region's width."""
-    return 0.5 * (tanh((x - centre + half) / (EDGE * half)) - tanh((x - centre - half) / (EDGE * half)))
+    return 0.5 * (
+        tanh((x - centre + half) / (EDGE * half)) - tanh((x - centre - half) / (EDGE * half))
+    )
 
 
 def move(world, scenario, number, instants):
@@ -160,7 +183,11 @@ def move(world, scenario, number, instants):
     out = np.empty((instants.size, 2))
     out[instants <= 0] = state
     for piece in felt(scenario, world.effects, until):
-        marks = [piece.begin, *(b for b in sorted(joint.breaks) if piece.begin < b < piece.end), piece.end]
+        marks = [
+            piece.begin,
+            *(b for b in sorted(joint.breaks) if piece.begin < b < piece.end),
+            piece.end,
+        ]
         for begin, end in pairwise(marks):
             joint.enter(piece.cut(begin, end))
             state = _through(joint, state, instants, out)
@@ -182,7 +209,9 @@ def _through(joint, state, instants, out):
 
 
 def _glide(joint, now, state: np.ndarray) -> tuple[float, np.ndarray, Callable | None]:
-    """Until the next standstill, breaking loose or the piece's end: when, the state there, the motion (None: none)."""
+    """Until the next standstill, breaking loose or the piece's end: when, the state there, the
+    motion (None: none).
+    """
     (x, v), end = state, joint.piece.end
     way = copysign(1.0, v) if v else 0.0
     if joint.limits and v == 0.0:
@@ -212,7 +241,9 @@ def _glide(joint, now, state: np.ndarray) -> tuple[float, np.ndarray, Callable |
 
 
 def _loose(joint, now, x):
-    """When what pulls exceeds friction, else the piece's end; within a piece only some forces change by themselves."""
+    """When what pulls exceeds friction, else the piece's end; within a piece only some forces
+    change by themselves.
+    """
     end = joint.piece.end
     if not joint.restless:
         return end
@@ -223,5 +254,8 @@ def _loose(joint, now, x):
     grid: Sequence[float] = np.linspace(now, end, max(3, int(500 * (end - now)))).tolist()
     for before, after in pairwise(grid):
         if excess(after) > 0:
-            return min(brentq(excess, before, after, xtol=1e-13) + 1e-12 if excess(before) < 0 else after, end)
+            return min(
+                brentq(excess, before, after, xtol=1e-13) + 1e-12 if excess(before) < 0 else after,
+                end,
+            )
     return end

@@ -1,6 +1,8 @@
-"""Write a batch of recordings: ``python -m tests.exam.make --kind single --system ball --count 20 --out DIR``.
+"""Write a batch of recordings: ``python -m tests.exam.make --kind single --system ball --count 20
+--out DIR``.
 
-With ``--each`` that many of every effect, else of whatever is drawn. Existing recordings are left as they are.
+With ``--each`` that many of every effect, else of whatever is drawn. Existing recordings are left
+as they are.
 """
 
 import argparse
@@ -16,7 +18,11 @@ def candidates(kind, system):
     """What can be hidden, of this kind in this system; None where nothing is."""
     if kind == "clean":
         return [None]
-    return list(FOREIGN[system]) if kind == "foreign" else sorted(library.library(SIMULATORS[system].system))
+    return (
+        list(FOREIGN[system])
+        if kind == "foreign"
+        else sorted(library.library(SIMULATORS[system].system))
+    )
 
 
 def main(arguments):
@@ -31,19 +37,37 @@ def main(arguments):
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
-    names = [given.effect] if given.effect else candidates(given.kind, given.system) if given.each else [None]
+    names = (
+        [given.effect]
+        if given.effect
+        else candidates(given.kind, given.system)
+        if given.each
+        else [None]
+    )
     for name in names:
         made = 0
-        for seed in range(given.seed, given.seed + 3 * given.count):  # what sensors cannot show is drawn again
-            item = draw(given.kind, given.system, seed, name, given.size) if made < given.count else None
+        for seed in range(
+            given.seed, given.seed + 3 * given.count
+        ):  # what sensors cannot show is drawn again
+            item = (
+                draw(given.kind, given.system, seed, name, given.size)
+                if made < given.count
+                else None
+            )
             if item is None:
                 continue
             made += 1
             if not (given.out / f"{item.name}.csv").exists():
                 realise(item, given.out)
-            print(f"{item.name}: size {item.size:.2f}, {item.noise} noise, {item.source}, {item.effects}", flush=True)
+            print(
+                f"{item.name}: size {item.size:.2f}, {item.noise} noise, {item.source}, {item.effects}",
+                flush=True,
+            )
         if made < given.count:
-            print(f"{given.system} {name or given.kind}: {made} of {given.count}, the others cannot show", flush=True)
+            print(
+                f"{given.system} {name or given.kind}: {made} of {given.count}, the others cannot show",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -24,7 +24,9 @@ QUICK = (
 
 @dataclass(frozen=True)
 class Question:
-    """What to draw: `part` is marks, or power for the power curve alone; `index` tells questions of one sort apart."""
+    """What to draw: `part` is marks, or power for the power curve alone; `index` tells questions of
+    one sort apart.
+    """
 
     part: str
     kind: str
@@ -40,7 +42,9 @@ class Question:
     def drawn(self, offset):
         """The first of several drawings that shows; None if none does."""
         first = 1000 * offset + 10 * self.index
-        items = (draw(self.kind, self.system, first + k, self.effect, self.size) for k in range(ATTEMPTS))
+        items = (
+            draw(self.kind, self.system, first + k, self.effect, self.size) for k in range(ATTEMPTS)
+        )
         return next((item for item in items if item is not None), None)
 
     def json(self):
@@ -49,14 +53,26 @@ class Question:
 
 def sheet(offset):
     """All questions of a whole exam."""
-    effects = [(system, name) for system in SYSTEMS for name in sorted(library.library(SIMULATORS[system].system))]
-    questions = [Question("marks", "clean", system, None, k, None) for system in SYSTEMS for k in range(CLEAN)]
+    effects = [
+        (system, name)
+        for system in SYSTEMS
+        for name in sorted(library.library(SIMULATORS[system].system))
+    ]
+    questions = [
+        Question("marks", "clean", system, None, k, None)
+        for system in SYSTEMS
+        for k in range(CLEAN)
+    ]
     questions += [
         Question("marks", "single", system, name, k, _size(offset, system, name, k))
         for system, name in effects
         for k in range(EACH)
     ]
-    questions += [Question("marks", "double", system, None, k, None) for system in SYSTEMS for k in range(DOUBLE)]
+    questions += [
+        Question("marks", "double", system, None, k, None)
+        for system in SYSTEMS
+        for k in range(DOUBLE)
+    ]
     questions += [
         Question("marks", "foreign", system, name, k, None)
         for system in SYSTEMS
@@ -71,21 +87,38 @@ def sheet(offset):
 
 def quick():
     """A few of every kind."""
-    questions = [Question("marks", "clean", system, None, k, None) for k, system in enumerate(SYSTEMS)]
-    questions += [Question("marks", kind, system, name, 0, size) for kind, system, name, size in QUICK]
+    questions = [
+        Question("marks", "clean", system, None, k, None) for k, system in enumerate(SYSTEMS)
+    ]
+    questions += [
+        Question("marks", kind, system, name, 0, size) for kind, system, name, size in QUICK
+    ]
     # The slider's pair takes minutes by itself: the whole exam asks it.
-    return questions + [Question("marks", "double", system, None, 0, None) for system in SYSTEMS[:2]]
+    return questions + [
+        Question("marks", "double", system, None, 0, None) for system in SYSTEMS[:2]
+    ]
 
 
 def _size(offset, system, name, index):
     """From 1 to 10, the questions about one effect spread evenly on a logarithmic scale."""
-    share = (index % EACH + np.random.default_rng([offset, index, *f"{system} {name}".encode()]).random()) / EACH
+    share = (
+        index % EACH + np.random.default_rng([offset, index, *f"{system} {name}".encode()]).random()
+    ) / EACH
     return float(f"{10**share:.3g}")
 
 
 def digest():
     """Of the code that draws; items drawn by the same code need not be drawn again."""
     here, text = Path(__file__).parent, hashlib.sha256()
-    for module in ("items", "settings", "shapes", "sizing", "rivals", "joints", "flights", "worlds"):
+    for module in (
+        "items",
+        "settings",
+        "shapes",
+        "sizing",
+        "rivals",
+        "joints",
+        "flights",
+        "worlds",
+    ):
         text.update((here / f"{module}.py").read_bytes())
     return text.hexdigest()[:16]

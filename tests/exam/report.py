@@ -27,17 +27,42 @@ def marks(summary):
     """Rows (what, wanted, reached, interval, whether met) of the marks that `explain` must reach."""
     single, clean, double = summary["single"], summary["clean"], summary["double"]
     at_least = [
-        ("single effects at 1 x the noise or more: named, or in a set of at most 2", 0.97, single["named"]),
-        ("the same, effects that no data can tell apart counted as one", 0.97, single["named up to equivalence"]),
-        ("the same, or in a larger set whose others explain these data as well", 0.97, single["named as data tell"]),
+        (
+            "single effects at 1 x the noise or more: named, or in a set of at most 2",
+            0.97,
+            single["named"],
+        ),
+        (
+            "the same, effects that no data can tell apart counted as one",
+            0.97,
+            single["named up to equivalence"],
+        ),
+        (
+            "the same, or in a larger set whose others explain these data as well",
+            0.97,
+            single["named as data tell"],
+        ),
         ("two effects: both found", 0.85, double["named"]),
         ("the same, up to equivalence", 0.85, double["named up to equivalence"]),
         ("a cause outside the library: unknown or partial", 0.95, summary["foreign"]["right"]),
     ]
-    rows = [("clean recordings: false alarms", "at most 1 %", clean["alarms"], _at(clean["alarms"], 0.0, 0.01))]
-    rows += [(what, f"at least {wanted:.0%}", got, _at(got, wanted, 1.0)) for what, wanted, got in at_least]
+    rows = [
+        (
+            "clean recordings: false alarms",
+            "at most 1 %",
+            clean["alarms"],
+            _at(clean["alarms"], 0.0, 0.01),
+        )
+    ]
+    rows += [
+        (what, f"at least {wanted:.0%}", got, _at(got, wanted, 1.0))
+        for what, wanted, got in at_least
+    ]
     held = summary["coverage"]["all"]
-    return [*rows, ("95 % intervals that hold the truth", "90 to 98 %", held, _at(held, 0.90, 0.98))]
+    return [
+        *rows,
+        ("95 % intervals that hold the truth", "90 to 98 %", held, _at(held, 0.90, 0.98)),
+    ]
 
 
 def _at(got, low, high):
@@ -46,16 +71,24 @@ def _at(got, low, high):
 
 def passes(summary):
     """Whether a quick exam went well: no alarm, nothing failed, most found."""
-    kinds = [summary["single"]["named up to equivalence"], summary["double"]["named up to equivalence"]]
+    kinds = [
+        summary["single"]["named up to equivalence"],
+        summary["double"]["named up to equivalence"],
+    ]
     kinds.append(summary["foreign"]["right"])
     hits, of = sum(k["count"] for k in kinds), sum(k["of"] for k in kinds)
-    return not summary["failed"] and not summary["clean"]["alarms"]["count"] and hits >= QUICK_SHARE * of
+    return (
+        not summary["failed"]
+        and not summary["clean"]["alarms"]["count"]
+        and hits >= QUICK_SHARE * of
+    )
 
 
 def printed(summary):
     """The marks as plain lines."""
     lines = [
-        f"{'yes' if met else 'NO ':4}{_ratio(got):>34}  {what} ({wanted})" for what, wanted, got, met in marks(summary)
+        f"{'yes' if met else 'NO ':4}{_ratio(got):>34}  {what} ({wanted})"
+        for what, wanted, got, met in marks(summary)
     ]
     return "\n".join([*lines, _seconds(summary)])
 
@@ -63,7 +96,9 @@ def printed(summary):
 def _ratio(got):
     if got["share"] is None:
         return "none asked"
-    return f"{got['count']}/{got['of']} = {got['share']:.1%} ({got['low']:.1%} to {got['high']:.1%})"
+    return (
+        f"{got['count']}/{got['of']} = {got['share']:.1%} ({got['low']:.1%} to {got['high']:.1%})"
+    )
 
 
 def _seconds(summary):
@@ -84,7 +119,8 @@ def page(summary):
     ]
     lines += ["|---|---|---|---|"]
     lines += [
-        f"| {what} | {wanted} | {_ratio(got)} | {'yes' if met else 'no'} |" for what, wanted, got, met in marks(summary)
+        f"| {what} | {wanted} | {_ratio(got)} | {'yes' if met else 'no'} |"
+        for what, wanted, got, met in marks(summary)
     ]
     lines += ["", _seconds(summary) + ".", ""]
     for title, kind, key in BREAKDOWNS:
@@ -92,7 +128,9 @@ def page(summary):
     lines += _breakdown("Intervals that hold the truth", _coverage(summary["coverage"]))
     lines += ["## Outcomes", "", "What each means stands in `tests/exam/score.py`.", ""]
     for kind, outcomes in summary["outcomes"].items():
-        lines.append(f"- {kind}: " + ", ".join(f"{count} {name}" for name, count in sorted(outcomes.items())))
+        lines.append(
+            f"- {kind}: " + ", ".join(f"{count} {name}" for name, count in sorted(outcomes.items()))
+        )
     cannot = [f"- {name}: {count}" for name, count in summary["cannot show"].items()]
     lines += ["", "## What the sensors cannot show", "", CANNOT, "", *(cannot or ["- nothing"]), ""]
     if summary["failed"]:
@@ -161,18 +199,33 @@ def _items(path, rows):
 def _line(row):
     item, mark, verdict = row["item"], row["mark"], row["verdict"] or {}
     held = [h for h in mark["covered"].values() if h is not None]
-    keys = ("name", "size", "beyond", "noise", "stated", "rate", "seconds", "runs", "source", "driven")
+    keys = (
+        "name",
+        "size",
+        "beyond",
+        "noise",
+        "stated",
+        "rate",
+        "seconds",
+        "runs",
+        "source",
+        "driven",
+    )
     heldout = verdict.get("heldout") or {}
     return {
         **{name: row[name] for name in ("question", "part", "kind", "system")},
         "channels": " ".join(item.get("channels", ())),
         **{"run_seconds" if key == "seconds" else key: _short(item.get(key)) for key in keys},
-        "hidden": " + ".join(f"{n}={','.join(f'{c:.4g}' for c in cs)}" for n, cs in item.get("effects", {}).items()),
+        "hidden": " + ".join(
+            f"{n}={','.join(f'{c:.4g}' for c in cs)}" for n, cs in item.get("effects", {}).items()
+        ),
         "verdict": verdict.get("verdict", ""),
         "named": mark["named"],
         "outcome": mark["outcome"],
         **{name: mark[name] for name in ("set_size", "class_size", "found", "found_class")},
-        "rivals_sigmas": " ".join(f"{name}={rival['sigmas']:.2g}" for name, rival in row["rivals"].items()),
+        "rivals_sigmas": " ".join(
+            f"{name}={rival['sigmas']:.2g}" for name, rival in row["rivals"].items()
+        ),
         "gap_closed": _short(heldout.get("gap_closed")),
         "intervals_holding": f"{sum(held)}/{len(held)}" if held else "",
         "seconds": _short(row["seconds"]),

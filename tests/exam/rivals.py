@@ -1,4 +1,6 @@
-"""What else would explain an observation: effects of the library refitted to it, the most promising ones."""
+"""What else would explain an observation: effects of the library refitted to it, the most promising
+ones.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +21,11 @@ SHAPES = {  # first guesses of what shapes an effect rather than scales it, in t
 
 
 def left_with(setting, observed, name, coefficients=None):
-    """What base parameters, initial states and the effect of this name leave of observations (R, T, C), refitted.
+    """What base parameters, initial states and the effect of this name leave of observations (R, T,
+    C), refitted.
 
-    It starts from the truth: the setting's numbers and these coefficients, or from guesses where none are given.
+    It starts from the truth: the setting's numbers and these coefficients, or from guesses where
+    none are given.
     """
     fit = Fitter(setting, [name])
     if coefficients is not None:
@@ -43,9 +47,13 @@ def best(setting, observed):
 
 
 def _guesses(setting, observed, name, bare):
-    """(what would be left to first order, theta) for every shape, the best first; `bare` is the fit without it."""
+    """(what would be left to first order, theta) for every shape, the best first; `bare` is the fit
+    without it.
+    """
     fit = Fitter(setting, [name])
-    if name == "input.saturation":  # it starts not at zero but at the peak, where its first order is none
+    if (
+        name == "input.saturation"
+    ):  # it starts not at zero but at the peak, where its first order is none
         peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
         guesses = [np.array([*bare.theta, share * peak]) for share in (0.9, 0.6)]
         result = [(_left_at(fit, observed, guess, bare), guess) for guess in guesses]
@@ -60,7 +68,9 @@ def _left_at(fit, observed, theta, bare):
 
 
 def _first_order(fit, observed, shape, bare):
-    """One step of least squares from the effect at zero, its shape held; numbers a system lacks are left out."""
+    """One step of least squares from the effect at zero, its shape held; numbers a system lacks are
+    left out.
+    """
     base, count = bare.theta.size, fit.theta.size
     shape = shape[: count - base - 1]
     scaled = count - len(shape)

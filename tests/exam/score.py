@@ -35,8 +35,8 @@ class Mark:
         set_size: effects in the set that holds the truth (the larger of two); 0 where none does.
         class_size: the same, with effects that are equivalent in any data counted as one.
         named: what was named, alternatives behind a bar: ``drag.linear|wind + force.bias``.
-        covered: by coefficient or parameter of what was answered rightly: whether the 95 % interval holds the truth;
-            None where the interval is open.
+        covered: by coefficient or parameter of what was answered rightly: whether the 95 % interval
+            holds the truth; None where the interval is open.
     """
 
     outcome: str
@@ -53,7 +53,9 @@ class Mark:
     @property
     def found_class(self):
         """Whether it counts, equivalent effects being one."""
-        return self.outcome == "right" or (self.outcome in ("set", "class") and self.class_size <= MOST)
+        return self.outcome == "right" or (
+            self.outcome in ("set", "class") and self.class_size <= MOST
+        )
 
 
 def marked(item: Item, verdict) -> Mark:
@@ -64,7 +66,11 @@ def marked(item: Item, verdict) -> Mark:
     outcome, strict, loose = OUTCOMES[item.kind](item, verdict["verdict"], sets)
     if verdict["verdict"] == "unidentifiable":
         outcome = "undecided"
-    covered = _covered(item, verdict, sets) if outcome in ("right", "set") and item.kind != "foreign" else {}
+    covered = (
+        _covered(item, verdict, sets)
+        if outcome in ("right", "set") and item.kind != "foreign"
+        else {}
+    )
     return Mark(outcome, strict, loose, " + ".join("|".join(names) for names in sets), covered)
 
 
@@ -85,7 +91,9 @@ def _library(item, verdict, sets):
     if not sets or verdict == "unknown":  # what it lists then are no answers
         return "unnamed", 0, 0
     strict = _matched(item.effects, sets, lambda effect, names: effect in names)
-    loose = _matched(item.effects, sets, lambda effect, names: bool(_same(item, effect) & set(names)))
+    loose = _matched(
+        item.effects, sets, lambda effect, names: bool(_same(item, effect) & set(names))
+    )
     if len(loose) < len(item.effects):
         return "one" if loose else "wrong", 0, 0
     sizes = max(len(sets[place]) for place in loose.values())
@@ -99,13 +107,19 @@ def _library(item, verdict, sets):
 
 
 def _matched(effects, sets, holds):
-    """Which set holds which effect, no set two: the fullest of the assignments, of two effects at most."""
+    """Which set holds which effect, no set two: the fullest of the assignments, of two effects at
+    most.
+    """
     best: dict[str, int] = {}
     for order in (list(effects), list(effects)[::-1]):
         for reverse in (False, True):
             found: dict[str, int] = {}
             for effect in order:
-                places = [i for i, names in enumerate(sets) if holds(effect, names) and i not in found.values()]
+                places = [
+                    i
+                    for i, names in enumerate(sets)
+                    if holds(effect, names) and i not in found.values()
+                ]
                 if places:
                     found[effect] = places[-1 if reverse else 0]
             best = max(best, found, key=len)
@@ -125,7 +139,11 @@ OUTCOMES = {"clean": _clean, "foreign": _foreign, "single": _library, "double": 
 
 def _covered(item, verdict, sets):
     """Intervals of base parameters and of the coefficients of what leads its set."""
-    system, truth, said = SIMULATORS[item.system].system, dict(item.parameters), dict(verdict["parameters"])
+    system, truth, said = (
+        SIMULATORS[item.system].system,
+        dict(item.parameters),
+        dict(verdict["parameters"]),
+    )
     led = {names[0] for names in sets}
     for cause in verdict["causes"]:
         if cause["effect"] in item.effects:

@@ -1,4 +1,6 @@
-"""The circumstances of an exam's recordings: parameters, runs, inputs, channels and noise, all drawn from a seed."""
+"""The circumstances of an exam's recordings: parameters, runs, inputs, channels and noise, all
+drawn from a seed.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +12,32 @@ from sims.base import Scenario
 from sims.pendulum.simulator import Pendulum
 from tests.exam.worlds import World, constants_of
 
-ALONG_GROUND = ("gravity.tilt", "lift.magnus", "wind", "contact.friction", "drag.quadratic", "updraft", "gust")
+ALONG_GROUND = (
+    "gravity.tilt",
+    "lift.magnus",
+    "wind",
+    "contact.friction",
+    "drag.quadratic",
+    "updraft",
+    "gust",
+)
 RANGES = {"ball": (2e-3, 2e-2), "pendulum": (1e-3, 1e-2), "slider": (1e-3, 1e-2)}  # sigma, m or rad
-RATES = {"pendulum": (3.0, 10.0), "slider": (2.0, 5.0)}  # how much noisier the rate is than the position, 1/s
-PENDULUM = Pendulum(observe=["q"], engine="batch")  # tells how far a drawn pendulum swings; gives no data
+RATES = {
+    "pendulum": (3.0, 10.0),
+    "slider": (2.0, 5.0),
+}  # how much noisier the rate is than the position, 1/s
+PENDULUM = Pendulum(
+    observe=["q"], engine="batch"
+)  # tells how far a drawn pendulum swings; gives no data
 MOST_RUNS = 6
 NOISES = ("white", "ar1", "quantised")
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Sensor noise: `sigma` by channel, its `kind`, the AR(1) coefficient, white noise in units of a rounding step."""
+    """Sensor noise: `sigma` by channel, its `kind`, the AR(1) coefficient, white noise in units of
+    a rounding step.
+    """
 
     sigma: dict[str, float]
     kind: str
@@ -75,7 +92,9 @@ def setting(system, rng, hidden=(), short=False):
     draw = {"ball": _ball, "pendulum": _pendulum, "slider": _slider}[system]
     parameters, channels, scenarios = draw(rng, times, runs, hidden)
     noise = _noise(rng, system, channels)
-    return Setting(system, parameters, constants_of(system), channels, tuple(scenarios), noise, rate, seconds)
+    return Setting(
+        system, parameters, constants_of(system), channels, tuple(scenarios), noise, rate, seconds
+    )
 
 
 def _noise(rng, system, channels):
@@ -83,7 +102,13 @@ def _noise(rng, system, channels):
     faster = float(rng.uniform(*RATES[system])) if system in RATES else 1.0
     by_channel = {name: sigma * (faster if name in ("qd", "v") else 1.0) for name in channels}
     kind = str(rng.choice(NOISES))
-    return Noise(by_channel, kind, float(rng.uniform(0.3, 0.9)), float(rng.uniform(0.3, 0.6)), bool(rng.random() < 0.5))
+    return Noise(
+        by_channel,
+        kind,
+        float(rng.uniform(0.3, 0.9)),
+        float(rng.uniform(0.3, 0.6)),
+        bool(rng.random() < 0.5),
+    )
 
 
 def _ball(rng, times, runs, hidden):
@@ -93,22 +118,31 @@ def _ball(rng, times, runs, hidden):
     for _ in range(runs):
         vx, vy = rng.uniform(-speed, speed, 2)
         z, vz = rng.uniform(2.0, 5.0), rng.choice([0.0, rng.uniform(-2.0, 3.0)])
-        scenarios.append(Scenario(times, {"x": 0.0, "y": 0.0, "z": z, "vx": vx, "vy": vy, "vz": vz}))
+        scenarios.append(
+            Scenario(times, {"x": 0.0, "y": 0.0, "z": z, "vx": vx, "vy": vy, "vz": vz})
+        )
     return parameters, ("z",) if upright else ("x", "y", "z"), scenarios
 
 
 def _pendulum(rng, times, runs, hidden):
     parameters = {"inertia": float(rng.uniform(2e-3, 6e-3))}
-    driven = any(name.startswith("input.") or name == "backlash" for name in hidden) or rng.random() < 0.5
+    driven = (
+        any(name.startswith("input.") or name == "backlash" for name in hidden)
+        or rng.random() < 0.5
+    )
     channels = ("q",) if rng.random() < 0.6 else ("q", "qd")
     form, scenarios = str(rng.choice(["steps", "sine", "chirp"])), []
     while len(scenarios) < runs:
-        inputs = {"u": rng.uniform(0.05, 0.2) * wave(form, times, rng, (0.3, 3.0))} if driven else {}
+        inputs = (
+            {"u": rng.uniform(0.05, 0.2) * wave(form, times, rng, (0.3, 3.0))} if driven else {}
+        )
         rates = rng.choice([0.0, rng.uniform(-5.0, 5.0)])
         start = {"q": rng.choice([-1, 1]) * rng.uniform(0.3, 2.5), "qd": rates}
         scenario = Scenario(times, start, inputs)
         swing = PENDULUM.simulate(np.array([[parameters["inertia"]]]), scenario)
-        if 0.25 < np.abs(swing).max() < 2.8:  # over the top, the smallest push decides which way it falls
+        if (
+            0.25 < np.abs(swing).max() < 2.8
+        ):  # over the top, the smallest push decides which way it falls
             scenarios.append(scenario)
     return parameters, channels, scenarios
 
@@ -118,20 +152,29 @@ def _slider(rng, times, runs, hidden):
     channels = ("x",) if rng.random() < 0.6 else ("x", "v")
     form, scenarios = str(rng.choice(["steps", "sine", "chirp"])), []
     for _ in range(runs):
-        start = {"x": rng.choice([0.0, rng.uniform(-0.5, 0.5)]), "v": rng.choice([0.0, rng.uniform(-0.3, 0.3)])}
+        start = {
+            "x": rng.choice([0.0, rng.uniform(-0.5, 0.5)]),
+            "v": rng.choice([0.0, rng.uniform(-0.3, 0.3)]),
+        }
         u = wave(form, times, rng, (0.3, 2.0))
         u -= u.mean()  # or else it runs away
         travel = np.ptp(np.cumsum(np.cumsum(u))) * times[1] ** 2 / parameters["mass"]
-        scenarios.append(Scenario(times, start, {"u": u * np.clip(rng.uniform(0.4, 2.5) / travel, 0.5, 8.0)}))
+        scenarios.append(
+            Scenario(times, start, {"u": u * np.clip(rng.uniform(0.4, 2.5) / travel, 0.5, 8.0)})
+        )
     return parameters, channels, scenarios
 
 
 def wave(form, times, rng, hertz):
-    """An input signal (T,) of amplitude one: steps between levels, a sine, or a chirp, within a range of frequency."""
+    """An input signal (T,) of amplitude one: steps between levels, a sine, or a chirp, within a
+    range of frequency.
+    """
     if form == "steps":
         lasting = rng.uniform(0.25, 1.0)
         place = np.floor(times / lasting).astype(int)
         return rng.uniform(-1.0, 1.0, place[-1] + 1)[place]
     low, high = np.sort(np.exp(rng.uniform(*np.log(hertz), 2)))
-    turns = low * times if form == "sine" else low * times + (high - low) * times**2 / (2 * times[-1])
+    turns = (
+        low * times if form == "sine" else low * times + (high - low) * times**2 / (2 * times[-1])
+    )
     return np.sin(2 * np.pi * (turns + rng.random()))

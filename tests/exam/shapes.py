@@ -1,6 +1,8 @@
-"""Coefficients of hidden causes: their shape is drawn, their strength s is left open, 1 being the far end of plausible.
+"""Coefficients of hidden causes: their shape is drawn, their strength s is left open, 1 being the
+far end of plausible.
 
-`shape(name, setting, rng)` gives a function from strength to coefficients. Bounds are of the library's tables.
+`shape(name, setting, rng)` gives a function from strength to coefficients. Bounds are of the
+library's tables.
 """
 
 from __future__ import annotations
@@ -12,7 +14,15 @@ from tests.exam.settings import MOST_RUNS
 from tests.exam.sizing import observed_by_batch
 from tests.exam.worlds import SIMULATORS
 
-SIGNED = ("force.bias", "gravity.scale", "input.gain", "input.bias", "sensor.gain", "sensor.bias", "sensor.drift")
+SIGNED = (
+    "force.bias",
+    "gravity.scale",
+    "input.gain",
+    "input.bias",
+    "sensor.gain",
+    "sensor.bias",
+    "sensor.drift",
+)
 SIGNED += ("clock.skew", "spring.cubic", "restitution.speed")
 LARGEST = 2.0  # beyond twice the plausible range nothing is asked
 
@@ -154,7 +164,12 @@ def _updraft(setting, rng):
 def _ball_gust(setting, rng):
     lasting, angle = float(rng.uniform(0.1, 0.4)), rng.uniform(0, 2 * np.pi)
     begins = _begins(setting, lasting, rng)
-    return lambda s: (20.0 * s * float(np.cos(angle)), 20.0 * s * float(np.sin(angle)), lasting, *begins)
+    return lambda s: (
+        20.0 * s * float(np.cos(angle)),
+        20.0 * s * float(np.sin(angle)),
+        lasting,
+        *begins,
+    )
 
 
 def _wear(setting, rng):

@@ -1,4 +1,5 @@
-"""How large a hidden effect has to be: the gap that it leaves once base parameters and initial states are refitted.
+"""How large a hidden effect has to be: the gap that it leaves once base parameters and initial
+states are refitted.
 
 Only here is the batch engine used, to choose sizes; the exam's data never come from it.
 """
@@ -32,17 +33,28 @@ class Fit:
 
 
 class Fitter:
-    """Least squares over base parameters, coefficients of `effects`, and the initial state of every run."""
+    """Least squares over base parameters, coefficients of `effects`, and the initial state of every
+    run.
+    """
 
     def __init__(self, setting, effects=()):
         kind = SIMULATORS[setting.system]
         self.simulator = kind(setting.constants, setting.channels, engine="batch", effects=effects)
-        self.scenarios, self.sigma, self.states = list(setting.scenarios), setting.sigma, list(kind.states)
+        self.scenarios, self.sigma, self.states = (
+            list(setting.scenarios),
+            setting.sigma,
+            list(kind.states),
+        )
         base = [setting.parameters[p.name] for p in kind.system.parameters]
         self.theta = np.array([*base, *(p.nominal for p in self.simulator.parameters[len(base) :])])
-        self.starts = np.array([[s.initial[name] for name in self.states] for s in setting.scenarios])
+        self.starts = np.array(
+            [[s.initial[name] for name in self.states] for s in setting.scenarios]
+        )
         low, high = np.array([p.bounds for p in self.simulator.parameters]).T
-        self.low, self.high = low, np.where(np.arange(low.size) < len(base), high, low + 2 * (high - low))
+        self.low, self.high = (
+            low,
+            np.where(np.arange(low.size) < len(base), high, low + 2 * (high - low)),
+        )
         self.scales = np.where(np.arange(low.size) < len(base), self.theta, 0.1 * (high - low))
 
     def __call__(self, observed, theta=None, starts=None, rounds=12):
@@ -77,7 +89,9 @@ class Fitter:
         return np.linalg.solve(gram, slope.T @ rest)
 
     def look(self, observed, theta, starts):
-        """What is left (N,), and how the simulation changes (N, P) with each fitted number in its scale."""
+        """What is left (N,), and how the simulation changes (N, P) with each fitted number in its
+        scale.
+        """
         runs, states, count = len(starts), len(self.states), theta.size
         moved = 1 + count + states
         thetas, begun = np.tile(theta, (runs, moved, 1)), np.tile(starts[:, None], (1, moved, 1))
@@ -87,7 +101,10 @@ class Fitter:
             begun[:, 1 + count + i, i] += NUDGE
         initial = {name: begun[:, :, i].ravel() for i, name in enumerate(self.states)}
         scenarios = [s for s in self.scenarios for _ in range(moved)]
-        seen = self.simulator.simulate_lanes(thetas.reshape(runs * moved, count), scenarios, initial) / self.sigma
+        seen = (
+            self.simulator.simulate_lanes(thetas.reshape(runs * moved, count), scenarios, initial)
+            / self.sigma
+        )
         seen = seen.reshape(runs, moved, -1)
         rest = (observed / self.sigma).reshape(runs, -1) - seen[:, 0]
         slopes = (seen[:, 1:] - seen[:, :1]) / NUDGE
@@ -104,12 +121,16 @@ def observed_by_batch(setting, effects):
     kind = SIMULATORS[setting.system]
     fixed = {name: list(c) for name, c in effects.items()}
     simulator = kind(setting.constants, setting.channels, engine="batch", fixed=fixed)
-    theta = np.array([[setting.parameters[p.name] for p in kind.system.parameters]] * len(setting.scenarios))
+    theta = np.array(
+        [[setting.parameters[p.name] for p in kind.system.parameters]] * len(setting.scenarios)
+    )
     return simulator.simulate_lanes(theta, setting.scenarios)
 
 
 def gap(setting, observed):
-    """The gap by strength: what base parameters and initial states leave of `observed(strength)`, (R, T, C)."""
+    """The gap by strength: what base parameters and initial states leave of `observed(strength)`,
+    (R, T, C).
+    """
     fit, last = Fitter(setting), []
 
     def left(strength):
@@ -128,7 +149,8 @@ def gap(setting, observed):
 
 
 def sized(left, wanted, largest, first=1e-3):
-    """The strength at which `left(strength)`, which grows from zero, is `wanted`; None if it is not below `largest`.
+    """The strength at which `left(strength)`, which grows from zero, is `wanted`; None if it is not
+    below `largest`.
 
     Secants on logarithmic scales, within a bracket once there is one.
     """
@@ -150,7 +172,9 @@ def sized(left, wanted, largest, first=1e-3):
 def _between(low, high, wanted):
     """The next strength to try, given (strength, left) on either side of what is wanted."""
     if not low[0]:
-        return high[0] * min(max(wanted / high[1], 1e-2), 0.9) if np.isfinite(high[1]) else high[0] / 5
+        return (
+            high[0] * min(max(wanted / high[1], 1e-2), 0.9) if np.isfinite(high[1]) else high[0] / 5
+        )
     if not np.isfinite(high[0]):
         return low[0] * min(wanted / max(low[1], 1e-9), LEAP)
     if not np.isfinite(high[1]) or high[0] / low[0] > LEAP**2:

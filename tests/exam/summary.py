@@ -1,4 +1,6 @@
-"""The numbers of an exam: shares with their 95 % intervals, coverage of intervals, times, power, confusion."""
+"""The numbers of an exam: shares with their 95 % intervals, coverage of intervals, times, power,
+confusion.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,21 @@ EVIDENCE = 4.0  # sigmas
 
 
 def share(rows, right, exact=False):
-    """How many are right, of how many, and the 95 % interval of the share (Wilson, or Clopper and Pearson)."""
+    """How many are right, of how many, and the 95 % interval of the share (Wilson, or Clopper and
+    Pearson).
+    """
     rows = list(rows)
     hits = sum(bool(right(row)) for row in rows)
     if not rows:
         return {"count": 0, "of": 0, "share": None, "low": None, "high": None}
     interval = binomtest(hits, len(rows)).proportion_ci(0.95, method="exact" if exact else "wilson")
-    return {"count": hits, "of": len(rows), "share": hits / len(rows), "low": interval.low, "high": interval.high}
+    return {
+        "count": hits,
+        "of": len(rows),
+        "share": hits / len(rows),
+        "low": interval.low,
+        "high": interval.high,
+    }
 
 
 def found(row):
@@ -33,7 +43,9 @@ def found_class(row):
 def as_data_tell(row):
     """Found, or in a set whose other members nothing in these data speaks against."""
     sigmas = [rival["sigmas"] for rival in row["rivals"].values()]
-    return found_class(row) or (row["mark"]["outcome"] == "set" and max(sigmas, default=np.inf) < EVIDENCE)
+    return found_class(row) or (
+        row["mark"]["outcome"] == "set" and max(sigmas, default=np.inf) < EVIDENCE
+    )
 
 
 def alarmed(row):
@@ -48,15 +60,27 @@ def summarised(rows):
     """All numbers about the rows of an exam."""
     answered = [row for row in rows if row.get("mark")]
     marks = [row for row in answered if row["part"] == "marks"]
-    of = {kind: [row for row in marks if row["kind"] == kind] for kind in ("clean", "single", "double", "foreign")}
+    of = {
+        kind: [row for row in marks if row["kind"] == kind]
+        for kind in ("clean", "single", "double", "foreign")
+    }
     seconds = [row["seconds"] for row in answered if row["seconds"] is not None]
     return {
         "items": len(answered),
-        "outcomes": {kind: dict(Counter(row["mark"]["outcome"] for row in group)) for kind, group in of.items()},
+        "outcomes": {
+            kind: dict(Counter(row["mark"]["outcome"] for row in group))
+            for kind, group in of.items()
+        },
         "single": _named(of["single"]),
-        "clean": {"alarms": share(of["clean"], alarmed, exact=True), **_by(of["clean"], alarmed, exact=True)},
+        "clean": {
+            "alarms": share(of["clean"], alarmed, exact=True),
+            **_by(of["clean"], alarmed, exact=True),
+        },
         "double": {**_named(of["double"], by=("system",)), "one": share(of["double"], _one)},
-        "foreign": {"right": share(of["foreign"], right), **_by(of["foreign"], right, ("system", "effect"))},
+        "foreign": {
+            "right": share(of["foreign"], right),
+            **_by(of["foreign"], right, ("system", "effect")),
+        },
         "coverage": _coverage(marks),
         "seconds": _times(seconds),
         "cannot show": _cannot(rows),
@@ -69,16 +93,23 @@ def _one(row):
 
 
 def _named(rows, by=("system", "effect", "noise", "stated", "source", "size")):
-    """Shares by names and by classes; whatever is `wrong` although the data tell the two apart stands by itself."""
+    """Shares by names and by classes; whatever is `wrong` although the data tell the two apart
+    stands by itself.
+    """
     result = {"named": share(rows, found), "named up to equivalence": share(rows, found_class)}
     result["named as data tell"] = share(rows, as_data_tell)
     result["named alone"] = share(rows, right)
-    result |= _by(rows, found, by) | {f"{k} up to equivalence": v for k, v in _by(rows, found_class, by).items()}
+    result |= _by(rows, found, by) | {
+        f"{k} up to equivalence": v for k, v in _by(rows, found_class, by).items()
+    }
     return result
 
 
 def _by(rows, right, by=("system", "noise", "stated"), exact=False):
-    return {f"by {key}": {str(v): share(group, right, exact) for v, group in _groups(rows, key)} for key in by}
+    return {
+        f"by {key}": {str(v): share(group, right, exact) for v, group in _groups(rows, key)}
+        for key in by
+    }
 
 
 def _groups(rows, key):
@@ -91,12 +122,16 @@ def _groups(rows, key):
 def _value(row, key):
     if key == "size":
         size = row["item"].get("size", 0.0)
-        return next((f"{low:.2g} to {high:.2g}" for low, high in BINS if low <= size < high), "other")
+        return next(
+            (f"{low:.2g} to {high:.2g}" for low, high in BINS if low <= size < high), "other"
+        )
     return row[key] if key in row else row["item"].get(key)
 
 
 def _coverage(rows):
-    """How many 95 % intervals hold the truth, of those that are closed; by what they are of, and by noise."""
+    """How many 95 % intervals hold the truth, of those that are closed; by what they are of, and by
+    noise.
+    """
     counts = [
         {
             "of": "coefficients" if "." in name else "parameters",
@@ -115,7 +150,8 @@ def _coverage(rows):
     result = {"all": share(closed, held), "open": len(counts) - len(closed)}
     for key in ("of", "noise", "kind"):
         result[f"by {key}"] = {
-            v: share([c for c in closed if c[key] == v], held) for v in sorted({c[key] for c in closed})
+            v: share([c for c in closed if c[key] == v], held)
+            for v in sorted({c[key] for c in closed})
         }
     return result
 
@@ -123,17 +159,27 @@ def _coverage(rows):
 def _times(seconds):
     if not seconds:
         return {"median": None, "p95": None, "max": None}
-    return {"median": float(np.median(seconds)), "p95": float(np.quantile(seconds, 0.95)), "max": float(max(seconds))}
+    return {
+        "median": float(np.median(seconds)),
+        "p95": float(np.quantile(seconds, 0.95)),
+        "max": float(max(seconds)),
+    }
 
 
 def _cannot(rows):
-    """Effects of which some or all drawings do not show within twice the plausible range, whatever was drawn."""
+    """Effects of which some or all drawings do not show within twice the plausible range, whatever
+    was drawn.
+    """
     asked, shown = Counter(), Counter()
     for row in rows:
         if row["kind"] == "single" and row["part"] == "marks":
             asked[row["system"], row["effect"]] += 1
             shown[row["system"], row["effect"]] += bool(row.get("mark"))
-    return {f"{s} {e}": f"{shown[s, e]} of {n} drawn" for (s, e), n in sorted(asked.items()) if shown[s, e] < n}
+    return {
+        f"{s} {e}": f"{shown[s, e]} of {n} drawn"
+        for (s, e), n in sorted(asked.items())
+        if shown[s, e] < n
+    }
 
 
 def power(rows):
@@ -143,7 +189,9 @@ def power(rows):
     for row in singles:
         size = row["item"]["size"]
         limits = (
-            next((b for b in BINS if b[0] <= size < b[1]), (size, size)) if row["part"] == "marks" else (size, size)
+            next((b for b in BINS if b[0] <= size < b[1]), (size, size))
+            if row["part"] == "marks"
+            else (size, size)
         )
         groups.setdefault((row["part"] == "marks", limits), []).append(row)
     return [

@@ -10,7 +10,16 @@ from scipy.optimize import least_squares
 from sims.base import Scenario
 from sims.recording.recording import read_recording
 from tests.exam import rivals, shapes, sizing
-from tests.exam.items import APART, EQUIVALENT, Item, coefficients, draw, held_out_of, realise, setting_of
+from tests.exam.items import (
+    APART,
+    EQUIVALENT,
+    Item,
+    coefficients,
+    draw,
+    held_out_of,
+    realise,
+    setting_of,
+)
 from tests.exam.questions import Question, quick, sheet
 from tests.exam.settings import Noise, setting
 from tests.exam.worlds import SIMULATORS, World, constants_of, simulated, solved
@@ -26,13 +35,19 @@ def refitted(item):
     states = ["z", "vz"] if drawn.channels == ("z",) else list(drawn.scenarios[0].initial)
 
     def rest(z):
-        own = World(item.system, dict(zip(names, np.exp(z[: len(names)]), strict=True)), constants_of(item.system))
+        own = World(
+            item.system,
+            dict(zip(names, np.exp(z[: len(names)]), strict=True)),
+            constants_of(item.system),
+        )
         starts = z[len(names) :].reshape(len(drawn.scenarios), -1)
         runs = [
             Scenario(s.times, {**s.initial, **dict(zip(states, start, strict=True))}, s.inputs)
             for s, start in zip(drawn.scenarios, starts, strict=True)
         ]
-        return ((observed - [solved(own, run, drawn.channels) for run in runs]) / drawn.sigma).ravel()
+        return (
+            (observed - [solved(own, run, drawn.channels) for run in runs]) / drawn.sigma
+        ).ravel()
 
     starts = [[s.initial[name] for name in states] for s in drawn.scenarios]
     guess = np.concatenate([np.log(list(drawn.parameters.values())), np.ravel(starts)])
@@ -42,7 +57,11 @@ def refitted(item):
 
 @pytest.mark.parametrize(
     ("system", "seed", "effect", "size"),
-    [("slider", 0, "drag.linear", 2.0), ("ball", 20, "sensor.gain", 3.0), ("pendulum", 9, "force.bias", 2.0)],
+    [
+        ("slider", 0, "drag.linear", 2.0),
+        ("ball", 20, "sensor.gain", 3.0),
+        ("pendulum", 9, "force.bias", 2.0),
+    ],
 )
 def test_the_gap_is_as_large_as_wanted(system, seed, effect, size):
     item = draw("single", system, seed, effect, size)
@@ -52,14 +71,23 @@ def test_the_gap_is_as_large_as_wanted(system, seed, effect, size):
 
 @pytest.mark.parametrize(
     ("system", "effect"),
-    [("ball", "wind"), ("ball", "sensor.lag"), ("slider", "friction.stribeck"), ("pendulum", "input.lag")],
+    [
+        ("ball", "wind"),
+        ("ball", "sensor.lag"),
+        ("slider", "friction.stribeck"),
+        ("pendulum", "input.lag"),
+    ],
 )
 def test_the_hidden_effect_explains_all(system, effect):
-    """Solver and engine differ by so little of the noise that no number of samples asked for could show it."""
+    """Solver and engine differ by so little of the noise that no number of samples asked for could
+    show it.
+    """
     item = Question("marks", "single", system, effect, 0, 4.0).drawn(0)
     drawn = setting_of(item)
     for see in (solved, simulated):
-        observed = np.array([see(drawn.world(item.effects), s, drawn.channels) for s in drawn.scenarios])
+        observed = np.array(
+            [see(drawn.world(item.effects), s, drawn.channels) for s in drawn.scenarios]
+        )
         left = rivals.left_with(drawn, observed, effect, item.effects[effect])
         assert left * observed.size**0.5 < 1.0  # sigmas of evidence against the truth
 
@@ -72,7 +100,9 @@ def test_what_the_sensors_cannot_show_is_not_asked():
 def test_of_two_effects_neither_does_for_both():
     item = draw("double", "ball", 1)
     observed = sizing.observed_by_batch(setting_of(item), item.effects)
-    left = [rivals.left_with(setting_of(item), observed, name, c) for name, c in item.effects.items()]
+    left = [
+        rivals.left_with(setting_of(item), observed, name, c) for name, c in item.effects.items()
+    ]
     assert len(left) == 2
     assert min(left) >= APART
 
@@ -87,10 +117,14 @@ def test_a_foreign_cause_is_out_of_the_librarys_reach():
 @pytest.mark.parametrize("system", ["ball", "slider"])
 def test_a_gust_blows_in_every_run(system):
     drawn = setting(system, np.random.default_rng(0), ("gust",))
-    numbers = shapes.foreign("gust", replace(drawn, scenarios=drawn.scenarios[:2]), np.random.default_rng(0))(0.5)
+    numbers = shapes.foreign(
+        "gust", replace(drawn, scenarios=drawn.scenarios[:2]), np.random.default_rng(0)
+    )(0.5)
     world = drawn.world(foreign={"gust": numbers})
     for number, run in enumerate(drawn.scenarios):
-        change = solved(world, run, drawn.channels, number) - solved(drawn.world(), run, drawn.channels)
+        change = solved(world, run, drawn.channels, number) - solved(
+            drawn.world(), run, drawn.channels
+        )
         assert np.abs(change).max() > 0.01
 
 
@@ -100,7 +134,9 @@ def test_equivalent_effects_leave_nothing_of_each_other(system, driven, names):
     drawn = setting(system, np.random.default_rng(3), hidden, short=True)
     assert drawn.driven is driven
     first = min(names)
-    observed = sizing.observed_by_batch(drawn, {first: coefficients(first, drawn, 3.0, np.random.default_rng(0))})
+    observed = sizing.observed_by_batch(
+        drawn, {first: coefficients(first, drawn, 3.0, np.random.default_rng(0))}
+    )
     for other in names - {first}:
         assert rivals.left_with(drawn, observed, other) < 0.03
 
@@ -111,24 +147,34 @@ def test_the_same_seed_gives_the_same_files(tmp_path):
         assert item == draw(kind, system, 5)
         assert item.parameters != draw(kind, system, 6).parameters
         paths = [
-            realise(item, tmp_path / place) for place in ("a", "b") if (tmp_path / place).mkdir(exist_ok=True) is None
+            realise(item, tmp_path / place)
+            for place in ("a", "b")
+            if (tmp_path / place).mkdir(exist_ok=True) is None
         ]
         assert paths[0].read_bytes() == paths[1].read_bytes()
         assert Item.of(json.loads(paths[0].with_suffix(".truth.json").read_text())) == item
 
 
-@pytest.mark.parametrize(("kind", "system"), [("clean", "ball"), ("clean", "pendulum"), ("single", "slider")])
+@pytest.mark.parametrize(
+    ("kind", "system"), [("clean", "ball"), ("clean", "pendulum"), ("single", "slider")]
+)
 def test_files_are_recordings(tmp_path, kind, system):
     item = draw(kind, system, 2)
     recording = read_recording(realise(item, tmp_path), SIMULATORS[system].system())
     assert recording.system == system
     assert len(recording.runs) == item.runs
-    assert [run.held_out for run in recording.runs] == [k >= item.runs - held_out_of(item) for k in range(item.runs)]
+    assert [run.held_out for run in recording.runs] == [
+        k >= item.runs - held_out_of(item) for k in range(item.runs)
+    ]
     assert bool(recording.noise) is item.stated
     assert all(run.times.size == round(item.rate * item.seconds) for run in recording.runs)
     drawn = setting_of(item)
-    clean = np.concatenate([solved(drawn.world(item.effects), s, drawn.channels) for s in drawn.scenarios])
-    seen = np.concatenate([np.column_stack([run.channels[c] for c in drawn.channels]) for run in recording.runs])
+    clean = np.concatenate(
+        [solved(drawn.world(item.effects), s, drawn.channels) for s in drawn.scenarios]
+    )
+    seen = np.concatenate(
+        [np.column_stack([run.channels[c] for c in drawn.channels]) for run in recording.runs]
+    )
     np.testing.assert_allclose((seen - clean).std(axis=0), drawn.sigma, rtol=0.15)
 
 
@@ -138,7 +184,9 @@ def test_noise_is_of_its_kind(kind):
     values = np.linspace(0, 1, 20000)[:, None]
     error = (noise.added(values, np.random.default_rng(0)) - values)[:, 0]
     assert error.std() == pytest.approx(0.01, rel=0.05)
-    assert np.corrcoef(error[1:], error[:-1])[0, 1] == pytest.approx(0.6 if kind == "ar1" else 0.0, abs=0.03)
+    assert np.corrcoef(error[1:], error[:-1])[0, 1] == pytest.approx(
+        0.6 if kind == "ar1" else 0.0, abs=0.03
+    )
     distinct = np.unique((error + values[:, 0]).round(12)).size
     assert distinct < 100 if kind == "quantised" else distinct > 19000
 
@@ -159,7 +207,9 @@ def test_the_sheet_asks_enough_of_everything():
 
 
 def test_a_question_is_drawn_until_it_shows():
-    asked = Question("marks", "single", "slider", "sensor.gain", 0, 2.5)  # needs the rate, which few record
+    asked = Question(
+        "marks", "single", "slider", "sensor.gain", 0, 2.5
+    )  # needs the rate, which few record
     item = asked.drawn(0)
     assert item.seed > 0
     assert setting_of(item).channels == ("x", "v")

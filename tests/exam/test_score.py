@@ -14,7 +14,23 @@ from tests.exam.summary import share
 
 
 def item(kind="single", system="slider", **effects):
-    return Item("name", system, kind, effects, 2.0, "white", True, 100, 4.0, 4, "scipy", True, ("x",), 0, {"mass": 1.5})
+    return Item(
+        "name",
+        system,
+        kind,
+        effects,
+        2.0,
+        "white",
+        True,
+        100,
+        4.0,
+        4,
+        "scipy",
+        True,
+        ("x",),
+        0,
+        {"mass": 1.5},
+    )
 
 
 def answer(verdict="named", *sets, **values):
@@ -79,7 +95,8 @@ def test_marks(hidden, given, outcome, found, found_class):
 
 def test_intervals_are_held_against_the_truth():
     wide, narrow, open_ = (
-        {"value": 1.5, "unit": "kg", "low": low, "high": high} for low, high in ((1, 2), (1, 1.2), (None, 2))
+        {"value": 1.5, "unit": "kg", "low": low, "high": high}
+        for low, high in ((1, 2), (1, 1.2), (None, 2))
     )
     for mass, held in ((wide, True), (narrow, False), (open_, None)):
         assert marked(item(**DRAG), answer("named", ["drag.linear"], mass=mass)).covered == {
@@ -89,13 +106,19 @@ def test_intervals_are_held_against_the_truth():
     assert marked(item(**{"drag.linear": (0.6,)}), answer("named", ["drag.linear"])).covered == {
         "drag.linear.coefficient": False
     }
-    assert marked(item("clean"), {**ADEQUATE, "parameters": {"mass": wide}}).covered == {"mass": True}
+    assert marked(item("clean"), {**ADEQUATE, "parameters": {"mass": wide}}).covered == {
+        "mass": True
+    }
     assert marked(item(**DRAG), answer("named", ["drag.quadratic"], mass=wide)).covered == {}
 
 
 def test_shares_have_their_intervals():
-    assert share([True] * 97 + [False] * 3, bool)["low"] == pytest.approx(0.9155, abs=1e-3)  # Wilson's
-    assert share([False] * 300, bool, exact=True)["high"] == pytest.approx(1 - 0.025 ** (1 / 300))  # Clopper, Pearson
+    assert share([True] * 97 + [False] * 3, bool)["low"] == pytest.approx(
+        0.9155, abs=1e-3
+    )  # Wilson's
+    assert share([False] * 300, bool, exact=True)["high"] == pytest.approx(
+        1 - 0.025 ** (1 / 300)
+    )  # Clopper, Pearson
 
 
 def test_a_crash_is_a_row():
@@ -119,4 +142,11 @@ def test_an_exam_goes_on_where_it_was(tmp_path, capsys):
     assert main([*given, *explain, "--fresh"]) == 0
     assert "0/3" in capsys.readouterr().out
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"items.jsonl", "items.csv", "confusion.csv", "summary.json", "README.md", "figures"}
+    assert names == {
+        "items.jsonl",
+        "items.csv",
+        "confusion.csv",
+        "summary.json",
+        "README.md",
+        "figures",
+    }

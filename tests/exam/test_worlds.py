@@ -1,4 +1,6 @@
-"""The exam's worlds: scipy and MuJoCo agree about every effect; foreign causes keep to closed forms."""
+"""The exam's worlds: scipy and MuJoCo agree about every effect; foreign causes keep to closed
+forms.
+"""
 
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from tests.exam.settings import wave
 from tests.exam.worlds import CHANNELS, SIMULATORS, World, constants_of, simulated, solved
 
 TIMES = np.arange(300) / 100
-# What MuJoCo's second-order steps of 1 ms (sensor.lag: what they miss at a bounce) leave, in m, rad, m/s, rad/s.
+# What MuJoCo's second-order steps of 1 ms (sensor.lag: what they miss at a bounce) leave, in m,
+# rad, m/s, rad/s.
 TOLERANCE = {"ball": (5e-5,) * 3, "pendulum": (1e-4, 1e-3), "slider": (5e-6, 5e-6)}
 BASE = {"ball": {"restitution": 0.7}, "pendulum": {"inertia": 0.004}, "slider": {"mass": 1.2}}
 SOMEWHERE = {
@@ -42,9 +45,27 @@ TOGETHER = [
     ("ball", {"drag.linear": (0.1,), "restitution.speed": (-0.1,), "sensor.delay": (0.02,)}),
     ("ball", {"contact.friction": (0.05,), "lift.magnus": (0.2, -0.1), "sensor.gain": (0.05,)}),
     ("pendulum", {"friction.coulomb": (0.01,), "input.saturation": (0.06,), "input.lag": (0.04,)}),
-    ("pendulum", {"friction.stribeck": (0.005, 0.01, 0.5), "force.periodic": (0.02, 0.0, 0.7), "clock.skew": (0.01,)}),
-    ("slider", {"friction.coulomb": (0.6,), "force.periodic": (0.5, 0.5, 0.6), "input.lag": (0.1,)}),
-    ("slider", {"backlash": (0.6,), "input.delay": (0.021,), "spring.linear": (3.0,), "sensor.lag": (0.02,)}),
+    (
+        "pendulum",
+        {
+            "friction.stribeck": (0.005, 0.01, 0.5),
+            "force.periodic": (0.02, 0.0, 0.7),
+            "clock.skew": (0.01,),
+        },
+    ),
+    (
+        "slider",
+        {"friction.coulomb": (0.6,), "force.periodic": (0.5, 0.5, 0.6), "input.lag": (0.1,)},
+    ),
+    (
+        "slider",
+        {
+            "backlash": (0.6,),
+            "input.delay": (0.021,),
+            "spring.linear": (3.0,),
+            "sensor.lag": (0.02,),
+        },
+    ),
 ]
 
 
@@ -61,7 +82,9 @@ def world(system, **effects):
     return World(system, BASE[system], constants_of(system), effects)
 
 
-@pytest.mark.parametrize(("system", "effect"), [(s, e) for s, effects in SOMEWHERE.items() for e in effects])
+@pytest.mark.parametrize(
+    ("system", "effect"), [(s, e) for s, effects in SOMEWHERE.items() for e in effects]
+)
 def test_scipy_and_mujoco_agree_about_each_effect(system, effect):
     run, hidden = scenario(system, "chirp"), world(system, **{effect: SOMEWHERE[system][effect]})
     seen, other = (see(hidden, run, CHANNELS[system]) for see in (solved, simulated))
@@ -86,7 +109,12 @@ def strange(system, foreign, initial, number=0, times=TIMES):
     """A run without input, with a foreign cause."""
     names = list(SIMULATORS[system].states)
     run = Scenario(times, dict(zip(names, initial, strict=True)))
-    return solved(World(system, BASE[system], constants_of(system), {}, foreign), run, CHANNELS[system], number)
+    return solved(
+        World(system, BASE[system], constants_of(system), {}, foreign),
+        run,
+        CHANNELS[system],
+        number,
+    )
 
 
 def test_gust_on_the_slider_is_a_push_for_a_while_in_its_own_time():
@@ -128,7 +156,12 @@ def test_pendulum_meets_the_same_causes():
     free = strange("pendulum", {}, start)
     far = {"patch": (0.1, 3.0, 0.1), "stop": (1.0, 3.0)}
     np.testing.assert_allclose(strange("pendulum", far, start), free, atol=1e-6)
-    for cause in ({"patch": (0.002, 0.2, 0.1)}, {"stop": (0.1, 0.2)}, {"gust": (0.02, 0.2, 1.0)}, {"ageing": (1e-3,)}):
+    for cause in (
+        {"patch": (0.002, 0.2, 0.1)},
+        {"stop": (0.1, 0.2)},
+        {"gust": (0.02, 0.2, 1.0)},
+        {"ageing": (1e-3,)},
+    ):
         assert np.abs(strange("pendulum", cause, start) - free)[:, 0].max() > 0.01
 
 
@@ -137,7 +170,9 @@ THROWN = (0.0, 0.0, 3.0, 1.5, -0.5, 1.0)
 
 def test_updraft_lifts_above_its_place_alone():
     everywhere = strange("ball", {"updraft": (2.0, 0.0, 1e6)}, THROWN)
-    lifted = solved(world("ball", **{"force.bias": (2.0,)}), Scenario(TIMES, _named(THROWN)), CHANNELS["ball"])
+    lifted = solved(
+        world("ball", **{"force.bias": (2.0,)}), Scenario(TIMES, _named(THROWN)), CHANNELS["ball"]
+    )
     np.testing.assert_allclose(everywhere, lifted, atol=1e-6)
     nowhere = strange("ball", {"updraft": (2.0, -50.0, 1.0)}, THROWN)
     np.testing.assert_allclose(nowhere, strange("ball", {}, THROWN), atol=1e-8)
@@ -145,7 +180,11 @@ def test_updraft_lifts_above_its_place_alone():
 
 def test_layer_drags_above_its_height_alone():
     everywhere = strange("ball", {"layer": (0.1, -5.0)}, THROWN)
-    dragged = solved(world("ball", **{"drag.quadratic": (0.1,)}), Scenario(TIMES, _named(THROWN)), CHANNELS["ball"])
+    dragged = solved(
+        world("ball", **{"drag.quadratic": (0.1,)}),
+        Scenario(TIMES, _named(THROWN)),
+        CHANNELS["ball"],
+    )
     np.testing.assert_allclose(everywhere, dragged, atol=1e-6)
     nowhere = strange("ball", {"layer": (0.1, 9.0)}, THROWN)
     np.testing.assert_allclose(nowhere, strange("ball", {}, THROWN), atol=1e-8)
@@ -157,7 +196,9 @@ def test_gust_on_the_ball_is_a_push_for_a_while():
     inside, after = np.clip(times - 0.1, 0.0, 0.2), np.clip(times - 0.3, 0.0, None)
     pushed = inside**2 / 2 + 0.2 * after
     np.testing.assert_allclose(seen[:, 0], 4.0 * pushed, atol=1e-8)
-    np.testing.assert_allclose(seen[:, 2], 4.0 + times - 9.81 * times**2 / 2 - 3.0 * pushed, atol=1e-8)
+    np.testing.assert_allclose(
+        seen[:, 2], 4.0 + times - 9.81 * times**2 / 2 - 3.0 * pushed, atol=1e-8
+    )
 
 
 def test_wear_lowers_one_bounce_after_the_other():

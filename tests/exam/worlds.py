@@ -1,7 +1,9 @@
-"""Worlds for the exam: one run of ball, pendulum or slider with any effect of the library, or with a foreign cause.
+"""Worlds for the exam: one run of ball, pendulum or slider with any effect of the library, or with
+a foreign cause.
 
-Solved with scipy, or simulated by MuJoCo; never by the engine that `explain` itself uses. What the numbers of an effect
-mean stands in sims/effects/README.md; the foreign causes are told here, where the library has nothing like them:
+Solved with scipy, or simulated by MuJoCo; never by the engine that `explain` itself uses. What the
+numbers of an effect mean stands in sims/effects/README.md; the foreign causes are told here, where
+the library has nothing like them:
 
 | cause | numbers | it does |
 |---|---|---|
@@ -59,7 +61,9 @@ def constants_of(system, **changed):
 
 
 def solved(world, scenario, channels, number=0):
-    """What noiseless sensors record of a run, (T, C), by scipy; `number` is the run's place in the recording."""
+    """What noiseless sensors record of a run, (T, C), by scipy; `number` is the run's place in the
+    recording.
+    """
     times = scenario.times - scenario.times[0]
     instants = times
     for name, c in world.effects.items():
@@ -68,7 +72,11 @@ def solved(world, scenario, channels, number=0):
         elif name == "clock.skew":
             instants = instants * (1 + c[0])
     instants = np.maximum.accumulate(np.maximum(instants, 0.0))
-    grid, rows = _refined(instants) if "sensor.lag" in world.effects else (instants, np.arange(instants.size))
+    grid, rows = (
+        _refined(instants)
+        if "sensor.lag" in world.effects
+        else (instants, np.arange(instants.size))
+    )
     move = flights.move if world.system == "ball" else joints.move
     states = move(world, scenario, number, grid)
     observed = states[:, [CHANNELS[world.system].index(name) for name in channels]]
@@ -90,9 +98,13 @@ def simulated(world, scenario, channels):
     assert not world.foreign
     effects = {name: list(c) for name, c in world.effects.items()}
     kind = SIMULATORS[world.system]
-    simulator = kind(world.constants, channels, engine="mujoco", fixed=effects, time_step=MUJOCO_STEP)
+    simulator = kind(
+        world.constants, channels, engine="mujoco", fixed=effects, time_step=MUJOCO_STEP
+    )
     try:
-        return simulator.simulate(np.array([[world.parameters[p.name] for p in kind.system.parameters]]), scenario)[0]
+        return simulator.simulate(
+            np.array([[world.parameters[p.name] for p in kind.system.parameters]]), scenario
+        )[0]
     finally:
         simulator.close()
 

@@ -32,7 +32,9 @@ def logistic(theta: Array) -> Array:
 def problem(
     observe: Observe, truth: Array, start: Array, budget: int, observed: Array | None = None
 ) -> tuple[Task, Evaluate]:
-    """A task whose target is `observe(truth)`, or `observed`, and its simulator; all arrays are read-only."""
+    """A task whose target is `observe(truth)`, or `observed`, and its simulator; all arrays are
+    read-only.
+    """
     target = observe(truth) if observed is None else observed
     dim = len(truth)
     scale, training = np.ones(target.shape[1]), np.stack([np.zeros(dim), np.ones(dim)])
@@ -53,8 +55,12 @@ def smooth(dim: int, budget: int) -> tuple[Task, Evaluate]:
     return problem(decays, TRUTH[:dim], START[:dim], budget)
 
 
-def errors(tuner: Tuner, observe: Observe, truth: Array, start: Array, budget: int, seed: int = 0) -> Array:
-    """(budget + 1,) largest error of the recommendation after k simulations; an early end counts with its last."""
+def errors(
+    tuner: Tuner, observe: Observe, truth: Array, start: Array, budget: int, seed: int = 0
+) -> Array:
+    """(budget + 1,) largest error of the recommendation after k simulations; an early end counts
+    with its last.
+    """
     task, evaluate = problem(observe, truth, start, budget)
     found = np.abs(run(tuner, task, evaluate, seed).recommendations - truth).max(axis=1)
     return np.append(found, np.full(budget + 1 - len(found), found[-1]))

@@ -17,7 +17,9 @@ def test_proposes_what_the_bare_library_proposes(dim: int) -> None:
     point, bare = START[:dim].tolist(), []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        process = cook_estimator("GP", space=[(0.0, 1.0)] * dim, random_state=seed, n_restarts_optimizer=0)
+        process = cook_estimator(
+            "GP", space=[(0.0, 1.0)] * dim, random_state=seed, n_restarts_optimizer=0
+        )
         library = Optimizer(
             [(0.0, 1.0)] * dim,
             process,

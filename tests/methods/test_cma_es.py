@@ -34,9 +34,16 @@ def test_proposes_what_the_bare_library_proposes(population: int | None) -> None
     assert np.array_equal(trace.proposals[:180], bare[:180])
 
 
-@pytest.mark.parametrize(("dim", "budget", "error"), [(1, 200, 1e-3), (2, 300, 1e-3), (5, 1000, 1e-2)])
+@pytest.mark.parametrize(
+    ("dim", "budget", "error"), [(1, 200, 1e-3), (2, 300, 1e-3), (5, 1000, 1e-2)]
+)
 def test_converges(dim: int, budget: int, error: float) -> None:
-    assert np.median([errors(CMAES(), decays, TRUTH[:dim], START[:dim], budget, s)[-1] for s in range(5)]) < error
+    assert (
+        np.median(
+            [errors(CMAES(), decays, TRUTH[:dim], START[:dim], budget, s)[-1] for s in range(5)]
+        )
+        < error
+    )
 
 
 def test_a_single_parameter_is_simulated_alone() -> None:
@@ -58,7 +65,9 @@ def test_mean_is_recommended_after_each_generation() -> None:
 
 
 def test_restarts_with_twice_the_population_when_pycma_stops() -> None:
-    flat = problem(lambda theta: np.ones((3, 1)), TRUTH[:2], START[:2], 400, observed=np.zeros((3, 1)))
+    flat = problem(
+        lambda theta: np.ones((3, 1)), TRUTH[:2], START[:2], 400, observed=np.zeros((3, 1))
+    )
     steps = CMAES().tune(flat[0], np.random.default_rng(0))
     sizes, seen = [], next(steps)
     for _ in range(30):

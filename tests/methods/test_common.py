@@ -21,7 +21,9 @@ TUNERS = [
     LeastSquares(),
     LeastSquares(horizons=(1.0,), secant=False, difference=1e-4),
 ]
-each = pytest.mark.parametrize("tuner", TUNERS, ids=[f"{tuner.name}-{i}" for i, tuner in enumerate(TUNERS)])
+each = pytest.mark.parametrize(
+    "tuner", TUNERS, ids=[f"{tuner.name}-{i}" for i, tuner in enumerate(TUNERS)]
+)
 
 
 def beyond(truth: Array) -> Array:
@@ -36,7 +38,9 @@ def beyond(truth: Array) -> Array:
 def test_budget_is_exact(tuner: Tuner) -> None:
     for dim in (1, 3):
         for budget in range(1, 8):
-            trace = run(tuner, *problem(decays, TRUTH[:dim], START[:dim], budget, beyond(TRUTH[:dim])))
+            trace = run(
+                tuner, *problem(decays, TRUTH[:dim], START[:dim], budget, beyond(TRUTH[:dim]))
+            )
             assert len(trace.losses) == budget
 
 
@@ -115,14 +119,21 @@ def test_failed_simulations_are_survived(tuner: Tuner) -> None:
 
 @each
 def test_nothing_but_failed_simulations_is_survived(tuner: Tuner) -> None:
-    task, evaluate = problem(lambda theta: np.full((30, 2), np.nan), TRUTH[:2], START[:2], 30, decays(TRUTH[:2]))
+    task, evaluate = problem(
+        lambda theta: np.full((30, 2), np.nan), TRUTH[:2], START[:2], 30, decays(TRUTH[:2])
+    )
     trace = run(tuner, task, evaluate)
     assert (trace.recommendations == START[:2]).all()
 
 
 @each
 def test_flat_loss_is_survived(tuner: Tuner) -> None:
-    trace = run(tuner, *problem(lambda theta: np.ones((9, 1)), TRUTH[:1], START[:1], 30, observed=np.zeros((9, 1))))
+    trace = run(
+        tuner,
+        *problem(
+            lambda theta: np.ones((9, 1)), TRUTH[:1], START[:1], 30, observed=np.zeros((9, 1))
+        ),
+    )
     assert len(trace.losses) >= 2
 
 
@@ -136,7 +147,9 @@ def test_missing_samples_are_survived(tuner: Tuner) -> None:
 
 def test_search_beats_chance_in_five_dimensions() -> None:
     def final(tuner: Tuner, seeds: int) -> float:
-        return float(np.mean([run(tuner, *smooth(5, 40), seed).losses.min() for seed in range(seeds)]))
+        return float(
+            np.mean([run(tuner, *smooth(5, 40), seed).losses.min() for seed in range(seeds)])
+        )
 
     chance = final(RandomSearch(), 50)
     assert final(LeastSquares(), 1) < 1e-6 * chance

@@ -2,7 +2,14 @@ import numpy as np
 import pytest
 
 from methods.base import Array
-from methods.entropy_search import EntropySearch, finite, logarithm, minimiser_probability, spread, uncertainty
+from methods.entropy_search import (
+    EntropySearch,
+    finite,
+    logarithm,
+    minimiser_probability,
+    spread,
+    uncertainty,
+)
 from methods.gaussian_process import GaussianProcess, Settings
 from tests.methods.problems import START, TRUTH, decays, errors, run, smooth
 
@@ -11,7 +18,9 @@ PUBLISHED = EntropySearch(published=True)
 
 def bowl(centre: float) -> GaussianProcess:
     points = np.linspace(0.0, 1.0, 8)[:, None]
-    return GaussianProcess(points, (points[:, 0] - centre) ** 2, Settings(kernel="rbf", noise=(1e-8, 0.1)))
+    return GaussianProcess(
+        points, (points[:, 0] - centre) ** 2, Settings(kernel="rbf", noise=(1e-8, 0.1))
+    )
 
 
 @pytest.mark.parametrize("truth", [0.0, 0.3, 0.77])
@@ -25,7 +34,9 @@ def test_probability_of_the_minimiser_sums_to_one_and_peaks_at_the_truth(truth: 
 
 def test_probability_is_even_where_nothing_is_known() -> None:
     process = GaussianProcess(np.array([[0.5]]), np.array([1.0]), Settings(length=(1e-3, 1.0)))
-    p = minimiser_probability(process, np.linspace(0.0, 0.4, 10)[:, None], 20000, np.random.default_rng(0))
+    p = minimiser_probability(
+        process, np.linspace(0.0, 0.4, 10)[:, None], 20000, np.random.default_rng(0)
+    )
     assert np.allclose(p, 0.1, atol=0.01)
 
 
@@ -54,13 +65,17 @@ def test_published_search_knows_several_parameters() -> None:
 
 
 def test_default_is_not_bounded_by_a_grid() -> None:
-    found = [errors(EntropySearch(), decays, TRUTH[:1], START[:1], 30, seed)[-1] for seed in range(3)]
+    found = [
+        errors(EntropySearch(), decays, TRUTH[:1], START[:1], 30, seed)[-1] for seed in range(3)
+    ]
     assert max(found) < 2e-3
     assert run(EntropySearch(), *smooth(1, 30)).status == "done"
 
 
 def test_converges_in_two_dimensions() -> None:
-    found = [errors(EntropySearch(), decays, TRUTH[:2], START[:2], 40, seed)[-1] for seed in range(3)]
+    found = [
+        errors(EntropySearch(), decays, TRUTH[:2], START[:2], 40, seed)[-1] for seed in range(3)
+    ]
     assert np.median(found) < 2e-2
 
 

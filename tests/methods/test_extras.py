@@ -11,7 +11,9 @@ from methods.turbo import TuRBO, _spread
 from tests.methods.problems import START, TRUTH, decays, errors
 from tests.methods.test_tunenet import Toy, run
 
-needs_sbi = pytest.mark.skipif(importlib.util.find_spec("sbi") is None, reason="sbi is not installed: simgap[npe]")
+needs_sbi = pytest.mark.skipif(
+    importlib.util.find_spec("sbi") is None, reason="sbi is not installed: simgap[npe]"
+)
 needs_botorch = pytest.mark.skipif(
     importlib.util.find_spec("botorch") is None, reason="botorch is not installed: simgap[turbo]"
 )
@@ -20,8 +22,12 @@ needs_botorch = pytest.mark.skipif(
 @pytest.mark.parametrize(("name", "package"), [("npe", "sbi"), ("turbo", "botorch")])
 def test_listed_as_skipped_without_its_extra(name, package, monkeypatch):
     found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *rest: None if n == package else found(n, *rest))
-    assert tuners.describe(name) == f"skipped: needs {package}, not installed (pip install {package})"
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda n, *rest: None if n == package else found(n, *rest)
+    )
+    assert (
+        tuners.describe(name) == f"skipped: needs {package}, not installed (pip install {package})"
+    )
 
 
 def test_candidates_fill_the_trust_region_and_stay_in_the_cube():

@@ -13,7 +13,9 @@ VALUES = np.sin(5.0 * POINTS[:, 0]) + 0.3 * POINTS[:, 1]
 def test_gradient_of_the_evidence(kernel: str) -> None:
     process = GaussianProcess(POINTS, VALUES, Settings(kernel=kernel), fit=False)  # type: ignore[arg-type]
     for hyper in (np.log([0.3, 0.5, 1e-2]), np.log([1.0, 0.1, 1e-3])):
-        error = check_grad(lambda h: process._evidence(h)[0], lambda h: process._evidence(h)[1], hyper)
+        error = check_grad(
+            lambda h: process._evidence(h)[0], lambda h: process._evidence(h)[1], hyper
+        )
         assert error < 1e-4 * np.linalg.norm(process._evidence(hyper)[1])
 
 
@@ -44,7 +46,9 @@ def test_draws_have_the_posterior_mean_and_covariance() -> None:
     k = process._correlation((together[:, None] - together) ** 2)[0]
     inside = k[:8, :8] + np.exp(process.hyper[-1]) * np.eye(8)
     covariance = process.variance * (k[8:, 8:] - k[8:, :8] @ np.linalg.solve(inside, k[:8, 8:]))
-    assert np.allclose(draws.mean(axis=0), process.predict(new), atol=0.02 * np.sqrt(covariance.max()))
+    assert np.allclose(
+        draws.mean(axis=0), process.predict(new), atol=0.02 * np.sqrt(covariance.max())
+    )
     assert np.allclose(np.cov(draws.T), covariance, atol=0.03 * covariance.max())
 
 

@@ -119,6 +119,11 @@ def test_everything_fails_and_it_still_uses_its_budget(two):
     toy = Toy(2, runs=3)
     toy.observe = lambda points, scenario: np.full((len(points), 180, 2), np.nan)
     task = Task(2, np.full(2, 0.5), np.zeros((180, 2)), np.ones(2), TRAINING[2], 9, (60, 60, 60))
-    trace = drive(two, task, lambda p: (toy.observe(p, None), np.full(len(p), np.inf)), np.random.default_rng(0))
+    trace = drive(
+        two,
+        task,
+        lambda p: (toy.observe(p, None), np.full(len(p), np.inf)),
+        np.random.default_rng(0),
+    )
     assert trace.status == "done"
     assert len(trace.losses) == 9

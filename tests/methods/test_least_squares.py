@@ -44,7 +44,9 @@ def test_growing_horizon_fits_what_is_chaotic_in_the_long_run(truth: float) -> N
 def test_horizon_is_a_share_of_each_run() -> None:
     task, _ = problem(decays, TRUTH[:2], START[:2], 5, observed=np.zeros((6, 2)))
     task = type(task)(2, task.start, task.observed, task.scale, task.training, 5, (4, 2))
-    assert Run(task, 0.0).samples(0.5).tolist() == [True] * 4 + [False] * 4 + [True] * 2 + [False] * 2
+    assert (
+        Run(task, 0.0).samples(0.5).tolist() == [True] * 4 + [False] * 4 + [True] * 2 + [False] * 2
+    )
     assert Run(task, 0.0).samples(1.0).all()
 
 
@@ -68,7 +70,9 @@ def test_minimum_outside_the_cube_leaves_the_others_free() -> None:
 
 
 def test_parameters_that_only_act_together_are_survived() -> None:
-    task, evaluate = problem(lambda theta: decays(theta[:1] + theta[1:]), np.array([0.2, 0.3]), START[:2], 30)
+    task, evaluate = problem(
+        lambda theta: decays(theta[:1] + theta[1:]), np.array([0.2, 0.3]), START[:2], 30
+    )
     trace = run(LeastSquares(), task, evaluate)
     assert trace.losses.min() < 1e-10
     assert trace.recommendations[-1].sum() == pytest.approx(0.5, abs=1e-8)
@@ -83,14 +87,19 @@ def test_new_start_leaves_a_plateau() -> None:
     def flat_below(theta: Array) -> Array:
         return decays(np.maximum(theta, 0.5))
 
-    found = [errors(LeastSquares(), flat_below, np.array([0.8]), np.array([0.2]), 20, seed)[-1] for seed in range(5)]
+    found = [
+        errors(LeastSquares(), flat_below, np.array([0.8]), np.array([0.2]), 20, seed)[-1]
+        for seed in range(5)
+    ]
     assert max(found) < 1e-8
 
 
 def test_new_start_leaves_a_local_minimum() -> None:
     def two_valleys(theta: Array) -> Array:
         x = theta[0]
-        return np.array([[(x - 0.8) * (1.0 + 4.0 * (x - 0.3) ** 2)], [1.5 * np.sin(6.0 * (x - 0.8))]])
+        return np.array(
+            [[(x - 0.8) * (1.0 + 4.0 * (x - 0.3) ** 2)], [1.5 * np.sin(6.0 * (x - 0.8))]]
+        )
 
     truth, start = np.array([0.8]), np.array([0.05])
     alone = LeastSquares(restart=False, horizons=(1.0,))

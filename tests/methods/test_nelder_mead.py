@@ -27,13 +27,17 @@ def test_proposes_what_the_bare_library_proposes(dim: int) -> None:
     assert (run(NelderMead(), task, evaluate).proposals == np.array(bare)).all()
 
 
-@pytest.mark.parametrize(("dim", "budget", "error"), [(1, 40, 1e-6), (2, 120, 1e-6), (5, 600, 1e-4)])
+@pytest.mark.parametrize(
+    ("dim", "budget", "error"), [(1, 40, 1e-6), (2, 120, 1e-6), (5, 600, 1e-4)]
+)
 def test_converges(dim: int, budget: int, error: float) -> None:
     assert errors(NelderMead(), decays, TRUTH[:dim], START[:dim], budget)[-1] < error
 
 
 def test_initial_step_is_nlopts() -> None:
-    assert run(NelderMead(initial_step=0.2), *smooth(1, 2)).proposals[1, 0] == pytest.approx(START[0] + 0.2)
+    assert run(NelderMead(initial_step=0.2), *smooth(1, 2)).proposals[1, 0] == pytest.approx(
+        START[0] + 0.2
+    )
 
 
 def test_collapsed_simplex_ends_the_run_with_a_reason_and_its_thread() -> None:
@@ -45,7 +49,9 @@ def test_collapsed_simplex_ends_the_run_with_a_reason_and_its_thread() -> None:
 
 
 def test_step_tolerance_ends_the_run_earlier() -> None:
-    fine, coarse = (run(NelderMead(step_tolerance=tolerance), *smooth(1, 500)) for tolerance in (0.0, 1e-3))
+    fine, coarse = (
+        run(NelderMead(step_tolerance=tolerance), *smooth(1, 500)) for tolerance in (0.0, 1e-3)
+    )
     assert len(coarse.losses) < len(fine.losses)
     assert abs(coarse.recommendations[-1, 0] - TRUTH[0]) < 2e-3
 

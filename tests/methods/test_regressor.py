@@ -32,7 +32,10 @@ def test_the_start_does_not_matter(fitted):
     toy = Toy()
     observed = toy.observe(np.array([[0.4]]), [1.5])[0]
     task = Task(1, np.zeros(1), observed, np.ones(2), toy.training, 5, toy.lengths)
-    asked = [next(fitted.tune(t, np.random.default_rng(0))).points for t in (task, replace(task, start=np.ones(1)))]
+    asked = [
+        next(fitted.tune(t, np.random.default_rng(0))).points
+        for t in (task, replace(task, start=np.ones(1)))
+    ]
     assert np.array_equal(*asked)
     assert asked[0] == pytest.approx(0.4, abs=0.02)
 
@@ -60,5 +63,8 @@ def test_two_parameters():
     toy = Toy(2, runs=2)
     tuner = Regressor(scenarios=80, points=60, epochs=100)
     tuner.fit(toy, np.random.default_rng(0), 10_000)
-    off = [np.abs(trace.recommendations[0] - truth).max() for trace, truth in (run(tuner, toy, s) for s in range(10))]
+    off = [
+        np.abs(trace.recommendations[0] - truth).max()
+        for trace, truth in (run(tuner, toy, s) for s in range(10))
+    ]
     assert np.mean(off) < 0.05

@@ -64,7 +64,9 @@ def run(tuner, toy, seed, wide=False, budget=10, spoil=None):
     observed = toy.observe(truth[None], scenario)[0]
     if spoil is not None:
         spoil(observed)
-    task = Task(toy.dim, start, observed, toy.scale, toy.training, budget, toy.lengths, toy.known(scenario))
+    task = Task(
+        toy.dim, start, observed, toy.scale, toy.training, budget, toy.lengths, toy.known(scenario)
+    )
 
     def evaluate(points):
         seen = toy.observe(points, scenario)
@@ -137,7 +139,9 @@ def test_a_noisy_target_is_left_to_the_network_that_knows_noise(one):
         observed += 0.01 * noise.standard_normal(observed.shape)
 
     assert errors(one, Toy(), spoil=spoil)[10] < 0.01
-    task = Task(1, np.zeros(1), swing(np.full((1, 1), 0.9), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,))
+    task = Task(
+        1, np.zeros(1), swing(np.full((1, 1), 0.9), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)
+    )
     assert one._fitted.suited(task) is one._fitted.clean
     spoil(task.observed)
     assert one._fitted.suited(task) is one._fitted.noisy
@@ -149,7 +153,10 @@ def test_roughness_is_the_noise_and_sees_no_motion():
     assert roughness(smooth, (1000, 1000)).max() < 1e-7
     rough = smooth + np.array([0.01, 0.3]) * np.random.default_rng(0).standard_normal(smooth.shape)
     rough[0, 5:50] = np.nan
-    share = roughness(rough, (1000, 1000))[0] / [0.01, 0.3]  # the calmest of eight parts is a little calmer
+    share = roughness(rough, (1000, 1000))[0] / [
+        0.01,
+        0.3,
+    ]  # the calmest of eight parts is a little calmer
     assert ((share > 0.75) & (share < 1.0)).all()
     assert (roughness(np.full((1, 9, 1), np.nan), (3, 6)) == 0.0).all()
 
@@ -158,7 +165,9 @@ def test_same_observation_means_no_difference(one):
     fitted = one._fitted.clean
     seen = fitted.read.seen(Toy().simulate(np.random.default_rng(0), np.full((3, 1), 0.5)), (60,))
     assert (fitted.difference(seen, seen) == 0.0).all()
-    assert (fitted.difference(seen[0], seen[0] + 1.0) == -fitted.difference(seen[0] + 1.0, seen[0])).all()
+    assert (
+        fitted.difference(seen[0], seen[0] + 1.0) == -fitted.difference(seen[0] + 1.0, seen[0])
+    ).all()
 
 
 def test_recommends_its_newest_guess(one):
@@ -182,7 +191,9 @@ def test_published_network_has_the_published_size():
     }
     assert sum(w.size for w in weights.values()) == 27_777
     assert toy.calls == [2] * 20
-    assert tuner._fitted.clean.read.seen(toy.observe(np.ones((1, 1)), [1.0]), (400,))[0, 0] == 1.0  # raw metres
+    assert (
+        tuner._fitted.clean.read.seen(toy.observe(np.ones((1, 1)), [1.0]), (400,))[0, 0] == 1.0
+    )  # raw metres
 
 
 def test_published_is_clamped_at_zero_only_and_does_not_settle():
@@ -190,7 +201,10 @@ def test_published_is_clamped_at_zero_only_and_does_not_settle():
     tuner.fit(Toy(), np.random.default_rng(0), 400)
     seen = tuner._fitted.clean.read.seen(Toy().observe(np.array([[0.5]]), [1.5]), (60,))[0]
     assert np.abs(tuner._fitted.clean.difference(seen, seen)).max() > 1e-6
-    steps = tuner.tune(Task(1, np.zeros(1), swing(np.ones((1, 1)), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)), None)
+    steps = tuner.tune(
+        Task(1, np.zeros(1), swing(np.ones((1, 1)), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)),
+        None,
+    )
     next(steps)
     tuner._fitted.clean.weights["output.bias"] = np.full(1, 9.0)
     assert steps.send(evaluation(0.9))[0] > 1.5
@@ -219,7 +233,11 @@ def test_budget_is_met_exactly_and_never_passed():
 def test_same_seed_gives_the_same_weights_and_touches_no_global_state():
     import torch
 
-    torch_state, numpy_state, threads = torch.get_rng_state(), np.random.get_state()[1].copy(), torch.get_num_threads()  # noqa: NPY002
+    torch_state, numpy_state, threads = (
+        torch.get_rng_state(),
+        np.random.get_state()[1].copy(),  # noqa: NPY002
+        torch.get_num_threads(),
+    )  # noqa: NPY002
     first, second = (trained(Toy(budget=64), epochs=3).state() for _ in range(2))
     other = trained(Toy(budget=64), seed=1, epochs=3).state()
     assert all(np.array_equal(first[name], second[name]) for name in first)
@@ -249,24 +267,45 @@ def test_state_survives_a_round_trip_and_is_checked(one, tmp_path):
     with pytest.raises(ValueError, match="train on"):
         one._fitted.clean.read.seen(np.zeros((1, 60, 1)), (60,))
     with pytest.raises(RuntimeError, match="not been trained"):
-        next(TuneNet().tune(Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 1, (1,)), None))
+        next(
+            TuneNet().tune(
+                Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 1, (1,)), None
+            )
+        )
 
 
 def test_weight_decay_is_that_of_equation_1():
-    """A step of gradient descent on data alike: w <- w - rate * 2 * lambda * w where the data have no say."""
+    """A step of gradient descent on data alike: w <- w - rate * 2 * lambda * w where the data have
+    no say.
+    """
     rows, parameters = Sides(*[np.zeros((4, 2, 5))] * 2), np.full((4, 2, 1), 0.5)
-    design = {"smooth": False, "antisymmetric": False, "adam": False, "rate": 0.1, "epochs": 1, "batch": 4}
+    design = {
+        "smooth": False,
+        "antisymmetric": False,
+        "adam": False,
+        "rate": 0.1,
+        "epochs": 1,
+        "batch": 4,
+    }
     free, decayed = (
-        train(rows, parameters, Design(**design, weight_decay=decay), np.random.default_rng(0)) for decay in (0.0, 0.5)
+        train(rows, parameters, Design(**design, weight_decay=decay), np.random.default_rng(0))
+        for decay in (0.0, 0.5)
     )
-    assert np.allclose(decayed["proposed.weight"], free["proposed.weight"] * (1 - 0.1 * 2 * 0.5), rtol=1e-5)
+    assert np.allclose(
+        decayed["proposed.weight"], free["proposed.weight"] * (1 - 0.1 * 2 * 0.5), rtol=1e-5
+    )
     assert PUBLISHED.weight_decay * 2 == 1e-2  # torch's weight_decay is the factor in the gradient
 
 
 def test_estimate_by_hand():
     one = np.ones((1, 1))
-    weights = {f"{layer}.weight": one * v for layer, v in (("proposed", 2.0), ("target", 3.0), ("output", 0.5))}
-    weights |= {f"{layer}.bias": np.zeros(1) for layer in ("proposed", "target", "joined", "output")}
+    weights = {
+        f"{layer}.weight": one * v
+        for layer, v in (("proposed", 2.0), ("target", 3.0), ("output", 0.5))
+    }
+    weights |= {
+        f"{layer}.bias": np.zeros(1) for layer in ("proposed", "target", "joined", "output")
+    }
     weights["joined.weight"] = np.array([[-1.0], [1.0]])
     value = estimate(weights, PUBLISHED, np.array([1.0]), np.array([2.0]))
     assert value == pytest.approx(np.tanh(0.5 * (3.0 * 2.0 - 2.0 * 1.0)))
@@ -274,7 +313,10 @@ def test_estimate_by_hand():
 
 def test_resampling_is_linear_run_by_run_and_bridges_gaps():
     observed = np.array([0.0, 1.0, 2.0, 10.0, np.nan, 30.0, 40.0, 50.0])[None, :, None]
-    assert resample(observed, (3, 5), 5)[0].tolist() == [[0.0, 0.5, 1.0, 1.5, 2.0], [10.0, 20.0, 30.0, 40.0, 50.0]]
+    assert resample(observed, (3, 5), 5)[0].tolist() == [
+        [0.0, 0.5, 1.0, 1.5, 2.0],
+        [10.0, 20.0, 30.0, 40.0, 50.0],
+    ]
     with pytest.raises(ValueError, match="add up"):
         resample(observed, (3, 4), 5)
 
@@ -284,7 +326,9 @@ def test_inputs_prefer_what_follows_the_parameters():
     parameters = rng.uniform(size=(20, 8, 1))
     jumping = np.where(parameters > 0.5, 3.0, 0.0)
     circumstance = np.broadcast_to(rng.uniform(size=(20, 1, 1)), (20, 8, 1))
-    observations = np.stack([parameters, jumping, circumstance], axis=-1)  # one channel each, a single sample
+    observations = np.stack(
+        [parameters, jumping, circumstance], axis=-1
+    )  # one channel each, a single sample
     observations = np.repeat(observations, 2, axis=2)
     data = Rehearsal(parameters, observations, (2,), (NOTHING,) * 20)
     inputs = weighed_inputs(data, 2, most=3 * 6, strictness=1000.0)
@@ -313,14 +357,24 @@ def test_search_survives_a_failed_simulation():
 
 
 def test_failed_simulation_is_no_evidence(one):
-    steps = one.tune(Task(1, np.zeros(1), swing(np.ones((1, 1)), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)), None)
+    steps = one.tune(
+        Task(1, np.zeros(1), swing(np.ones((1, 1)), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)),
+        None,
+    )
     next(steps)
     failed = evaluation(0.0)._replace(observations=np.full((1, 60, 2), np.nan))
-    assert steps.send(failed).recommend.tolist() == [0.25]  # half the way to the middle of the training range
+    assert steps.send(failed).recommend.tolist() == [
+        0.25
+    ]  # half the way to the middle of the training range
 
 
 def test_torch_stays_out_until_it_trains(one):
     import subprocess
 
     code = "import methods.tunenet, methods.regressor, sys; print('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "False\n"
+    )

@@ -9,7 +9,9 @@ from tests.methods.test_tunenet import Toy, errors, run
 
 
 class Filmed(Toy):
-    """The toy's oscillation, and another sensor that shows it magnified, shifted and upside down by chance."""
+    """The toy's oscillation, and another sensor that shows it magnified, shifted and upside down by
+    chance.
+    """
 
     def scenario(self, rng):
         return np.array([rng.uniform(1.0, 2.0), rng.uniform(0.5, 2.0), rng.uniform(-1.0, 1.0)])
@@ -52,7 +54,16 @@ def test_gaps_are_bridged_by_the_proposed_model(tuner):
     target[:, 0] = np.nan
 
     def off(observed):
-        task = Task(1, np.full(1, 0.4), observed, toy.scale, toy.training, 9, toy.lengths, toy.known(scenario))
+        task = Task(
+            1,
+            np.full(1, 0.4),
+            observed,
+            toy.scale,
+            toy.training,
+            9,
+            toy.lengths,
+            toy.known(scenario),
+        )
         return abs(tuner.fitted().estimator(task)(toy.observe(np.array([[0.55]]), scenario))[0])
 
     hidden, held = target.copy(), target.copy()
@@ -67,13 +78,24 @@ def test_sides_read_their_own_channels(tuner):
     target, proposed = (toy.observe(np.array([[value]]), scenario) for value in (0.6, 0.4))
 
     def estimate(seen, shown):
-        task = Task(1, np.full(1, 0.4), seen[0], toy.scale, toy.training, 9, toy.lengths, toy.known(scenario))
+        task = Task(
+            1,
+            np.full(1, 0.4),
+            seen[0],
+            toy.scale,
+            toy.training,
+            9,
+            toy.lengths,
+            toy.known(scenario),
+        )
         return tuner.fitted().estimator(task)(shown)[0]
 
     blind, deaf = target.copy(), proposed.copy()
     blind[..., 0], deaf[..., 1] = 7.0, -7.0
     assert estimate(target, proposed) == pytest.approx(0.2, abs=0.1)
-    assert estimate(blind, deaf) == estimate(target, proposed), "z of the target and v of the simulation say nothing"
+    assert estimate(blind, deaf) == estimate(target, proposed), (
+        "z of the target and v of the simulation say nothing"
+    )
 
 
 def test_state_survives_a_round_trip(tuner):

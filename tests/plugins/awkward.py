@@ -49,7 +49,9 @@ class Stopping(Tuner):
 
 
 class Snooping(Tuner):
-    """Writes down every number that it can reach: from its task, the frames that call it, everything alive."""
+    """Writes down every number that it can reach: from its task, the frames that call it,
+    everything alive.
+    """
 
     def tune(self, task, rng):
         seen = yield task.start
@@ -60,7 +62,9 @@ class Snooping(Tuner):
             walk(dict(frame.f_locals), numbers, set(), 6)
             frame = frame.f_back
         for thing in gc.get_objects():
-            if type(thing) in (list, tuple, dict, np.ndarray) or hasattr(thing, "__dataclass_fields__"):
+            if type(thing) in (list, tuple, dict, np.ndarray) or hasattr(
+                thing, "__dataclass_fields__"
+            ):
                 walk(thing, numbers, set(), 2)
         Path(os.environ["SNOOPED"]).write_text(json.dumps(sorted(numbers)))
 

@@ -16,7 +16,10 @@ class Spring(Simulator):
     states = {"x": 1.0}  # noqa: RUF012
 
     def simulate(self, theta, scenario):
-        self.run_constants(scenario), self.run_inputs(scenario)  # it has none: refuses those that a scenario names
+        (
+            self.run_constants(scenario),
+            self.run_inputs(scenario),
+        )  # it has none: refuses those that a scenario names
         t, x0 = scenario.times, self.run_initial(scenario)["x"]
         rate, decay = theta[:, :1], theta[:, 1:]
         x = x0 * np.exp(-decay * t) * np.cos(rate * t)

@@ -16,10 +16,13 @@ from sims.slider.simulator import Slider
 
 SIMULATORS = {"ball": Ball, "pendulum": Pendulum, "slider": Slider, "servo": Servo}
 THETA = {"ball": [0.8], "pendulum": [3.3e-3], "slider": [1.3], "servo": [0.5, 4.0, 2e-3]}
-STEPS = {name: np.array([1.0, 0.5, 0.25, 0.125]) / (60 if name == "ball" else 100) for name in SIMULATORS}
+STEPS = {
+    name: np.array([1.0, 0.5, 0.25, 0.125]) / (60 if name == "ball" else 100) for name in SIMULATORS
+}
 OTHERS = ("pybullet", "mujoco")
 
-# For systems that count force per unit mass, in N, and in N*m. An effect has as many of them as the system takes.
+# For systems that count force per unit mass, in N, and in N*m. An effect has as many of them as the
+# system takes.
 COEFFICIENTS = {
     "backlash": (None, 0.02, 0.02),
     "clock.skew": (0.002, 0.002, 0.002),
@@ -63,7 +66,9 @@ def scenario(system):
     if system == "slider":
         return Scenario(t, {"x": 0.1, "v": -1.0}, {"u": 2.0 * np.sign(np.sin(5.3 * t + 0.2))})
     goal = np.where(t < 0.8, 1.0, -0.6)
-    return Scenario(t, {"q": 0.2, "qd": 0.0}, {"goal": goal, "torque_enable": (t < 1.6).astype(float)})
+    return Scenario(
+        t, {"q": 0.2, "qd": 0.0}, {"goal": goal, "torque_enable": (t < 1.6).astype(float)}
+    )
 
 
 def has(system, effect):
@@ -109,7 +114,11 @@ def systems_table():
         exact = motion(system, "batch", time_step=2.5e-4)
         for engine in ("batch", *OTHERS):
             errors = [apart(motion(system, engine, time_step=h), exact) for h in steps]
-            order = "exact" if max(errors) < 1e-9 else f"{np.polyfit(np.log(steps), np.log(errors), 1)[0]:.2f}"
+            order = (
+                "exact"
+                if max(errors) < 1e-9
+                else f"{np.polyfit(np.log(steps), np.log(errors), 1)[0]:.2f}"
+            )
             error, cost = apart(motion(system, engine), exact), seconds(system, engine)
             yield f"| {system} | {engine} | {order} | {error:.0e} | {1e3 * cost:.1f} |"
 

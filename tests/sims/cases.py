@@ -96,12 +96,16 @@ def random_case(system, seed):
     if system == "ball":
         initial = np.array([0, 0, rng.uniform(0.6, 4.0), *rng.uniform(-3, 3, 3)])
         constants = {"mass": 1.0, "radius": 0.5, "gravity": 9.81}
-        return reference.Case(system, {"restitution": rng.uniform(0.2, 0.95)}, constants, initial, effects, t)
+        return reference.Case(
+            system, {"restitution": rng.uniform(0.2, 0.95)}, constants, initial, effects, t
+        )
     u = {"pendulum": 0.15, "slider": 3.0, "servo": 1.5}[system]
     inputs = {"goal" if system == "servo" else "u": steps(rng, t.size, u)}
     if system == "servo":
         inputs["torque_enable"] = np.where(np.arange(t.size) < 0.8 * t.size, 1.0, 0.0)
-    parameters = {p.name: float(np.exp(rng.uniform(*np.log(p.bounds)))) for p in SIMULATORS[system].parameters}
+    parameters = {
+        p.name: float(np.exp(rng.uniform(*np.log(p.bounds)))) for p in SIMULATORS[system].parameters
+    }
     constants = {c.name: c.value for c in SIMULATORS[system].constants}
     initial = {"x": rng.uniform(-1, 1), "v": rng.choice([0.0, rng.uniform(-2, 2)])}
     return reference.Case(system, parameters, constants, initial, effects, t, inputs)
@@ -125,7 +129,9 @@ def errors(case, **settings):
         expected = reference.hinge(case)
         return np.abs(seen - expected[:, : seen.shape[1]]).max(axis=0)
     expected, impacts = reference.ball(case)
-    differences = np.abs(seen - np.column_stack([expected[:, :3], expected[:, 8] + case.constants["gravity"]]))
+    differences = np.abs(
+        seen - np.column_stack([expected[:, :3], expected[:, 8] + case.constants["gravity"]])
+    )
     if impacts.size:  # the acceleration jumps at an impact if drag acts
         away = np.abs(case.t[:, None] - impacts).min(axis=1) > 1e-3
         differences[~away, 3] = 0.0

@@ -1,7 +1,9 @@
-"""The systems and effects once more, written out lane by lane for scipy: what the batch engine is measured against.
+"""The systems and effects once more, written out lane by lane for scipy: what the batch engine is
+measured against.
 
-Nothing here uses the code under test but its scenarios. Motion between events is integrated by an explicit method of
-eighth order (DOP853, rtol 1e-9, atol 1e-11); impacts, standstill and breaking loose are events.
+Nothing here uses the code under test but its scenarios. Motion between events is integrated by an
+explicit method of eighth order (DOP853, rtol 1e-9, atol 1e-11); impacts, standstill and breaking
+loose are events.
 """
 
 import bisect
@@ -91,7 +93,11 @@ class Plant:
             if self.felt[1] <= 0.5:
                 return 0.0
             duty = min(max(k["kp"] * k["error_gain"] * (self.felt[0] - x), -1.0), 1.0)
-            return p["torque_constant"] * (duty * k["voltage"] - p["torque_constant"] * v) / p["resistance"]
+            return (
+                p["torque_constant"]
+                * (duty * k["voltage"] - p["torque_constant"] * v)
+                / p["resistance"]
+            )
         return self.felt[0]
 
     def weight(self, x):
@@ -178,7 +184,13 @@ def _glide(plant, now, state, end, times, out):
 
     turns.terminal, turns.direction = True, -1
     solved = solve_ivp(
-        rate, (now, end), state, events=turns if plant.dry else None, dense_output=True, max_step=0.05, **SETTINGS
+        rate,
+        (now, end),
+        state,
+        events=turns if plant.dry else None,
+        dense_output=True,
+        max_step=0.05,
+        **SETTINGS,
     )
     assert solved.success
     inside = (times > now) & (times <= solved.t[-1])
@@ -250,10 +262,16 @@ def ball(case):
     out[0, :6], out[0, 6:] = y, accelerate(0.0, y[3:])
     rising = 0.0
     while now < end:
-        # the rise after a bounce is integrated without looking for the ground, which is where it begins
+        # the rise after a bounce is integrated without looking for the ground, which is where it
+        # begins
         until = min(end, now + rising) if rising else end
         solved = solve_ivp(
-            rate, (now, until), y, events=None if rising or resting else meets, dense_output=True, **SETTINGS
+            rate,
+            (now, until),
+            y,
+            events=None if rising or resting else meets,
+            dense_output=True,
+            **SETTINGS,
         )
         assert solved.success
         inside = (case.t > now) & (case.t <= solved.t[-1])

@@ -1,4 +1,6 @@
-"""The arm against the two-link equations of motion, written here from their textbook form and solved by scipy."""
+"""The arm against the two-link equations of motion, written here from their textbook form and
+solved by scipy.
+"""
 
 import copy
 import importlib.util
@@ -36,13 +38,17 @@ def solved(theta, k, torques, start, times, sharpness=1e-5):
         turn = m2 * k["length"] * c2 * np.sin(q2)
         coriolis = np.array([-turn * (2 * w1 * w2 + w2**2), turn * w1**2])
         outer = m2 * c2 * k["gravity"] * np.sin(q1 + q2)
-        gravity = np.array([(m1 * c1 + m2 * k["length"]) * k["gravity"] * np.sin(q1) + outer, outer])
+        gravity = np.array(
+            [(m1 * c1 + m2 * k["length"]) * k["gravity"] * np.sin(q1) + outer, outer]
+        )
         dry = np.array([f1 * np.tanh(w1 / sharpness), f2 * np.tanh(w2 / sharpness)])
         torque = np.array(torques(t)) - np.array([d1 * w1, d2 * w2]) - dry - coriolis - gravity
         return [w1, w2, *np.linalg.solve(matrix(theta, k, q2), torque)]
 
     method = "Radau" if f1 or f2 else "DOP853"
-    found = solve_ivp(rates, (0, times[-1]), list(start.values()), method, times, rtol=1e-9, atol=1e-10)
+    found = solve_ivp(
+        rates, (0, times[-1]), list(start.values()), method, times, rtol=1e-9, atol=1e-10
+    )
     return found.y.T
 
 
@@ -95,7 +101,10 @@ def test_energy_is_kept_without_damping_and_falls_with_it():
 def test_dry_friction_holds_what_pulls_less():
     theta = FREE.copy()
     theta[6:] = 0.5, 0.5
-    start = {"q1": 0.05, "q2": 0.05}  # gravity pulls with at most 0.34 N m on joint 1, 0.13 on joint 2
+    start = {
+        "q1": 0.05,
+        "q2": 0.05,
+    }  # gravity pulls with at most 0.34 N m on joint 1, 0.13 on joint 2
     seen = Arm().simulate(theta[None], Scenario(TIMES, start))[0]
     np.testing.assert_allclose(seen[:, :2], 0.05, atol=1e-12)
     theta[6] = 0.3
@@ -118,7 +127,9 @@ def test_a_copy_has_a_world_of_its_own():
 
 
 def test_what_it_cannot_have_is_refused_by_name():
-    with pytest.raises(InputError, match=r"arm cannot have effect friction\.coulomb: it takes no forces"):
+    with pytest.raises(
+        InputError, match=r"arm cannot have effect friction\.coulomb: it takes no forces"
+    ):
         Arm(effects=["friction.coulomb"])
     with pytest.raises(InputError, match="arm steps itself; it has no engine 'mujoco'"):
         Arm(engine="mujoco")
@@ -126,5 +137,10 @@ def test_what_it_cannot_have_is_refused_by_name():
 
 def test_without_pybullet_it_is_listed_as_skipped(monkeypatch):
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pybullet" else find(name))
-    assert simulators.describe("arm") == "skipped: needs pybullet, not installed (pip install pybullet)"
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "pybullet" else find(name)
+    )
+    assert (
+        simulators.describe("arm")
+        == "skipped: needs pybullet, not installed (pip install pybullet)"
+    )

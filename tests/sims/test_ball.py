@@ -1,4 +1,6 @@
-"""The ball on the stepping engines: free fall, drag, bounces, rest, and that a used world is as good as a new one."""
+"""The ball on the stepping engines: free fall, drag, bounces, rest, and that a used world is as
+good as a new one.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +14,12 @@ PUBLISHED = Scenario(np.arange(400) / 60)
 NATIVE = {"engine": "pybullet", "native_contact": True}
 AIR = {"drag.linear": DAMPING, "drag.quadratic": DAMPING}  # what Bullet takes for air
 ENGINES = ["pybullet", "mujoco"]
-BUILDS = [NATIVE, {"engine": "pybullet"}, {"engine": "mujoco"}, {"engine": "mujoco", "native_contact": True}]
+BUILDS = [
+    NATIVE,
+    {"engine": "pybullet"},
+    {"engine": "mujoco"},
+    {"engine": "mujoco", "native_contact": True},
+]
 
 
 def heights(restitution, scenario=PUBLISHED, constants=None, **settings):
@@ -39,7 +46,10 @@ def parabolas(restitution, times, z=4.5, gravity=GRAVITY):
     """The exact height of a ball without air."""
     start, v, result = 0.0, 0.0, []
     for t in times:
-        while v is not None and start + (flight := (v + (v * v + 2 * gravity * (z - RADIUS)) ** 0.5) / gravity) <= t:
+        while (
+            v is not None
+            and start + (flight := (v + (v * v + 2 * gravity * (z - RADIUS)) ** 0.5) / gravity) <= t
+        ):
             v, z, start = restitution * (gravity * flight - v), RADIUS, start + flight
             if 2 * v < 5e-5 * gravity:
                 v = None
@@ -73,7 +83,9 @@ def exact_ratio(restitution, damping):
 
 def apex_ratio(restitution, **settings):
     """The same as simulated, at samples so dense that the apex is not missed."""
-    return (first_apex(heights(restitution, Scenario(np.arange(2400) * 1e-3), **settings)) / 4.0) ** 0.5
+    return (
+        first_apex(heights(restitution, Scenario(np.arange(2400) * 1e-3), **settings)) / 4.0
+    ) ** 0.5
 
 
 def order(steps, errors):
@@ -83,7 +95,8 @@ def order(steps, errors):
 # ---------------------------------------------------------------------- Bullet as it comes
 
 
-# Heights before this ball became an engine's: restitution 0.5123, dropped from 4.3217 m, every 20th of 400 samples.
+# Heights before this ball became an engine's: restitution 0.5123, dropped from 4.3217 m, every 20th
+# of 400 samples.
 GOLDEN = [
     "0x1.1496bb98c7e28p+2", "0x1.e0ce97c122145p+1", "0x1.158322f0f1bcdp+1", "0x1.93e36b846c479p-1",
     "0x1.f4d7bb63965e5p-1", "0x1.3a70211bd478ap-1", "0x1.1242438432eb6p-1", "0x1.01392d1c2811ep-1",
@@ -94,10 +107,17 @@ GOLDEN = [
 
 
 def test_the_published_scene_is_the_same_bit_for_bit():
-    published = {"linear_damping": 0.04, "lateral_friction": 0.2, "plane_restitution": 1.0, "time_step": 1 / 60}
+    published = {
+        "linear_damping": 0.04,
+        "lateral_friction": 0.2,
+        "plane_restitution": 1.0,
+        "time_step": 1 / 60,
+    }
     found = heights(0.5123, Scenario(PUBLISHED.times, {"z": 4.3217}), **NATIVE, **published)
     assert [float(z).hex() for z in found[::20]] == GOLDEN
-    np.testing.assert_array_equal(heights(0.5123, Scenario(PUBLISHED.times, {"z": 4.3217}), **NATIVE), found)
+    np.testing.assert_array_equal(
+        heights(0.5123, Scenario(PUBLISHED.times, {"z": 4.3217}), **NATIVE), found
+    )
 
 
 @pytest.mark.parametrize("step", [1 / 60, 1 / 240])
@@ -115,7 +135,8 @@ def test_native_free_fall_without_air_is_the_exact_discrete_parabola():
 
 
 def test_native_free_fall_with_air_converges_to_the_closed_form_in_first_order():
-    # w' = g - k w - k w^2 for the downward speed w has the fixed points r1 > 0 > r2 and integrates to a logarithm.
+    # w' = g - k w - k w^2 for the downward speed w has the fixed points r1 > 0 > r2 and integrates
+    # to a logarithm.
     root = (0.25 + GRAVITY / DAMPING) ** 0.5
     r1, r2, end = -0.5 + root, -0.5 - root, 0.8
     share = np.exp(-DAMPING * (r1 - r2) * end)
@@ -135,7 +156,9 @@ def test_native_fall_matches_an_accurate_integrator_in_three_dimensions():
         v = state[3:]
         return np.concatenate([v, [0, 0, -GRAVITY] - DAMPING * v * (1 + np.linalg.norm(v))])
 
-    exact = solve_ivp(law, (0, 0.7), list(start.values()), t_eval=times, rtol=1e-9, atol=1e-9).y[:3].T
+    exact = (
+        solve_ivp(law, (0, 0.7), list(start.values()), t_eval=times, rtol=1e-9, atol=1e-9).y[:3].T
+    )
 
     def fall(step):
         ball = Ball({"gravity": GRAVITY}, ["x", "y", "z"], **NATIVE, time_step=step)
@@ -143,7 +166,9 @@ def test_native_fall_matches_an_accurate_integrator_in_three_dimensions():
 
     found = fall(1e-4)
     np.testing.assert_allclose(found, exact, atol=6e-4)
-    np.testing.assert_allclose(2 * fall(5e-5) - found, exact, atol=1e-7)  # what is left is of second order
+    np.testing.assert_allclose(
+        2 * fall(5e-5) - found, exact, atol=1e-7
+    )  # what is left is of second order
 
 
 def test_the_published_first_bounce():
@@ -152,13 +177,16 @@ def test_the_published_first_bounce():
 
 
 def test_bullets_own_contact_swallows_bounces_at_short_steps():
-    # Why it is not the default; with the published 60 Hz the same ball bounces to 0.656 squared of its height.
+    # Why it is not the default; with the published 60 Hz the same ball bounces to 0.656 squared of
+    # its height.
     z = heights(0.7, Scenario(np.arange(2400) / 960), **NATIVE)
     assert z[np.flatnonzero(z < 0.51)[0] :].max() < 0.51
 
 
 def test_native_restitutions_multiply():
-    np.testing.assert_array_equal(heights(0.8, **NATIVE, plane_restitution=0.5), heights(0.4, **NATIVE))
+    np.testing.assert_array_equal(
+        heights(0.8, **NATIVE, plane_restitution=0.5), heights(0.4, **NATIVE)
+    )
 
 
 def test_native_friction_at_an_impact_is_the_product_of_both():
@@ -168,11 +196,17 @@ def test_native_friction_at_an_impact_is_the_product_of_both():
     path = ball.simulate(np.array([[0.6]]), Scenario(np.arange(30) / 60, start))[0]
     change = (np.diff(path, axis=0)[-1] - np.diff(path, axis=0)[0]) * 60
     assert change[1] > 2.5
-    assert change[0] == pytest.approx(-0.25 * change[1], rel=1e-6)  # sliding: 0.5 * 0.5 of the normal impulse
+    assert change[0] == pytest.approx(
+        -0.25 * change[1], rel=1e-6
+    )  # sliding: 0.5 * 0.5 of the normal impulse
 
 
 def test_native_accelerometer_shows_air_and_rest():
-    z, a = Ball({"gravity": GRAVITY}, ["z", "accel_z"], **NATIVE).simulate(np.array([[0.0]]), PUBLISHED)[0].T
+    z, a = (
+        Ball({"gravity": GRAVITY}, ["z", "accel_z"], **NATIVE)
+        .simulate(np.array([[0.0]]), PUBLISHED)[0]
+        .T
+    )
     speed = (z[20] - z[19]) * 60
     assert a[20] == pytest.approx(-DAMPING * speed * (1 + abs(speed)), rel=1e-6)
     assert a[-1] == GRAVITY
@@ -193,7 +227,9 @@ def test_native_effects_change_impacts_too():
     lost = (plain[-1] - plain[-2] - sticky[-1] + sticky[-2]) * 60
     assert lost == pytest.approx(0.05 * 1.7 * 8.86, rel=0.05)
     drag = heights(0.7, Scenario(np.arange(40) / 60), **NATIVE, linear_damping=0.0, fixed=AIR)
-    np.testing.assert_allclose(drag, heights(0.7, Scenario(np.arange(40) / 60), **NATIVE), atol=1e-12)
+    np.testing.assert_allclose(
+        drag, heights(0.7, Scenario(np.arange(40) / 60), **NATIVE), atol=1e-12
+    )
 
 
 # ---------------------------------------------------------------------- the converging ball
@@ -205,7 +241,9 @@ def test_native_effects_change_impacts_too():
 def test_without_air_bounces_are_exact_at_any_step(engine, step, restitution):
     z = heights(restitution, engine=engine, time_step=step)
     # MuJoCo lets a ball at rest sink in by 10 (1 - 0.9999) g h^2
-    np.testing.assert_allclose(z, parabolas(restitution, PUBLISHED.times), atol=2e-9 + 1e-2 * step**2)
+    np.testing.assert_allclose(
+        z, parabolas(restitution, PUBLISHED.times), atol=2e-9 + 1e-2 * step**2
+    )
     before = PUBLISHED.times < 1.2
     np.testing.assert_allclose(z[before], parabolas(restitution, PUBLISHED.times)[before], atol=2e-9 + (
         1e-2 * step**2 if restitution == 0.0 else 0.0))  # fmt: skip
@@ -218,7 +256,10 @@ def test_bounces_in_air_converge_to_physics_in_second_order(engine, restitution)
     steps = np.array([1 / 60, 1 / 120, 1 / 240])
     scenario = Scenario(np.linspace(0.0, 1.5, 31))
     fine = heights(restitution, scenario, engine=engine, fixed=AIR, time_step=1 / 4000)
-    errors = [np.abs(heights(restitution, scenario, engine=engine, fixed=AIR, time_step=h) - fine).max() for h in steps]
+    errors = [
+        np.abs(heights(restitution, scenario, engine=engine, fixed=AIR, time_step=h) - fine).max()
+        for h in steps
+    ]
     assert order(steps, errors) == pytest.approx(2.0, abs=0.1)
     assert errors[0] < 1.2e-3
     assert apex_ratio(restitution, engine=engine, fixed=AIR) == pytest.approx(exact, abs=3e-6)
@@ -235,9 +276,15 @@ def test_energy_is_kept_without_air_at_full_restitution(engine):
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("friction", "kept"), [(0.25, 1 - 0.25 * 1.6 * 2.0 / 5.0), (3.0, 0.0)])
 def test_friction_takes_what_it_says_and_no_more(engine, friction, kept):
-    # Tangential speed lost: c (1 + e) |vn|, whatever the direction along the ground; the ball does not spin.
-    ball = Ball({"gravity": 0.0}, ["x", "y", "z"], engine=engine, fixed={"contact.friction": friction})
-    path = ball.simulate(np.array([[0.6]]), Scenario(np.arange(20) / 60, {"z": 0.6, "vx": 3.0, "vy": 4.0, "vz": -2.0}))
+    # Tangential speed lost: c (1 + e) |vn|, whatever the direction along the ground; the ball does
+    # not spin.
+    ball = Ball(
+        {"gravity": 0.0}, ["x", "y", "z"], engine=engine, fixed={"contact.friction": friction}
+    )
+    path = ball.simulate(
+        np.array([[0.6]]),
+        Scenario(np.arange(20) / 60, {"z": 0.6, "vx": 3.0, "vy": 4.0, "vz": -2.0}),
+    )
     velocity = np.diff(path[0], axis=0) * 60
     np.testing.assert_allclose(velocity[0], [3.0, 4.0, -2.0], atol=1e-9)
     np.testing.assert_allclose(velocity[-1], [3.0 * kept, 4.0 * kept, 1.2], atol=1e-7)
@@ -264,7 +311,9 @@ def test_ball_rests_on_the_ground(engine):
         assert z[-1] == pytest.approx(RADIUS, abs=1e-6)
         assert (a[0], a[-1]) == (0.0, GRAVITY)
     small = {"radius": 0.2}
-    assert heights(0.0, Scenario(np.arange(90) / 60, {"z": 0.2}), small, engine=engine) == pytest.approx(0.2, abs=1e-6)
+    assert heights(
+        0.0, Scenario(np.arange(90) / 60, {"z": 0.2}), small, engine=engine
+    ) == pytest.approx(0.2, abs=1e-6)
 
 
 def test_native_ball_rests_on_the_ground():
@@ -283,7 +332,12 @@ def test_a_ball_at_rest_slides_and_lifts_off(engine):
     x, z = tilted.simulate(np.array([[0.5]]), Scenario(t, start))[0].T
     np.testing.assert_allclose(x, t + 0.0981 * 5.0 * t**2, atol=1e-9)
     np.testing.assert_allclose(z, RADIUS, atol=1e-6)
-    lifted = Ball({"gravity": GRAVITY}, ["z", "accel_z"], engine=engine, fixed={"force.periodic": [12.0, 0.0, 1.0]})
+    lifted = Ball(
+        {"gravity": GRAVITY},
+        ["z", "accel_z"],
+        engine=engine,
+        fixed={"force.periodic": [12.0, 0.0, 1.0]},
+    )
     z, a = lifted.simulate(np.array([[0.0]]), Scenario(t, start))[0].T
     off = np.arcsin(GRAVITY / 12.0) / (2 * np.pi)  # when the push exceeds the weight
     assert np.abs(z[t < off] - RADIUS).max() < 1e-6
@@ -296,7 +350,9 @@ def test_a_ball_at_rest_slides_and_lifts_off(engine):
 def test_speeds_are_not_clipped(settings):
     air = {"linear_damping": 0.0} if settings is NATIVE else {}
     ball = Ball({"gravity": 0.0}, **settings, **air)
-    path = ball.simulate(np.array([[1.0]]), Scenario(np.arange(9) / 60, {"vx": 300.0, "vz": -300.0, "z": 13.0}))[0]
+    path = ball.simulate(
+        np.array([[1.0]]), Scenario(np.arange(9) / 60, {"vx": 300.0, "vz": -300.0, "z": 13.0})
+    )[0]
     np.testing.assert_allclose(np.diff(path[:3, 0]) * 60, 300.0, rtol=1e-12)
     np.testing.assert_allclose(np.diff(path[:3, 2]) * 60, -300.0, rtol=1e-12)
     assert path[-1, 2] - path[-2, 2] > 4.999
@@ -307,10 +363,14 @@ def test_samples_between_do_not_change_the_motion(settings):
     fine = heights(0.6, Scenario(np.arange(241) / 240), **settings, time_step=1 / 240)
     coarse = heights(0.6, Scenario(np.arange(61) / 60), **settings, time_step=1 / 240)
     np.testing.assert_allclose(coarse, fine[::4], atol=1e-11)
-    if "native_contact" not in settings:  # otherwise the step makes a difference, and uneven samples change it
+    if (
+        "native_contact" not in settings
+    ):  # otherwise the step makes a difference, and uneven samples change it
         uneven = np.sort(np.random.default_rng(0).choice(np.arange(1, 241), 50, replace=False))
         uneven = np.concatenate([[0], uneven])
-        np.testing.assert_allclose(heights(0.6, Scenario(uneven / 240), **settings), fine[uneven], atol=1e-9)
+        np.testing.assert_allclose(
+            heights(0.6, Scenario(uneven / 240), **settings), fine[uneven], atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("settings", BUILDS)
@@ -319,13 +379,15 @@ def test_first_sample_is_the_initial_state_and_observe_orders(settings):
     everything = Ball(**settings).simulate(np.array([[0.5]]), scenario)
     np.testing.assert_array_equal(everything[0, 0, :3], [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(
-        Ball(observe=["z", "x"], **settings).simulate(np.array([[0.5]]), scenario), everything[..., [2, 0]]
+        Ball(observe=["z", "x"], **settings).simulate(np.array([[0.5]]), scenario),
+        everything[..., [2, 0]],
     )
 
 
 @pytest.mark.parametrize("settings", BUILDS)
 def test_a_used_world_gives_the_same_bits_as_a_new_one(settings):
-    # Starts on, in and just above the ground, at the same place: where contacts left over from before would matter.
+    # Starts on, in and just above the ground, at the same place: where contacts left over from
+    # before would matter.
     rng = np.random.default_rng(3)
     effects = ["drag.quadratic", "contact.friction", "restitution.speed"]
     used, new = (Ball(effects=effects, **settings) for _ in range(2))
@@ -350,7 +412,9 @@ def test_a_used_world_gives_the_same_bits_as_a_new_one(settings):
 def test_constants_of_one_run_do_not_stay(settings):
     ball, theta = Ball(**settings), np.array([[0.6]])
     before = ball.simulate(theta, PUBLISHED)
-    moon = ball.simulate(theta, Scenario(PUBLISHED.times, constants={"gravity": 1.62, "radius": 0.1}))
+    moon = ball.simulate(
+        theta, Scenario(PUBLISHED.times, constants={"gravity": 1.62, "radius": 0.1})
+    )
     assert moon[0, 60, 2] == pytest.approx(4.5 - 1.62 / 2, abs=0.05)
     np.testing.assert_array_equal(ball.simulate(theta, PUBLISHED), before)
 
@@ -360,17 +424,38 @@ def test_constants_of_one_run_do_not_stay(settings):
     [
         (lambda: Ball({"colour": 1.0}), "unknown constant .* there are: gravity, .*, radius"),
         (lambda: Ball({"mass": 0.0}), "'mass' .* must be > 0"),
-        (lambda: Ball(observe=["height"]), "unknown channel .* there are: accel_z, x, y, z|x, y, z"),
-        (lambda: Ball().simulate([[0.5]], Scenario([0.0], {"q": 1.0})), "unknown initial state .* vx, vy, vz, x, y, z"),
-        (lambda: Ball().simulate([[0.5]], Scenario([0.0], inputs={"u": [1.0]})), "unknown input .* there are: none"),
-        (lambda: Ball().simulate([[0.5]], Scenario([0.0], constants={"g": 1.0})), "unknown constant .*: gravity"),
-        (lambda: Ball(linear_damping=0.1), "linear_damping belongs to Bullet's own contact: set native_contact = true"),
-        (lambda: Ball(**NATIVE, plane_restitution=-1.0), "plane_restitution must be a number of at least 0, found -1"),
+        (
+            lambda: Ball(observe=["height"]),
+            "unknown channel .* there are: accel_z, x, y, z|x, y, z",
+        ),
+        (
+            lambda: Ball().simulate([[0.5]], Scenario([0.0], {"q": 1.0})),
+            "unknown initial state .* vx, vy, vz, x, y, z",
+        ),
+        (
+            lambda: Ball().simulate([[0.5]], Scenario([0.0], inputs={"u": [1.0]})),
+            "unknown input .* there are: none",
+        ),
+        (
+            lambda: Ball().simulate([[0.5]], Scenario([0.0], constants={"g": 1.0})),
+            "unknown constant .*: gravity",
+        ),
+        (
+            lambda: Ball(linear_damping=0.1),
+            "linear_damping belongs to Bullet's own contact: set native_contact = true",
+        ),
+        (
+            lambda: Ball(**NATIVE, plane_restitution=-1.0),
+            "plane_restitution must be a number of at least 0, found -1",
+        ),
         (
             lambda: Ball(engine="mujoco", stiffness=1e4),
             "stiffness belongs to MuJoCo's contact .* native_contact = true",
         ),
-        (lambda: Ball(engine="mujoco", native_contact=True, stiffness=-1.0), "stiffness must be a positive number"),
+        (
+            lambda: Ball(engine="mujoco", native_contact=True, stiffness=-1.0),
+            "stiffness must be a positive number",
+        ),
         (
             lambda: Ball(engine="pybullet", colour=1),
             "unknown setting of engine pybullet .colour.; there are: .*time_step",

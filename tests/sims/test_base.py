@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from sims.base import Channel, Constant, InputError, Parameter, Scenario, Simulator, UnitCube, adjusted
+from sims.base import (
+    Channel,
+    Constant,
+    InputError,
+    Parameter,
+    Scenario,
+    Simulator,
+    UnitCube,
+    adjusted,
+)
 
 LINEAR = Parameter("stiffness", "N/m", 3.0, (-1.0, 4.0), (0.0, 2.0))
 LOG = Parameter("inertia", "kg*m^2", 0.01, (1e-3, 1e-1), (1e-3, 1e-2), log=True)
@@ -24,7 +33,9 @@ class Spring(Simulator):
 def test_unit_cube_is_linear_over_the_bounds():
     cube = UnitCube([LINEAR])
     assert cube.dim == 1
-    np.testing.assert_allclose(cube.physical(np.array([[0.0], [0.2], [1.0]])), [[-1.0], [0.0], [4.0]], atol=1e-15)
+    np.testing.assert_allclose(
+        cube.physical(np.array([[0.0], [0.2], [1.0]])), [[-1.0], [0.0], [4.0]], atol=1e-15
+    )
     np.testing.assert_allclose(cube.inverse(np.array([1.5])), [0.5], atol=1e-15)
 
 
@@ -35,7 +46,9 @@ def test_unit_cube_is_logarithmic_where_asked():
     np.testing.assert_allclose(cube.inverse(np.array([-1.0, 1e-1])), [0.0, 1.0], atol=1e-14)
 
 
-@pytest.mark.parametrize("parameters", [[LINEAR], [LOG], [LINEAR, LOG]], ids=["linear", "log", "both"])
+@pytest.mark.parametrize(
+    "parameters", [[LINEAR], [LOG], [LINEAR, LOG]], ids=["linear", "log", "both"]
+)
 def test_unit_cube_maps_are_inverse_also_outside(parameters):
     cube = UnitCube(parameters)
     points = np.random.default_rng(5).uniform(-0.2, 1.2, size=(3, 40, cube.dim))
@@ -71,7 +84,9 @@ def test_impossible_parameters_are_refused(change, says):
 
 
 def test_adjusted_replaces_what_the_experiment_gives():
-    [narrow, untouched] = adjusted([LINEAR, LOG], {"stiffness": {"training": [1, 2], "nominal": 1.0}})
+    [narrow, untouched] = adjusted(
+        [LINEAR, LOG], {"stiffness": {"training": [1, 2], "nominal": 1.0}}
+    )
     assert (narrow.training, narrow.nominal, narrow.bounds) == ((1, 2), 1.0, (-1.0, 4.0))
     assert untouched == LOG
 
@@ -80,7 +95,10 @@ def test_adjusted_replaces_what_the_experiment_gives():
     ("changes", "says"),
     [
         ({"mass": {"nominal": 1.0}}, "unknown parameter 'mass'; there are: inertia, stiffness"),
-        ({"inertia": {"unit": "g"}}, "unknown attribute of parameter inertia 'unit'; there are: bounds, log"),
+        (
+            {"inertia": {"unit": "g"}},
+            "unknown attribute of parameter inertia 'unit'; there are: bounds, log",
+        ),
     ],
 )
 def test_adjusted_lists_what_there_is(changes, says):
@@ -123,17 +141,44 @@ def test_a_run_overrides_the_simulator_which_overrides_the_defaults():
 @pytest.mark.parametrize(
     ("refused", "says"),
     [
-        (lambda: Spring({"colour": 1.0}), "unknown constant of simulator spring 'colour'; there are: gravity, mass"),
-        (lambda: Spring({"mass": 0.0}), "constant 'mass' of simulator spring must be > 0, found 0.0"),
-        (lambda: Spring({"gravity": np.nan}), "constant 'gravity' of simulator spring must be finite"),
-        (lambda: Spring(observe=["x", "z"]), "unknown channel of simulator spring 'z'; there are: a, v, x"),
+        (
+            lambda: Spring({"colour": 1.0}),
+            "unknown constant of simulator spring 'colour'; there are: gravity, mass",
+        ),
+        (
+            lambda: Spring({"mass": 0.0}),
+            "constant 'mass' of simulator spring must be > 0, found 0.0",
+        ),
+        (
+            lambda: Spring({"gravity": np.nan}),
+            "constant 'gravity' of simulator spring must be finite",
+        ),
+        (
+            lambda: Spring(observe=["x", "z"]),
+            "unknown channel of simulator spring 'z'; there are: a, v, x",
+        ),
         (lambda: Spring(observe=[]), "one or more different channels"),
         (lambda: Spring(observe=["x", "x"]), "one or more different channels"),
-        (lambda: Spring().run_initial(Scenario([0.0], {"q": 1.0})), "unknown initial state .* there are: v, x"),
-        (lambda: Spring().run_initial(Scenario([0.0], {"x": np.inf})), "initial state 'x' .* must be finite"),
-        (lambda: Spring().run_inputs(Scenario([0.0], inputs={"w": [0.0]})), "unknown input .* there are: u"),
-        (lambda: Spring().run_inputs(Scenario([0.0], inputs={"u": [np.nan]})), "input 'u' .* must be finite"),
-        (lambda: Spring().run_constants(Scenario([0.0], constants={"mass": -1.0})), "must be > 0, found -1.0"),
+        (
+            lambda: Spring().run_initial(Scenario([0.0], {"q": 1.0})),
+            "unknown initial state .* there are: v, x",
+        ),
+        (
+            lambda: Spring().run_initial(Scenario([0.0], {"x": np.inf})),
+            "initial state 'x' .* must be finite",
+        ),
+        (
+            lambda: Spring().run_inputs(Scenario([0.0], inputs={"w": [0.0]})),
+            "unknown input .* there are: u",
+        ),
+        (
+            lambda: Spring().run_inputs(Scenario([0.0], inputs={"u": [np.nan]})),
+            "input 'u' .* must be finite",
+        ),
+        (
+            lambda: Spring().run_constants(Scenario([0.0], constants={"mass": -1.0})),
+            "must be > 0, found -1.0",
+        ),
     ],
 )
 def test_simulators_refuse_what_they_cannot_use(refused, says):

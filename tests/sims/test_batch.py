@@ -34,7 +34,9 @@ def test_agrees_with_scipy_on_fifty_random_lanes(system, position, rate):
     assert (worst < tolerance).all(), worst
 
 
-@pytest.mark.parametrize(("system", "seed"), [("pendulum", 10), ("pendulum", 8), ("slider", 14), ("servo", 12)])
+@pytest.mark.parametrize(
+    ("system", "seed"), [("pendulum", 10), ("pendulum", 8), ("slider", 14), ("servo", 12)]
+)
 def test_agrees_with_scipy_to_its_own_accuracy_when_steps_are_short(system, seed):
     assert errors(random_case(system, seed), time_step=5e-4).max() < 1e-6
 
@@ -43,7 +45,12 @@ def order(cls, fixed, theta, scenario, lengths=(0.02, 0.01, 0.005)):
     """Slope of the logarithm of the error over that of the step."""
     exact = cls(engine="batch", fixed=fixed, time_step=2.5e-4).simulate(theta, scenario)
     found = [
-        np.sqrt(np.mean((cls(engine="batch", fixed=fixed, time_step=h).simulate(theta, scenario) - exact) ** 2))
+        np.sqrt(
+            np.mean(
+                (cls(engine="batch", fixed=fixed, time_step=h).simulate(theta, scenario) - exact)
+                ** 2
+            )
+        )
         for h in lengths
     ]
     return np.polyfit(np.log(lengths), np.log(found), 1)[0]
@@ -52,9 +59,24 @@ def order(cls, fixed, theta, scenario, lengths=(0.02, 0.01, 0.005)):
 @pytest.mark.parametrize(
     ("cls", "fixed", "theta", "initial"),
     [
-        (Slider, {"spring.linear": 2.0, "spring.cubic": 1.0, "drag.linear": 1.0}, [[1.0]], {"x": 1.0, "v": 1.0}),
-        (Slider, {"spring.linear": 4.0, "drag.linear": 0.3, "friction.coulomb": 0.3}, [[1.0]], {"x": 2.0}),
-        (Ball, {"drag.quadratic": 0.3, "lift.magnus": [1.0, 0.5]}, [[0.8]], {"z": 2.0, "vx": 5.0, "vy": 3.0}),
+        (
+            Slider,
+            {"spring.linear": 2.0, "spring.cubic": 1.0, "drag.linear": 1.0},
+            [[1.0]],
+            {"x": 1.0, "v": 1.0},
+        ),
+        (
+            Slider,
+            {"spring.linear": 4.0, "drag.linear": 0.3, "friction.coulomb": 0.3},
+            [[1.0]],
+            {"x": 2.0},
+        ),
+        (
+            Ball,
+            {"drag.quadratic": 0.3, "lift.magnus": [1.0, 0.5]},
+            [[0.8]],
+            {"z": 2.0, "vx": 5.0, "vy": 3.0},
+        ),
     ],
 )
 def test_converges_with_order_four_through_impacts_and_standstill(cls, fixed, theta, initial):
@@ -69,7 +91,9 @@ def test_ball_in_closed_form():
     fall = np.sqrt(2 * h / g)
     apex = fall * (1 + e)  # of the first bounce
     times = np.array([0.0, fall / 2, apex, fall * (1 + 2 * e + e * e), 3.9, 4.0])
-    seen = Ball(engine="batch").simulate(np.array([[e]]), Scenario(times, {"z": h + 0.5, "vx": 1.5}))[0]
+    seen = Ball(engine="batch").simulate(
+        np.array([[e]]), Scenario(times, {"z": h + 0.5, "vx": 1.5})
+    )[0]
     np.testing.assert_allclose(seen[:4, 2] - 0.5, [h, h * 0.75, h * e**2, h * e**4], rtol=1e-13)
     np.testing.assert_allclose(seen[:, 0], 1.5 * times, rtol=1e-13)
     np.testing.assert_allclose(seen[:, 3], 0.0, atol=1e-13)
@@ -79,13 +103,17 @@ def test_ball_in_closed_form():
 def test_bounces_die_out_and_the_ball_rests_and_glides(fixed):
     g, h, e = 9.81, 1.0, 0.5
     over = np.sqrt(2 * h / g) * (1 + e) / (1 - e)
-    times = np.array([0.0, over - 0.05, over + 1e-3, over + 1.0])  # the last bounces fall into one interval
+    times = np.array(
+        [0.0, over - 0.05, over + 1e-3, over + 1.0]
+    )  # the last bounces fall into one interval
     ball = Ball(engine="batch", fixed={"contact.friction": 0.1, **fixed})
     seen = ball.simulate(np.array([[e]]), Scenario(times, {"z": h + 0.5, "vx": 4.0}))[0]
     assert (seen[2:, 2] == 0.5).all()
     assert (seen[2:, 3] == g).all()
     lost = 0.1 * (1 + e) * np.sqrt(2 * g * h) / (1 - e)
-    np.testing.assert_allclose(np.diff(seen[2:, 0]), (4.0 - lost) * (times[3] - times[2]), rtol=1e-7)
+    np.testing.assert_allclose(
+        np.diff(seen[2:, 0]), (4.0 - lost) * (times[3] - times[2]), rtol=1e-7
+    )
 
 
 def test_every_lane_may_bounce_many_times_within_one_step():
@@ -93,7 +121,9 @@ def test_every_lane_may_bounce_many_times_within_one_step():
     theta = np.linspace(0.3, 0.9, 13)[:, None]
     scenario = Scenario(times, {"z": 2.0})
     free = Ball(engine="batch").simulate(theta, scenario)
-    stepped = Ball(engine="batch", fixed={"drag.linear": 1e-13}, time_step=4.0).simulate(theta, scenario)
+    stepped = Ball(engine="batch", fixed={"drag.linear": 1e-13}, time_step=4.0).simulate(
+        theta, scenario
+    )
     np.testing.assert_allclose(stepped, free, atol=1e-8)
 
 
@@ -126,12 +156,16 @@ def test_friction_stops_where_it_should_and_then_holds_exactly_still():
 
 def test_what_sticks_breaks_loose_within_a_step():
     c, a, f = 1.0, 1.5, 0.5
-    slider = Slider(engine="batch", fixed={"friction.coulomb": c, "force.periodic": [a, 0.0, f]}, time_step=0.05)
+    slider = Slider(
+        engine="batch", fixed={"friction.coulomb": c, "force.periodic": [a, 0.0, f]}, time_step=0.05
+    )
     w = 2 * np.pi * f
     loose = np.arcsin(c / a) / w
     seen = slider.simulate(np.array([[1.0]]), Scenario(T[:60:5]))[0]
     t = T[:60:5]
-    expected = np.where(t > loose, a / w * (np.cos(w * loose) - np.cos(w * t)) - c * (t - loose), 0.0)
+    expected = np.where(
+        t > loose, a / w * (np.cos(w * loose) - np.cos(w * t)) - c * (t - loose), 0.0
+    )
     np.testing.assert_allclose(seen[:, 1], expected, atol=1e-6)
     assert (seen[t < loose] == 0.0).all()
 
@@ -157,7 +191,9 @@ def slid(v, limit, lengths, every=1):
     v = np.atleast_2d(np.array(v, dtype=float))
     c = np.full((1, len(v), 1), limit)
     still, theta = np.zeros_like(v), np.zeros((len(v), 1))
-    lanes = Lanes(Puck(), theta, {}, still, v, np.tile(lengths, (len(v), 1)), {}, ((Coulomb(), c),), every)
+    lanes = Lanes(
+        Puck(), theta, {}, still, v, np.tile(lengths, (len(v), 1)), {}, ((Coulomb(), c),), every
+    )
     return engine(Puck).integrate(lanes)
 
 
@@ -195,8 +231,13 @@ def test_a_lane_depends_on_itself_alone(system):
     runs = []
     for k in range(5):
         t = np.arange(150 - 20 * k) / (40.0 + 20 * k)
-        command = {channel.name: steps(rng, t.size, 1.0) + (channel.name == "torque_enable") for channel in cls.inputs}
-        runs.append(Scenario(t, {name: value + 0.3 * k for name, value in cls.states.items()}, command))
+        command = {
+            channel.name: steps(rng, t.size, 1.0) + (channel.name == "torque_enable")
+            for channel in cls.inputs
+        }
+        runs.append(
+            Scenario(t, {name: value + 0.3 * k for name, value in cls.states.items()}, command)
+        )
     scenarios = [runs[k % 5] for k in range(40)]
     together = simulator.simulate_lanes(theta, scenarios)
     for lane in [*range(0, 40, 4), 20, 21, 22, 23, 24]:
@@ -218,7 +259,10 @@ def test_steps_of_no_length_change_nothing():
 
 @pytest.mark.parametrize("system", ["ball", "pendulum"])
 def test_finite_differences_are_smooth_through_events(system):
-    names = {"ball": {"drag.quadratic": [0.1], "contact.friction": [0.05]}, "pendulum": {"friction.coulomb": [0.01]}}
+    names = {
+        "ball": {"drag.quadratic": [0.1], "contact.friction": [0.05]},
+        "pendulum": {"friction.coulomb": [0.01]},
+    }
     t = np.arange(81) / 40
     inputs = {} if system == "ball" else {"u": 0 * t}
     start = np.array([0, 0, 2.0, 3.0, 0, 0.5]) if system == "ball" else {"x": 1.0, "v": 0.0}
@@ -226,7 +270,9 @@ def test_finite_differences_are_smooth_through_events(system):
     parameter = SIMULATORS[system].parameters[0].name
 
     def case(value):
-        return reference.Case(system, {parameter: value}, constants, start, names[system], t, inputs)
+        return reference.Case(
+            system, {parameter: value}, constants, start, names[system], t, inputs
+        )
 
     value = {"ball": 0.7, "pendulum": 4e-3}[system]
     columns = [0, 2] if system == "ball" else [0]
@@ -268,7 +314,9 @@ def test_a_lane_that_overflows_is_nan_and_spoils_no_other():
 
 def test_stiff_servo_stays_stable_at_the_corner_of_its_bounds():
     theta = np.array([[3.0, 0.5, 1e-4]])
-    scenario = Scenario(T, {}, {"goal": np.where(T < 1.0, 1.0, -1.0), "torque_enable": np.ones(T.size)})
+    scenario = Scenario(
+        T, {}, {"goal": np.where(T < 1.0, 1.0, -1.0), "torque_enable": np.ones(T.size)}
+    )
     coarse = Servo(engine="batch").simulate(theta, scenario)
     fine = Servo(engine="batch", time_step=1e-3).simulate(theta, scenario)
     np.testing.assert_allclose(coarse, fine, atol=2e-5)
@@ -276,11 +324,15 @@ def test_stiff_servo_stays_stable_at_the_corner_of_its_bounds():
 
 def test_one_sample_and_no_lanes():
     pendulum = Pendulum(engine="batch")
-    assert pendulum.simulate(np.array([[3e-3]]), Scenario(np.array([1.0]), {"q": 0.2})).tolist() == [[[0.2, 0.0]]]
+    assert pendulum.simulate(
+        np.array([[3e-3]]), Scenario(np.array([1.0]), {"q": 0.2})
+    ).tolist() == [[[0.2, 0.0]]]
     assert pendulum.simulate(np.empty((0, 1)), Scenario(T)).shape[0] == 0
 
 
-@pytest.mark.parametrize(("settings", "says"), [({"time_step": 0.0}, "time_step"), ({"stepsize": 1.0}, "stepsize")])
+@pytest.mark.parametrize(
+    ("settings", "says"), [({"time_step": 0.0}, "time_step"), ({"stepsize": 1.0}, "stepsize")]
+)
 def test_refuses_settings_it_cannot_use(settings, says):
     with pytest.raises(InputError, match=says):
         Ball(engine="batch", **settings)
@@ -297,21 +349,29 @@ def test_a_lane_that_needs_too_many_steps_is_given_up_and_no_other():
     whole = Slider(engine="batch", effects=list(kinds), time_step=0.01)
     hasty = Slider(engine="batch", effects=list(kinds), time_step=0.01, patience=1.5)
     scenario = Scenario(times, {"x": 0.0, "v": 0.0}, {"u": 6.0 * np.sin(40.0 * times)})
-    theta = np.array([[1.0, 0.1, 0.0, 0.0, 0.02], [1.0, 0.0, 0.02, 4.0, 0.02], [1.3, 0.2, 0.0, 0.0, 0.02]])
+    theta = np.array(
+        [[1.0, 0.1, 0.0, 0.0, 0.02], [1.0, 0.0, 0.02, 4.0, 0.02], [1.3, 0.2, 0.0, 0.0, 0.02]]
+    )
     expected, found = whole.simulate(theta, scenario), hasty.simulate(theta, scenario)
     assert np.isfinite(expected).all()
     np.testing.assert_array_equal(found[[0, 2]], expected[[0, 2]])
-    assert np.isnan(found[1]).any(), "reversals forty times a second, in a friction that falls within 0.02 m/s"
+    assert np.isnan(found[1]).any(), (
+        "reversals forty times a second, in a friction that falls within 0.02 m/s"
+    )
     np.testing.assert_array_equal(hasty.simulate(theta[1:2], scenario), found[1:2])
     np.testing.assert_array_equal(Slider(engine="batch", effects=list(kinds), time_step=0.01, patience=50.0).simulate(
         theta, scenario), expected)  # fmt: skip
 
 
-@pytest.mark.parametrize(("simple", "rich"), [("friction.coulomb", "friction.stribeck"), ("drag.quadratic", "wind")])
+@pytest.mark.parametrize(
+    ("simple", "rich"), [("friction.coulomb", "friction.stribeck"), ("drag.quadratic", "wind")]
+)
 def test_an_effect_becomes_the_one_it_contains(simple, rich):
     effect = library.get(rich)
     assert effect.contains == (simple,)
-    scenario = Scenario(np.arange(101) / 50.0, {"x": 0.0, "v": 2.0}, {"u": np.sin(np.arange(101) / 9.0)})
+    scenario = Scenario(
+        np.arange(101) / 50.0, {"x": 0.0, "v": 2.0}, {"u": np.sin(np.arange(101) / 9.0)}
+    )
     one, other = (Slider(engine="batch", effects=[name]) for name in (simple, rich))
     theta = np.zeros((1, len(other.parameters)))
     theta[0, :2] = 1.0, 0.4
@@ -323,7 +383,9 @@ def test_an_effect_becomes_the_one_it_contains(simple, rich):
 
 
 def test_a_lane_given_up_holds_nobody_up():
-    """Its clock has ended at once: one that an impact without speed had set back ran on for minutes."""
+    """Its clock has ended at once: one that an impact without speed had set back ran on for
+    minutes.
+    """
     lanes = SimpleNamespace(steps=np.full((2, 3), 0.1), inputs={}, every=1, x=np.zeros((2, 1)))
     clock, state = Clock(lanes), np.ones((3, 2))
     clock.correct(np.array([0]), np.array([[-50.0]]))

@@ -43,12 +43,16 @@ def test_import_is_lazy_and_quiet():
         "Ball(engine='pybullet'); Pendulum(engine='pybullet'); print('pybullet' in sys.modules)"
     )
     assert lazy.stdout == "False\n"
-    used = python("from sims import bullet\nprint('before', flush=True); bullet.engine(); print('after')")
+    used = python(
+        "from sims import bullet\nprint('before', flush=True); bullet.engine(); print('after')"
+    )
     assert (used.stdout, used.stderr) == ("before\nafter\n", "")
 
 
 def test_import_survives_closed_streams():
-    assert python("import os; os.close(1); from sims import bullet; bullet.engine()").returncode == 0
+    assert (
+        python("import os; os.close(1); from sims import bullet; bullet.engine()").returncode == 0
+    )
 
 
 @pytest.mark.parametrize(("kind", "settings"), KINDS)
@@ -91,7 +95,9 @@ def test_an_interrupted_rollout_leaves_nothing_behind(kind, settings, monkeypatc
     with pytest.raises(KeyboardInterrupt):
         simulator.simulate(theta, scenario)
     monkeypatch.undo()
-    np.testing.assert_array_equal(simulator.simulate(theta, scenario), made(kind, settings).simulate(theta, scenario))
+    np.testing.assert_array_equal(
+        simulator.simulate(theta, scenario), made(kind, settings).simulate(theta, scenario)
+    )
 
 
 GROWTH = """
@@ -113,7 +119,9 @@ print(-rollouts(count // 4) + rollouts(count))
 
 
 def growth(kind, count, samples, constants, engine="pybullet", **settings):
-    """Growth in bytes of the memory of a process of its own over `count` rollouts, after a quarter as many."""
+    """Growth in bytes of the memory of a process of its own over `count` rollouts, after a quarter
+    as many.
+    """
     values = {
         "kind": kind.__name__, "engine": engine, "settings": settings, "theta": theta_for(kind).tolist(),
         "initial": {"z": 0.51} if kind is Ball else {}, "constants": constants,

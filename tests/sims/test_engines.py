@@ -1,4 +1,6 @@
-"""All engines: they agree, system by system, effect by effect; each gives the same bits whatever it did before."""
+"""All engines: they agree, system by system, effect by effect; each gives the same bits whatever it
+did before.
+"""
 
 import copy
 import functools
@@ -29,12 +31,16 @@ from tests.sims.agreement import (
     scenario,
 )
 
-# Largest distance from the batch engine in metres or radians with any one effect of the library, at the default step.
+# Largest distance from the batch engine in metres or radians with any one effect of the library, at
+# the default step.
 TOLERANCE = {"ball": 1.5e-4, "pendulum": 1e-3, "slider": 5e-6, "servo": 1.6e-4}
-# A lag follows the reading from step to step; it rounds off the ball's bounces, where steps of 1/120 s tell.
+# A lag follows the reading from step to step; it rounds off the ball's bounces, where steps of
+# 1/120 s tell.
 LAGGED = {"ball": 5e-3}
 
-CASES = [(system, effect) for effect in COEFFICIENTS for system in SIMULATORS if has(system, effect)]
+CASES = [
+    (system, effect) for effect in COEFFICIENTS for system in SIMULATORS if has(system, effect)
+]
 BUILDS = [(system, engine, {}) for system in SIMULATORS for engine in OTHERS]
 BUILDS += [("ball", engine, {"native_contact": True}) for engine in OTHERS]
 
@@ -72,7 +78,9 @@ def test_without_effects_what_is_uniform_is_exact_at_any_step(system, engine):
 @pytest.mark.parametrize("system", ["pendulum", "servo"])
 def test_without_effects_engines_converge_in_second_order(system):
     exact = motion(system, "batch", time_step=1e-3)
-    errors = {e: [apart(motion(system, e, time_step=h), exact) for h in STEPS[system]] for e in OTHERS}
+    errors = {
+        e: [apart(motion(system, e, time_step=h), exact) for h in STEPS[system]] for e in OTHERS
+    }
     for found in errors.values():
         assert order(STEPS[system], found) == pytest.approx(2.0, abs=0.05)
         assert found[-1] < 7e-5
@@ -83,8 +91,12 @@ def test_without_effects_engines_converge_in_second_order(system):
 def test_engines_agree_with_each_effect(system, effect):
     fixed = {effect: coefficients(system, effect)}
     # what a lag makes of a signal depends on the step, on every engine
-    exact = motion(system, "batch", fixed, **({"time_step": 1e-3} if effect.endswith(".lag") else {}))
-    tolerance = LAGGED.get(system, TOLERANCE[system]) if effect == "sensor.lag" else TOLERANCE[system]
+    exact = motion(
+        system, "batch", fixed, **({"time_step": 1e-3} if effect.endswith(".lag") else {})
+    )
+    tolerance = (
+        LAGGED.get(system, TOLERANCE[system]) if effect == "sensor.lag" else TOLERANCE[system]
+    )
     assert apart(exact, plain(system)) > 20 * tolerance
     bullet, mujoco = (motion(system, engine, fixed) for engine in OTHERS)
     assert apart(bullet, exact) < tolerance
@@ -96,18 +108,37 @@ def test_engines_agree_with_each_effect(system, effect):
     ("system", "fixed"),
     [
         ("ball", {"drag.quadratic": 0.05, "restitution.speed": -0.1, "contact.friction": 0.1}),
-        ("ball", {"wind": [0.05, 3.0, -2.0], "lift.magnus": [0.3, 0.1], "force.periodic": [1.0, 0.5, 1.3]}),
+        (
+            "ball",
+            {
+                "wind": [0.05, 3.0, -2.0],
+                "lift.magnus": [0.3, 0.1],
+                "force.periodic": [1.0, 0.5, 1.3],
+            },
+        ),
         ("pendulum", {"drag.quadratic": 3e-4, "friction.coulomb": 0.015}),
-        ("pendulum", {"friction.stribeck": [0.01, 0.01, 0.5], "spring.cubic": 0.05, "gravity.tilt": 0.05}),
+        (
+            "pendulum",
+            {"friction.stribeck": [0.01, 0.01, 0.5], "spring.cubic": 0.05, "gravity.tilt": 0.05},
+        ),
         ("slider", {"drag.quadratic": 0.5, "friction.coulomb": 0.7, "force.bias": 0.2}),
-        ("slider", {"spring.linear": 30.0, "friction.stribeck": [0.4, 0.4, 0.1], "force.periodic": [0.5, 0.3, 1.3]}),
+        (
+            "slider",
+            {
+                "spring.linear": 30.0,
+                "friction.stribeck": [0.4, 0.4, 0.1],
+                "force.periodic": [0.5, 0.3, 1.3],
+            },
+        ),
         ("servo", {"friction.load": 0.1, "drag.linear": 0.01, "force.ripple": [0.02, 0.01, 0.5]}),
     ],
 )
 def test_with_effects_engines_converge_too(system, fixed):
     exact = motion(system, "batch", fixed, time_step=1e-3)
     for engine in OTHERS:
-        errors = np.array([apart(motion(system, engine, fixed, time_step=h), exact) for h in STEPS[system]])
+        errors = np.array(
+            [apart(motion(system, engine, fixed, time_step=h), exact) for h in STEPS[system]]
+        )
         assert order(STEPS[system], errors) > 1.7
         assert errors[-1] < 0.1 * errors[0]
 
@@ -135,7 +166,9 @@ def test_the_servo_is_stable_over_all_its_bounds():
     # The stiffest: back EMF with a time constant of 0.28 ms, at steps of 2.5 ms.
     servo = SIMULATORS["servo"]
     corners = np.array(np.meshgrid(*[p.bounds for p in servo.parameters])).reshape(3, -1).T
-    fine, *others = (servo(engine=e).simulate(corners, scenario("servo"))[:, :, 0] for e in ("batch", *OTHERS))
+    fine, *others = (
+        servo(engine=e).simulate(corners, scenario("servo"))[:, :, 0] for e in ("batch", *OTHERS)
+    )
     for found in others:
         assert np.abs(found - fine).max() < 0.02
 
@@ -144,13 +177,17 @@ def test_the_servo_is_stable_over_all_its_bounds():
 
 
 @pytest.mark.parametrize("engine", OTHERS)
-@pytest.mark.parametrize("friction", [{"friction.coulomb": 1.0}, {"friction.stribeck": [0.6, 0.4, 0.1]}])
+@pytest.mark.parametrize(
+    "friction", [{"friction.coulomb": 1.0}, {"friction.stribeck": [0.6, 0.4, 0.1]}]
+)
 def test_what_sticks_stays_put_and_breaks_loose_at_its_limit(engine, friction):
     t = np.arange(400) / 100
     slider = SIMULATORS["slider"](engine=engine, fixed=friction)
 
     def slide(force):
-        return slider.simulate(np.array([[2.0]]), Scenario(t, {"x": 0.3}, {"u": np.full(400, force)}))[0]
+        return slider.simulate(
+            np.array([[2.0]]), Scenario(t, {"x": 0.3}, {"u": np.full(400, force)})
+        )[0]
 
     np.testing.assert_allclose(slide(0.999), np.tile([0.3, 0.0], (400, 1)), atol=1e-15)
     assert slide(1.01)[-1, 0] > 0.3 + 0.03
@@ -166,7 +203,8 @@ def test_sliding_to_a_stop_takes_the_closed_distance(engine, step):
     np.testing.assert_allclose(x, 1.03 * t - 0.25 * t**2, atol=0.125 * 0.5 * step**2 + 1e-12)
 
 
-# ---------------------------------------------------------------------- plain numbers for common effects
+# ---------------------------------------------------------------------- plain numbers for common
+# effects
 
 
 class Linear(effects.get("drag.linear")):
@@ -249,7 +287,11 @@ def test_any_effect_runs_on_any_engine(engine, monkeypatch):
 @pytest.mark.parametrize(("system", "engine", "settings"), BUILDS)
 def test_lanes_do_not_depend_on_their_neighbours(system, engine, settings):
     kind = SIMULATORS[system]
-    simulator, run, theta = kind(engine=engine, **settings), Scenario(np.arange(150) / 50), theta_for(kind, 6)
+    simulator, run, theta = (
+        kind(engine=engine, **settings),
+        Scenario(np.arange(150) / 50),
+        theta_for(kind, 6),
+    )
     together = simulator.simulate(theta, run)
     assert together.shape == (6, 150, len(simulator.channels))
     apart_ = np.concatenate([simulator.simulate(row[None], run) for row in theta[::-1]])[::-1]
@@ -273,7 +315,11 @@ def test_lanes_of_different_runs_come_out_as_alone(system, engine, settings):
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
 def test_non_finite_parameters_give_nan_lanes(system, engine, settings, broken):
     kind = SIMULATORS[system]
-    simulator, run, theta = kind(engine=engine, **settings), Scenario(np.arange(30) / 50), theta_for(kind, 3)
+    simulator, run, theta = (
+        kind(engine=engine, **settings),
+        Scenario(np.arange(30) / 50),
+        theta_for(kind, 3),
+    )
     healthy = kind(engine=engine, **settings).simulate(theta, run)
     theta[1, -1] = broken
     result = simulator.simulate(theta, run)
@@ -284,7 +330,10 @@ def test_non_finite_parameters_give_nan_lanes(system, engine, settings, broken):
 @pytest.mark.parametrize(("system", "engine", "settings"), BUILDS)
 def test_a_numerical_failure_gives_nan_and_harms_nobody(system, engine, settings):
     kind = SIMULATORS[system]
-    simulator, theta = kind(engine=engine, effects=["drag.quadratic"], **settings), theta_for(kind, 2)
+    simulator, theta = (
+        kind(engine=engine, effects=["drag.quadratic"], **settings),
+        theta_for(kind, 2),
+    )
     theta = np.concatenate([theta, [[0.0], [1e-3]]], axis=1)
     rate = {"ball": "vz", "slider": "v"}.get(system, "qd")
     wild, calm = Scenario(np.arange(30) / 50, {rate: 1e300}), Scenario(np.arange(200) / 50)
@@ -295,7 +344,9 @@ def test_a_numerical_failure_gives_nan_and_harms_nobody(system, engine, settings
 
 
 @pytest.mark.parametrize("engine", OTHERS)
-@pytest.mark.parametrize(("system", "theta"), [("slider", [0.0]), ("slider", [-1.0]), ("servo", [0.5, 4.0, -1.0])])
+@pytest.mark.parametrize(
+    ("system", "theta"), [("slider", [0.0]), ("slider", [-1.0]), ("servo", [0.5, 4.0, -1.0])]
+)
 def test_impossible_inertia_gives_nan(system, engine, theta):
     simulator = SIMULATORS[system](engine=engine)
     result = simulator.simulate(np.array([theta, THETA[system]]), scenario(system))
@@ -304,10 +355,16 @@ def test_impossible_inertia_gives_nan(system, engine, theta):
 
 
 @pytest.mark.parametrize(("system", "engine", "settings"), BUILDS)
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda s: pickle.loads(pickle.dumps(s))], ids=["copy", "pickle"])
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda s: pickle.loads(pickle.dumps(s))], ids=["copy", "pickle"]
+)
 def test_a_copy_has_a_world_of_its_own(system, engine, settings, copied):
     kind = SIMULATORS[system]
-    simulator, run, theta = kind(engine=engine, **settings), Scenario(np.arange(50) / 50), theta_for(kind)
+    simulator, run, theta = (
+        kind(engine=engine, **settings),
+        Scenario(np.arange(50) / 50),
+        theta_for(kind),
+    )
     first = simulator.simulate(theta, run)
     twin = copied(simulator)
     np.testing.assert_array_equal(twin.simulate(theta, run), first)
@@ -356,7 +413,9 @@ def test_a_fresh_process_gives_the_same_bits():
                 simulator.simulate(theta_for(kind, 2), Scenario(np.arange(30) / 50))
                 found = simulator.simulate(np.array([THETA[system]]), scenario(system))
                 here.append(hashlib.sha256(found.tobytes()).hexdigest())
-    found = subprocess.run([sys.executable, "-c", FINGERPRINT], capture_output=True, text=True, check=True)
+    found = subprocess.run(
+        [sys.executable, "-c", FINGERPRINT], capture_output=True, text=True, check=True
+    )
     assert found.stdout.split() == here
 
 
@@ -389,7 +448,8 @@ def test_what_an_engine_cannot_carry_is_named(engine):
         system = Elsewhere
 
     with pytest.raises(
-        InputError, match=f"engine {engine} cannot carry system elsewhere: no module .*_world beside a_"
+        InputError,
+        match=f"engine {engine} cannot carry system elsewhere: no module .*_world beside a_",
     ):
         Ours(engine=engine)
     with pytest.raises(InputError, match="system slider does not bounce: leave native_contact out"):

@@ -44,15 +44,25 @@ def test_the_loaded_simulator_is_the_fitted_one_to_the_last_bit(path):
     kind = load(path, simulators.get)
     simulator = kind()
     assert [p.name for p in simulator.parameters] == ["inertia", "drag.linear", "sensor.delay"]
-    fitted = Pendulum(MODEL.constants, ["qd", "q"], engine="batch", effects=["drag.linear", "sensor.delay"])
+    fitted = Pendulum(
+        MODEL.constants, ["qd", "q"], engine="batch", effects=["drag.linear", "sensor.delay"]
+    )
     theta = np.array([[3.1e-3, 7e-4, 0.013]])
     assert [p.nominal for p in simulator.parameters] == theta[0].tolist()
-    scenario = Scenario(np.arange(90) / 60, {"q": 1.1, "qd": -0.4}, {"u": np.sin(np.arange(90) / 9)})
-    np.testing.assert_array_equal(simulator.simulate(theta, scenario), fitted.simulate(theta, scenario))
+    scenario = Scenario(
+        np.arange(90) / 60, {"q": 1.1, "qd": -0.4}, {"u": np.sin(np.arange(90) / 9)}
+    )
+    np.testing.assert_array_equal(
+        simulator.simulate(theta, scenario), fitted.simulate(theta, scenario)
+    )
     assert [c.name for c in simulator.channels] == ["qd", "q"]
     assert simulator.constant_values["mass"] == 0.2
     assert kind.says == "pendulum with drag.linear, sensor.delay, fitted to: A swing, measured"
-    assert kind({"mass": 0.3}, ["q"]).constant_values == {"mass": 0.3, "length": 0.15, "gravity": 9.7}
+    assert kind({"mass": 0.3}, ["q"]).constant_values == {
+        "mass": 0.3,
+        "length": 0.15,
+        "gravity": 9.7,
+    }
 
 
 def test_the_training_range_is_about_the_interval(path):
@@ -114,15 +124,31 @@ def test_engine_title_and_constants_may_be_left_out(path):
     ("old", "new", "message"),
     [
         ("drag.linear", "drag.cubic", "unknown effect 'drag.cubic'; there are: .*drag.linear"),
-        ("drag.linear", "wind", "system pendulum cannot have effect wind|unknown coefficient of effect wind"),
-        ("coefficient", "strength", "unknown coefficient of effect drag.linear 'strength'; there are: coefficient"),
+        (
+            "drag.linear",
+            "wind",
+            "system pendulum cannot have effect wind|unknown coefficient of effect wind",
+        ),
+        (
+            "coefficient",
+            "strength",
+            "unknown coefficient of effect drag.linear 'strength'; there are: coefficient",
+        ),
         ("inertia", "mass", "unknown parameter of system pendulum 'mass'; there are: inertia"),
         ('"pendulum"', '"pendulums"', "unknown simulator 'pendulums'; there are: .*pendulum"),
         ("3.3e-3", '"large"', "parameters.inertia.value: expected a finite number, found 'large'"),
         ("3.3e-3", "nan", "parameters.inertia.value: expected a finite number, found nan"),
         ("3.3e-3", "true", "parameters.inertia.value: expected a finite number, found True"),
-        ("value = 1e-4", "low = 1e-4", "effects.drag.linear.coefficient.value: expected a finite number, found None"),
-        ("value = 1e-4", "value = 1\nlow = inf", "coefficient.low: expected a finite number, found inf"),
+        (
+            "value = 1e-4",
+            "low = 1e-4",
+            "effects.drag.linear.coefficient.value: expected a finite number, found None",
+        ),
+        (
+            "value = 1e-4",
+            "value = 1\nlow = inf",
+            "coefficient.low: expected a finite number, found inf",
+        ),
         ('unit = "kg*m^2"', "", "unit: expected a text, found None"),
         ("format = 1", "format = 2", "expected an extended simulator with format = 1, found 2"),
         ("format = 1", "", "expected an extended simulator with format = 1, found None"),
@@ -132,15 +158,47 @@ def test_engine_title_and_constants_may_be_left_out(path):
         ('observe = ["q"]', "", r"observe: expected a list of channel names, found \[\]"),
         ('["q"]', '["z"]', "unknown channel of simulator pendulum 'z'; there are: q, qd"),
         ('["q"]', '["q", "q"]', "observe needs one or more different channels"),
-        ("format = 1", "format = 1\nspeed = 3", "unknown key of .*extended.toml 'speed'; there are: "),
-        ("format = 1", 'format = 1\nengine = "ode"', "unknown engine 'ode'; there are: batch, mujoco, pybullet"),
-        ("format = 1", "format = 1\nconstants = {weight = 2}", "unknown constant of simulator pendulum 'weight'"),
-        ("format = 1", "format = 1\nconstants = {mass = -2}", "constant 'mass' of simulator pendulum must be > 0"),
-        ("format = 1", 'format = 1\nconstants = {mass = "a"}', "constants.mass: expected a finite number, found 'a'"),
+        (
+            "format = 1",
+            "format = 1\nspeed = 3",
+            "unknown key of .*extended.toml 'speed'; there are: ",
+        ),
+        (
+            "format = 1",
+            'format = 1\nengine = "ode"',
+            "unknown engine 'ode'; there are: batch, mujoco, pybullet",
+        ),
+        (
+            "format = 1",
+            "format = 1\nconstants = {weight = 2}",
+            "unknown constant of simulator pendulum 'weight'",
+        ),
+        (
+            "format = 1",
+            "format = 1\nconstants = {mass = -2}",
+            "constant 'mass' of simulator pendulum must be > 0",
+        ),
+        (
+            "format = 1",
+            'format = 1\nconstants = {mass = "a"}',
+            "constants.mass: expected a finite number, found 'a'",
+        ),
         ("format = 1", "format = 1\nconstants = 3", "constants: expected a table, found 3"),
-        ('[effects."drag.linear".coefficient]', '[effects."drag.linear"]', "expected a table with value and unit"),
-        ('[effects."drag.linear".coefficient]', "[effects]", "value: expected a table, found 0.0001"),
-        ("[parameters.inertia]", "[parameters]", "parameters.value: expected a table with value and unit"),
+        (
+            '[effects."drag.linear".coefficient]',
+            '[effects."drag.linear"]',
+            "expected a table with value and unit",
+        ),
+        (
+            '[effects."drag.linear".coefficient]',
+            "[effects]",
+            "value: expected a table, found 0.0001",
+        ),
+        (
+            "[parameters.inertia]",
+            "[parameters]",
+            "parameters.value: expected a table with value and unit",
+        ),
         (GOOD, "", "expected an extended simulator with format = 1, found None"),
         (GOOD, "not = = toml", "not valid TOML"),
     ],
@@ -167,7 +225,10 @@ def test_as_a_plugin_it_is_registered_once_by_its_name(path, tmp_path):
     assert simulators.get("pendulum_extended").parameters[1].nominal == 7e-4
     other = tmp_path / "other.toml"
     other.write_bytes(path.read_bytes())
-    with pytest.raises(InputError, match=r"other.toml: simulator 'pendulum_extended' exists already; give it another"):
+    with pytest.raises(
+        InputError,
+        match=r"other.toml: simulator 'pendulum_extended' exists already; give it another",
+    ):
         load_plugins([other])
     with pytest.raises(InputError, match="no such file"):
         load_plugins([tmp_path / "none.toml"])
@@ -175,8 +236,14 @@ def test_as_a_plugin_it_is_registered_once_by_its_name(path, tmp_path):
 
 def test_it_makes_recordings_as_its_system_does(path):
     load_plugins([path])
-    made = make(Wish("pendulum_extended", runs=2, seconds=0.5, engine="mujoco", effects=["force.bias=1e-3"]))
-    assert made.truth["parameters"] == {"inertia": 3.1e-3, "drag.linear": 7e-4, "sensor.delay": 0.013}
+    made = make(
+        Wish("pendulum_extended", runs=2, seconds=0.5, engine="mujoco", effects=["force.bias=1e-3"])
+    )
+    assert made.truth["parameters"] == {
+        "inertia": 3.1e-3,
+        "drag.linear": 7e-4,
+        "sensor.delay": 0.013,
+    }
     assert 0.5 <= made.truth["runs"]["1"]["initial"]["q"] <= 1.5, "drawn as for any pendulum"
     assert made.recording.constants["mass"] == 0.2
     assert list(made.recording.runs[0].channels) == ["qd", "q"]
@@ -189,7 +256,8 @@ def test_an_extended_simulator_is_not_extended_again(path, tmp_path):
     twice = tmp_path / "twice.toml"
     write(replace(MODEL, name="twice", system="pendulum_extended", effects={}), twice)
     with pytest.raises(
-        InputError, match=r"twice.toml: simulator pendulum_extended is extended already; name .* pendulum"
+        InputError,
+        match=r"twice.toml: simulator pendulum_extended is extended already; name .* pendulum",
     ):
         load_plugins([twice])
 
@@ -211,7 +279,16 @@ samples = 30
 def test_compare_tunes_it_in_worker_processes(path, tmp_path, capsys):
     (tmp_path / "swing.toml").write_text(EXPERIMENT)
     out = tmp_path / "out"
-    command = ["compare", str(tmp_path / "swing.toml"), "--plugin", str(path), "--jobs", "2", "--out", str(out)]
+    command = [
+        "compare",
+        str(tmp_path / "swing.toml"),
+        "--plugin",
+        str(path),
+        "--jobs",
+        "2",
+        "--out",
+        str(out),
+    ]
     assert main(command) == 0
     rows = (out / "status.csv").read_text().splitlines()
     assert len(rows) == 2
@@ -220,5 +297,7 @@ def test_compare_tunes_it_in_worker_processes(path, tmp_path, capsys):
 
     runs = pd.read_parquet(out / "runs.parquet")
     assert list(runs.k) == [0, 1, 2, 3, 4]
-    assert {"proposal_drag.linear", "true_drag.linear", "recommendation_sensor.delay"} <= set(runs.columns)
+    assert {"proposal_drag.linear", "true_drag.linear", "recommendation_sensor.delay"} <= set(
+        runs.columns
+    )
     assert runs["true_drag.linear"].between(5.6e-4, 8.4e-4).all()

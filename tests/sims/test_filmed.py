@@ -11,13 +11,18 @@ from sims.filmed.simulator import FilmedBall
 TIMES = np.arange(60) / 60.0
 CONSTANTS = {"radius": 0.5, "gravity": 9.8}
 vision = pytest.mark.skipif(
-    not all(map(importlib.util.find_spec, ("av", "cv2"))), reason="PyAV and OpenCV are not installed: simgap[vision]"
+    not all(map(importlib.util.find_spec, ("av", "cv2"))),
+    reason="PyAV and OpenCV are not installed: simgap[vision]",
 )
 
 
 def test_row_of_a_resting_ball_is_that_of_the_pinhole():
-    """A level camera in the distance d sees the ground contact's ball h - r below its axis at focal (h - r) / d."""
-    far = FilmedBall({"radius": 0.001, "camera_distance": 20.0, "camera_height": 2.0, "pixels": 400.0})
+    """A level camera in the distance d sees the ground contact's ball h - r below its axis at focal
+    (h - r) / d.
+    """
+    far = FilmedBall(
+        {"radius": 0.001, "camera_distance": 20.0, "camera_height": 2.0, "pixels": 400.0}
+    )
     seen = far.simulate(np.array([[0.5]]), Scenario(TIMES[:1], {"z": 1.0}))[0, 0]
     focal = 200.0 / np.tan(np.radians(20.0))
     assert seen[0] == pytest.approx(1.0)
@@ -27,7 +32,9 @@ def test_row_of_a_resting_ball_is_that_of_the_pinhole():
 def test_a_ball_on_the_optical_axis_is_in_the_middle_wherever_the_camera_stands():
     for azimuth, distance, height in ((0.0, 5.0, 5.0), (2.0, 8.0, 7.0)):
         place = {"camera_azimuth": azimuth, "camera_distance": distance, "camera_height": height}
-        seen = FilmedBall(CONSTANTS).simulate(np.array([[0.5]]), Scenario(TIMES[:1], {"z": 2.0}, {}, place))
+        seen = FilmedBall(CONSTANTS).simulate(
+            np.array([[0.5]]), Scenario(TIMES[:1], {"z": 2.0}, {}, place)
+        )
         assert seen[0, 0, 1] == pytest.approx(49.5, abs=1e-9)
 
 
@@ -43,7 +50,9 @@ def test_tracked_rows_are_those_of_the_projection_within_a_pixel_and_heights_are
     there = np.isfinite(seen[:, 1])
     assert there.mean() > 0.8
     assert np.sqrt(np.mean((seen[there, 1] - true[there, 1]) ** 2)) < 1.0
-    assert np.array_equal(seen, FilmedBall(CONSTANTS, film="tracked").simulate(theta, fall)[0], equal_nan=True)
+    assert np.array_equal(
+        seen, FilmedBall(CONSTANTS, film="tracked").simulate(theta, fall)[0], equal_nan=True
+    )
 
 
 @vision

@@ -35,7 +35,9 @@ def test_instability_is_silent_and_writes_no_file(tmp_path, monkeypatch):
     mujoco.set_mju_user_warning(heard.append)
     try:
         pendulum = Pendulum(engine="mujoco", time_step=0.1, fixed={"force.bias": 1e9})
-        assert np.isnan(pendulum.simulate(np.array([[1e-3]]), Scenario(np.arange(1e4) / 10, {"qd": 1e300}))).all()
+        assert np.isnan(
+            pendulum.simulate(np.array([[1e-3]]), Scenario(np.arange(1e4) / 10, {"qd": 1e300}))
+        ).all()
         assert heard == []
         assert mujoco.get_mju_user_warning() is not None  # the user's own is back
     finally:
@@ -55,14 +57,19 @@ def test_an_interrupted_rollout_leaves_nothing_behind(monkeypatch):
 
     for kind, theta in ((Ball, [[0.7]]), (Servo, [[0.5, 4.0, 2e-3]])):
         calls.clear()
-        theta, scenario = np.array(theta), Scenario(np.arange(50) / 50, {"vx": 1.0} if kind is Ball else {"q": 1.0})
+        theta, scenario = (
+            np.array(theta),
+            Scenario(np.arange(50) / 50, {"vx": 1.0} if kind is Ball else {"q": 1.0}),
+        )
         simulator = kind(engine="mujoco", fixed={"drag.linear": 0.01})
         with monkeypatch.context() as patch:
             patch.setattr(mujoco, "mj_step", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 simulator.simulate(theta, scenario)
         fresh = kind(engine="mujoco", fixed={"drag.linear": 0.01})
-        np.testing.assert_array_equal(simulator.simulate(theta, scenario), fresh.simulate(theta, scenario))
+        np.testing.assert_array_equal(
+            simulator.simulate(theta, scenario), fresh.simulate(theta, scenario)
+        )
 
 
 @pytest.mark.parametrize("restitution", [0.1, 0.37, 0.7, 0.9, 1.0])
@@ -77,14 +84,18 @@ def test_damping_ratio_against_the_spring_and_damper_itself(restitution):
 
 
 @pytest.mark.parametrize(("restitution", "friction"), [(0.8, 0.0), (0.6, 0.1)])
-def test_soft_contact_has_the_restitution_and_friction_asked_for_as_the_step_shrinks(restitution, friction):
+def test_soft_contact_has_the_restitution_and_friction_asked_for_as_the_step_shrinks(
+    restitution, friction
+):
     start = Scenario(np.arange(40) / 100, {"z": 0.6, "vz": -2.0, "vx": 3.0})
     errors = []
     for step in (4e-4, 1e-4):
         ball = Ball({"gravity": 0.0}, ["x", "z"], engine="mujoco", native_contact=True, time_step=step,
                     fixed={"contact.friction": friction})  # fmt: skip
         velocity = np.diff(ball.simulate(np.array([[restitution]]), start)[0], axis=0)[-1] * 100
-        errors.append(np.abs(velocity - [3.0 - friction * (1 + restitution) * 2.0, 2.0 * restitution]).max())
+        errors.append(
+            np.abs(velocity - [3.0 - friction * (1 + restitution) * 2.0, 2.0 * restitution]).max()
+        )
     assert errors[0] < 0.06
     assert errors[1] < errors[0] / 3
 
@@ -106,4 +117,6 @@ def test_four_thousand_rollouts_leak_nothing(kind):
 @pytest.mark.parametrize("kind", [Ball, Pendulum])
 def test_rebuilding_worlds_leaks_nothing(kind):
     # A world takes half a megabyte; what the allocator keeps comes and goes in a few.
-    assert growth(kind, 400, 2, [{"gravity": 9.8}, {"gravity": 9.81}], engine="mujoco") < 400 * 50_000
+    assert (
+        growth(kind, 400, 2, [{"gravity": 9.8}, {"gravity": 9.81}], engine="mujoco") < 400 * 50_000
+    )

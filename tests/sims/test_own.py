@@ -35,7 +35,12 @@ class Block(OwnSimulator):
     time_step = 0.01
 
     def reset(self, theta, constants, initial):
-        self.mass, self.wind, self.state, self.extra = theta["mass"], constants["wind"], dict(initial), 0.0
+        self.mass, self.wind, self.state, self.extra = (
+            theta["mass"],
+            constants["wind"],
+            dict(initial),
+            0.0,
+        )
         self.steps = []
 
     def step(self, inputs, seconds):
@@ -56,7 +61,9 @@ class Block(OwnSimulator):
 
 
 TIMES = np.arange(51) / 50
-PUSHED = Scenario(TIMES, {"v": 1.0, "charge": 3.0}, {"push": np.where(TIMES < 0.5, 2.0, 0.0)}, {"wind": 1.0})
+PUSHED = Scenario(
+    TIMES, {"v": 1.0, "charge": 3.0}, {"push": np.where(TIMES < 0.5, 2.0, 0.0)}, {"wind": 1.0}
+)
 
 
 def test_it_is_a_simulator_like_any_other():
@@ -64,7 +71,9 @@ def test_it_is_a_simulator_like_any_other():
     seen = block.simulate(np.array([[1.0], [2.0]]), PUSHED)
     assert seen.shape == (2, 51, 3)
     assert Block.says == "A block that an input pushes along a level track, stepped exactly."
-    np.testing.assert_allclose(seen[:, -1, 0], [1 + 1.0 + 1.0, 1 + 0.5 + 0.5], rtol=1e-12)  # 0.5 s of push, 1 s of wind
+    np.testing.assert_allclose(
+        seen[:, -1, 0], [1 + 1.0 + 1.0, 1 + 0.5 + 0.5], rtol=1e-12
+    )  # 0.5 s of push, 1 s of wind
     np.testing.assert_array_equal(seen[:, :, 1], 3.0)
     np.testing.assert_allclose(seen[0, 25, 2], 0.5 + 3 * 0.125, rtol=1e-12)
     np.testing.assert_allclose(block.steps, 0.01, rtol=1e-9)
@@ -75,11 +84,17 @@ def test_it_is_a_simulator_like_any_other():
 
 def test_runs_that_miss_samples_or_fail():
     uneven = Scenario(np.array([0.0, 0.013, 0.5]), {"v": 2.0})
-    np.testing.assert_allclose(Block().simulate(np.array([[1.0]]), uneven)[0, :, 0], [0.0, 0.026, 1.0], rtol=1e-12)
-    seen = Block().simulate(np.array([[np.nan], [1.0], [0.0]]) + 1e-300, Scenario(TIMES[:2], {"v": 1.0}))
+    np.testing.assert_allclose(
+        Block().simulate(np.array([[1.0]]), uneven)[0, :, 0], [0.0, 0.026, 1.0], rtol=1e-12
+    )
+    seen = Block().simulate(
+        np.array([[np.nan], [1.0], [0.0]]) + 1e-300, Scenario(TIMES[:2], {"v": 1.0})
+    )
     assert np.isnan(seen[0]).all()
     np.testing.assert_allclose(seen[1, 1], [0.02, 1.0, 1.0])
-    assert Block().simulate(np.array([[1.0]]), Scenario(np.array([7.0]), {"x": 4.0})).tolist() == [[[4.0, 0.0, 1.0]]]
+    assert Block().simulate(np.array([[1.0]]), Scenario(np.array([7.0]), {"x": 4.0})).tolist() == [
+        [[4.0, 0.0, 1.0]]
+    ]
 
 
 def test_effects_through_the_force_hook():
@@ -87,7 +102,9 @@ def test_effects_through_the_force_hook():
     dragged = Block(fixed={"drag.linear": 3.0}, time_step=1e-3).simulate(theta, coast)[0, -1, 1]
     assert dragged == pytest.approx(math.exp(-1.5), rel=2e-3)
     slowed = Block(fixed={"friction.coulomb": 4.0}).simulate(theta, coast)[0]
-    np.testing.assert_allclose(slowed[:, 1], np.maximum(0.0, 1 - 2 * TIMES), atol=0.021)  # a step of 0.01 s
+    np.testing.assert_allclose(
+        slowed[:, 1], np.maximum(0.0, 1 - 2 * TIMES), atol=0.021
+    )  # a step of 0.01 s
     assert slowed[-1, 0] == pytest.approx(0.25, abs=0.011)
     np.testing.assert_allclose(slowed[30:, 1], 0.0, atol=1e-12, err_msg="it holds still")
 
@@ -95,7 +112,9 @@ def test_effects_through_the_force_hook():
 def test_friction_holds_against_a_constant_pull_and_lets_go_of_a_greater_one():
     held = Scenario(TIMES, {}, {}, {"wind": 1.5})
     friction = Block(fixed={"friction.coulomb": 2.0})
-    assert np.abs(friction.simulate(np.array([[2.0]]), held)[0, :, 1]).max() < 0.01, "one step of pull, then none"
+    assert np.abs(friction.simulate(np.array([[2.0]]), held)[0, :, 1]).max() < 0.01, (
+        "one step of pull, then none"
+    )
     pulled = Scenario(TIMES, {}, {}, {"wind": 6.0})
     assert friction.simulate(np.array([[2.0]]), pulled)[0, -1, 1] == pytest.approx(2.0, rel=0.02)
 
@@ -166,7 +185,9 @@ def test_faulty_declarations_are_one_line():
     with pytest.raises(InputError, match=r"observe\(\) gave no 'charge'; it gave: x, v"):
         declared(observe=lambda self: {"x": 0.0, "v": 0.0})().simulate(np.array([[1.0]]), PUSHED)
     with pytest.raises(InputError, match="the attribute 'engine' is the base class's"):
-        declared(reset=lambda self, *_: setattr(self, "engine", 1))().simulate(np.array([[1.0]]), PUSHED)
+        declared(reset=lambda self, *_: setattr(self, "engine", 1))().simulate(
+            np.array([[1.0]]), PUSHED
+        )
 
 
 def test_examples_are_short():
@@ -187,8 +208,12 @@ def test_puck_slides_as_the_closed_form_says(incline):
     seen = puck.simulate(friction, Scenario(TIMES))
     expected = 9.81 * (math.sin(incline) - friction * math.cos(incline))
     np.testing.assert_allclose(seen[:, :, 1], expected * TIMES, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(seen[:, :, 0], expected * TIMES**2 / 2, atol=0.012)  # half a step's way: Bullet's order
-    assert puck.simulate(np.array([[0.8]]), Scenario(TIMES))[0, -1, 0] < 2e-4, "steep friction holds it"
+    np.testing.assert_allclose(
+        seen[:, :, 0], expected * TIMES**2 / 2, atol=0.012
+    )  # half a step's way: Bullet's order
+    assert puck.simulate(np.array([[0.8]]), Scenario(TIMES))[0, -1, 0] < 2e-4, (
+        "steep friction holds it"
+    )
     more = example("puck", "Puck")({"incline": incline}, fixed={"friction.coulomb": 0.08})
     slower = more.simulate(friction[:2], Scenario(TIMES))
     np.testing.assert_allclose(slower[:, -1, 1], expected[:2, 0] - 0.5, atol=0.01)
@@ -198,13 +223,39 @@ def test_bob_swings_as_the_closed_form_says():
     bob = example("bob", "Bob")()
     (seen,) = bob.simulate(np.array([[20.0, 0.1]]), Scenario(TIMES))[:, :, 0]
     decay, rate = 0.25, math.sqrt(100.0 - 0.25**2)
-    expected = 0.1 * np.exp(-decay * TIMES) * (np.cos(rate * TIMES) + decay / rate * np.sin(rate * TIMES))
+    expected = (
+        0.1 * np.exp(-decay * TIMES) * (np.cos(rate * TIMES) + decay / rate * np.sin(rate * TIMES))
+    )
     np.testing.assert_allclose(seen, expected, atol=6e-4)
 
 
 @pytest.mark.slow
 def test_puck_is_compared_as_a_plugin(tmp_path, capsys):
-    arguments = ["compare", str(EXAMPLES / "puck.toml"), "--plugin", str(PUCK), "--out", str(tmp_path / "out")]
-    assert main([*arguments, "--targets", "2", "--seeds", "1", "--tuners", "least_squares", "--jobs", "1"]) == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("least_squares"))
+    arguments = [
+        "compare",
+        str(EXAMPLES / "puck.toml"),
+        "--plugin",
+        str(PUCK),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert (
+        main(
+            [
+                *arguments,
+                "--targets",
+                "2",
+                "--seeds",
+                "1",
+                "--tuners",
+                "least_squares",
+                "--jobs",
+                "1",
+            ]
+        )
+        == 0
+    )
+    line = next(
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("least_squares")
+    )
     assert float(line.split()[-2]) < 1e-3, "friction is found from a second of positions"

@@ -1,4 +1,6 @@
-"""The pendulum in Bullet and MuJoCo against closed forms, an accurate integrator, and its own used world."""
+"""The pendulum in Bullet and MuJoCo against closed forms, an accurate integrator, and its own used
+world.
+"""
 
 import numpy as np
 import pytest
@@ -23,7 +25,9 @@ def engine(request, monkeypatch):
 def swing(scenario, inertia=INERTIA, damping=0.0, constants=None, fixed=None, **settings):
     """q and qd, each (T,)."""
     fixed = {**(fixed or {}), **({"drag.linear": damping} if damping else {})}
-    return Pendulum(constants, fixed=fixed, **settings).simulate(np.array([[inertia]]), scenario)[0].T
+    return (
+        Pendulum(constants, fixed=fixed, **settings).simulate(np.array([[inertia]]), scenario)[0].T
+    )
 
 
 def exact(times, q, qd, inertia=INERTIA, damping=DAMPING, torque=lambda _: 0.0, quadratic=0.0):
@@ -76,7 +80,11 @@ def test_damped_small_swing_decays_at_the_closed_rate():
     q, _ = swing(Scenario(times, {"q": 1e-3, "qd": 0.0}), damping=damping, time_step=1e-3)
     rate = damping / (2 * INERTIA)
     omega = (OMEGA**2 - rate**2) ** 0.5
-    expected = 1e-3 * np.exp(-rate * times) * (np.cos(omega * times) + rate / omega * np.sin(omega * times))
+    expected = (
+        1e-3
+        * np.exp(-rate * times)
+        * (np.cos(omega * times) + rate / omega * np.sin(omega * times))
+    )
     np.testing.assert_allclose(q, expected, atol=3e-7)
 
 
@@ -91,13 +99,16 @@ def test_torque_step_without_gravity_is_a_parabola():
 
 def test_constant_torque_holds_where_it_balances_gravity():
     balance = WEIGHT * np.sin(0.7)
-    q, qd = swing(Scenario(np.arange(500) * 0.01, {"q": 0.7}, {"u": np.full(500, balance)}), damping=DAMPING)
+    q, qd = swing(
+        Scenario(np.arange(500) * 0.01, {"q": 0.7}, {"u": np.full(500, balance)}), damping=DAMPING
+    )
     np.testing.assert_allclose(q, 0.7, atol=1e-12)
     np.testing.assert_allclose(qd, 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("q", "qd", "tolerance"), [(0.5, 0.0, 5e-4), (-1.6, 1.8, 1e-3), (2.5, 3.0, 3e-3), (0.0, 25.0, 8e-3)]
+    ("q", "qd", "tolerance"),
+    [(0.5, 0.0, 5e-4), (-1.6, 1.8, 1e-3), (2.5, 3.0, 3e-3), (0.0, 25.0, 8e-3)],
 )
 def test_default_step_stays_near_an_accurate_integrator(q, qd, tolerance):
     times = np.arange(1000) / 200
@@ -125,26 +136,38 @@ def test_second_order_in_the_step_with_damping_and_torque(damping, torque):
     scenario = Scenario(times, {"q": 1.5, "qd": -2.0}, {"u": np.full(4, torque)})
     reference = exact(times, 1.5, -2.0, damping=damping, torque=lambda _: torque)
     steps = np.array([8e-3, 4e-3, 2e-3, 1e-3])
-    errors = np.array([np.abs(swing(scenario, damping=damping, time_step=h) - reference).max(axis=1) for h in steps])
+    errors = np.array(
+        [
+            np.abs(swing(scenario, damping=damping, time_step=h) - reference).max(axis=1)
+            for h in steps
+        ]
+    )
     for channel in (0, 1):
         assert order(steps, errors[:, channel]) == pytest.approx(2.0, abs=0.1)
 
 
-@pytest.mark.parametrize("fixed", [{"drag.quadratic": 1e-3}, {"drag.linear": 1e-3, "drag.quadratic": 1e-3}])
+@pytest.mark.parametrize(
+    "fixed", [{"drag.quadratic": 1e-3}, {"drag.linear": 1e-3, "drag.quadratic": 1e-3}]
+)
 def test_second_order_with_forces_from_outside(fixed):
     times = np.array([0.0, 0.13, 0.5, 1.0])
     scenario = Scenario(times, {"q": 1.5, "qd": -2.0}, {"u": np.full(4, 0.05)})
     known = {"damping": fixed.get("drag.linear", 0.0), "quadratic": fixed["drag.quadratic"]}
     reference = exact(times, 1.5, -2.0, torque=lambda _: 0.05, **known)
     steps = np.array([8e-3, 4e-3, 2e-3, 1e-3])
-    errors = np.array([np.abs(swing(scenario, fixed=fixed, time_step=h) - reference).max(axis=1) for h in steps])
+    errors = np.array(
+        [np.abs(swing(scenario, fixed=fixed, time_step=h) - reference).max(axis=1) for h in steps]
+    )
     for channel in (0, 1):
         assert order(steps, errors[:, channel]) == pytest.approx(2.0, abs=0.1)
 
 
 def test_damping_carried_by_the_joint_is_damping_put_in_from_outside():
-    # A second effect makes the engine ask for forces; one that is next to nothing changes nothing else.
-    scenario = Scenario(np.arange(200) / 100, {"q": 1.5}, {"u": 0.05 * np.sign(np.sin(3.0 * np.arange(200) / 100))})
+    # A second effect makes the engine ask for forces; one that is next to nothing changes nothing
+    # else.
+    scenario = Scenario(
+        np.arange(200) / 100, {"q": 1.5}, {"u": 0.05 * np.sign(np.sin(3.0 * np.arange(200) / 100))}
+    )
     carried = swing(scenario, damping=1e-3)
     known = swing(scenario, damping=1e-3, fixed={"drag.quadratic": 1e-300})
     asked = swing(scenario, damping=1e-3, fixed={"spring.linear": 1e-300})
@@ -156,7 +179,9 @@ def test_strong_damping_is_stable():
     # 2.5 ms steps against a time constant of 0.33 ms: explicit damping would blow up.
     times = np.arange(200) / 100
     q, qd = swing(Scenario(times, {"q": 1.0}), damping=10.0, fixed={"drag.quadratic": 1e-300})
-    np.testing.assert_allclose(q, 2.0 * np.arctan(np.tan(0.5) * np.exp(-WEIGHT / 10.0 * times)), atol=1e-4)
+    np.testing.assert_allclose(
+        q, 2.0 * np.arctan(np.tan(0.5) * np.exp(-WEIGHT / 10.0 * times)), atol=1e-4
+    )
     assert np.abs(qd).max() < 0.05
 
 
@@ -177,7 +202,9 @@ def test_damping_only_takes_energy():
 
 
 def test_whirling_is_not_limited():
-    q, qd = swing(Scenario(np.arange(100) * 0.01, {"q": 0.0, "qd": 300.0}), constants={"gravity": 0.0})
+    q, qd = swing(
+        Scenario(np.arange(100) * 0.01, {"q": 0.0, "qd": 300.0}), constants={"gravity": 0.0}
+    )
     np.testing.assert_allclose(qd, 300.0, rtol=1e-12)
     assert q[-1] == pytest.approx(297.0, rel=1e-12)
 
@@ -198,7 +225,9 @@ def test_impossible_inertia_gives_nan(inertia):
     assert np.isfinite(result[1]).all()
 
 
-@pytest.mark.parametrize("effects", [["drag.linear"], ["drag.linear", "friction.coulomb", "spring.linear"]])
+@pytest.mark.parametrize(
+    "effects", [["drag.linear"], ["drag.linear", "friction.coulomb", "spring.linear"]]
+)
 def test_a_used_world_gives_the_same_bits_as_a_new_one(engine, effects):
     rng = np.random.default_rng(4)
     used, new = Pendulum(effects=effects), Pendulum(effects=effects)
@@ -221,9 +250,18 @@ def test_a_used_world_gives_the_same_bits_as_a_new_one(engine, effects):
         (lambda: Pendulum({"colour": 1.0}), "unknown constant .* there are: gravity, length, mass"),
         (lambda: Pendulum({"length": -0.1}), "'length' .* must be > 0"),
         (lambda: Pendulum(observe=["angle"]), "unknown channel .* there are: q, qd"),
-        (lambda: Pendulum().simulate([[1e-3]], Scenario([0.0], {"x": 1.0})), "unknown initial .* there are: q, qd"),
-        (lambda: Pendulum().simulate([[1e-3]], Scenario([0.0], inputs={"w": [1.0]})), "unknown input .* are: u"),
-        (lambda: Pendulum().simulate([[1e-3]], Scenario([0.0], inputs={"u": [np.nan]})), "'u' .* must be finite"),
+        (
+            lambda: Pendulum().simulate([[1e-3]], Scenario([0.0], {"x": 1.0})),
+            "unknown initial .* there are: q, qd",
+        ),
+        (
+            lambda: Pendulum().simulate([[1e-3]], Scenario([0.0], inputs={"w": [1.0]})),
+            "unknown input .* are: u",
+        ),
+        (
+            lambda: Pendulum().simulate([[1e-3]], Scenario([0.0], inputs={"u": [np.nan]})),
+            "'u' .* must be finite",
+        ),
     ],
 )
 def test_errors_list_the_names(refused, says):

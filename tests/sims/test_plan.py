@@ -1,4 +1,6 @@
-"""When lanes step, what they are sampled at, and what their plants feel: against numbers worked out by hand."""
+"""When lanes step, what they are sampled at, and what their plants feel: against numbers worked out
+by hand.
+"""
 
 import numpy as np
 import pytest
@@ -57,7 +59,9 @@ def test_effects_on_time_move_the_instants_of_their_lanes_only():
     kept = np.concatenate([np.zeros((3, 1)), plan.ends[:, plan.every - 1 :: plan.every]], axis=1)
     sampled = np.take_along_axis(kept, plan.rows, axis=1)
     np.testing.assert_allclose(
-        sampled, [[0, 0, 0.005, 0.015], [0, 0.01, 0.02, 0.03], [0.005, 0.015, 0.025, 0.035]], atol=1e-15
+        sampled,
+        [[0, 0, 0.005, 0.015], [0, 0.01, 0.02, 0.03], [0.005, 0.015, 0.025, 0.035]],
+        atol=1e-15,
     )
     skewed = planned(times, acting=((Skew(), coefficients(0.5)),))
     np.testing.assert_allclose(skewed.ends[0, -1], 0.045, rtol=1e-12)
@@ -65,10 +69,14 @@ def test_effects_on_time_move_the_instants_of_their_lanes_only():
 
 
 def test_a_delayed_command_changes_between_steps():
-    runs = make_runs([Scenario(np.array([0.0, 0.01, 0.02, 0.03]), {}, {"u": [1.0, 3.0, 3.0, 3.0]})] * 2)
+    runs = make_runs(
+        [Scenario(np.array([0.0, 0.01, 0.02, 0.03]), {}, {"u": [1.0, 3.0, 3.0, 3.0]})] * 2
+    )
     commands, delay = [dict(runs.distinct[0].inputs)], ((Delay(), coefficients(0.004, 0.0)),)
     plan = make_plan(runs, commands, delay, 0.01)
-    np.testing.assert_allclose(plan.steps, [[0.01, 0.004, 0.006, 0.01], [0.01, 0.01, 0.01, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(
+        plan.steps, [[0.01, 0.004, 0.006, 0.01], [0.01, 0.01, 0.01, 0.0]], atol=1e-15
+    )
     assert plan.rows.tolist() == [[0, 1, 3, 4], [0, 1, 2, 3]]
     felt = felt_inputs(plan, runs, commands, delay)["u"]
     np.testing.assert_allclose(felt, [[1, 1, 3, 3], [1, 3, 3, 3]], rtol=1e-12)
@@ -108,7 +116,9 @@ def test_input_effects_act_in_order_on_the_first_input_and_where_they_are_on():
 def test_waiting_feels_nothing_new():
     runs = make_runs([Scenario(np.array([0.0, 0.01, 0.02]), {}, {"u": [0.0, 1.0, 0.0]})])
     commands, play = [dict(runs.distinct[0].inputs)], ((Backlash(), coefficients(0.2)),)
-    steps = np.array([[0.01, 0.0, 0.01, 0.0]])  # at the second step the command is 1 already, at the fourth 0 again
+    steps = np.array(
+        [[0.01, 0.0, 0.01, 0.0]]
+    )  # at the second step the command is 1 already, at the fourth 0 again
     plan = Plan(steps, np.cumsum(steps, axis=1), 1, np.array([[0, 2, 4]]))
     felt = felt_inputs(plan, runs, commands, play)["u"]
     np.testing.assert_allclose(felt, [[0.0, 0.0, 0.9, 0.9]], atol=1e-15)
@@ -117,7 +127,11 @@ def test_waiting_feels_nothing_new():
 def test_scenarios_with_the_same_content_are_one_run():
     t = np.arange(5) / 10
     runs = make_runs(
-        [Scenario(t, {}, {"u": t}), Scenario(t, {"x": 1.0}, {"u": t.copy()}), Scenario(t, {}, {"u": 2 * t})]
+        [
+            Scenario(t, {}, {"u": t}),
+            Scenario(t, {"x": 1.0}, {"u": t.copy()}),
+            Scenario(t, {}, {"u": 2 * t}),
+        ]
     )
     assert len(runs.distinct) == 2
     assert runs.of.tolist() == [0, 0, 1]
@@ -141,7 +155,10 @@ def test_initial_states_may_be_given_lane_by_lane():
 
 
 def test_a_wrong_shape_is_refused():
-    slider, scenario = Slider(engine="batch", effects=["drag.linear"]), Scenario(np.array([0.0, 0.5]))
+    slider, scenario = (
+        Slider(engine="batch", effects=["drag.linear"]),
+        Scenario(np.array([0.0, 0.5])),
+    )
     with pytest.raises(InputError, match=r"theta must have shape \(2, 2\), found \(2, 1\)"):
         slider.simulate_lanes(np.ones((2, 1)), [scenario] * 2)
 
@@ -154,5 +171,7 @@ def test_sensor_effects_act_on_samples_and_filters_on_every_step():
     np.testing.assert_allclose(seen[:, 0], 1.5 * (2.0 + np.maximum(t - 0.25, 0.0)), rtol=1e-12)
     assert seen[:, 1].tolist() == [1.0] * 6
     lag = 0.05
-    seen = Slider(engine="batch", fixed={"sensor.lag": lag}).simulate(np.ones((1, 1)), Scenario(t, {"v": 1.0}))[0]
+    seen = Slider(engine="batch", fixed={"sensor.lag": lag}).simulate(
+        np.ones((1, 1)), Scenario(t, {"v": 1.0})
+    )[0]
     np.testing.assert_allclose(seen[:, 0], t - lag * (1.0 - np.exp(-t / lag)), atol=1e-13)

@@ -1,4 +1,6 @@
-"""The bounce shot: closed forms without air, the planner against them, the world against an independent integrator."""
+"""The bounce shot: closed forms without air, the planner against them, the world against an
+independent integrator.
+"""
 
 import math
 from dataclasses import replace
@@ -20,10 +22,14 @@ FINE = 1e-5  # the hoop's plane is met on a chord of 1/240 s, which sags by g / 
 
 
 def launch(height, restitution=E, kept=1.0, angle=ANGLE):
-    """Velocity (vx, vz) after a fall from `height`: normal speed times -e, tangential speed times `kept`."""
+    """Velocity (vx, vz) after a fall from `height`: normal speed times -e, tangential speed times
+    `kept`.
+    """
     v = math.sqrt(2 * GRAVITY * height)
     away, along = restitution * v * math.cos(angle), kept * v * math.sin(angle)
-    return along * math.cos(angle) + away * math.sin(angle), away * math.cos(angle) - along * math.sin(angle)
+    return along * math.cos(angle) + away * math.sin(angle), away * math.cos(
+        angle
+    ) - along * math.sin(angle)
 
 
 def landing(height, drop, kept=1.0, restitution=E):
@@ -44,8 +50,12 @@ def test_drop_without_friction_leaves_the_incline_as_in_closed_form():
     fall = math.sqrt(2 * 1.2 / GRAVITY)
     t = times[times > fall + 1e-9] - fall
     vx, vz = launch(1.2)
-    expected = np.stack([vx * t, 0 * t, RADIUS / math.cos(ANGLE) + vz * t - GRAVITY / 2 * t**2], axis=1)
-    ahead = expected[:, 2] > -expected[:, 0] * math.tan(ANGLE) + RADIUS / math.cos(ANGLE)  # still in the air
+    expected = np.stack(
+        [vx * t, 0 * t, RADIUS / math.cos(ANGLE) + vz * t - GRAVITY / 2 * t**2], axis=1
+    )
+    ahead = expected[:, 2] > -expected[:, 0] * math.tan(ANGLE) + RADIUS / math.cos(
+        ANGLE
+    )  # still in the air
     assert ahead.sum() > 300
     np.testing.assert_allclose(seen[times > fall + 1e-9][ahead], expected[ahead], atol=1e-9)
     assert seen[0].tolist() == [0.0, 0.0, pytest.approx(1.2 + RADIUS / math.cos(ANGLE))]
@@ -116,7 +126,9 @@ def test_hoop_out_of_reach_is_a_plan_that_expects_to_miss_and_dead_ball_none():
     found = plan(BounceShot(), np.array([E]), far, KNOWN, HEIGHTS)
     assert found.found
     assert found.height == pytest.approx(3.0, abs=1e-9)
-    assert found.margin == pytest.approx(0.15 - (9.0 - landing(3.0, 0.1 + RADIUS / math.cos(ANGLE))), abs=1e-3)
+    assert found.margin == pytest.approx(
+        0.15 - (9.0 - landing(3.0, 0.1 + RADIUS / math.cos(ANGLE))), abs=1e-3
+    )
     dead = plan(BounceShot(), np.array([0.0]), Scene(ANGLE, 1.0, 0.2, 0.15), KNOWN, HEIGHTS)
     assert not dead.found
     assert math.isnan(dead.margin)
@@ -130,10 +142,14 @@ def test_where_a_path_comes_through_the_hoop_counts_after_its_bounce():
     low = [(0, 0, 1), (0, 0, 0.2), (0.4, 0, 0.45), (0.8, 0, 0.4), (1.0, 0, 0.3)]
     where = crossings(np.array([falls, low], dtype=float), scene)
     twice = [(0, 0, 1), (0, 0, 0.2), (0.4, 0, 0.8), (0.6, 0, 0.55), (0.9, 0, 0.7), (1.0, 0, 0.3)]
-    assert np.isnan(crossings(np.array([twice], dtype=float), scene)).all()  # it struck something before the hoop
+    assert np.isnan(
+        crossings(np.array([twice], dtype=float), scene)
+    ).all()  # it struck something before the hoop
     np.testing.assert_allclose(where[0], [0.9, 0.09])
     assert np.isnan(where[1]).all()
-    assert margins(np.array([falls], dtype=float), scene)[0] == pytest.approx(0.2 - math.hypot(0.1, 0.09))
+    assert margins(np.array([falls], dtype=float), scene)[0] == pytest.approx(
+        0.2 - math.hypot(0.1, 0.09)
+    )
 
 
 def drag_of(ball):
@@ -145,7 +161,12 @@ def test_world_falls_as_scipy_integrates():
     times = np.arange(0, 0.6, 1 / 60)
     c = drag_of(ball)
     exact = solve_ivp(
-        lambda _, y: [y[1], -GRAVITY - c * abs(y[1]) * y[1]], (0, 0.6), [3, 0], t_eval=times, rtol=1e-10, atol=1e-12
+        lambda _, y: [y[1], -GRAVITY - c * abs(y[1]) * y[1]],
+        (0, 0.6),
+        [3, 0],
+        t_eval=times,
+        rtol=1e-10,
+        atol=1e-12,
     )
     seen = fly(ball, Ground(), (0.0, 0.0, 3.0), times)
     assert (3 - exact.y[0]).max() < 1.75 - 0.03  # a fall without air: 1.766 m
@@ -154,7 +175,9 @@ def test_world_falls_as_scipy_integrates():
 
 @pytest.mark.parametrize("restitution", [0.4, 0.75, 0.95])
 def test_world_gives_the_restitution_asked_for(restitution):
-    """Height of the first bounce without air; contact at a distance of about v CONTACT / pi in the ground counts."""
+    """Height of the first bounce without air; contact at a distance of about v CONTACT / pi in the
+    ground counts.
+    """
     ball = replace(BALLS["tennis"], restitution=restitution, exponent=0.0)
     times = np.arange(0, 1.2, 1e-3)
     z = fly(ball, Ground(), (0, 0, 1.0 + ball.radius), times, air=0.0)[:, 2] - ball.radius
@@ -173,9 +196,13 @@ def test_world_restitution_falls_with_speed_as_its_exponent_says():
     for height in (0.3, 1.5):
         z = fly(ball, Ground(), (0, 0, height + ball.radius), times, air=0.0)[:, 2] - ball.radius
         fall = math.sqrt(2 * height / GRAVITY)
-        rebounds.append(math.sqrt(z[(times > fall + CONTACT) & (times < fall * 2.8)].max() / height))
+        rebounds.append(
+            math.sqrt(z[(times > fall + CONTACT) & (times < fall * 2.8)].max() / height)
+        )
     assert rebounds[0] / rebounds[1] == pytest.approx((1.5 / 0.3) ** 0.1, abs=0.01)
-    assert rebounds[1] == pytest.approx(0.8 * (math.sqrt(2 * GRAVITY * 1.5) / 4.0) ** -0.2, abs=0.005)
+    assert rebounds[1] == pytest.approx(
+        0.8 * (math.sqrt(2 * GRAVITY * 1.5) / 4.0) ** -0.2, abs=0.005
+    )
 
 
 def test_damping_ratio_inverts_the_restitution_of_a_contact_that_ends_with_its_force():
@@ -188,12 +215,19 @@ def test_damping_ratio_inverts_the_restitution_of_a_contact_that_ends_with_its_f
 
         ends.terminal, ends.direction = True, -1
         contact = solve_ivp(
-            lambda t, y, ends=ends: [y[1], ends(t, y)], (0, 50), [0, -1.0], events=ends, rtol=1e-10, atol=1e-12
+            lambda t, y, ends=ends: [y[1], ends(t, y)],
+            (0, 50),
+            [0, -1.0],
+            events=ends,
+            rtol=1e-10,
+            atol=1e-12,
         )
         assert contact.y[1, -1] == pytest.approx(restitution, abs=1e-6)
 
 
-@pytest.mark.parametrize(("friction", "inertia", "kept"), [(0.0, 0.4, 1.0), (0.5, 0.4, 5 / 7), (0.5, 2 / 3, 3 / 5)])
+@pytest.mark.parametrize(
+    ("friction", "inertia", "kept"), [(0.0, 0.4, 1.0), (0.5, 0.4, 5 / 7), (0.5, 2 / 3, 3 / 5)]
+)
 def test_world_bounces_off_the_incline_as_an_impact_would(friction, inertia, kept):
     ball = replace(BALLS["golf"], restitution=E, exponent=0.0, inertia_ratio=inertia)
     height, touching = 1.2, ball.radius / math.cos(ANGLE)
@@ -201,12 +235,16 @@ def test_world_bounces_off_the_incline_as_an_impact_would(friction, inertia, kep
     seen = fly(ball, Ground(ANGLE, friction), (0, 0, height + touching), times, air=0.0)
     place = crossings(seen[None], Scene(ANGLE, 1.0, touching, 0.2))[0]
     vx, vz = launch(height, kept=kept)
-    assert place[0] == pytest.approx(2 * vx * vz / GRAVITY, rel=0.012)  # the impact takes 3 ms, 1.5 cm at 5 m/s
+    assert place[0] == pytest.approx(
+        2 * vx * vz / GRAVITY, rel=0.012
+    )  # the impact takes 3 ms, 1.5 cm at 5 m/s
     assert place[1] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_world_spin_bends_the_path_downward_as_lift_of_topspin():
-    """Gripping topspin takes w = v_t / r; its lift, integrated by scipy from the launch, shortens the flight."""
+    """Gripping topspin takes w = v_t / r; its lift, integrated by scipy from the launch, shortens
+    the flight.
+    """
     ball = replace(BALLS["table-tennis"], restitution=E, exponent=0.0)
     touching = ball.radius / math.cos(ANGLE)
     times, scene = np.arange(0, 1.6, 1 / 240), Scene(ANGLE, 1.0, touching, 0.2)
@@ -232,7 +270,11 @@ def test_world_spin_bends_the_path_downward_as_lift_of_topspin():
 
 
 def test_every_ball_states_its_source_and_bounces_within_the_heights_of_its_rules():
-    rules = {"table-tennis": (0.305, 0.240, 0.260), "tennis": (2.54, 1.35, 1.47), "basketball": (1.8, 0.96, 1.16)}
+    rules = {
+        "table-tennis": (0.305, 0.240, 0.260),
+        "tennis": (2.54, 1.35, 1.47),
+        "basketball": (1.8, 0.96, 1.16),
+    }
     for name, (drop, low, high) in rules.items():
         ball = ball_named(name)
         assert low <= ball.restitution**2 * drop <= high

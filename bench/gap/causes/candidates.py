@@ -1,8 +1,9 @@
-"""What to try of each effect: directions in which it would change the trajectories, and where a fit of it may begin.
+"""What to try of each effect: directions in which it would change the trajectories, and where a fit
+of it may begin.
 
-An effect's coefficients scale it (a drag), shape it (a period), or modify it (the speed of a wind without which there
-is drag in still air). Those that scale give a direction each; those that shape or modify are laid on a grid, since a
-trajectory says nothing of them while the effect is off.
+An effect's coefficients scale it (a drag), shape it (a period), or modify it (the speed of a wind
+without which there is drag in still air). Those that scale give a direction each; those that shape
+or modify are laid on a grid, since a trajectory says nothing of them while the effect is off.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ LEVELS = (0.15, 0.35, 0.6, 0.85, 0.95, 0.99)
 NOTHING = 1e-11
 """Share of the largest observation below which a change is rounding."""
 SHAPES, FREQUENCIES, SPREAD = 12, 96, 1.5
-"""Sizes tried of a shape, frequencies at most, and how much closer slow ones lie than fast ones, as a power."""
+"""Sizes tried of a shape, frequencies at most, and how much closer slow ones lie than fast ones, as
+a power.
+"""
 MODIFIED = (-0.7, -0.25, 0.0, 0.25, 0.7)
 
 
@@ -54,7 +57,9 @@ class Probe:
 
 @dataclass(frozen=True)
 class Directions:
-    """Probes and what they change: (R, T, C, K), in units of the coefficient that scales, or of the whole change."""
+    """Probes and what they change: (R, T, C, K), in units of the coefficient that scales, or of the
+    whole change.
+    """
 
     probes: tuple[Probe, ...]
     values: Array
@@ -95,7 +100,10 @@ def _first(world: World, name: str) -> Iterator[Probe]:
             yield Probe(name, group, place, c, p.bounds[0] < 0)
         group += 1
     if world.effects[name].coefficients[0].of == "input" and parameters[0].bounds[0] == 0:
-        largest = max(float(np.abs(next(iter(t.scenario.inputs.values()), np.zeros(1))).max()) for t in world.tracks)
+        largest = max(
+            float(np.abs(next(iter(t.scenario.inputs.values()), np.zeros(1))).max())
+            for t in world.tracks
+        )
         for level in LEVELS:
             if largest > 0:
                 yield Probe(name, group, 0, np.array([level * largest]), False, True)
@@ -112,7 +120,9 @@ def _grid(world: World, parameter: Parameter) -> Array:
 
 
 def neighbours(world: World, fit: Fit) -> Iterator[Start]:
-    """The model with what repeats in it a little faster or slower: least squares stops at the nearest such minimum."""
+    """The model with what repeats in it a little faster or slower: least squares stops at the
+    nearest such minimum.
+    """
     for name in fit.effects:
         for place in range(*world.slots[name].indices(len(world.parameters))):
             parameter, value = world.parameters[place], float(fit.theta[place])
@@ -120,7 +130,9 @@ def neighbours(world: World, fit: Fit) -> Iterator[Start]:
                 if parameter.unit == "Hz":
                     moved = value + cycles / world.longest
                 elif parameter.name.endswith(".period") and world.travel > 0 and value > 0:
-                    moved = 1.0 / max(1.0 / value + cycles / world.travel, 1.0 / parameter.bounds[1])
+                    moved = 1.0 / max(
+                        1.0 / value + cycles / world.travel, 1.0 / parameter.bounds[1]
+                    )
                 else:
                     break
                 theta = fit.theta.copy()
@@ -139,12 +151,16 @@ def _moving(world: World, probes: Sequence[Probe], values: Array) -> Mask:
     """(K,) which probes change more than rounding does."""
     sizes = np.array([1.0 if p.fixed else p.c[p.place] for p in probes])
     changes = np.abs(values).max(axis=(0, 1), initial=0.0) * np.abs(sizes)
-    moving: Mask = (changes > NOTHING * np.nanmax(np.abs(world.observed), axis=(0, 1))[:, None]).any(axis=0)
+    moving: Mask = (
+        changes > NOTHING * np.nanmax(np.abs(world.observed), axis=(0, 1))[:, None]
+    ).any(axis=0)
     return moving
 
 
 def _modified(world: World, probes: Sequence[Probe], moves: Mask) -> Iterator[Probe]:
-    """Grid points of coefficients that change nothing by themselves but belong to an effect that acts."""
+    """Grid points of coefficients that change nothing by themselves but belong to an effect that
+    acts.
+    """
     acting = {p.effect for p, m in zip(probes, moves, strict=True) if m}
     idle: dict[str, list[Probe]] = {}
     for p, m in zip(probes, moves, strict=True):
@@ -162,7 +178,9 @@ def _modified(world: World, probes: Sequence[Probe], moves: Mask) -> Iterator[Pr
 
 
 def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
-    """(R, T, C, K): the change that each probe makes, per unit of its coefficient, or as it is where that is fixed."""
+    """(R, T, C, K): the change that each probe makes, per unit of its coefficient, or as it is
+    where that is fixed.
+    """
     changed = simulate_with(world, at, [(p.effect, p.c) for p in probes])
     values = np.nan_to_num(np.moveaxis(changed - at.simulated, 0, -1))
     sizes = np.array([1.0 if p.fixed else p.c[p.place] for p in probes])
@@ -171,12 +189,16 @@ def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
 
 
 def simulate_with(world: World, at: Fit, added: Sequence[tuple[str, Array]]) -> Array:
-    """(K, R, T, C): the fitted model's runs with one more effect, for each of K effects with their coefficients."""
+    """(K, R, T, C): the fitted model's runs with one more effect, for each of K effects with their
+    coefficients.
+    """
     runs = len(world.tracks)
     theta = np.tile(at.theta, (len(added), 1))
     for row, (name, c) in zip(theta, added, strict=True):
         row[world.slots[name]] = c
     seen = world.simulate(
-        np.repeat(theta, runs, axis=0), np.tile(np.arange(runs), len(added)), np.tile(at.states, (len(added), 1))
+        np.repeat(theta, runs, axis=0),
+        np.tile(np.arange(runs), len(added)),
+        np.tile(at.states, (len(added), 1)),
     )
     return seen.reshape(len(added), runs, *seen.shape[1:])

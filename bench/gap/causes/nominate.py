@@ -1,4 +1,6 @@
-"""Where fits of a model with one more effect begin: the effects that score well, at the sizes that their scores say."""
+"""Where fits of a model with one more effect begin: the effects that score well, at the sizes that
+their scores say.
+"""
 
 from __future__ import annotations
 
@@ -17,27 +19,40 @@ from bench.gap.model.world import World
 from methods.base import Array
 
 WHITE = 3
-"""So many of the best by sum of squares alone are refitted besides: far from the data, noise that remembers explains
-almost anything."""
+"""So many of the best by sum of squares alone are refitted besides: far from the data, noise that
+remembers explains almost anything."""
 PROMISING = 0.25
 """Candidates are refitted that promise at least this share of the best one's score."""
 
 
 def nominated(
-    world: World, noise: Noise, model: Model, found: Directions, scores: Scores, most: int, patient: bool
+    world: World,
+    noise: Noise,
+    model: Model,
+    found: Directions,
+    scores: Scores,
+    most: int,
+    patient: bool,
 ) -> list[Start]:
-    """Where to begin with the most promising candidates, at what scores say and at less; with all in patience."""
+    """Where to begin with the most promising candidates, at what scores say and at less; with all
+    in patience.
+    """
     promise = scores.score - scores.chance
     order = np.argsort(-promise, kind="stable")
     chosen = [i for i in order if patient or promise[i] >= PROMISING * promise[order[0]]]
     if not patient:
-        near = [i for i in np.argsort(-scores.white, kind="stable")[:WHITE] if i not in chosen[:most]]
+        near = [
+            i for i in np.argsort(-scores.white, kind="stable")[:WHITE] if i not in chosen[:most]
+        ]
         chosen = chosen[:most] + near
     result = []
     for i in chosen:
         name = scores.effects[i]
         for peak, (group, scored) in enumerate(scores.peaks[i]):
-            result += [(peak, _with(world, model, name, c)) for c in _sizes(world, found, group, scored, name)]
+            result += [
+                (peak, _with(world, model, name, c))
+                for c in _sizes(world, found, group, scored, name)
+            ]
     return _nearest(world, noise, result, HORIZONS[0][0] if patient else 1.0)
 
 
@@ -50,8 +65,12 @@ def _with(world: World, model: Model, name: str, c: Array) -> Start:
     return Start((*(n for n in model.names if n not in held), name), theta, model.fit.states)
 
 
-def _sizes(world: World, found: Directions, group: Group, scored: Array, name: str) -> Iterator[Array]:
-    """Coefficients to begin with: as scored, less, and at shares of the plausible range where one scales it."""
+def _sizes(
+    world: World, found: Directions, group: Group, scored: Array, name: str
+) -> Iterator[Array]:
+    """Coefficients to begin with: as scored, less, and at shares of the plausible range where one
+    scales it.
+    """
     bounds = coefficient_bounds(world, name)
     first = found.probes[group.columns[0]]
     if first.fixed:
@@ -71,8 +90,12 @@ def _sizes(world: World, found: Directions, group: Group, scored: Array, name: s
             yield c
 
 
-def _nearest(world: World, noise: Noise, numbered: Sequence[tuple[int, Start]], share: float) -> list[Start]:
-    """Of starts of one number and the same effects the one nearest to the data over the first share of the runs."""
+def _nearest(
+    world: World, noise: Noise, numbered: Sequence[tuple[int, Start]], share: float
+) -> list[Start]:
+    """Of starts of one number and the same effects the one nearest to the data over the first share
+    of the runs.
+    """
     if not numbered:
         return []
     starts = [start for _, start in numbered]

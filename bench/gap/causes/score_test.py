@@ -1,10 +1,13 @@
-"""How much each candidate would explain: a score test in trajectory space, calibrated over the whole library.
+"""How much each candidate would explain: a score test in trajectory space, calibrated over the
+whole library.
 
-What an effect changes is compared with the residual after taking out of both what the fitted parameters and initial
-states can absorb (a Lagrange multiplier test; C. R. Rao 1948, doi:10.1017/S0305004100023987; R. F. Engle, Handbook of
-Econometrics II, chapter 13). The score is twice the gain in log likelihood, each hypothesis with the correlation of
-noise that suits it best, so that noise that remembers is no cause. What the best of a whole library reaches by chance
-is found by doing the same to surrogate residuals (max-statistic calibration; P. H. Westfall, S. S. Young 1993).
+What an effect changes is compared with the residual after taking out of both what the fitted
+parameters and initial states can absorb (a Lagrange multiplier test; C. R. Rao 1948,
+doi:10.1017/S0305004100023987; R. F. Engle, Handbook of Econometrics II, chapter 13). The score is
+twice the gain in log likelihood, each hypothesis with the correlation of noise that suits it best,
+so that noise that remembers is no cause. What the best of a whole library reaches by chance is
+found by doing the same to surrogate residuals (max-statistic calibration; P. H. Westfall, S. S.
+Young 1993).
 """
 
 from __future__ import annotations
@@ -24,7 +27,9 @@ from methods.base import Array
 SMALL = 4
 """Groups of more columns are taken as they are, without a choice of columns."""
 ABSORBED = 1e-12
-"""Of a direction's sum of squares less than this share is left where the model's own freedom absorbs it."""
+"""Of a direction's sum of squares less than this share is left where the model's own freedom
+absorbs it.
+"""
 MANY, PEAKS = 12, 3
 """An effect with more shapes than the first is begun from so many of them."""
 RANK = 1e-9
@@ -51,9 +56,11 @@ class Scores:
         effects: names, the highest score first.
         score: twice the gain in log likelihood of each.
         chance: its 90 % quantile over surrogates (0 without them).
-        peaks: of each its best group with the coefficients of its columns, in units of the directions; behind it, where
-            an effect has shapes by the dozen, further ones that are better than their neighbours.
-        p_value: probability that the highest score of a library, less its chance, is reached with nothing missing.
+        peaks: of each its best group with the coefficients of its columns, in units of the
+            directions; behind it, where an effect has shapes by the dozen, further ones that are
+            better than their neighbours.
+        p_value: probability that the highest score of a library, less its chance, is reached with
+            nothing missing.
         phi: correlation of the noise under the best hypothesis.
         by_chance: (E, S) scores of the surrogates, less their chance.
         white: (E,) scores if noise does not remember.
@@ -70,13 +77,17 @@ class Scores:
 
 
 class Products:
-    """Inner products of residuals and directions after all that the model's own freedom absorbs is taken out.
+    """Inner products of residuals and directions after all that the model's own freedom absorbs is
+    taken out.
 
-    Whitening by a correlation phi mixes products of samples with themselves and with those before them, so that one
-    pass over the samples serves every phi. All are computed run by run, since initial states are a run's own.
+    Whitening by a correlation phi mixes products of samples with themselves and with those before
+    them, so that one pass over the samples serves every phi. All are computed run by run, since
+    initial states are a run's own.
     """
 
-    def __init__(self, at: Fit, residuals: Array, directions: Array, seen: Mask, sigma: Array) -> None:
+    def __init__(
+        self, at: Fit, residuals: Array, directions: Array, seen: Mask, sigma: Array
+    ) -> None:
         self._own, self._states = at.free.size, at.jacobian.shape[3] - at.free.size
         self._directions, self._runs = directions.shape[3], []
         follows = np.zeros_like(seen)
@@ -92,8 +103,10 @@ class Products:
         total: Array = np.zeros(())
         normal, cross, whole = total, total, total
         for squares, products, mixed in self._runs:
-            n, c, t = (part[0] + (part[1] - phi * part[2] + phi * phi * part[3]) / (1.0 - phi * phi) for part in
-                       (products, mixed, squares))  # fmt: skip
+            n, c, t = (
+                part[0] + (part[1] - phi * part[2] + phi * phi * part[3]) / (1.0 - phi * phi)
+                for part in (products, mixed, squares)
+            )
             own = slice(q, q + s)
             whole = whole + np.diagonal(n)[q + s :]
             rest = np.r_[0:q, q + s : len(n)]
@@ -114,19 +127,26 @@ Parts = tuple[Array, Array, Array, Array]
 
 
 def _laid(left: Array, right: Array, seen: Mask, follows: Mask) -> tuple[Parts, Parts, Parts]:
-    """Products of samples without a forerunner, of those with one, of both with each other, and of the forerunners."""
+    """Products of samples without a forerunner, of those with one, of both with each other, and of
+    the forerunners.
+    """
     here, later = seen & ~follows, follows[1:]
     first, second = (_rows(part, here) for part in (left, right))
     now, then = ((_rows(part[1:], later), _rows(part[:-1], later)) for part in (left, right))
     mixed = now[0].T @ now[1]
     products = (first.T @ first, now[0].T @ now[0], mixed + mixed.T, now[1].T @ now[1])
     cross = (
-        first.T @ second, now[0].T @ then[0], now[0].T @ then[1] + now[1].T @ then[0], now[1].T @ then[1]
-    )  # fmt: skip
+        first.T @ second,
+        now[0].T @ then[0],
+        now[0].T @ then[1] + now[1].T @ then[0],
+        now[1].T @ then[1],
+    )
     squares = (
-        np.square(second).sum(axis=0), np.square(then[0]).sum(axis=0),
-        2.0 * (then[0] * then[1]).sum(axis=0), np.square(then[1]).sum(axis=0),
-    )  # fmt: skip
+        np.square(second).sum(axis=0),
+        np.square(then[0]).sum(axis=0),
+        2.0 * (then[0] * then[1]).sum(axis=0),
+        np.square(then[1]).sum(axis=0),
+    )
     return squares, products, cross
 
 
@@ -159,7 +179,8 @@ def groups(directions: Directions) -> list[Group]:
 
 
 def explained(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
-    """Sum of squares (S,) that a group explains, and its coefficients (k, S): the best choice of its columns.
+    """Sum of squares (S,) that a group explains, and its coefficients (k, S): the best choice of
+    its columns.
 
     Coefficients that must not be negative are held at zero where they would be.
     """
@@ -203,7 +224,12 @@ def _jointly(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
 
 
 def score(
-    at: Fit, residual: Array, directions: Directions, seen: Mask, noise: Noise, surrogate: Array | None = None
+    at: Fit,
+    residual: Array,
+    directions: Directions,
+    seen: Mask,
+    noise: Noise,
+    surrogate: Array | None = None,
 ) -> Scores:
     """Score every effect that has directions.
 
@@ -223,8 +249,9 @@ def score(
     count, shape = int(seen.sum()), (len(names), everything.shape[3])
     nothing, white = np.full(shape[1], -np.inf), np.zeros(len(names))
     best = np.full(shape, -np.inf)
-    which: dict[str, list[_Found]] = {n: [_Found(-np.inf, g, np.zeros(0), 0.0) for g in members if g.effect == n]
-                                      for n in names}  # fmt: skip
+    which: dict[str, list[_Found]] = {
+        n: [_Found(-np.inf, g, np.zeros(0), 0.0) for g in members if g.effect == n] for n in names
+    }
     products = Products(at, everything, directions.values, seen, noise.sigma)
     for phi in GRID:
         total, gram, cross = products.projected(phi)
@@ -239,12 +266,17 @@ def score(
                     which[name][i] = _Found(float(value[0]), found.group, c[:, 0], phi)
                 best[row] = np.maximum(best[row], value)
                 if phi == 0:
-                    white[row] = max(white[row], count * float(np.log(total[0] / max(total[0] - gain[0], floor[0]))))
+                    white[row] = max(
+                        white[row],
+                        count * float(np.log(total[0] / max(total[0] - gain[0], floor[0]))),
+                    )
     return _ranked(names, best - nothing, which, white)
 
 
 class _Found(NamedTuple):
-    """The likeliest hypothesis about a group: twice its log likelihood, coefficients, correlation of the noise."""
+    """The likeliest hypothesis about a group: twice its log likelihood, coefficients, correlation
+    of the noise.
+    """
 
     value: float
     group: Group
@@ -256,12 +288,18 @@ def _peaks(found: Sequence[_Found]) -> tuple[Peak, ...]:
     """The best, and of a dozen and more the next that are better than their neighbours."""
     values = np.array([f.value for f in found])
     around = np.concatenate([[-np.inf], values, [-np.inf]])
-    local = (values >= around[:-2]) & (values >= around[2:]) if len(found) > MANY else values == values.max()
+    local = (
+        (values >= around[:-2]) & (values >= around[2:])
+        if len(found) > MANY
+        else values == values.max()
+    )
     order = [i for i in np.argsort(-values, kind="stable") if local[i]]
     return tuple((found[i].group, found[i].c) for i in order[: PEAKS if len(found) > MANY else 1])
 
 
-def _ranked(names: Sequence[str], gains: Array, which: dict[str, list[_Found]], white: Array) -> Scores:
+def _ranked(
+    names: Sequence[str], gains: Array, which: dict[str, list[_Found]], white: Array
+) -> Scores:
     observed, chance = gains[:, 0], np.zeros(len(names))
     p_value = 1.0
     if gains.shape[1] > 1:
@@ -271,15 +309,23 @@ def _ranked(names: Sequence[str], gains: Array, which: dict[str, list[_Found]], 
     ranked = [names[i] for i in order]
     phi = max(which[ranked[0]], key=lambda found: found.value).phi if ranked else 0.0
     return Scores(
-        tuple(ranked), observed[order], chance[order], tuple(_peaks(which[n]) for n in ranked), p_value, phi,
-        (gains[:, 1:] - chance[:, None])[order], white[order],
-    )  # fmt: skip
+        tuple(ranked),
+        observed[order],
+        chance[order],
+        tuple(_peaks(which[n]) for n in ranked),
+        p_value,
+        phi,
+        (gains[:, 1:] - chance[:, None])[order],
+        white[order],
+    )
 
 
 def tail(by_chance: Array, observed: Array) -> float:
-    """Probability that the largest of a column of `by_chance` (E, S) reaches the largest of `observed` (E,).
+    """Probability that the largest of a column of `by_chance` (E, S) reaches the largest of
+    `observed` (E,).
 
-    Beyond the most extreme fifth of the surrogates the tail is taken for exponential, as that of a likelihood ratio is.
+    Beyond the most extreme fifth of the surrogates the tail is taken for exponential, as that of a
+    likelihood ratio is.
     """
     if not observed.size:
         return 1.0

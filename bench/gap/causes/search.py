@@ -1,8 +1,10 @@
-"""Finds the effects that explain a recording: linear scores nominate, simulation decides, moves correct.
+"""Finds the effects that explain a recording: linear scores nominate, simulation decides, moves
+correct.
 
-Forward selection alone is not enough: where two effects act, the first pick is often a third one that mimics both. So
-several models are carried along (a beam search), and each larger model is compared with those that lack or replace one
-of its effects (A. Miller, Subset Selection in Regression, 2nd ed., 2002, doi:10.1201/9781420035933, chapter 3).
+Forward selection alone is not enough: where two effects act, the first pick is often a third one
+that mimics both. So several models are carried along (a beam search), and each larger model is
+compared with those that lack or replace one of its effects (A. Miller, Subset Selection in
+Regression, 2nd ed., 2002, doi:10.1201/9781420035933, chapter 3).
 """
 
 from __future__ import annotations
@@ -29,8 +31,9 @@ CERTAIN = 1e-6
 UNLIKELY, DOUBTFUL = 0.1, 0.015
 """Chance of the linear scores above which no effect, or no further one, is tried by simulation."""
 LOUD, FORGOT = 1.3, 0.01
-"""What is left that exceeds the noise floor by more is looked into by simulation whatever the scores say; but for an
-estimated floor, where the chance that it is first-order noise is above the second."""
+"""What is left that exceeds the noise floor by more is looked into by simulation whatever the
+scores say; but for an estimated floor, where the chance that it is first-order noise is above the
+second."""
 MOST_EFFECTS = 3
 NOMINATED = 7
 MOVES = 2
@@ -39,11 +42,17 @@ FAR = 0.5
 HOPELESS = 0.5
 """Share of the base model's excess that two effects leave where a third is not worth a try."""
 IDLE = 0.85
-"""The same, of the excess that the best single effect leaves: what is left is then nothing that the library knows."""
+"""The same, of the excess that the best single effect leaves: what is left is then nothing that the
+library knows.
+"""
 CLEARLY = 0.5
-"""Share of the excess over the noise to which other effects must bring a model to take the place of fewer."""
+"""Share of the excess over the noise to which other effects must bring a model to take the place of
+fewer.
+"""
 SKETCHED, TRANSFERRED = 2, 5
-"""Models of at most so many effects are sought over short pieces; so many of the best are fitted to the whole runs."""
+"""Models of at most so many effects are sought over short pieces; so many of the best are fitted to
+the whole runs.
+"""
 BEAM, NEAREST = 3, 2
 RIVAL = 0.5
 """A model goes on in the beam if it has at least this share of the best one's gain."""
@@ -84,26 +93,34 @@ class Search(Models):
         scores = score(model.fit, residual, found, self.seen, self.weights(model), like)
         self.scanned[key] = (found, scores)
         self.tests[key] = scores.p_value
-        if not key and not self.chances:  # kept, so that merits stay comparable when a better base fit turns up
+        if (
+            not key and not self.chances
+        ):  # kept, so that merits stay comparable when a better base fit turns up
             self.chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         return scores
 
     def extend(self, beam: Iterable[Model], most: int, patient: bool = False) -> None:
-        """Refit the most promising extensions of some models; those that are known already only with patience."""
+        """Refit the most promising extensions of some models; those that are known already only
+        with patience.
+        """
         starts = []
         for model in beam:
             key = frozenset(model.names)
             scores = self.scanned[key][1] if key in self.scanned else self.scan(model)
             start = self.models[key]
-            found = nominated(self.world, self.noise, start, self.scanned[key][0], scores, most, patient)
+            found = nominated(
+                self.world, self.noise, start, self.scanned[key][0], scores, most, patient
+            )
             starts += [s for s in found if patient or frozenset(s.effects) not in self.models]
         if starts:
             self.refit(starts, patient=patient)
 
     def missing(self, model: Model, larger: Model) -> float:
-        """Probability that a model which lacks nothing would seem to gain as much by becoming the larger one.
+        """Probability that a model which lacks nothing would seem to gain as much by becoming the
+        larger one.
 
-        The surrogates have the colour of what the larger model leaves, which is closer to the noise alone.
+        The surrogates have the colour of what the larger model leaves, which is closer to the noise
+        alone.
         """
         gain = larger.likelihood.value - model.likelihood.value
         model = self.models[frozenset(model.names)]
@@ -114,18 +131,27 @@ class Search(Models):
         return min(scores.p_value, self._gained(scores, larger, gain))
 
     def _gained(self, scores: Scores, larger: Model, gain: float) -> float:
-        """Chance of a gain in twice the log likelihood, less what chance gives the larger model's effects."""
+        """Chance of a gain in twice the log likelihood, less what chance gives the larger model's
+        effects.
+        """
         chance = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
-        return tail(scores.by_chance, np.array([gain - max((chance.get(n, 0.0) for n in larger.names), default=0.0)]))
+        return tail(
+            scores.by_chance,
+            np.array([gain - max((chance.get(n, 0.0) for n in larger.names), default=0.0)]),
+        )
 
     def plain(self, model: Model, doubt: float) -> bool:
-        """Whether nothing suggests that the model lacks something: neither a score nor the size of what it leaves."""
+        """Whether nothing suggests that the model lacks something: neither a score nor the size of
+        what it leaves.
+        """
         return self.scan(model).p_value > doubt and self._quiet(model)
 
     def _quiet(self, model: Model) -> bool:
-        """Whether what a model leaves may be noise: as small as the floor, or larger where the floor is an estimate.
+        """Whether what a model leaves may be noise: as small as the floor, or larger where the
+        floor is an estimate.
 
-        The floor is estimated as if noise forgot itself; what is left may exceed it if it is of first order.
+        The floor is estimated as if noise forgot itself; what is left may exceed it if it is of
+        first order.
         """
         loud = np.nan_to_num(model.likelihood.sigma, nan=np.inf) >= LOUD * self.noise.sigma
         if not loud.any():
@@ -147,11 +173,15 @@ class Search(Models):
         for name in names:
             theta = model.fit.theta.copy()
             theta[self.world.slots[name]] = 0.0
-            starts.append(Start(tuple(n for n in model.names if n != name), theta, model.fit.states))
+            starts.append(
+                Start(tuple(n for n in model.names if n != name), theta, model.fit.states)
+            )
         self.refit(starts)
 
     def drop(self, model: Model) -> Model:
-        """The model without effects that it does not need; each smaller one is fitted from here, known or not."""
+        """The model without effects that it does not need; each smaller one is fitted from here,
+        known or not.
+        """
         if len(model.names) > 1 and frozenset(model.names) not in self._lessened:
             self._lessened.add(frozenset(model.names))
             self._lessen(model, model.names)
@@ -174,8 +204,8 @@ class Search(Models):
     def run(self) -> Model:
         """The model of all effects that the data show.
 
-        While much is left to explain the search goes on although no step of it pays by itself: of two effects that
-        only together come near the data neither is worth much alone.
+        While much is left to explain the search goes on although no step of it pays by itself: of
+        two effects that only together come near the data neither is worth much alone.
         """
         best = self.models[frozenset()]
         for size in range(1, MOST_EFFECTS + 1):
@@ -197,13 +227,17 @@ class Search(Models):
         return best
 
     def _hopeless(self, larger: Model) -> bool:
-        """Whether a model of several effects is so far from the data that one more is not worth a try."""
+        """Whether a model of several effects is so far from the data that one more is not worth a
+        try.
+        """
         singles = [self.excess(m) for m in self.models.values() if len(m.names) == 1]
         before = self.excess(self.models[frozenset()])
         return self.excess(larger) > min(HOPELESS * before, IDLE * min(singles, default=np.inf))
 
     def _grown(self, size: int) -> Model | None:
-        """The best model of so many effects: from the best smaller one, then from its rivals, or with patience."""
+        """The best model of so many effects: from the best smaller one, then from its rivals, or
+        with patience.
+        """
         beam = self._beam(size - 1)
         self.extend(beam[:1], NOMINATED)
         first = self.best(size)
@@ -229,35 +263,59 @@ class Search(Models):
             self._sketch.refit([Start((), base.theta, cut.guess)])
         sketch = self._sketch
         sketch.extend(sketch._beam(size - 1), NOMINATED)
-        found = sorted((m for m in sketch.models.values() if len(m.names) == size), key=lambda m: -m.merit)
+        found = sorted(
+            (m for m in sketch.models.values() if len(m.names) == size), key=lambda m: -m.merit
+        )
         self.refit([whole(self.world, m.fit) for m in found[:TRANSFERRED]])
 
     def _simpler(self, single: Model) -> Model:
-        """The effect that the single one contains, where structure is left to which the rest of it may have bent."""
+        """The effect that the single one contains, where structure is left to which the rest of it
+        may have bent.
+        """
         if self.plain(single, ALPHA):
             return single
         held = self.world.effects[single.names[0]].contains
-        there = [self.models[frozenset([name])] for name in held if frozenset([name]) in self.models]
+        there = [
+            self.models[frozenset([name])] for name in held if frozenset([name]) in self.models
+        ]
         return next((m for m in there if self.excess(single) > CLEARLY * self.excess(m)), single)
 
     def _conservative(self, best: Model, larger: Model) -> Model:
-        """The larger model, unless it puts other effects in place of the best one's and is hardly nearer to the noise.
+        """The larger model, unless it puts other effects in place of the best one's and is hardly
+        nearer to the noise.
 
-        Two effects mimic many a third; where neither account reaches the noise, the shorter one is built upon.
+        Two effects mimic many a third; where neither account reaches the noise, the shorter one is
+        built upon.
         """
-        if set(best.names) <= set(larger.names) or self.excess(larger) < CLEARLY * self.excess(best):
+        if set(best.names) <= set(larger.names) or self.excess(larger) < CLEARLY * self.excess(
+            best
+        ):
             return larger
-        there = [m for m in self.models.values() if set(best.names) < set(m.names) and m.merit > best.merit]
-        return max((m for m in there if len(m.names) == len(best.names) + 1), key=lambda m: m.merit, default=best)
+        there = [
+            m
+            for m in self.models.values()
+            if set(best.names) < set(m.names) and m.merit > best.merit
+        ]
+        return max(
+            (m for m in there if len(m.names) == len(best.names) + 1),
+            key=lambda m: m.merit,
+            default=best,
+        )
 
     def _beam(self, size: int) -> list[Model]:
-        """Models of so many effects to go on from: those of the most merit, and those that come nearest to the data."""
-        there = sorted((m for m in self.models.values() if len(m.names) == size), key=lambda m: -m.merit)
+        """Models of so many effects to go on from: those of the most merit, and those that come
+        nearest to the data.
+        """
+        there = sorted(
+            (m for m in self.models.values() if len(m.names) == size), key=lambda m: -m.merit
+        )
         base = self.models[frozenset()].merit
         if not size or not there:
             return there
         rivals = [m for m in there if m.merit - base >= RIVAL * (there[0].merit - base)][:BEAM]
-        return rivals + [m for m in sorted(there, key=lambda m: m.fit.cost)[:NEAREST] if m not in rivals]
+        return rivals + [
+            m for m in sorted(there, key=lambda m: m.fit.cost)[:NEAREST] if m not in rivals
+        ]
 
 
 _NOTHING = Scores((), np.zeros(0), np.zeros(0), (), 1.0, 0.0, np.zeros((0, 0)), np.zeros(0))

@@ -1,9 +1,10 @@
 """Is there structure that no effect of the library accounts for?
 
-Two tests. Where the recording states its noise, what a model leaves must not exceed it. And whether or not it does, a
-force of any shape must not help: hats over time, position and speed, along each axis and against the motion, stand for
-causes that nobody has thought of (a nonparametric lack-of-fit test; J. D. Hart, Nonparametric Smoothing and Lack-of-Fit
-Tests, 1997, doi:10.1007/978-1-4757-2722-7), calibrated by surrogates as the library is.
+Two tests. Where the recording states its noise, what a model leaves must not exceed it. And whether
+or not it does, a force of any shape must not help: hats over time, position and speed, along each
+axis and against the motion, stand for causes that nobody has thought of (a nonparametric
+lack-of-fit test; J. D. Hart, Nonparametric Smoothing and Lack-of-Fit Tests, 1997,
+doi:10.1007/978-1-4757-2722-7), calibrated by surrogates as the library is.
 """
 
 from __future__ import annotations
@@ -26,14 +27,18 @@ BINS = 7
 AGAINST, ALONG = 0, 2
 TIME, SPEED, POSITION = 0, 1, 2
 CHANCE, UNSURE = 1e-3, 1e-4
-"""Chance at which structure would be seen where there is none; the second where the recording states no noise, and a
-noise that remembers may be all there is."""
+"""Chance at which structure would be seen where there is none; the second where the recording
+states no noise, and a noise that remembers may be all there is."""
 EXCESS, SIGMAS = 0.05, 4.0
-"""What is left may exceed the stated noise by this share and so many standard errors: no sensor is known better."""
+"""What is left may exceed the stated noise by this share and so many standard errors: no sensor is
+known better.
+"""
 
 
 class Hat(Force):
-    """A force over a stretch of time, position or speed: along an axis, against the motion, or as dry friction."""
+    """A force over a stretch of time, position or speed: along an axis, against the motion, or as
+    dry friction.
+    """
 
     name = "probe.hat"
     says = "a force acts over a stretch of time, position or speed"
@@ -45,18 +50,28 @@ class Hat(Force):
 
     def force(self, c: Array, moment: Moment) -> Array:
         """Strength times a triangle around the centre."""
-        variables = np.concatenate([np.broadcast_to(moment.t, moment.speed.shape), moment.speed, moment.x], axis=1)
+        variables = np.concatenate(
+            [np.broadcast_to(moment.t, moment.speed.shape), moment.speed, moment.x], axis=1
+        )
         value = np.take_along_axis(variables, c[1].astype(np.intp), axis=1)
         height = np.maximum(1.0 - np.abs(value - c[2]) / np.maximum(c[3], 1e-12), 0.0)
-        against = -moment.v / (moment.speed + np.maximum(c[5], 1e-9))  # smooth, so that no step has to be shortened
-        directions = [-moment.v, against, *(np.eye(moment.x.shape[1])[d] for d in range(moment.x.shape[1]))]
+        against = -moment.v / (
+            moment.speed + np.maximum(c[5], 1e-9)
+        )  # smooth, so that no step has to be shortened
+        directions = [
+            -moment.v,
+            against,
+            *(np.eye(moment.x.shape[1])[d] for d in range(moment.x.shape[1])),
+        ]
         chosen = sum(np.where(c[4] == i, way, 0.0) for i, way in enumerate(directions))
         result: Array = c[0] * height * chosen
         return result
 
 
 SLOWEST = 7.0
-"""Estimated noise that is exceeded by more than this would have to remember for 30 samples: that is no sensor's."""
+"""Estimated noise that is exceeded by more than this would have to remember for 30 samples: that is
+no sensor's.
+"""
 
 
 @dataclass(frozen=True)
@@ -64,7 +79,8 @@ class Remains:
     """What a model leaves unexplained.
 
     Attributes:
-        p_value: chance of the best force of any shape where nothing is missing; 1 where the test does not apply.
+        p_value: chance of the best force of any shape where nothing is missing; 1 where the test
+            does not apply.
         where: what that force follows, e.g. ``position x``.
         excess: (C,) RMS left in units of the noise floor.
         loud: names of channels whose noise is exceeded.
@@ -112,7 +128,9 @@ def remains(search: Search, model: Model) -> Remains:
 
 
 def _error(search: Search, model: Model, channel: int) -> float:
-    """Standard error of a channel's sigma, as a share of it: fewer samples count where noise remembers."""
+    """Standard error of a channel's sigma, as a share of it: fewer samples count where noise
+    remembers.
+    """
     phi = min(abs(float(model.likelihood.phi[channel])), 0.99)
     count = max(int(search.seen[:, :, channel].sum()), 2)
     return float(np.sqrt((1.0 + phi * phi) / (1.0 - phi * phi) / (2.0 * count)))
@@ -153,7 +171,13 @@ def _families(world: World) -> Iterator[tuple[str, int, int, float, float]]:
         low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
         if high > low:
             if not (free and axis == axes - 1):
-                yield f"position {name}, along {system.coordinates[-1]}", POSITION + axis, ALONG + axes - 1, low, high
+                yield (
+                    f"position {name}, along {system.coordinates[-1]}",
+                    POSITION + axis,
+                    ALONG + axes - 1,
+                    low,
+                    high,
+                )
             yield f"position {name}, against the motion", POSITION + axis, AGAINST, low, high
             if not free:
                 yield f"position {name}, dry", POSITION + axis, AGAINST + 1, low, high

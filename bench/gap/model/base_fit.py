@@ -1,4 +1,6 @@
-"""Fits the base model: parameters that the system has anyway, and initial states, from anywhere in the bounds."""
+"""Fits the base model: parameters that the system has anyway, and initial states, from anywhere in
+the bounds.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +17,19 @@ from sims.base import Parameter
 
 STARTS, KEPT = 15, 3
 HORIZONS = ((0.2, 6), (0.45, 6), (1.0, 20))
-"""Shares of each run that are fitted one after another, and steps of each: the end of a run depends on its beginning in
-ways that only a nearly fitted model follows."""
+"""Shares of each run that are fitted one after another, and steps of each: the end of a run depends
+on its beginning in ways that only a nearly fitted model follows."""
 TOUCHED = 1.0
-"""A parameter that changes the observations by less than this many sigmas in all, moved across its bounds, is not
-touched by the data."""
+"""A parameter that changes the observations by less than this many sigmas in all, moved across its
+bounds, is not touched by the data."""
 LOGARITHMIC = 5.0
 
 
 @dataclass(frozen=True)
 class Base:
-    """The fitted base model: its fit, and which parameters the data do not touch, which stay nominal."""
+    """The fitted base model: its fit, and which parameters the data do not touch, which stay
+    nominal.
+    """
 
     fit: Fit
     untouched: frozenset[int]
@@ -37,7 +41,8 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
     Args:
         world: the runs.
         noise: weighs the channels.
-        given: (b,) base parameters to start from, those of a tuner; else a grid of starts over the bounds.
+        given: (b,) base parameters to start from, those of a tuner; else a grid of starts over the
+            bounds.
     """
     starts = [Start((), theta, world.guess) for theta in _starts(world, given)]
     if len(starts) > KEPT:
@@ -72,14 +77,17 @@ def _starts(world: World, given: Array | None) -> list[Array]:
 
 
 def evenly(count: int, dim: int) -> Array:
-    """Points (count, dim) spread evenly over the unit cube: an additive recurrence with the generalised golden ratio.
+    """Points (count, dim) spread evenly over the unit cube: an additive recurrence with the
+    generalised golden ratio.
 
     M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018.
     """
     ratio = 2.0
     for _ in range(60):
         ratio = (1.0 + ratio) ** (1.0 / (dim + 1))
-    points: Array = (0.5 + np.arange(1, count + 1)[:, None] * ratio ** -np.arange(1.0, dim + 1)) % 1.0
+    points: Array = (
+        0.5 + np.arange(1, count + 1)[:, None] * ratio ** -np.arange(1.0, dim + 1)
+    ) % 1.0
     return points
 
 

@@ -9,14 +9,17 @@ from sims.system import Friction
 BEYOND, DRY = 20.0, 4.0
 """The second for dry friction: what is stronger only sticks."""
 CYCLES = 1.0
-"""What comes and goes must do so about once in the longest run, else any slow change would be called periodic."""
+"""What comes and goes must do so about once in the longest run, else any slow change would be
+called periodic.
+"""
 
 
 def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
     """The range in which a fit may move each coefficient of an effect.
 
-    A plausible range orders causes; it does not overrule the data: what may have either sign may be twenty times
-    larger. What is zero or positive by its meaning stays so, and what shapes an effect stays in its range.
+    A plausible range orders causes; it does not overrule the data: what may have either sign may be
+    twenty times larger. What is zero or positive by its meaning stays so, and what shapes an effect
+    stays in its range.
     """
     bounds = []
     for parameter in effect_parameters(world.effects[name], world.simulator.system, world.channels):
@@ -24,5 +27,7 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
         if parameter.unit == "Hz":
             low = min(max(low, CYCLES / world.longest), high / 2.0)
         beyond = DRY if isinstance(world.effects[name], Friction) else BEYOND
-        bounds.append((low, high) if low > 0 else (0.0 if low == 0 else beyond * low, beyond * high))
+        bounds.append(
+            (low, high) if low > 0 else (0.0 if low == 0 else beyond * low, beyond * high)
+        )
     return bounds

@@ -1,10 +1,11 @@
-"""Least squares on trajectories: parameters that all runs share, initial states that each run has for itself.
+"""Least squares on trajectories: parameters that all runs share, initial states that each run has
+for itself.
 
-Levenberg-Marquardt for many models at once, so that one call of the engine serves all of them. Initial states are
-eliminated run by run (damping by Nielsen's rule, IMM-REP-1999-05; the Schur complement of the arrow-shaped normal
-equations; B. Triggs et al., Bundle adjustment, 2000, doi:10.1007/3-540-44480-7_21, section 6), so the cost grows
-linearly with the number of runs. Noise that remembers is whitened first (`colour`), which makes the fit one of
-generalised least squares.
+Levenberg-Marquardt for many models at once, so that one call of the engine serves all of them.
+Initial states are eliminated run by run (damping by Nielsen's rule, IMM-REP-1999-05; the Schur
+complement of the arrow-shaped normal equations; B. Triggs et al., Bundle adjustment, 2000,
+doi:10.1007/3-540-44480-7_21, section 6), so the cost grows linearly with the number of runs. Noise
+that remembers is whitened first (`colour`), which makes the fit one of generalised least squares.
 """
 
 from __future__ import annotations
@@ -20,15 +21,19 @@ from bench.gap.model.world import Indices, Mask, World
 from methods.base import Array
 
 RESPONSE = 0.1
-"""Finite differences move a parameter until the observation changes by this share of its noise, RMS."""
+"""Finite differences move a parameter until the observation changes by this share of its noise,
+RMS.
+"""
 UNMEASURED, MEASURED = 3.0, 100.0
-"""1 sigma of what is known beforehand of an initial state, SI units: without, and with samples that show it."""
+"""1 sigma of what is known beforehand of an initial state, SI units: without, and with samples that
+show it.
+"""
 BEATEN, RACED, HOPE = 100.0, 4, 10.0
-"""After so many steps a model is given up whose sum of squares, less several times what the next step promises, is so
-much above the best one's."""
+"""After so many steps a model is given up whose sum of squares, less several times what the next
+step promises, is so much above the best one's."""
 ENOUGH, SHARE = 0.02, 1e-4
-"""A fit has converged when a step lowers the sum of squares, in units of the noise, by less than this and less than
-this share of it."""
+"""A fit has converged when a step lowers the sum of squares, in units of the noise, by less than
+this and less than this share of it."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +93,15 @@ class _Problem:
     done: bool = False
 
     def fit(self) -> Fit:
-        return Fit(self.start.effects, self.theta, self.states, self.free, self.simulated, self.jacobian, self.cost)
+        return Fit(
+            self.start.effects,
+            self.theta,
+            self.states,
+            self.free,
+            self.simulated,
+            self.jacobian,
+            self.cost,
+        )
 
 
 @dataclass(frozen=True)
@@ -110,12 +123,20 @@ class Fitter:
     parameters: bool = True
 
     def fit(
-        self, starts: Sequence[Start], iterations: int = 12, race: bool = False, reached: float = np.inf
+        self,
+        starts: Sequence[Start],
+        iterations: int = 12,
+        race: bool = False,
+        reached: float = np.inf,
     ) -> list[Fit]:
-        """Fit each model from its start; in a race, those far behind the best, or the cost reached, stay unfinished."""
+        """Fit each model from its start; in a race, those far behind the best, or the cost reached,
+        stay unfinished.
+        """
         problems = [self._problem(start) for start in starts]
         seen = self.world.counted(self.share)
-        for problem, (simulated, jacobian) in zip(problems, self._derivatives(problems), strict=True):
+        for problem, (simulated, jacobian) in zip(
+            problems, self._derivatives(problems), strict=True
+        ):
             self._take(problem, problem.theta, problem.states, simulated, jacobian, seen)
         for taken in range(iterations):
             best = min(reached, *(p.cost for p in problems))
@@ -127,7 +148,9 @@ class Fitter:
             if not trials:
                 break
             moved = [replace_at(p, theta, states) for p, theta, states in trials]
-            for (p, theta, states), (simulated, jacobian) in zip(trials, self._derivatives(moved), strict=True):
+            for (p, theta, states), (simulated, jacobian) in zip(
+                trials, self._derivatives(moved), strict=True
+            ):
                 self._judge(p, theta, states, simulated, jacobian, seen)
         return [p.fit() for p in problems]
 
@@ -145,10 +168,21 @@ class Fitter:
         theta = start.theta.copy()
         theta[free] = np.clip(theta[free], low, high)
         steps = np.concatenate([1e-4 * widths, np.full(len(world.states), 1e-5)])
-        return _Problem(start, np.array(free, dtype=np.intp), low, high, widths, steps, theta, start.states.copy())
+        return _Problem(
+            start,
+            np.array(free, dtype=np.intp),
+            low,
+            high,
+            widths,
+            steps,
+            theta,
+            start.states.copy(),
+        )
 
     def _derivatives(self, problems: Sequence[_Problem]) -> list[tuple[Array, Array]]:
-        """Simulated runs (R, T, C) of each problem and their derivatives (R, T, C, q + s), in one call."""
+        """Simulated runs (R, T, C) of each problem and their derivatives (R, T, C, q + s), in one
+        call.
+        """
         runs, states = self.world.guess.shape
         blocks = []
         for p in problems:
@@ -167,7 +201,9 @@ class Fitter:
         seen = self.world.simulate(thetas, lanes, begins, self.share)
         result, place = [], 0
         for theta, _, steps in blocks:
-            part = seen[place : place + len(theta) * runs].reshape(len(theta), runs, *seen.shape[1:])
+            part = seen[place : place + len(theta) * runs].reshape(
+                len(theta), runs, *seen.shape[1:]
+            )
             place += len(theta) * runs
             with np.errstate(all="ignore"):
                 jacobian = np.moveaxis(part[1:] - part[0], 0, -1) / steps
@@ -181,13 +217,23 @@ class Fitter:
         steps[: p.free.size][beyond] *= -1.0
         return steps
 
-    def _take(self, p: _Problem, theta: Array, states: Array, simulated: Array, jacobian: Array, seen: Mask) -> None:
+    def _take(
+        self,
+        p: _Problem,
+        theta: Array,
+        states: Array,
+        simulated: Array,
+        jacobian: Array,
+        seen: Mask,
+    ) -> None:
         p.theta, p.states, p.simulated, p.jacobian = theta, states, simulated, jacobian
         p.cost = self._cost(simulated, states, seen)
         sizes = np.sqrt(np.mean(np.square(jacobian / self.noise.sigma[:, None]), axis=(0, 1, 2)))
         largest = np.concatenate([1e-2 * p.widths, np.full(states.shape[1], 1e-2)])
         with np.errstate(divide="ignore"):
-            p.steps = np.clip(RESPONSE / np.where(sizes > 0, sizes, 1e-300), 1e-5 * largest, largest)
+            p.steps = np.clip(
+                RESPONSE / np.where(sizes > 0, sizes, 1e-300), 1e-5 * largest, largest
+            )
 
     def _cost(self, simulated: Array, states: Array, seen: Mask) -> float:
         residual = np.where(seen, self.world.observed - simulated, 0.0)
@@ -198,12 +244,16 @@ class Fitter:
         return float((w * w).sum() + (drift * drift).sum())
 
     def _step(self, p: _Problem, seen: Mask) -> tuple[Array, Array]:
-        """The next parameters and initial states to try; marks the problem done if they promise nothing."""
+        """The next parameters and initial states to try; marks the problem done if they promise
+        nothing.
+        """
         q = p.free.size
         if not np.isfinite(p.cost):
             p.done = True
             return p.theta, p.states
-        residual = whitened(np.where(seen, self.world.observed - p.simulated, 0.0), seen, self.noise)
+        residual = whitened(
+            np.where(seen, self.world.observed - p.simulated, 0.0), seen, self.noise
+        )
         jacobian = whitened(np.where(seen[..., None], p.jacobian, 0.0), seen, self.noise)
         prior = prior_of(self.world)
         drift, stuck = (p.states - self.world.guess) / prior, _stuck(p, residual, jacobian)
@@ -215,13 +265,24 @@ class Fitter:
             p.done = True
         return theta, p.states + solved.own
 
-    def _judge(self, p: _Problem, theta: Array, states: Array, simulated: Array, jacobian: Array, seen: Mask) -> None:
+    def _judge(
+        self,
+        p: _Problem,
+        theta: Array,
+        states: Array,
+        simulated: Array,
+        jacobian: Array,
+        seen: Mask,
+    ) -> None:
         cost = self._cost(simulated, states, seen)
         if cost < p.cost:
             gained = p.cost - cost
             ratio = gained / max(p.promised, 1e-300)
             self._take(p, theta, states, simulated, jacobian, seen)
-            p.damping, p.growth = max(p.damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3), 1e-10), 2.0
+            p.damping, p.growth = (
+                max(p.damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3), 1e-10),
+                2.0,
+            )
             p.done = gained < ENOUGH + SHARE * cost
         else:
             p.damping, p.growth = p.damping * 2.0 * p.growth, 2.0 * p.growth
@@ -248,9 +309,18 @@ class _Solved:
 
 
 def arrow_step(
-    residual: Array, jacobian: Array, q: int, drift: Array, prior: Array, known: Mask, damping: float, stuck: Mask
+    residual: Array,
+    jacobian: Array,
+    q: int,
+    drift: Array,
+    prior: Array,
+    known: Mask,
+    damping: float,
+    stuck: Mask,
 ) -> _Solved:
-    """One damped Gauss-Newton step: shared parameters (q,), initial states (R, s), promised decrease of the cost."""
+    """One damped Gauss-Newton step: shared parameters (q,), initial states (R, s), promised
+    decrease of the cost.
+    """
     runs, size = len(residual), jacobian.shape[3]
     j = jacobian.reshape(runs, -1, size)
     r = residual.reshape(runs, -1)

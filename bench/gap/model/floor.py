@@ -18,7 +18,9 @@ PRECISION = 1e-4
 
 @dataclass(frozen=True)
 class Floor:
-    """Noise of each channel, (C,) arrays: 1 sigma, whether it is stated, the step if quantised (0 if it is not)."""
+    """Noise of each channel, (C,) arrays: 1 sigma, whether it is stated, the step if quantised (0
+    if it is not).
+    """
 
     sigma: Array
     stated: NDArray[np.bool_]
@@ -38,8 +40,14 @@ def noise_floor(world: World, recording: Recording) -> Floor:
         sigma = recording.noise[name] if known else guess.sigma
         spread = float(np.ptp(np.quantile(values, [0.02, 0.98]))) if values.size else 0.0
         least = max(PRECISION * spread, 1e-12)
-        sigmas.append(max(sigma, least) if np.isfinite(sigma) else max(least, 1e-3 * world.simulator.channels[c].scale))
+        sigmas.append(
+            max(sigma, least)
+            if np.isfinite(sigma)
+            else max(least, 1e-3 * world.simulator.channels[c].scale)
+        )
         stated.append(known)
         steps.append(guess.step)
-        doubts.append(0.0 if known else 1.2 / max(values.size, 4) ** 0.5)  # a median's, over independent samples
+        doubts.append(
+            0.0 if known else 1.2 / max(values.size, 4) ** 0.5
+        )  # a median's, over independent samples
     return Floor(np.array(sigmas), np.array(stated), np.array(steps), np.array(doubts))

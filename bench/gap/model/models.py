@@ -26,9 +26,10 @@ class Model:
     Attributes:
         fit: the fit.
         likelihood: of its residual.
-        merit: twice the log likelihood less the log of the number of samples for each parameter and initial state that
-            the data fix (G. Schwarz, Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136); for an effect with many
-            shapes, less what the best of them gains by chance.
+        merit: twice the log likelihood less the log of the number of samples for each parameter and
+            initial state that the data fix (G. Schwarz, Ann. Stat. 6(2), 461, 1978,
+            doi:10.1214/aos/1176344136); for an effect with many shapes, less what the best of them
+            gains by chance.
     """
 
     fit: Fit
@@ -93,19 +94,26 @@ class Models:
         return float(np.log(max(int(self.seen.sum()), 2)))
 
     def _chance(self, name: str) -> float:
-        """What an effect costs beside that: its shapes are tried by the dozen, and the best of them gains by chance."""
+        """What an effect costs beside that: its shapes are tried by the dozen, and the best of them
+        gains by chance.
+        """
         slot = self.world.slots[name]
         return float(max(self.chances.get(name, 0.0) - (slot.stop - slot.start) * self._price, 0.0))
 
     def refit(
-        self, starts: Sequence[Start], noise: Noise | None = None, patient: bool = False, race: bool = True
+        self,
+        starts: Sequence[Start],
+        noise: Noise | None = None,
+        patient: bool = False,
+        race: bool = True,
     ) -> None:
         """Fit models from their starts and enter them.
 
         Args:
             starts: where to begin.
             noise: weighs the samples; the search's own if None.
-            patient: fit the beginnings of the runs first, as the base model's fit does, and go on with the best.
+            patient: fit the beginnings of the runs first, as the base model's fit does, and go on
+                with the best.
             race: give up what falls far behind.
         """
         noise = noise or self.noise
@@ -117,9 +125,13 @@ class Models:
             self.enter(fit)
 
     def _reached(self, starts: Sequence[Start]) -> float:
-        """The least sum of squares of the models known that have no more effects than the largest of these."""
+        """The least sum of squares of the models known that have no more effects than the largest
+        of these.
+        """
         most = max(len(start.effects) for start in starts)
-        return min((m.fit.cost for m in self.models.values() if 0 < len(m.names) <= most), default=np.inf)
+        return min(
+            (m.fit.cost for m in self.models.values() if 0 < len(m.names) <= most), default=np.inf
+        )
 
     def best(self, size: int) -> Model | None:
         """The best model with so many effects."""
@@ -127,7 +139,9 @@ class Models:
         return max(there, key=lambda m: m.merit) if there else None
 
     def excess(self, model: Model) -> float:
-        """RMS of what a model leaves in units of the noise floor, less the one that noise itself leaves."""
+        """RMS of what a model leaves in units of the noise floor, less the one that noise itself
+        leaves.
+        """
         left = self.residual(model.fit) / self.noise.sigma
         return float(np.sqrt(np.square(left[self.seen]).mean())) - 1.0
 
@@ -138,10 +152,16 @@ class Models:
 
 
 def freedom(world: World, fit: Fit, noise: Noise) -> float:
-    """How many initial states the data fix, all runs together: one that a model does not use gives it no freedom."""
+    """How many initial states the data fix, all runs together: one that a model does not use gives
+    it no freedom.
+    """
     seen = np.isfinite(world.observed)
-    states = np.where(seen[..., None], fit.jacobian[..., fit.free.size :], 0.0) / noise.sigma[:, None]
-    columns = states.reshape(len(states), seen.shape[1] * seen.shape[2], states.shape[3]) * prior_of(world)
+    states = (
+        np.where(seen[..., None], fit.jacobian[..., fit.free.size :], 0.0) / noise.sigma[:, None]
+    )
+    columns = states.reshape(
+        len(states), seen.shape[1] * seen.shape[2], states.shape[3]
+    ) * prior_of(world)
     columns = np.where(world.known[:, None, :], 0.0, columns)
     powers = np.linalg.eigvalsh(np.matmul(columns.transpose(0, 2, 1), columns))
     return float((powers / (1.0 + np.maximum(powers, 0.0))).clip(0.0, 1.0).sum())

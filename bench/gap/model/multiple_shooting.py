@@ -1,9 +1,10 @@
-"""Fits short pieces of the runs first, each from initial states of its own, to begin long runs near the right minimum.
+"""Fits short pieces of the runs first, each from initial states of its own, to begin long runs near
+the right minimum.
 
-Over a long run a small change of a period, a limit or a delay moves the trajectory far from the data, so the sum of
-squares has many minima. Over pieces it has few, since every piece begins where the data are (multiple shooting;
-H. G. Bock 1983, doi:10.1007/978-1-4684-7324-7_7). What the pieces find is where fits of the whole runs begin; it
-decides nothing.
+Over a long run a small change of a period, a limit or a delay moves the trajectory far from the
+data, so the sum of squares has many minima. Over pieces it has few, since every piece begins where
+the data are (multiple shooting; H. G. Bock 1983, doi:10.1007/978-1-4684-7324-7_7). What the pieces
+find is where fits of the whole runs begin; it decides nothing.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ PIECES, LEAST = 4, 20
 def pieces(world: World) -> World | None:
     """The world of the pieces, with the same parameters; None where every run is too short for two.
 
-    None for what bounces, too: a piece that begins beside an impact leaves open on which side of it, and a ball that
-    comes to rest is searched for a minimum among hundreds of small bounces (minutes, on the exam's updrafts).
+    None for what bounces, too: a piece that begins beside an impact leaves open on which side of
+    it, and a ball that comes to rest is searched for a minimum among hundreds of small bounces
+    (minutes, on the exam's updrafts).
     """
     if world.simulator.system.bounces:
         return None
@@ -34,7 +36,10 @@ def pieces(world: World) -> World | None:
         return None
     freed = [p.name for p in world.freed]
     cut = World(world.kind, world.recording, runs, world.engine, world.extra, freed, world.library)
-    cut.longest, cut.travel = world.longest, world.travel  # what is periodic goes on from piece to piece
+    cut.longest, cut.travel = (
+        world.longest,
+        world.travel,
+    )  # what is periodic goes on from piece to piece
     return cut
 
 

@@ -1,4 +1,6 @@
-"""The recorded runs as the simulator meets them: any parameters, effects and initial states, many lanes in one call."""
+"""The recorded runs as the simulator meets them: any parameters, effects and initial states, many
+lanes in one call.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +22,19 @@ Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 LANE_SAMPLES = 400_000
-"""Samples simulated in one call of the engine: beyond it more lanes cost memory and gain nothing."""
+"""Samples simulated in one call of the engine: beyond it more lanes cost memory and gain nothing.
+"""
 TIME_STEP = 0.01
-"""Longest step of the batch engine, seconds; it shortens its steps itself where motion or forces ask for it."""
+"""Longest step of the batch engine, seconds; it shortens its steps itself where motion or forces
+ask for it.
+"""
 TURN, PATIENCE = 0.14, 4.0
-"""Radians of an oscillation in a step of the batch engine: its phase is then off by 3e-6 of itself. A lane is given up
-that needs so many times the planned steps."""
+"""Radians of an oscillation in a step of the batch engine: its phase is then off by 3e-6 of itself.
+A lane is given up that needs so many times the planned steps."""
 FINE_STEP = 0.0025
-"""The same where a sensor filters: a filter takes what it reads for linear over each step, which an impact is not."""
+"""The same where a sensor filters: a filter takes what it reads for linear over each step, which an
+impact is not.
+"""
 FREED = 5.0
 """A constant that is set free is searched from a fifth of its value to five times it."""
 
@@ -38,10 +45,12 @@ class Track:
 
     Attributes:
         name: the run's name.
-        scenario: what the simulator is given; its initial states are guesses where they are not stated.
+        scenario: what the simulator is given; its initial states are guesses where they are not
+            stated.
         observed: (T, C) SI units, NaN where missing.
         guess: (s,) initial states, stated or guessed from the first samples.
-        known: (s,) which of them are not to be estimated: stated, or of a coordinate that is not recorded.
+        known: (s,) which of them are not to be estimated: stated, or of a coordinate that is not
+            recorded.
     """
 
     name: str
@@ -52,10 +61,12 @@ class Track:
 
 
 class World:
-    """Some runs of a recording, and one simulator that has every effect at hand, off unless its coefficients say so.
+    """Some runs of a recording, and one simulator that has every effect at hand, off unless its
+    coefficients say so.
 
-    A vector theta (P,) holds the system's own parameters, constants set free, then all coefficients. `longest` is the
-    duration of the longest run in seconds, `travel` the largest range of the primary coordinate in one run.
+    A vector theta (P,) holds the system's own parameters, constants set free, then all
+    coefficients. `longest` is the duration of the longest run in seconds, `travel` the largest
+    range of the primary coordinate in one run.
 
     Args:
         kind: the simulator's class.
@@ -66,7 +77,8 @@ class World:
         free: constants to treat as parameters.
 
     Raises:
-        InputError: the simulator is no system that takes effects, a constant does not exist, or no channel is its own.
+        InputError: the simulator is no system that takes effects, a constant does not exist, or no
+            channel is its own.
     """
 
     def __init__(
@@ -91,15 +103,22 @@ class World:
             pace = {"turn": TURN, "patience": PATIENCE}
             steps = {"time_step": TIME_STEP, **pace}, {"time_step": FINE_STEP, **pace}
         self.simulator, self._fine = (
-            kind(recording.constants, observe, engine=engine, effects=chosen, **settings) for settings in steps
+            kind(recording.constants, observe, engine=engine, effects=chosen, **settings)
+            for settings in steps
         )
         own = list(self.simulator.system.parameters)
         self.own = len(own)
         self.freed = [self._freed(name) for name in free]
-        self.parameters: tuple[Parameter, ...] = (*own, *self.freed, *self.simulator.parameters[len(own) :])
+        self.parameters: tuple[Parameter, ...] = (
+            *own,
+            *self.freed,
+            *self.simulator.parameters[len(own) :],
+        )
         self.base: Indices = np.arange(len(own) + len(self.freed))
         self.slots = self._slots()
-        self.states = [*self.simulator.system.coordinates, *self.simulator.system.rates] or list(kind.states)
+        self.states = [*self.simulator.system.coordinates, *self.simulator.system.rates] or list(
+            kind.states
+        )
         self.tracks = tuple(self._track(run) for run in runs)
         self.lengths: Indices = np.array([len(t.observed) for t in self.tracks])
         self.observed = np.full((len(runs), self.lengths.max(), len(observe)), np.nan)
@@ -122,7 +141,9 @@ class World:
         return max(float(t.scenario.times[-1] - t.scenario.times[0]) for t in self.tracks) or 1.0
 
     def _travel(self) -> float:
-        """The range of the primary coordinate in the run where it is largest; 0 where it is not recorded."""
+        """The range of the primary coordinate in the run where it is largest; 0 where it is not
+        recorded.
+        """
         system = self.simulator.system
         name = system.coordinates[system.primary] if system.coordinates else ""
         if name not in self.channels:
@@ -142,9 +163,11 @@ class World:
         return values
 
     def simulate(self, theta: Array, runs: Indices, states: Array, share: float = 1.0) -> Array:
-        """Observations (L, T, C) of lanes with parameters (L, P), in runs (L,), from initial states (L, s).
+        """Observations (L, T, C) of lanes with parameters (L, P), in runs (L,), from initial states
+        (L, s).
 
-        Only the first share of each run is simulated; what is behind it, or behind the end of a shorter run, is NaN.
+        Only the first share of each run is simulated; what is behind it, or behind the end of a
+        shorter run, is NaN.
         """
         self.simulations += len(theta)
         result = np.full((len(theta), self.observed.shape[1], self.observed.shape[2]), np.nan)
@@ -169,10 +192,14 @@ class World:
     def _scenarios(self, share: float) -> list[Scenario]:
         """The first share of every run, made once."""
         if share not in self._parts:
-            self._parts[share] = [first_of(t.scenario, int(np.ceil(share * len(t.observed)))) for t in self.tracks]
+            self._parts[share] = [
+                first_of(t.scenario, int(np.ceil(share * len(t.observed)))) for t in self.tracks
+            ]
         return self._parts[share]
 
-    def _simulated(self, simulator: Simulated, theta: Array, runs: Indices, states: Array, share: float) -> Array:
+    def _simulated(
+        self, simulator: Simulated, theta: Array, runs: Indices, states: Array, share: float
+    ) -> Array:
         whole = self._scenarios(share)
         scenarios = [whole[run] for run in runs]
         if self.freed:
@@ -183,7 +210,9 @@ class World:
                 for s, row in zip(scenarios, values, strict=True)
             ]
         lanes = np.delete(theta, np.arange(self.own, self.base.size), axis=1)
-        return simulator.simulate_lanes(lanes, scenarios, dict(zip(self.states, states.T, strict=True)))
+        return simulator.simulate_lanes(
+            lanes, scenarios, dict(zip(self.states, states.T, strict=True))
+        )
 
     def close(self) -> None:
         """Give back what the engine holds."""
@@ -196,7 +225,9 @@ class World:
             raise unknown(f"constant of system {self.kind.name}", name, list(constants) or ["none"])
         value = self.simulator.constant_values[name]
         if value == 0 or any(name in run.constants for run in self.recording.runs):
-            raise InputError(f"--free {name}: expected a constant that is not zero and the same in every run")
+            raise InputError(
+                f"--free {name}: expected a constant that is not zero and the same in every run"
+            )
         low, high = sorted((value / FREED, value * FREED))
         return Parameter(name, constants[name].unit, value, (low, high), says=constants[name].says)
 
@@ -209,7 +240,9 @@ class World:
         return slots
 
     def _delaying(self) -> tuple[Indices, Indices]:
-        """Where coefficients stand that move instants, and that need every step: such lanes are simulated apart."""
+        """Where coefficients stand that move instants, and that need every step: such lanes are
+        simulated apart.
+        """
         found: tuple[list[int], list[int]] = ([], [])
         for effect in self.simulator.effects:
             places = range(*self.slots[effect.name].indices(len(self.parameters)))
@@ -229,7 +262,9 @@ class World:
         return Track(run.name, scenario, observed, guess, known)
 
     def _start(self, run: Run) -> tuple[Array, Mask]:
-        """Initial states (s,), and which of them are stated: from the first samples where they are not."""
+        """Initial states (s,), and which of them are stated: from the first samples where they are
+        not.
+        """
         system, defaults = self.simulator.system, self.kind.states
         values = dict(defaults)
         for coordinate, rate in zip(
@@ -246,21 +281,29 @@ class World:
         return np.array([values[name] for name in self.states]), np.array(known)
 
     def _hidden(self) -> set[str]:
-        """States of coordinates that nothing recorded has to do with: taken to be at their defaults."""
+        """States of coordinates that nothing recorded has to do with: taken to be at their
+        defaults.
+        """
         system, shown = self.simulator.system, self.channels
         hidden = set()
-        for axis, (coordinate, rate) in enumerate(zip(system.coordinates, system.rates, strict=False)):
+        for axis, (coordinate, rate) in enumerate(
+            zip(system.coordinates, system.rates, strict=False)
+        ):
             about = (coordinate, rate, f"accel_{coordinate}")
             if axis != system.primary and not any(name in shown for name in about):
                 hidden |= {coordinate, rate}
         return hidden
 
     def _lift(self, values: dict[str, float], run: Run) -> None:
-        """Where the height above the ground is not recorded, no impact can be told: begin too high for one."""
+        """Where the height above the ground is not recorded, no impact can be told: begin too high
+        for one.
+        """
         system = self.simulator.system
         if not system.bounces or system.coordinates[-1] in run.channels:
             return
-        gravity = float(run.constants.get("gravity", self.simulator.constant_values.get("gravity", 9.81)))
+        gravity = float(
+            run.constants.get("gravity", self.simulator.constant_values.get("gravity", 9.81))
+        )
         seconds = float(run.times[-1] - run.times[0])
         values[system.coordinates[-1]] = 10.0 + 100.0 * seconds + gravity * seconds**2
 
@@ -274,7 +317,9 @@ def first_of(scenario: Scenario, samples: int) -> Scenario:
 
 
 def beginning(times: Array, values: Array) -> tuple[float, float]:
-    """Value and slope at the first instant, from a parabola through the first samples that are there."""
+    """Value and slope at the first instant, from a parabola through the first samples that are
+    there.
+    """
     seen = np.isfinite(values)
     t, y = times[seen][:_FIRST] - times[0], values[seen][:_FIRST]
     if t.size == 0:

@@ -1,4 +1,6 @@
-"""The account of an explanation in plain sentences: for the terminal, and what the page and the figures say too."""
+"""The account of an explanation in plain sentences: for the terminal, and what the page and the
+figures say too.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ from methods.base import Array
 
 WIDTH = 100
 ESTIMATED = 1.2
-"""An estimated noise is known to this over the root of the number of samples, as a share of it (see `floor`)."""
+"""An estimated noise is known to this over the root of the number of samples, as a share of it (see
+`floor`).
+"""
 ONE_SIDED = 1.645
 PERFECT = "with a perfect model the sensor's noise would leave"
 MOVED = 0.05
@@ -34,7 +38,9 @@ MOVED = 0.05
 
 
 def account(story: Story) -> list[str]:
-    """The lines that a terminal shows: the verdict in a sentence, the gain, where, what moved, what remains."""
+    """The lines that a terminal shows: the verdict in a sentence, the gain, where, what moved, what
+    remains.
+    """
     lines = [clean(story.title, WIDTH), ""]
     for text in (headline(story), *following(story)):
         lines += wrap(text, WIDTH)
@@ -54,7 +60,11 @@ def details(story: Story) -> Iterator[str]:
     if story.verdict["verdict"] != "adequate" and (
         places := [text for kind in ("run", "channel", "phase") if (text := largest(story, kind))]
     ):
-        yield "Where the gap is largest, RMS in units of the noise (1 is the noise floor): " + "; ".join(places) + "."
+        yield (
+            "Where the gap is largest, RMS in units of the noise (1 is the noise floor): "
+            + "; ".join(places)
+            + "."
+        )
     if moved := [text for p in story.parameters if (text := moves(story, p))]:
         yield "Parameters: " + " ".join(moved)
     if story.remains:
@@ -95,7 +105,9 @@ def _sets(causes: Sequence[Mapping[str, Any]]) -> str:
 
 
 def unfixed(story: Story) -> list[str]:
-    """Parameters that the recording cannot fix: those named so, else without interval, else not touched, else all."""
+    """Parameters that the recording cannot fix: those named so, else without interval, else not
+    touched, else all.
+    """
     unbounded = [p.name for p in story.parameters if p.touched and not np.isfinite(p.before).all()]
     untouched = [p.name for p in story.parameters if not p.touched]
     names = list(story.vague) or unbounded or untouched or [p.name for p in story.parameters]
@@ -110,21 +122,32 @@ def following(story: Story) -> Iterator[str]:
         yield hiding(story)
     yield gain(story)
     if verdict == "partial" or (verdict == "named" and len(story.verdict["causes"]) > 1):
-        told = [f"{noun(cause['effect'])}: {clean(cause['says']).rstrip('.')}" for cause in story.verdict["causes"]]
+        told = [
+            f"{noun(cause['effect'])}: {clean(cause['says']).rstrip('.')}"
+            for cause in story.verdict["causes"]
+        ]
         yield sentence("; ".join(told))
     if verdict == "ambiguous":
         yield "To tell them apart: " + (experiment(story) or "no experiment is proposed.")
 
 
 def gain(story: Story) -> str:
-    """The held-out error before and after against the floor; that it was not measured where no run is held out."""
+    """The held-out error before and after against the floor; that it was not measured where no run
+    is held out.
+    """
     found = story.verdict["heldout"]
     if found is None:
         return _fitted_gain(story)
-    base, extended, floor = (_error(story, found[k]) for k in ("rmse_base", "rmse_extended", "noise_floor"))
+    base, extended, floor = (
+        _error(story, found[k]) for k in ("rmse_base", "rmse_extended", "noise_floor")
+    )
     if not story.verdict["causes"]:
         return f"On held-out runs the tuned simulation errs by {base} (RMSE); {PERFECT} {floor}."
-    closed = f"{_closer(story)} {percent(found['gap_closed'])} of the gap{interval(found)}" if closes(found) else ""
+    closed = (
+        f"{_closer(story)} {percent(found['gap_closed'])} of the gap{interval(found)}"
+        if closes(found)
+        else ""
+    )
     errors = f"the error on held-out runs (RMSE) is {base} before and {extended} after; {PERFECT} {floor}."
     return f"{closed}: {errors}" if closed else errors[0].upper() + errors[1:]
 
@@ -159,11 +182,15 @@ def _fitted_gain(story: Story) -> str:
     said = f"the tuned simulation's error is {number(before)} times the noise"
     if story.verdict["causes"]:
         said += f" before and {number(after)} times after"
-    return f"No run is held out, so the gain is not measured independently; on the fitted runs {said}."
+    return (
+        f"No run is held out, so the gain is not measured independently; on the fitted runs {said}."
+    )
 
 
 def heldout_unit(story: Story) -> str:
-    """The unit of the held-out errors: stated, or that of the channels whose noise together makes the floor."""
+    """The unit of the held-out errors: stated, or that of the channels whose noise together makes
+    the floor.
+    """
     found = story.verdict["heldout"] or {}
     if "unit" in found:
         return str(found["unit"])
@@ -204,39 +231,56 @@ def hiding(story: Story) -> str:
 def hidden(story: Story) -> Array:
     """(C,) RMS in the channel's unit of the largest gap that a channel's noise could hide, at 95 %.
 
-    The mean square of the residual, less that of the noise, plus what the former is uncertain by: fewer samples count
-    where the noise remembers, and a noise that is estimated is itself uncertain.
+    The mean square of the residual, less that of the noise, plus what the former is uncertain by:
+    fewer samples count where the noise remembers, and a noise that is estimated is itself
+    uncertain.
     """
     sizes = []
     for c, channel in enumerate(story.channels):
-        rows = [row for side in sides(story) for row in (side.observed - side.before)[:, :, c] / channel.sigma]
+        rows = [
+            row
+            for side in sides(story)
+            for row in (side.observed - side.before)[:, :, c] / channel.sigma
+        ]
         seen = np.concatenate([row[np.isfinite(row)] for row in rows])
         if seen.size < 2:
             sizes.append(np.nan)
             continue
         square = float(np.mean(seen**2))
         pairs = np.concatenate([row[1:] * row[:-1] for row in rows])
-        phi = float(np.clip(np.nanmean(pairs) / square, 0.0, 0.98)) if np.isfinite(pairs).any() and square else 0.0
+        phi = (
+            float(np.clip(np.nanmean(pairs) / square, 0.0, 0.98))
+            if np.isfinite(pairs).any() and square
+            else 0.0
+        )
         counted = seen.size * (1.0 - phi**2) / (1.0 + phi**2)
         doubt = 0.0 if channel.stated else 2.0 * ESTIMATED / seen.size**0.5
-        excess = max(0.0, square - 1.0) + ONE_SIDED * float(np.hypot(square * (2.0 / counted) ** 0.5, doubt))
+        excess = max(0.0, square - 1.0) + ONE_SIDED * float(
+            np.hypot(square * (2.0 / counted) ** 0.5, doubt)
+        )
         sizes.append(channel.sigma * excess**0.5)
     return np.array(sizes)
 
 
 def sides(story: Story) -> list[Side]:
     """Fitted and held-out runs, as far as there are any."""
-    return [side for side in (story.fitting, story.held_out) if side is not None and len(side.names)]
+    return [
+        side for side in (story.fitting, story.held_out) if side is not None and len(side.names)
+    ]
 
 
 def rms(story: Story, side: Side, which: str) -> float:
-    """RMS of a side's residual over all channels in units of the noise; ``which`` is before or after."""
+    """RMS of a side's residual over all channels in units of the noise; ``which`` is before or
+    after.
+    """
     left = (side.observed - getattr(side, which)) / np.array([c.sigma for c in story.channels])
     return float(np.sqrt(np.nanmean(left**2))) if np.isfinite(left).any() else float("nan")
 
 
 def coefficients(cause: Mapping[str, Any]) -> str:
-    """A cause's coefficients with intervals, how unlikely it is by chance, and what would do as well."""
+    """A cause's coefficients with intervals, how unlikely it is by chance, and what would do as
+    well.
+    """
     parts = [
         f"{clean(name, 60)} {with_unit(estimate(c['value'], c['low'], c['high']), c['unit'])}"
         for name, c in cause["coefficients"].items()
@@ -260,13 +304,17 @@ def largest(story: Story, kind: str) -> str:
 
 
 def moves(story: Story, p: Tuned) -> str:
-    """How far a parameter moves once the cause is in: what the base model had bent to absorb of the gap."""
+    """How far a parameter moves once the cause is in: what the base model had bent to absorb of the
+    gap.
+    """
     unit, name = f" {pretty(p.unit)}" if pretty(p.unit) else "", clean(p.name, 60)
     if not p.touched:
         return f"{name} is not touched by these data and stays at its nominal {number(p.before[0])}{unit}."
     if not story.verdict["causes"]:
         return f"{name} = {estimate(*p.before)}{unit}."
-    change = f"{name} {estimate(*p.before)}{unit} before, {estimate(*p.after)}{unit} after ({shift(p)})"
+    change = (
+        f"{name} {estimate(*p.before)}{unit} before, {estimate(*p.after)}{unit} after ({shift(p)})"
+    )
     return change + (": it had absorbed part of the gap." if absorbed(p) else ".")
 
 
@@ -279,8 +327,13 @@ def shift(p: Tuned) -> str:
 
 
 def absorbed(p: Tuned) -> bool:
-    """Whether a parameter moves out of the interval that the base model gives, or that the extended one does."""
-    inside = [low <= value <= high for value, (_, low, high) in ((p.after[0], p.before), (p.before[0], p.after))]
+    """Whether a parameter moves out of the interval that the base model gives, or that the extended
+    one does.
+    """
+    inside = [
+        low <= value <= high
+        for value, (_, low, high) in ((p.after[0], p.before), (p.before[0], p.after))
+    ]
     if not np.isfinite([*p.before, *p.after]).all():
         return abs(p.after[0] - p.before[0]) > MOVED * abs(p.before[0])
     return not all(inside)

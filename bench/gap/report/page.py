@@ -1,6 +1,8 @@
-"""The page of an explanation: one file, readable without a network or scripts, in the light, in the dark and in print.
+"""The page of an explanation: one file, readable without a network or scripts, in the light, in the
+dark and in print.
 
-Ten seconds come first: what is wrong, the gain, the run that shows it. Every text from a file or plugin passes `safe`.
+Ten seconds come first: what is wrong, the gain, the run that shows it. Every text from a file or
+plugin passes `safe`.
 """
 
 from __future__ import annotations
@@ -11,7 +13,16 @@ from math import isfinite
 from pathlib import Path
 
 from bench.gap.report.account import closes, effort, following, headline, heldout_unit, interval
-from bench.gap.report.sections import candidates, numbers, reading, remains, safe, where, why, worst_first
+from bench.gap.report.sections import (
+    candidates,
+    numbers,
+    reading,
+    remains,
+    safe,
+    where,
+    why,
+    worst_first,
+)
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, joined, name_of, number, percent, pretty, with_unit
 from sims.base import InputError
@@ -35,7 +46,8 @@ _CAPTIONS = {
 
 
 def write_report(story: Story, folder: Path, figures: Sequence[Path]) -> Path:
-    """Write ``report.html`` into `folder`, the PNG files among `figures` within it; returns its path.
+    """Write ``report.html`` into `folder`, the PNG files among `figures` within it; returns its
+    path.
 
     Raises:
         InputError: the folder cannot be made or written to.
@@ -90,7 +102,9 @@ def _gain(story: Story) -> Iterator[str]:
     rows = [("before", tuned, found["rmse_base"]), ("floor", "noise floor", found["noise_floor"])]
     if story.verdict["causes"]:
         rows.insert(1, ("after", "after: with what was found", found["rmse_extended"]))
-    most = max((value for _, _, value in rows if value is not None and isfinite(value)), default=0.0)
+    most = max(
+        (value for _, _, value in rows if value is not None and isfinite(value)), default=0.0
+    )
     yield '<section class="gain" aria-label="error on held-out runs">'
     if closes(found) and story.verdict["causes"]:
         share = percent(found["gap_closed"])
@@ -118,8 +132,13 @@ def _alternative(story: Story, stem: str) -> str:
         names = joined([clean(c.name, 30) for c in story.channels])
         return f"Measured and simulated {names} of the run that fits worst, with the residual. {headline(story)}"
     if stem == "where":
-        parts = [f"{p.kind} {clean(p.label, 30)} {number(p.before, 2)}" for p in worst_first(story.places)[:5]]
-        return f"Size of the residual in units of the noise, the largest before: {'; '.join(parts)}."
+        parts = [
+            f"{p.kind} {clean(p.label, 30)} {number(p.before, 2)}"
+            for p in worst_first(story.places)[:5]
+        ]
+        return (
+            f"Size of the residual in units of the noise, the largest before: {'; '.join(parts)}."
+        )
     best = [f"{name_of(c['effect'])} {number(c['score'])}" for c in story.verdict["candidates"][:5]]
     return f"Scores of the candidates, the best: {'; '.join(best)}."
 

@@ -1,4 +1,6 @@
-"""Panels of the figures: places and profiles of the gap, candidates; and the look that all figures share."""
+"""Panels of the figures: places and profiles of the gap, candidates; and the look that all figures
+share.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,12 @@ if TYPE_CHECKING:
 MOST_RUNS, MOST_PLACES, MOST_PROFILES, MOST_CANDIDATES = 8, 6, 4, 12
 BEFORE: Mapping[str, Any] = {"color": "#D55E00", "linestyle": (0, (5, 2)), "linewidth": 1.3}
 AFTER: Mapping[str, Any] = {"color": "#0072B2", "linestyle": "-", "linewidth": 1.5}
-OPEN: Mapping[str, Any] = {"marker": "s", "markersize": 6, "markerfacecolor": "white", "color": "#D55E00"}
+OPEN: Mapping[str, Any] = {
+    "marker": "s",
+    "markersize": 6,
+    "markerfacecolor": "white",
+    "color": "#D55E00",
+}
 FILLED: Mapping[str, Any] = {"marker": "o", "markersize": 5.5, "color": "#0072B2"}
 _LOOKS: Mapping[str, Mapping[str, Any]] = {
     "found": {"facecolor": "#0072B2"},
@@ -55,16 +62,38 @@ def places_panel(axis: Axes, places: Sequence[Place], story: Story) -> None:
         new = i == 0 or places[i - 1].kind != place.kind
         rows.append((rows[-1] if rows else -0.6) + (2.1 if new and rows else 1.6 if new else 1.0))
         if new:
-            axis.text(-0.035, rows[-1] - 0.85, f"by {place.kind} (samples)", transform=axis.get_yaxis_transform(),
-                      ha="right", va="center", fontsize=8.5, weight="bold")  # fmt: skip
+            axis.text(
+                -0.035,
+                rows[-1] - 0.85,
+                f"by {place.kind} (samples)",
+                transform=axis.get_yaxis_transform(),
+                ha="right",
+                va="center",
+                fontsize=8.5,
+                weight="bold",
+            )
     noise = [min(2 / (2 * p.samples) ** 0.5, 0.9) for p in places]
-    axis.errorbar(np.ones(len(rows)), rows, xerr=noise, fmt="none", ecolor="#A8A8A8", elinewidth=7, label=_ALONE)
+    axis.errorbar(
+        np.ones(len(rows)),
+        rows,
+        xerr=noise,
+        fmt="none",
+        ecolor="#A8A8A8",
+        elinewidth=7,
+        label=_ALONE,
+    )
     axis.axvline(1.0, color="#333333", linewidth=1.0, linestyle=":", label=_FLOOR)
     squares, dots = [p.before for p in places], [p.after for p in places]
     if changed(story):
         axis.hlines(rows, dots, squares, color="#999999", linewidth=0.9)
         axis.plot(dots, rows, linestyle="", label="after", **FILLED)
-    axis.plot(squares, rows, linestyle="", label="before" if changed(story) else "simulated (tuned)", **OPEN)
+    axis.plot(
+        squares,
+        rows,
+        linestyle="",
+        label="before" if changed(story) else "simulated (tuned)",
+        **OPEN,
+    )
     _decades(axis, [*squares, *(dots if changed(story) else []), 1.0])
     axis.set_yticks(rows, [f"{label(p.label, most=18)} ({p.samples})" for p in places])
     axis.set_ylim(rows[-1] + 0.7, -0.1)
@@ -74,7 +103,9 @@ def places_panel(axis: Axes, places: Sequence[Place], story: Story) -> None:
 def in_order(axis: Axes) -> tuple[list[Any], list[str]]:
     """Handles and labels of a legend in the order in which a reader meets them."""
     found = dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    labels = [name for name in ("before", "simulated (tuned)", "after", _FLOOR, _ALONE) if name in found]
+    labels = [
+        name for name in ("before", "simulated (tuned)", "after", _FLOOR, _ALONE) if name in found
+    ]
     return [found[name] for name in labels], labels
 
 
@@ -94,7 +125,9 @@ def _decades(axis: Axes, values: Sequence[float]) -> None:
 
 
 def telling(profiles: Sequence[Profile]) -> list[Profile]:
-    """The profiles in which the residual before stands out most, one for each variable before a second for any."""
+    """The profiles in which the residual before stands out most, one for each variable before a
+    second for any.
+    """
     ranked = sorted((p for p in profiles if np.isfinite(_standing(p))), key=lambda p: -_standing(p))
     variables = [p.variable for p in ranked]
     again = [name in variables[:i] for i, name in enumerate(variables)]
@@ -103,7 +136,11 @@ def telling(profiles: Sequence[Profile]) -> list[Profile]:
 
 def _standing(profile: Profile) -> float:
     there = np.isfinite(profile.before) & (profile.error > 0)
-    return float(np.mean((profile.before[there] / profile.error[there]) ** 2)) if there.sum() > 1 else float("nan")
+    return (
+        float(np.mean((profile.before[there] / profile.error[there]) ** 2))
+        if there.sum() > 1
+        else float("nan")
+    )
 
 
 def profile_panel(axis: Axes, profile: Profile, unit: str, extended: bool) -> None:
@@ -140,11 +177,15 @@ def scores_panel(axis: Axes, story: Story, found: Sequence[Mapping[str, Any]]) -
     for row, size, c in zip(rows, sizes, found, strict=True):
         axis.barh(row, size, height=0.62, edgecolor="white", **_LOOKS[standing(story, c["effect"])])
         said = f"{number(c['score'])}  ({probability(c['p_value'])})"
-        axis.annotate(said, (size, row), (4, 0), textcoords="offset points", va="center", fontsize=8)
+        axis.annotate(
+            said, (size, row), (4, 0), textcoords="offset points", va="center", fontsize=8
+        )
     axis.set_yticks(rows, [label(name_of(c["effect"]), most=34) for c in found])
     axis.set_ylim(len(found) - 0.4, -0.6)
     axis.set_xlim(0, 1.35 * max(*sizes, 1e-9))
-    axis.set_xlabel("score: evidence that the simulation lacks it\n(twice the gain in log likelihood)")
+    axis.set_xlabel(
+        "score: evidence that the simulation lacks it\n(twice the gain in log likelihood)"
+    )
 
 
 def gains_panel(axis: Axes, story: Story, found: Sequence[Mapping[str, Any]]) -> None:

@@ -1,7 +1,8 @@
 """The figures of an explanation: the run with the largest gap, where the gap is, the candidates.
 
-Made for print and for grey: before is dashed with open squares, after solid with filled circles, beside their colours.
-Each figure is written as PNG and PDF. Texts from files are never read as mathematics.
+Made for print and for grey: before is dashed with open squares, after solid with filled circles,
+beside their colours. Each figure is written as PNG and PDF. Texts from files are never read as
+mathematics.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ _STYLE: dict[Any, Any] = {
 
 
 def draw(story: Story, folder: Path) -> list[Path]:
-    """Draw what there is to see into `folder`, each figure as PNG and PDF; returns the files, PNG before PDF.
+    """Draw what there is to see into `folder`, each figure as PNG and PDF; returns the files, PNG
+    before PDF.
 
     Raises:
         InputError: the folder cannot be made or written to.
@@ -62,8 +64,10 @@ def draw(story: Story, folder: Path) -> list[Path]:
     from matplotlib import rc_context
 
     makers: dict[str, Callable[[Story], Figure | None]] = {
-        "overview": _overview, "where": _where, "candidates": _candidates
-    }  # fmt: skip
+        "overview": _overview,
+        "where": _where,
+        "candidates": _candidates,
+    }
     made = []
     with rc_context(_STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # a title may be in any script
@@ -86,7 +90,9 @@ def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
 
 
 class Shot(NamedTuple):
-    """The run that is shown: its side, its row, whether it is held out, and its channels, the worst first."""
+    """The run that is shown: its side, its row, whether it is held out, and its channels, the worst
+    first.
+    """
 
     side: Side
     row: int
@@ -100,7 +106,9 @@ def worst(story: Story) -> Shot:
     sigma = np.array([c.sigma for c in story.channels])
     squares = ((side.observed - side.before) / sigma) ** 2
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a run or channel without a sample has no mean
+        warnings.simplefilter(
+            "ignore", RuntimeWarning
+        )  # a run or channel without a sample has no mean
         row = int(np.argmax(np.nan_to_num(np.nanmean(squares, axis=(1, 2)))))
         by_channel = np.nan_to_num(np.nanmean(squares[row], axis=0))
     channels = np.argsort(-by_channel, kind="stable")[:MOST_CHANNELS]
@@ -131,15 +139,31 @@ def _signal(above: Axes, below: Axes, story: Story, shot: Shot, c: int) -> None:
     """One channel: measured and simulated, and under it what the simulation leaves."""
     channel, side = story.channels[c], shot.side
     length = len(side.times[shot.row])
-    measured, before, after = (a[shot.row, :length, c] for a in (side.observed, side.before, side.after))
+    measured, before, after = (
+        a[shot.row, :length, c] for a in (side.observed, side.before, side.after)
+    )
     rows = kept(measured)
     t, measured, before, after = (a[rows] for a in (side.times[shot.row], measured, before, after))
     size = 3.6 if rows.size < 250 else 2.6
-    above.plot(t, measured, "o", color="black", markersize=size, markeredgewidth=0, label="measured", zorder=4)
+    above.plot(
+        t,
+        measured,
+        "o",
+        color="black",
+        markersize=size,
+        markeredgewidth=0,
+        label="measured",
+        zorder=4,
+    )
     tuned = "simulated before (tuned)" if changed(story) else "simulated (tuned)"
     above.plot(t, before, label=tuned, zorder=3, **BEFORE)
     below.axhspan(
-        -2 * channel.sigma, 2 * channel.sigma, color=BAND, linewidth=0, label="±2σ: 95 % of the noise", zorder=0
+        -2 * channel.sigma,
+        2 * channel.sigma,
+        color=BAND,
+        linewidth=0,
+        label="±2σ: 95 % of the noise",
+        zorder=0,
     )
     below.axhline(0, color="#555555", linewidth=0.6, zorder=1)
     below.plot(t, measured - before, zorder=3, **{**BEFORE, "linewidth": 1.0})
@@ -156,13 +180,17 @@ def _signal(above: Axes, below: Axes, story: Story, shot: Shot, c: int) -> None:
 
 
 def kept(values: Array) -> Any:
-    """Places of at most about `MOST_POINTS` samples that look the same: the least and largest of each stretch."""
+    """Places of at most about `MOST_POINTS` samples that look the same: the least and largest of
+    each stretch.
+    """
     if values.size <= MOST_POINTS:
         return np.arange(values.size)
     edges = np.linspace(0, values.size, MOST_POINTS // 2 + 1).astype(int)
     low, high = np.nan_to_num(values, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
     stretches = [*pairwise(edges)]
-    chosen = [a + np.argmin(low[a:b]) for a, b in stretches] + [a + np.argmax(high[a:b]) for a, b in stretches]
+    chosen = [a + np.argmin(low[a:b]) for a, b in stretches] + [
+        a + np.argmax(high[a:b]) for a, b in stretches
+    ]
     return np.unique(chosen)
 
 
@@ -176,7 +204,10 @@ def _where(story: Story) -> Figure | None:
     if not places:
         return None
     columns, rows = -(-len(profiles) // 2), min(2, len(profiles))
-    width, tall = 5.2 + (3.1 * columns if columns != 1 else 4.4), max(2.6 + 0.27 * len(places), 1.5 + 1.9 * rows)
+    width, tall = (
+        5.2 + (3.1 * columns if columns != 1 else 4.4),
+        max(2.6 + 0.27 * len(places), 1.5 + 1.9 * rows),
+    )
     figure, axes = _canvas(1, 1, (width, tall))
     axis = axes[0][0]
     axis.set_position((1.9 / width, 1.0 / tall, 3.1 / width, 1 - 1.4 / tall))
@@ -185,13 +216,25 @@ def _where(story: Story) -> Figure | None:
     figure.legend(*in_order(axis), loc="lower left", ncols=2, fontsize=8.5, columnspacing=1.0)
     if not profiles:
         return figure
-    figure.text(6.0 / width, 1 - 0.22 / tall, "What it follows: mean residual in bins", fontsize=11, va="center")
+    figure.text(
+        6.0 / width,
+        1 - 0.22 / tall,
+        "What it follows: mean residual in bins",
+        fontsize=11,
+        va="center",
+    )
     note = "residual: measured − simulated; bars: ±2 standard errors"
     figure.text(6.0 / width, 0.2 / tall, note, fontsize=8.5, va="center")
     grid = figure.add_gridspec(
-        rows, columns, left=6.0 / width, right=1 - 0.12 / width, bottom=0.85 / tall, top=1 - 0.5 / tall,
-        hspace=0.45, wspace=0.42,
-    )  # fmt: skip
+        rows,
+        columns,
+        left=6.0 / width,
+        right=1 - 0.12 / width,
+        bottom=0.85 / tall,
+        top=1 - 0.5 / tall,
+        hspace=0.45,
+        wspace=0.42,
+    )
     units = {c.name: c.unit for c in story.channels}
     for i, profile in enumerate(profiles):
         axis = figure.add_subplot(grid[i // columns, i % columns])
@@ -210,7 +253,9 @@ def _candidates(story: Story) -> Figure | None:
     some = f", the best {len(found)} of {total}" if len(found) < total else ""
     figure.text(0.015, 1 - 0.22 / tall, f"Candidate causes{some}", fontsize=11, va="center")
     figure.legend(*standings(story), loc="upper right", ncols=3, fontsize=8.5)
-    figure.subplots_adjust(left=0.25, right=0.985, bottom=0.68 / tall, top=1 - 0.45 / tall, wspace=0.06)
+    figure.subplots_adjust(
+        left=0.25, right=0.985, bottom=0.68 / tall, top=1 - 0.45 / tall, wspace=0.06
+    )
     return figure
 
 

@@ -1,4 +1,6 @@
-"""Sections of the page below what one sees first: why, where, candidates, numbers, what remains, how to read it."""
+"""Sections of the page below what one sees first: why, where, candidates, numbers, what remains,
+how to read it.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,17 @@ import numpy as np
 from bench.gap.report.account import absorbed, experiment, rms, shift
 from bench.gap.report.panels import standing
 from bench.gap.report.story import Place, Side, Story, Tuned
-from bench.gap.report.words import clean, estimate, joined, name_of, noun, number, probability, sentence, with_unit
+from bench.gap.report.words import (
+    clean,
+    estimate,
+    joined,
+    name_of,
+    noun,
+    number,
+    probability,
+    sentence,
+    with_unit,
+)
 from methods.base import Array
 
 MOST_ROWS = 40
@@ -45,13 +57,26 @@ def where(story: Story, picture: str) -> Iterator[str]:
     worst = worst_first(story.places)
     shown = [p for p in story.places if p in worst[:MOST_ROWS]]
     extended = bool(story.verdict["causes"])
-    heads = ["part of the data", "-samples", *(["-RMS before", "-RMS after"] if extended else ["-RMS"])]
+    heads = [
+        "part of the data",
+        "-samples",
+        *(["-RMS before", "-RMS after"] if extended else ["-RMS"]),
+    ]
     rows = [
-        [safe(f"{p.kind} {p.label}", 80), str(p.samples), f"{p.before:.2f}", *([f"{p.after:.2f}"] if extended else [])]
+        [
+            safe(f"{p.kind} {p.label}", 80),
+            str(p.samples),
+            f"{p.before:.2f}",
+            *([f"{p.after:.2f}"] if extended else []),
+        ]
         for p in shown
     ]
     if rows:
-        some = f" The {len(rows)} worst of {len(story.places)}." if len(rows) < len(story.places) else ""
+        some = (
+            f" The {len(rows)} worst of {len(story.places)}."
+            if len(rows) < len(story.places)
+            else ""
+        )
         yield f'<p class="soft">RMS of the residual in units of the noise; 1 is the noise floor.{some}</p>'
         yield table(heads, rows)
     yield from _channels(story)
@@ -69,7 +94,9 @@ def _channels(story: Story) -> Iterator[str]:
     there = [(name, side) for name, side in runs if side is not None and len(side.names)]
     heads = ["channel", "-noise, 1σ", "known how"]
     for name, _ in there:
-        heads += [f"-RMSE{when}, {name} runs" for when in ((" before", " after") if extended else ("",))]
+        heads += [
+            f"-RMSE{when}, {name} runs" for when in ((" before", " after") if extended else ("",))
+        ]
     rows = []
     for i, c in enumerate(story.channels):
         known = "stated" if c.stated else "estimated"
@@ -104,12 +131,19 @@ def candidates(story: Story, picture: str) -> Iterator[str]:
     if candidates:
         heads = ["candidate", "name", "-score", "-p", "-gain on held-out runs", "standing"]
         rows = [
-            [safe(name_of(c["effect"])), f"<code>{safe(c['effect'], 80)}</code>", number(c["score"]),
-             probability(c["p_value"]).removeprefix("p = ").removeprefix("p "), number(c["heldout_gain"]),
-             standing(story, c["effect"]) if story.verdict["causes"] else "not convincing"]
+            [
+                safe(name_of(c["effect"])),
+                f"<code>{safe(c['effect'], 80)}</code>",
+                number(c["score"]),
+                probability(c["p_value"]).removeprefix("p = ").removeprefix("p "),
+                number(c["heldout_gain"]),
+                standing(story, c["effect"]) if story.verdict["causes"] else "not convincing",
+            ]
             for c in candidates
-        ]  # fmt: skip
-        marks = ["found" if standing(story, c["effect"]) != "not needed" else "" for c in candidates]
+        ]
+        marks = [
+            "found" if standing(story, c["effect"]) != "not needed" else "" for c in candidates
+        ]
         yield table(heads, rows, marks)
     else:
         yield "<p>No candidate was tried.</p>"
@@ -121,21 +155,35 @@ def _set(story: Story, cause: Mapping[str, Any]) -> str:
     parts = []
     for name in (cause["effect"], *cause["alternatives"]):
         found = scores.get(name)
-        evidence = f" (score {number(found['score'])}, held-out gain {number(found['heldout_gain'])})" if found else ""
+        evidence = (
+            f" (score {number(found['score'])}, held-out gain {number(found['heldout_gain'])})"
+            if found
+            else ""
+        )
         parts.append(noun(name) + evidence)
-    return f"{joined(parts)} change these runs so much alike that either explains them equally well."
+    return (
+        f"{joined(parts)} change these runs so much alike that either explains them equally well."
+    )
 
 
 def numbers(story: Story) -> Iterator[str]:
     """What was found in numbers, and how the parameters move."""
     rows = [
-        [safe(noun(cause["effect"])), safe(cause["says"]), safe(name, 60), _estimated(c), probability(cause["p_value"])]
+        [
+            safe(noun(cause["effect"])),
+            safe(cause["says"]),
+            safe(name, 60),
+            _estimated(c),
+            probability(cause["p_value"]),
+        ]
         for cause in story.verdict["causes"]
         for name, c in cause["coefficients"].items()
     ]
     if rows:
         yield "<h2>What was found, in numbers</h2>"
-        yield table(["cause", "what it does", "coefficient", "value (95 % interval)", "by chance"], rows)
+        yield table(
+            ["cause", "what it does", "coefficient", "value (95 % interval)", "by chance"], rows
+        )
     if story.parameters:
         yield "<h2>The simulator's own parameters</h2>"
         yield from _parameters(story)
@@ -169,7 +217,11 @@ def _tuned(p: Tuned, value: tuple[float, float, float]) -> str:
 def _move(p: Tuned) -> str:
     if not p.touched:
         return "–"
-    return f"{shift(p)}, had absorbed part of the gap" if absorbed(p) else f"{shift(p)}, within its interval"
+    return (
+        f"{shift(p)}, had absorbed part of the gap"
+        if absorbed(p)
+        else f"{shift(p)}, within its interval"
+    )
 
 
 def _intervals(p: Tuned) -> str:
@@ -181,19 +233,21 @@ def _intervals(p: Tuned) -> str:
     parts = []
     for kind, y, values in (("before", 8, p.before), ("after", 22, p.after)):
         middle, left, right = (10.0 + (v - low) * scale for v in values)
-        parts.append(f'<line class="{kind}" x1="{left:.1f}" x2="{right:.1f}" y1="{y}" y2="{y}" stroke-width="2"/>')
+        parts.append(
+            f'<line class="{kind}" x1="{left:.1f}" x2="{right:.1f}" y1="{y}" y2="{y}" stroke-width="2"/>'
+        )
         parts.append(f'<circle class="{kind}" cx="{middle:.1f}" cy="{y}" r="4" stroke-width="2"/>')
     name = safe(p.name, 60)
-    return (
-        f'<svg viewBox="0 0 200 30" role="img" aria-label="intervals of {name} before and after">{"".join(parts)}</svg>'
-    )
+    return f'<svg viewBox="0 0 200 30" role="img" aria-label="intervals of {name} before and after">{"".join(parts)}</svg>'
 
 
 def remains(story: Story) -> Iterator[str]:
     """What is left unexplained."""
     yield "<h2>What remains</h2>"
     if story.remains:
-        yield "<ul>" + "".join(f"<li>{safe(sentence(text))}</li>" for text in story.remains) + "</ul>"
+        yield (
+            "<ul>" + "".join(f"<li>{safe(sentence(text))}</li>" for text in story.remains) + "</ul>"
+        )
         return
     side, name = (story.held_out, "held-out") if story.held_out else (story.fitting, "fitted")
     left = number(rms(story, side, "after"), 2)
@@ -206,12 +260,24 @@ def reading() -> Iterator[str]:
     yield "<h2>How to read this</h2>\n<dl>"
     for word, meaning in (
         ("RMSE, RMS", "root mean square: the typical size of the error."),
-        ("noise floor", "the error that a perfect simulation would still have, from the sensor's noise (σ)."),
+        (
+            "noise floor",
+            "the error that a perfect simulation would still have, from the sensor's noise (σ).",
+        ),
         ("gap", "what the tuned simulation's error exceeds the noise floor by."),
-        ("before, after", "the simulation with its own parameters tuned; the same with what was found, tuned again."),
+        (
+            "before, after",
+            "the simulation with its own parameters tuned; the same with what was found, tuned again.",
+        ),
         ("held-out runs", "runs on which nothing was fitted but where they begin."),
-        ("interval", "95 %: where the true value lies 19 times in 20, as far as the model is right."),
-        ("score, p", "evidence for a cause, and how probable as much is by chance where nothing is missing."),
+        (
+            "interval",
+            "95 %: where the true value lies 19 times in 20, as far as the model is right.",
+        ),
+        (
+            "score, p",
+            "evidence for a cause, and how probable as much is by chance where nothing is missing.",
+        ),
     ):
         yield f"<dt>{word}</dt><dd>{meaning}</dd>"
     yield "</dl>"
@@ -220,10 +286,16 @@ def reading() -> Iterator[str]:
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]], marks: Sequence[str] = ()) -> str:
     """An HTML table of cells that are safe already; a head that begins with - heads numbers."""
     kinds = [' class="number"' if head.startswith("-") else "" for head in heads]
-    top = "".join(f'<th scope="col"{k}>{h.removeprefix("-")}</th>' for h, k in zip(heads, kinds, strict=True))
+    top = "".join(
+        f'<th scope="col"{k}>{h.removeprefix("-")}</th>' for h, k in zip(heads, kinds, strict=True)
+    )
     lines = []
     for i, row in enumerate(rows):
         mark = f' class="{marks[i]}"' if marks and marks[i] else ""
-        lines.append(f"<tr{mark}>" + "".join(f"<td{k}>{c}</td>" for c, k in zip(row, kinds, strict=True)) + "</tr>")
+        lines.append(
+            f"<tr{mark}>"
+            + "".join(f"<td{k}>{c}</td>" for c, k in zip(row, kinds, strict=True))
+            + "</tr>"
+        )
     body = "\n".join(lines)
     return f'<div class="scroll"><table>\n<thead><tr>{top}</tr></thead>\n<tbody>\n{body}\n</tbody>\n</table></div>'

@@ -12,7 +12,9 @@ from methods.base import Array
 
 BINS = 12
 SLOW, QUIET = 0.05, 0.01
-"""Shares of the largest speed: below the first a motion turns round, below the second, for a while, it is at rest."""
+"""Shares of the largest speed: below the first a motion turns round, below the second, for a while,
+it is at rest.
+"""
 NEAR_IMPACT = 2
 """Samples to either side of an impact that belong to it."""
 
@@ -24,7 +26,9 @@ def side(world: World, before: Array, after: Array) -> Side:
 
 
 def places(world: World, before: Array, after: Array, sigma: Array, mark: str = "") -> list[Place]:
-    """RMS of the residual in units of the noise, by run, channel and phase; `mark` is set behind names of runs."""
+    """RMS of the residual in units of the noise, by run, channel and phase; `mark` is set behind
+    names of runs.
+    """
     residuals = [(world.observed - simulated) / sigma for simulated in (before, after)]
     seen = np.isfinite(world.observed)
     parts: list[tuple[str, str, Mask]] = []
@@ -35,14 +39,21 @@ def places(world: World, before: Array, after: Array, sigma: Array, mark: str = 
     for phase, where in phases(world, after).items():
         parts.append(("phase", phase, seen & where[:, :, None]))
     return [
-        Place(kind, label, int(mask.sum()), *(float(np.sqrt(np.square(r[mask]).mean())) for r in residuals))
+        Place(
+            kind,
+            label,
+            int(mask.sum()),
+            *(float(np.sqrt(np.square(r[mask]).mean())) for r in residuals),
+        )
         for kind, label, mask in parts
         if mask.any()
     ]
 
 
 def phases(world: World, simulated: Array) -> dict[str, Mask]:
-    """(R, T) masks: flight, impact, at rest for what bounces; motion, reversal, at rest for the others; saturated."""
+    """(R, T) masks: flight, impact, at rest for what bounces; motion, reversal, at rest for the
+    others; saturated.
+    """
     system = world.simulator.system
     speed = speeds(world, simulated)
     if speed is None:
@@ -63,7 +74,9 @@ def phases(world: World, simulated: Array) -> dict[str, Mask]:
 
 
 def speeds(world: World, simulated: Array) -> Array | None:
-    """(R, T) speed of the simulated motion along the recorded coordinates, 0 behind the end; None without any."""
+    """(R, T) speed of the simulated motion along the recorded coordinates, 0 behind the end; None
+    without any.
+    """
     squares = np.zeros(simulated.shape[:2])
     shown = [n for n in world.simulator.system.coordinates if n in world.channels]
     for name in shown:
@@ -111,7 +124,9 @@ def _saturated(world: World) -> Mask:
 
 
 def profiles(world: World, before: Array, after: Array, sigma: Array) -> list[Profile]:
-    """The residual of the channel that the sensor effects act on, against time, position, speed and the inputs."""
+    """The residual of the channel that the sensor effects act on, against time, position, speed and
+    the inputs.
+    """
     name = world.simulator.system.reading(world.channels)
     c = world.channels.index(name)
     found = []
@@ -132,7 +147,9 @@ def profiles(world: World, before: Array, after: Array, sigma: Array) -> list[Pr
             ]
             error = sigma[c] / np.sqrt(counts)
         error[counts == 0] = np.nan
-        found.append(Profile(name, variable, unit, (edges[1:] + edges[:-1]) / 2.0, means[0], means[1], error))
+        found.append(
+            Profile(name, variable, unit, (edges[1:] + edges[:-1]) / 2.0, means[0], means[1], error)
+        )
     return found
 
 

@@ -12,7 +12,9 @@ from methods.base import Array
 
 @dataclass(frozen=True)
 class Shown:
-    """One recorded channel: name, unit, noise (1 sigma), whether that is stated, its quantisation (0: none)."""
+    """One recorded channel: name, unit, noise (1 sigma), whether that is stated, its quantisation
+    (0: none).
+    """
 
     name: str
     unit: str
@@ -42,7 +44,8 @@ class Side:
 
 @dataclass(frozen=True)
 class Place:
-    """Where the gap is: RMS of the residual in units of the noise, before and after, in one part of the data.
+    """Where the gap is: RMS of the residual in units of the noise, before and after, in one part of
+    the data.
 
     Attributes:
         kind: ``run``, ``channel`` or ``phase``.
@@ -84,7 +87,9 @@ class Profile:
 
 @dataclass(frozen=True)
 class Tuned:
-    """A parameter before and after the extension, each with its 95 % interval (NaN where the data give none)."""
+    """A parameter before and after the extension, each with its 95 % interval (NaN where the data
+    give none).
+    """
 
     name: str
     unit: str
@@ -100,14 +105,16 @@ class Story:
     Attributes:
         title: of the recording.
         path: of the recording.
-        verdict: verdict.json, see DESIGN; its ``says`` and names are texts from files or plugins: escape them.
+        verdict: verdict.json, see DESIGN; its ``says`` and names are texts from files or plugins:
+            escape them.
         channels: the recorded ones.
         fitting: runs for fitting.
         held_out: runs for measuring; None where there are none.
         places: where the gap is, held-out runs included.
         profiles: the residual against time, position, speed and inputs.
         parameters: before and after.
-        remains: what the extended model leaves unexplained and what to bear in mind, a sentence each; may be empty.
+        remains: what the extended model leaves unexplained and what to bear in mind, a sentence
+            each; may be empty.
         why: sentences that say why the verdict is what it is, the most important first.
         vague: names of base parameters that the data do not fix.
     """

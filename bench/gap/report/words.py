@@ -41,19 +41,26 @@ _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _SMALL, _LARGE = 1e-3, 1e5
 """Magnitudes beyond which numbers are written with a power of ten."""
 _FEW = log10(3.55)
-"""Mantissa of an interval below which it is written with two digits (Particle Data Group's rule)."""
+"""Mantissa of an interval below which it is written with two digits (Particle Data Group's rule).
+"""
 _LEAST = 1e-12
 """Probabilities below this are all the same."""
 
 
 def clean(text: object, most: int = 400) -> str:
-    """Text from a file or plugin on one line: what a terminal would obey is spelled out, what is too long cut."""
-    plain = "".join(c if c.isprintable() else " " if c.isspace() else ascii(c)[1:-1] for c in str(text)).strip()
+    """Text from a file or plugin on one line: what a terminal would obey is spelled out, what is
+    too long cut.
+    """
+    plain = "".join(
+        c if c.isprintable() else " " if c.isspace() else ascii(c)[1:-1] for c in str(text)
+    ).strip()
     return plain if len(plain) <= most else plain[: most - 1] + "…"
 
 
 def noun(effect: str) -> str:
-    """An effect as a noun, e.g. ``linear drag``; effects joined by + as ``a and b``; unknown ones keep their name."""
+    """An effect as a noun, e.g. ``linear drag``; effects joined by + as ``a and b``; unknown ones
+    keep their name.
+    """
     return joined([_NOUNS.get(part.strip(), clean(part, 60)) for part in effect.split("+")])
 
 
@@ -72,13 +79,17 @@ def sentence(text: object) -> str:
     plain = clean(text)
     if not plain:
         return plain
-    begin = plain[0].upper() if plain.split()[0].rstrip(",:;.").isalpha() else plain[0]  # a name stays as it is
+    begin = (
+        plain[0].upper() if plain.split()[0].rstrip(",:;.").isalpha() else plain[0]
+    )  # a name stays as it is
     return begin + plain[1:] + ("" if plain[-1] in ".!?…" else ".")
 
 
 def pretty(unit: str) -> str:
     """A unit as printed, ``kg·m²``; empty for a pure number."""
-    raised = re.sub(r"(?:\^|\*\*)(-?\d+)", lambda power: power[1].translate(_RAISED), clean(unit, 60))
+    raised = re.sub(
+        r"(?:\^|\*\*)(-?\d+)", lambda power: power[1].translate(_RAISED), clean(unit, 60)
+    )
     return "" if raised == "1" else raised.replace("*", "·")
 
 
@@ -106,13 +117,17 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def estimate(value: float, low: float | None, high: float | None) -> str:
-    """``0.00333 (0.00330 to 0.00336)``: one digit of the interval's half width, two where it begins with 1 to 3."""
+    """``0.00333 (0.00330 to 0.00336)``: one digit of the interval's half width, two where it begins
+    with 1 to 3.
+    """
     if low is None or high is None or not (isfinite(low) and isfinite(high)) or high <= low:
         return f"{number(value)} (no interval)"
     exponent = _exponent(max(abs(value), abs(low), abs(high)))
     half = log10((high - low) / 2) - exponent
     decimals = min(max(0, (half % 1 < _FEW) - floor(half)), 9)
-    texts = [_signed(f"{x / 10.0**exponent:.{decimals}f}") + _power(exponent) for x in (value, low, high)]
+    texts = [
+        _signed(f"{x / 10.0**exponent:.{decimals}f}") + _power(exponent) for x in (value, low, high)
+    ]
     return f"{texts[0]} ({texts[1]} to {texts[2]})"
 
 

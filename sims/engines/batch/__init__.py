@@ -1,8 +1,8 @@
 """The project's own engine: many lanes of a small system at once, in numpy.
 
-Each lane's motion is computed from that lane alone, so it does not depend, bit for bit, on what else is in the call,
-and an effect that is off in a lane changes nothing there. Lanes on which only a constant force acts fly in closed form
-(`parabola`); the others are stepped (`stepping`).
+Each lane's motion is computed from that lane alone, so it does not depend, bit for bit, on what
+else is in the call, and an effect that is off in a lane changes nothing there. Lanes on which only
+a constant force acts fly in closed form (`parabola`); the others are stepped (`stepping`).
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ class Batch:
     """Integrates lanes of any system.
 
     Args:
-        time_step: longest step in seconds; steps are shorter where a lane's motion is too fast for it.
+        time_step: longest step in seconds; steps are shorter where a lane's motion is too fast for
+            it.
         turn: radians by which an oscillation may turn in a step; see `sims.engines.batch.pace`.
-        patience: a lane is given up, and NaN, that needs so many times the planned steps; so a search through forces
-            that bend sharply at every reversal never waits for what is no answer. Without a limit by default.
+        patience: a lane is given up, and NaN, that needs so many times the planned steps; so a
+            search through forces that bend sharply at every reversal never waits for what is no
+            answer. Without a limit by default.
 
     Raises:
         InputError: a setting that is not a positive number.
@@ -41,13 +43,21 @@ class Batch:
     name = "batch"
     requires = REQUIRES
 
-    def __init__(self, time_step: float = TIME_STEP, turn: float = TURN, patience: float = np.inf) -> None:
+    def __init__(
+        self, time_step: float = TIME_STEP, turn: float = TURN, patience: float = np.inf
+    ) -> None:
         if not (np.isfinite(time_step) and time_step > 0):
-            raise InputError(f"engine batch: time_step must be a positive number of seconds, found {time_step}")
+            raise InputError(
+                f"engine batch: time_step must be a positive number of seconds, found {time_step}"
+            )
         for name, value in (("turn", turn), ("patience", patience)):
             if not value > 0:
                 raise InputError(f"engine batch: {name} must be a positive number, found {value}")
-        self.largest_step, self._turn, self._patience = float(time_step), float(turn), float(patience)
+        self.largest_step, self._turn, self._patience = (
+            float(time_step),
+            float(turn),
+            float(patience),
+        )
 
     def integrate(self, lanes: Lanes) -> Motion:
         """Integrate every lane over its steps; a lane whose numbers overflow is NaN throughout."""
@@ -57,7 +67,9 @@ class Batch:
                 motion = self._moved(lanes)
             else:
                 parts = [order[moved[order] == kind] for kind in (False, True)]
-                motion = _joined([(part, self._moved(_take(lanes, part))) for part in parts if part.size], lanes)
+                motion = _joined(
+                    [(part, self._moved(_take(lanes, part))) for part in parts if part.size], lanes
+                )
         lost = ~(np.isfinite(motion.x[:, -1]) & np.isfinite(motion.v[:, -1])).all(axis=1)
         if lost.any():
             for values in (motion.x, motion.v, motion.a):
@@ -74,8 +86,13 @@ class Batch:
         spans = np.max(lanes.steps, axis=1, keepdims=True, initial=0.0)
         parts = divisions(lanes, field, spans, self._turn)
         slow = (parts > FEW)[:, 0]
-        if slow.any() and not slow.all():  # few lanes in many short steps would keep the others waiting in every one
-            apart = [(part, self._moved(_take(lanes, part))) for part in map(np.flatnonzero, (~slow, slow))]
+        if (
+            slow.any() and not slow.all()
+        ):  # few lanes in many short steps would keep the others waiting in every one
+            apart = [
+                (part, self._moved(_take(lanes, part)))
+                for part in map(np.flatnonzero, (~slow, slow))
+            ]
             return _joined(apart, lanes)
         return Stepping(lanes, field, ground, spans, parts).run(self._patience)
 
@@ -99,7 +116,9 @@ def engine(
 
 
 def _sorted(lanes: Lanes) -> tuple[Mask, Indices]:
-    """(L,) whether more than a constant force acts in a lane; lanes in the order of what acts in them."""
+    """(L,) whether more than a constant force acts in a lane; lanes in the order of what acts in
+    them.
+    """
     forces = [acts(c) for effect, c in lanes.effects if isinstance(effect, (Force, Friction))]
     steps = not lanes.system.uniform
     if not forces:
@@ -119,7 +138,9 @@ def _take(lanes: Lanes, i: Indices) -> Lanes:
         constants={name: values[i] for name, values in lanes.constants.items()},
         x=lanes.x[i],
         v=lanes.v[i],
-        steps=np.broadcast_to(lanes.steps[0], (i.size, lanes.steps.shape[1])) if shared else lanes.steps[i],
+        steps=np.broadcast_to(lanes.steps[0], (i.size, lanes.steps.shape[1]))
+        if shared
+        else lanes.steps[i],
         inputs={name: values[i] for name, values in lanes.inputs.items()},
         effects=tuple((effect, c[:, i]) for effect, c in lanes.effects),
     )

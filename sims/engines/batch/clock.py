@@ -12,8 +12,8 @@ from sims.system import Lanes, Motion
 class Clock:
     """A clock for every lane.
 
-    While all lanes are in the same step they are served by whole rows; from the first time that they differ, one by
-    one.
+    While all lanes are in the same step they are served by whole rows; from the first time that
+    they differ, one by one.
 
     Attributes:
         t: (L, 1) seconds since the start of the run.
@@ -27,7 +27,9 @@ class Clock:
         none = np.zeros((1, len(steps)))  # rows must lie together: they are looked up by place
         self._steps = np.ascontiguousarray(np.concatenate([steps.T, none]))
         self._starts = np.ascontiguousarray(np.concatenate([none, np.cumsum(steps, axis=1).T]))
-        self._inputs = {name: np.ascontiguousarray(values.T) for name, values in lanes.inputs.items()}
+        self._inputs = {
+            name: np.ascontiguousarray(values.T) for name, values in lanes.inputs.items()
+        }
         self._every = lanes.every
         self._kept = np.empty((self._end // lanes.every + 1, count, 3 * lanes.x.shape[1]))
         self._lane = np.arange(count)
@@ -89,7 +91,9 @@ class Clock:
             self._common = None
 
     def give_up(self, lanes: Mask, state: Array) -> None:
-        """Lanes (L,) have made their last step; keep the state (3 D, L) as what is behind their last sample."""
+        """Lanes (L,) have made their last step; keep the state (3 D, L) as what is behind their
+        last sample.
+        """
         self._part()
         self._step[lanes] = self._end
         self._kept[-1, lanes] = state[:, lanes].T

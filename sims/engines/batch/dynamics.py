@@ -1,7 +1,8 @@
 """Accelerations during a step: forces, dry friction, and the ground that bears what rests on it.
 
-Dry friction opposes motion with all of its limit. Its direction is held during a step, so that the step is smooth. A
-lane that is still sticks while what pulls is within the limit, else it slips where it is pulled.
+Dry friction opposes motion with all of its limit. Its direction is held during a step, so that the
+step is smooth. A lane that is still sticks while what pulls is within the limit, else it slips
+where it is pulled.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ class Dynamics:
         rests: (L, 1) lanes that lie on the ground.
         sticks: (L, 1) lanes that dry friction holds during the present step.
         way: (L, D) direction of motion at the beginning of the present step; unit vectors.
-        rubs: (L, D) dry friction at each instant asked for since the present step began, had it acted against motion.
-        excess: (L, 1) by how much what pulled exceeded the limit, at the beginning of the step and in the last call.
+        rubs: (L, D) dry friction at each instant asked for since the present step began, had it
+            acted against motion.
+        excess: (L, 1) by how much what pulled exceeded the limit, at the beginning of the step and
+            in the last call.
     """
 
     def __init__(self, field: Field, shape: tuple[int, int]) -> None:
@@ -34,7 +37,9 @@ class Dynamics:
         self._any_rests = False
 
     def begin(self, t: Array, x: Array, v: Array) -> Array:
-        """(L, D) acceleration at the beginning of a step; decides what sticks and which way the rest moves."""
+        """(L, D) acceleration at the beginning of a step; decides what sticks and which way the
+        rest moves.
+        """
         pull = self._borne(t, x, v)
         if not self.field.dry:
             return pull / self.field.mass

@@ -1,7 +1,8 @@
 """Forces of the batch engine: what accelerates every lane at one instant.
 
-Lanes come sorted by the effects that act in them, so that each effect is asked for the span of lanes between the first
-and the last one it acts in. Whatever is computed for a lane is computed from that lane alone.
+Lanes come sorted by the effects that act in them, so that each effect is asked for the span of
+lanes between the first and the last one it acts in. Whatever is computed for a lane is computed
+from that lane alone.
 """
 
 from __future__ import annotations
@@ -67,13 +68,21 @@ class Field:
 
     def __init__(self, lanes: Lanes) -> None:
         self._system = lanes.system
-        self._moment = Moment(lanes.system, lanes.theta, lanes.constants, np.zeros((1, 1)), lanes.x, lanes.v)
+        self._moment = Moment(
+            lanes.system, lanes.theta, lanes.constants, np.zeros((1, 1)), lanes.x, lanes.v
+        )
         self.mass = lanes.system.mass(lanes.theta, lanes.constants)
         self._none = np.zeros_like(self.mass)
         shares = _shares(lanes)
-        self._forces = [(share, share.effect) for share in shares if isinstance(share.effect, Force)]
-        self._frictions = [(share, share.effect) for share in shares if isinstance(share.effect, Friction)]
-        self.pushed, self.rubs = (_where(found, len(lanes.x)) for found in (self._forces, self._frictions))
+        self._forces = [
+            (share, share.effect) for share in shares if isinstance(share.effect, Force)
+        ]
+        self._frictions = [
+            (share, share.effect) for share in shares if isinstance(share.effect, Friction)
+        ]
+        self.pushed, self.rubs = (
+            _where(found, len(lanes.x)) for found in (self._forces, self._frictions)
+        )
         self.feel({name: values[:, :1] for name, values in lanes.inputs.items()})
         start = self._at(self._moment.t, lanes.x, lanes.v)
         self._constant = _by_coordinate(lanes.system.force(start)) if lanes.system.uniform else None
@@ -144,8 +153,13 @@ def _shares(lanes: Lanes) -> list[Share]:
         span = slice(int(there[0]), int(there[-1]) + 1)
         constants = {name: values[span] for name, values in lanes.constants.items()}
         start = np.zeros((1, 1))
-        moment = Moment(lanes.system, lanes.theta[span], constants, start, lanes.x[span], lanes.v[span])
+        moment = Moment(
+            lanes.system, lanes.theta[span], constants, start, lanes.x[span], lanes.v[span]
+        )
         everywhere = bool(on[span].all())
-        mask, whole = None if everywhere else on[span, None], there[0] == 0 and there[-1] == len(on) - 1
+        mask, whole = (
+            None if everywhere else on[span, None],
+            there[0] == 0 and there[-1] == len(on) - 1,
+        )
         result.append(Share(effect, c[:, span], span, mask, moment, whole))
     return result

@@ -1,8 +1,9 @@
 """How long a lane's steps may be, from how fast its own motion changes.
 
-The forces are asked, at the lane's initial state and at rest at zero, at some instants of its run, how they answer to a
-small change of position and of velocity. An oscillation may turn by `TURN` radians in a step, which keeps the
-fourth-order method's error of phase near 2e-7 of the phase; a decay may go through `DECAY` of its time.
+The forces are asked, at the lane's initial state and at rest at zero, at some instants of its run,
+how they answer to a small change of position and of velocity. An oscillation may turn by `TURN`
+radians in a step, which keeps the fourth-order method's error of phase near 2e-7 of the phase; a
+decay may go through `DECAY` of its time.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ INSTANTS, NUDGE = 6, 1e-5
 
 
 def divisions(lanes: Lanes, field: Field, spans: Array, turn: float = TURN) -> Array:
-    """(L, 1) into how many parts steps of `spans` (L, 1) seconds must be divided; what cannot be told is one.
+    """(L, 1) into how many parts steps of `spans` (L, 1) seconds must be divided; what cannot be
+    told is one.
 
-    An oscillation then turns by `turn` radians in each at most, and decay is held to a share in proportion.
+    An oscillation then turns by `turn` radians in each at most, and decay is held to a share in
+    proportion.
     """
     parts = np.ones_like(spans)
     for inputs in _instants(lanes):
@@ -36,7 +39,9 @@ def divisions(lanes: Lanes, field: Field, spans: Array, turn: float = TURN) -> A
 
 
 def _instants(lanes: Lanes) -> Iterator[dict[str, Array]]:
-    """Inputs of each lane at some of its own steps; waiting does not count, since it depends on the others."""
+    """Inputs of each lane at some of its own steps; waiting does not count, since it depends on the
+    others.
+    """
     if not lanes.inputs or not lanes.steps.size:
         yield {name: np.zeros((len(lanes.x), 1)) for name in lanes.inputs}
         return
@@ -56,6 +61,11 @@ def _rates(field: Field, x: Array, v: Array) -> tuple[Array, Array]:
     for d in range(x.shape[1]):
         nudge = np.zeros_like(x)
         nudge[:, d] = NUDGE
-        for which, largest in ((field.force(t, x + nudge, v), turning), (field.force(t, x, v + nudge), decaying)):
-            np.fmax(largest, np.abs((which - base)[:, d : d + 1] / (NUDGE * field.mass)), out=largest)
+        for which, largest in (
+            (field.force(t, x + nudge, v), turning),
+            (field.force(t, x, v + nudge), decaying),
+        ):
+            np.fmax(
+                largest, np.abs((which - base)[:, d : d + 1] / (NUDGE * field.mass)), out=largest
+            )
     return turning, decaying

@@ -1,7 +1,7 @@
 """Motion under a constant force, with bounces, in closed form: no steps at all.
 
-From impact to impact every coordinate is a parabola, so the engine goes from impact to impact, and then reads all
-samples off the parabolas at once.
+From impact to impact every coordinate is a parabola, so the engine goes from impact to impact, and
+then reads all samples off the parabolas at once.
 """
 
 from __future__ import annotations
@@ -27,14 +27,19 @@ class Arcs:
 
     def take(self, chosen: Mask) -> Arcs:
         """Some of them."""
-        return Arcs(self.lanes[chosen], self.t[chosen], self.x[chosen], self.v[chosen], self.a[chosen])
+        return Arcs(
+            self.lanes[chosen], self.t[chosen], self.x[chosen], self.v[chosen], self.a[chosen]
+        )
 
     def joined(self, others: list[Arcs]) -> Arcs:
         """These and others, sorted by lane."""
         every = [self, *others]
         lanes = np.concatenate([arcs.lanes for arcs in every])
         order = np.argsort(lanes, kind="stable")
-        t, x, v, a = (np.concatenate([getattr(arcs, name) for arcs in every])[order] for name in ("t", "x", "v", "a"))
+        t, x, v, a = (
+            np.concatenate([getattr(arcs, name) for arcs in every])[order]
+            for name in ("t", "x", "v", "a")
+        )
         return Arcs(lanes[order], t, x, v, a)
 
 

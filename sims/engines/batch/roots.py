@@ -8,7 +8,8 @@ from sims.base import Array
 
 
 def root(value: Array, rate: Array, later: Array, h: Array) -> Array:
-    """(n,) seconds to the last root of the parabola through `value` >= 0, with `rate`, and through `later` < 0.
+    """(n,) seconds to the last root of the parabola through `value` >= 0, with `rate`, and through
+    `later` < 0.
 
     The error is of third order in h; what it leaves is corrected when the root is reached.
 

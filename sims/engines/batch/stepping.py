@@ -1,13 +1,15 @@
 """Fixed steps of fourth order, with what happens within them: impacts, standstill, breaking loose.
 
-The method is the classical one of Runge and Kutta, written for x'' = a(t, x, v) (Hairer, Norsett, Wanner, Solving
-Ordinary Differential Equations I, section II.1, doi:10.1007/978-3-540-78862-1). Steps are those of the plan, divided
-where a lane's motion is too fast for them. Every lane has its own clock: a step in which something happens is taken
-back and taken again up to that instant, estimated by interpolation and corrected to second order by what is then left;
-the state is changed there, and the rest of the step follows. No lane waits for another, nor knows of it.
+The method is the classical one of Runge and Kutta, written for x'' = a(t, x, v) (Hairer, Norsett,
+Wanner, Solving Ordinary Differential Equations I, section II.1, doi:10.1007/978-3-540-78862-1).
+Steps are those of the plan, divided where a lane's motion is too fast for them. Every lane has its
+own clock: a step in which something happens is taken back and taken again up to that instant,
+estimated by interpolation and corrected to second order by what is then left; the state is changed
+there, and the rest of the step follows. No lane waits for another, nor knows of it.
 
-A lane with dry friction whose velocity would turn round is stopped where it is zero. Steps in which friction or the
-forces of effects bend sharply (Stribeck's peak, the ripples of a fast motor) are taken back and shortened.
+A lane with dry friction whose velocity would turn round is stopped where it is zero. Steps in which
+friction or the forces of effects bend sharply (Stribeck's peak, the ripples of a fast motor) are
+taken back and shortened.
 """
 
 from __future__ import annotations
@@ -23,9 +25,15 @@ from sims.engines.ground import Ground, Indices, Mask
 from sims.system import Lanes, Motion
 
 EVENTS = 256  # in one step of one lane; what else happens in that step is passed over
-FRICTION_BEND, FORCE_BEND = 0.05, 0.005  # by which they may bend within a step, each of its largest so far
+FRICTION_BEND, FORCE_BEND = (
+    0.05,
+    0.005,
+)  # by which they may bend within a step, each of its largest so far
 FAINT = 1e-5  # share of all acceleration below which friction may bend as it likes
-SHORTENED, FINEST = 0.25, 1.0 / 256.0  # a step that bends is shortened to this share, and to this of the full one
+SHORTENED, FINEST = (
+    0.25,
+    1.0 / 256.0,
+)  # a step that bends is shortened to this share, and to this of the full one
 PUNCTUAL = 1e-4  # share of a step by which breaking loose may be late
 NOTHING, IMPACT, STANDSTILL, LOOSE = range(4)
 
@@ -41,7 +49,9 @@ class Stepping:
         parts: (L, 1) into how many parts it is to be divided.
     """
 
-    def __init__(self, lanes: Lanes, field: Field, ground: Ground | None, spans: Array, parts: Array) -> None:
+    def __init__(
+        self, lanes: Lanes, field: Field, ground: Ground | None, spans: Array, parts: Array
+    ) -> None:
         count, dim = lanes.x.shape
         self._field, self._ground = field, ground
         # Stored coordinate by coordinate: what is per lane, (L, 1), multiplies whole rows.
@@ -62,13 +72,17 @@ class Stepping:
         self._try = np.full((count, 1), np.inf)  # seconds to an event
         self._goal = np.full(count, NOTHING, dtype=np.int8)
         self._events = np.zeros(count, dtype=np.intp)
-        self._open = np.ones(count, dtype=bool)  # to events: under way to none, and not after too many
+        self._open = np.ones(
+            count, dtype=bool
+        )  # to events: under way to none, and not after too many
         self._awaits = self._shortened = False
         if ground is not None:
             self._start_on(ground)
 
     def run(self, patience: float = np.inf) -> Motion:
-        """All steps; a lane that needs more than `patience` times the planned ones is NaN from there on."""
+        """All steps; a lane that needs more than `patience` times the planned ones is NaN from
+        there on.
+        """
         clock, dynamics = self._clock, self._dynamics
         hurries = self._eventful and np.isfinite(patience)
         while True:
@@ -88,7 +102,9 @@ class Stepping:
                 clock.finish()
 
     def _overdue(self, patience: float) -> bool:
-        """Count a step of every lane on its way, and give up those with too many; whether none is left."""
+        """Count a step of every lane on its way, and give up those with too many; whether none is
+        left.
+        """
         self._taken += self._clock.left[:, 0] > 0
         late = self._taken > patience * self._planned
         if not late.any():
@@ -100,7 +116,9 @@ class Stepping:
         return bool(self._clock.over)
 
     def _stepped(self, h: Array, k1: Array) -> tuple[Array, Array, Array, Array]:
-        """Position, velocity and (to third order) acceleration a step of h (L, 1) later; how the acceleration bent."""
+        """Position, velocity and (to third order) acceleration a step of h (L, 1) later; how the
+        acceleration bent.
+        """
         t, x, v, during = self._clock.t, self._x, self._v, self._dynamics.during
         half = 0.5 * h
         middle, sixth = t + half, h / 6.0
@@ -111,7 +129,12 @@ class Stepping:
         k4 = during(t + h, x + h * v3, v + h * k3)
         inner = k2 + k3
         outer = k1 + k4
-        return x + h * (v + sixth * (k1 + inner)), v + sixth * (outer + 2.0 * inner), k4, outer - inner
+        return (
+            x + h * (v + sixth * (k1 + inner)),
+            v + sixth * (outer + 2.0 * inner),
+            k4,
+            outer - inner,
+        )
 
     def _settle(self, h: Array, k1: Array) -> None:
         """Make steps of h (L, 1) where nothing happens in them; prepare to make the others again."""
@@ -137,13 +160,16 @@ class Stepping:
             self._open = (self._goal == NOTHING) & (self._events < EVENTS)
 
     def _bent(self, h: Array, k1: Array, bend: Array) -> Mask | None:
-        """(L,) lanes whose step must be shorter, as forces bend too much in it; None if there are none."""
+        """(L,) lanes whose step must be shorter, as forces bend too much in it; None if there are
+        none.
+        """
         field = self._field
         self._peak = np.maximum(self._peak, dot(k1, k1))
         sharp = field.pushed & (dot(bend, bend) > (6.0 * FORCE_BEND) ** 2 * self._peak)
         if field.dry:
             first, second, third, fourth = self._dynamics.rubs
-            # Against the largest so far: a Stribeck peak's tail, all but nothing at speed, bends sharply in proportion.
+            # Against the largest so far: a Stribeck peak's tail, all but nothing at speed, bends
+            # sharply in proportion.
             self._rubbed = np.maximum(self._rubbed, np.maximum(length(first), length(fourth)))
             most = np.maximum(self._rubbed, FAINT * np.sqrt(self._peak) * field.mass)
             bends = length(first - second - third + fourth) > 6.0 * FRICTION_BEND * most
@@ -158,9 +184,14 @@ class Stepping:
         return sharp[:, 0] if any_sharp else None
 
     def _found(
-        self, h: Array, now: tuple[Array, Array, Array], then: tuple[Array, Array, Array], refused: Mask | None
+        self,
+        h: Array,
+        now: tuple[Array, Array, Array],
+        then: tuple[Array, Array, Array],
+        refused: Mask | None,
     ) -> Mask | None:
-        """(L,) lanes to which something happens within the step, with the seconds to it set; None if there are none.
+        """(L,) lanes to which something happens within the step, with the seconds to it set; None
+        if there are none.
 
         Args:
             h: (L, 1) the step.
@@ -180,7 +211,9 @@ class Stepping:
             moves = (watched[:, None] & self._field.rubs & ~dynamics.sticks)[:, 0]
             turned = moves & (dot(then[1], dynamics.way) < 0)[:, 0]
             if turned.any():
-                self._await(turned, h, self._standstills(np.flatnonzero(turned), h, now, then), STANDSTILL)
+                self._await(
+                    turned, h, self._standstills(np.flatnonzero(turned), h, now, then), STANDSTILL
+                )
                 result = turned if result is None else result | turned
             before, after = dynamics.excess
             late = np.where(self._goal == LOOSE, PUNCTUAL, 0.0)[:, None] * (after - before)
@@ -191,25 +224,33 @@ class Stepping:
                 result = loose if result is None else result | loose
         return result
 
-    def _impacts(self, i: Indices, h: Array, now: tuple[Array, ...], then: tuple[Array, ...]) -> Array:
+    def _impacts(
+        self, i: Indices, h: Array, now: tuple[Array, ...], then: tuple[Array, ...]
+    ) -> Array:
         """(n,) seconds to the impacts of lanes i (n,)."""
         floor = self._ground.floor[i, 0] if self._ground is not None else np.zeros(i.size)
         return root(now[0][i, -1] - floor, now[1][i, -1], then[0][i, -1] - floor, h[i, 0])
 
-    def _standstills(self, i: Indices, h: Array, now: tuple[Array, ...], then: tuple[Array, ...]) -> Array:
+    def _standstills(
+        self, i: Indices, h: Array, now: tuple[Array, ...], then: tuple[Array, ...]
+    ) -> Array:
         """(n,) seconds until lanes i (n,) have lost their speed along their way."""
         way = self._dynamics.way[i]
         speed, rate, later = (dot(part[i], way)[:, 0] for part in (now[1], now[2], then[1]))
         return root(speed, rate, later, h[i, 0])
 
     def _loosenings(self, i: Indices, h: Array) -> Array:
-        """(n,) seconds until what pulls lanes i (n,) exceeds friction, and hardly longer, so that it surely does."""
+        """(n,) seconds until what pulls lanes i (n,) exceeds friction, and hardly longer, so that
+        it surely does.
+        """
         before, after = (excess[i, 0] for excess in self._dynamics.excess)
         result: Array = h[i, 0] * (before / (before - after) + 0.1 * PUNCTUAL)
         return result
 
     def _await(self, found: Mask, h: Array, seconds: Array, goal: int) -> None:
-        """Note to what and when the next steps of lanes `found` (L,) lead; of two events the first counts."""
+        """Note to what and when the next steps of lanes `found` (L,) lead; of two events the first
+        counts.
+        """
         i = np.flatnonzero(found)
         first = seconds < self._try[i, 0]
         i, seconds = i[first], seconds[first]
@@ -226,7 +267,9 @@ class Stepping:
             there &= ~refused
         if not there.any():
             return
-        struck, stopped = (np.flatnonzero(there & (self._goal == goal)) for goal in (IMPACT, STANDSTILL))
+        struck, stopped = (
+            np.flatnonzero(there & (self._goal == goal)) for goal in (IMPACT, STANDSTILL)
+        )
         if struck.size:
             self._strike(struck, k4[struck])
         if stopped.size:
@@ -251,7 +294,9 @@ class Stepping:
             self._dynamics.lay(i[outcome.rests])
 
     def _rounding(self, i: Indices, seconds: Array) -> Array:
-        """Corrections (n, 1) of lanes i (n,), none longer than a step: of a lane all but at rest they mean nothing."""
+        """Corrections (n, 1) of lanes i (n,), none longer than a step: of a lane all but at rest
+        they mean nothing.
+        """
         bounded: Array = np.clip(np.nan_to_num(seconds), -self._longest[i], self._longest[i])
         return bounded
 
@@ -267,12 +312,17 @@ class Stepping:
         self._v[i] = np.where(length(v) <= 1e-9 * length(a) * self._longest[i], 0.0, v)
 
     def _start_on(self, ground: Ground) -> None:
-        """Lift lanes that start in the ground onto it; throw back or lay to rest those that do not move up."""
+        """Lift lanes that start in the ground onto it; throw back or lay to rest those that do not
+        move up.
+        """
         self._x[:, -1:] = np.maximum(self._x[:, -1:], ground.floor)
         down = (self._x[:, -1] <= ground.floor[:, 0]) & (self._v[:, -1] <= 0)
         if down.any():
             a = self._dynamics.begin(self._clock.t, self._x, self._v)
-            struck, lying = np.flatnonzero(down & (self._v[:, -1] < 0)), np.flatnonzero(down & (self._v[:, -1] == 0))
+            struck, lying = (
+                np.flatnonzero(down & (self._v[:, -1] < 0)),
+                np.flatnonzero(down & (self._v[:, -1] == 0)),
+            )
             if struck.size:
                 self._strike(struck, a[struck])
             self._dynamics.lay(lying)

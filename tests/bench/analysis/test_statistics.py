@@ -1,4 +1,6 @@
-"""ERT, runtime distributions, paired tests, ranks, break-even: numbers worked out by hand or by another way."""
+"""ERT, runtime distributions, paired tests, ranks, break-even: numbers worked out by hand or by
+another way.
+"""
 
 import numpy as np
 import pandas as pd
@@ -13,7 +15,9 @@ from tests.bench.test_stats import runs_of, statuses_of
 
 def curves_of(errors, budget=4, failed=(), seconds=None):
     """errors: {tuner: {(target, seed): errors after 0..k}}"""
-    runs = pd.concat([runs_of(c, tuner=t, metric="param_error") for t, c in errors.items()], ignore_index=True)
+    runs = pd.concat(
+        [runs_of(c, tuner=t, metric="param_error") for t, c in errors.items()], ignore_index=True
+    )
     if seconds is not None:
         runs["tuner_seconds"] = np.where(runs["k"] == 0, np.nan, seconds)
     statuses = statuses_of(runs)
@@ -23,18 +27,36 @@ def curves_of(errors, budget=4, failed=(), seconds=None):
 
 
 def test_a_threshold_is_reached_when_the_error_stays_below_it_and_not_at_the_first_touch():
-    curves = curves_of({"a": {(0, 0): [1, 0.05, 0.5, 0.04, 0.03], (1, 0): [1, 0.05], (2, 0): [0.1], (3, 0): [1, 1, 1]}})
+    curves = curves_of(
+        {
+            "a": {
+                (0, 0): [1, 0.05, 0.5, 0.04, 0.03],
+                (1, 0): [1, 0.05],
+                (2, 0): [0.1],
+                (3, 0): [1, 1, 1],
+            }
+        }
+    )
     assert reached(curves, 0.1).tolist() == [3, 1, 0, np.inf]
     assert reached(curves, 0.01).tolist() == [np.inf] * 4
     assert reached(curves, 2.0).tolist() == [0] * 4
 
 
 def test_ert_is_all_simulations_over_successes_and_a_failed_run_costs_its_budget():
-    errors = {"a": {(0, 0): [1, 0.05], (1, 0): [1, 1, 0.05, 0.05, 0.05], (2, 0): [1, 1, 1], (3, 0): [0.01]}}
+    errors = {
+        "a": {
+            (0, 0): [1, 0.05],
+            (1, 0): [1, 1, 0.05, 0.05, 0.05],
+            (2, 0): [1, 1, 1],
+            (3, 0): [0.01],
+        }
+    }
     curves = curves_of(errors, failed=["a/in-3/0"])
     spent = effort(curves, 0.1, 4)
     assert spent.simulations.tolist() == [1, 2, 2, 4]
-    assert spent.successes.tolist() == [1, 1, 0, 0], "what a failed run would deliver counts for nothing"
+    assert spent.successes.tolist() == [1, 1, 0, 0], (
+        "what a failed run would deliver counts for nothing"
+    )
     assert spent.ert() == pytest.approx(9 / 2)
     table = ert_table(curves, (0.1, 1e-6), 4).set_index("threshold")
     assert table.loc[0.1, ["ert", "successes", "runs", "failures"]].tolist() == [4.5, 2, 4, 1]
@@ -67,9 +89,13 @@ def test_pairs_agree_with_scipy_and_holm_is_worked_out_by_hand():
     rng = np.random.default_rng(3)
     base = rng.exponential(size=15)
     columns = {"a": base * 0.3, "b": base * rng.uniform(0.5, 2.0, 15), "c": base}
-    curves = curves_of({t: {(f"{i:02d}", 0): [1.0, e] for i, e in enumerate(v)} for t, v in columns.items()})
+    curves = curves_of(
+        {t: {(f"{i:02d}", 0): [1.0, e] for i, e in enumerate(v)} for t, v in columns.items()}
+    )
     table = pairs(curves).set_index(["a", "b"])
-    expected = {k: wilcoxon(np.log(columns[k[0]]) - np.log(columns[k[1]])).pvalue for k in table.index}
+    expected = {
+        k: wilcoxon(np.log(columns[k[0]]) - np.log(columns[k[1]])).pvalue for k in table.index
+    }
     for key, p in expected.items():
         assert table.loc[key, "p_value"] == pytest.approx(p)
     ordered = sorted(expected, key=expected.get)
@@ -131,7 +157,9 @@ def test_break_even_is_training_over_what_a_target_saves():
     assert break_even(price(12, fit=800), search) == np.inf, "it never pays"
     nothing = Price(Effort(np.full(10, 50.0), np.zeros(10), np.zeros(10, dtype=int), 10))
     assert break_even(learned, nothing) == 0, "the search never gets there"
-    lines = break_even_table("e", "in", 0.1, {"net": learned, "grid": search, "other": price(3, fit=10)})
+    lines = break_even_table(
+        "e", "in", 0.1, {"net": learned, "grid": search, "other": price(3, fit=10)}
+    )
     assert lines[["learned", "search"]].to_numpy().tolist() == [["net", "grid"], ["other", "grid"]]
     assert lines["targets"].tolist() == [100, pytest.approx(10 / 7)]
     assert lines["low"].tolist() == lines["targets"].tolist(), "equal targets leave no doubt"
@@ -139,7 +167,11 @@ def test_break_even_is_training_over_what_a_target_saves():
 
 def test_who_wins_changes_where_the_costs_cross():
     quick, frugal = price(100, seconds=0.001), price(10, seconds=1.0)
-    held = {"quick": quick, "frugal": frugal, "never": Price(Effort(np.ones(3), np.ones(3), np.zeros(3, dtype=int), 3))}
+    held = {
+        "quick": quick,
+        "frugal": frugal,
+        "never": Price(Effort(np.ones(3), np.ones(3), np.zeros(3, dtype=int), 3)),
+    }
     (a, b, first), (c, d, second) = winners(held, 100)
     assert (first, second) == ("quick", "frugal")
     assert b < 0.999 / 90 < c, "100 c + 0.001 = 10 c + 1"
@@ -179,15 +211,26 @@ def test_a_million_rows_are_read_for_the_table_within_five_seconds(tmp_path):
     rng = np.random.default_rng(0)
     numbers = {
         name: rng.exponential(size=runs * 100)
-        for name in ("loss", "param_error", "obs_error", "tuner_seconds", "simulator_seconds", "proposal_rate")
+        for name in (
+            "loss",
+            "param_error",
+            "obs_error",
+            "tuner_seconds",
+            "simulator_seconds",
+            "proposal_rate",
+        )
     }
     pd.DataFrame({
         "run": np.repeat(names, 100), "experiment": "e", "tuner": np.repeat(np.array(list("abcdefghij")), 100_000),
         "simulator": "spring", "target": np.repeat(np.tile(np.char.add("in-", np.arange(200).astype(str)), 50), 100),
         "seed": np.repeat(np.arange(runs) // 200 % 5, 100), "range": "in", "k": np.tile(k, runs), **numbers,
     }).to_parquet(folder / "runs.parquet")  # fmt: skip
-    pd.DataFrame({"run": names, "tuner": "a", "status": "done", "reason": ""}).to_csv(folder / "status.csv")
-    pd.DataFrame({"tuner": [], "seed": [], "simulations": [], "seconds": []}).to_csv(folder / "training.csv")
+    pd.DataFrame({"run": names, "tuner": "a", "status": "done", "reason": ""}).to_csv(
+        folder / "status.csv"
+    )
+    pd.DataFrame({"tuner": [], "seed": [], "simulations": [], "seconds": []}).to_csv(
+        folder / "training.csv"
+    )
     started = time.process_time()
     stored = read(folder, NEEDED)
     lines = table(stored.runs, stored.statuses, 99, stored.costs)

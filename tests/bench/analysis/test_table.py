@@ -21,7 +21,11 @@ def statuses_of(runs, **ends):
     names = runs["run"].unique()
     tuners = [n.split("/")[0] for n in names]
     return pd.DataFrame(
-        {"run": names, "tuner": tuners, "status": [ends.get(n.replace("/", "_"), "done") for n in names]}
+        {
+            "run": names,
+            "tuner": tuners,
+            "status": [ends.get(n.replace("/", "_"), "done") for n in names],
+        }
     )
 
 
@@ -36,7 +40,15 @@ def test_checkpoints_stop_at_the_budget_and_include_it():
 
 
 def test_mean_and_median_are_over_targets_after_the_mean_over_seeds():
-    runs = runs_of({(0, 0): [1.0, 0.1], (0, 1): [1.0, 0.3], (1, 0): [2.0, 0.5], (1, 1): [2.0, 0.7], (2, 0): [6.0, 3.0]})
+    runs = runs_of(
+        {
+            (0, 0): [1.0, 0.1],
+            (0, 1): [1.0, 0.3],
+            (1, 0): [2.0, 0.5],
+            (1, 1): [2.0, 0.7],
+            (2, 0): [6.0, 3.0],
+        }
+    )
     line = at(table(runs, statuses_of(runs), 1), 1)
     assert line["mean"] == pytest.approx((0.2 + 0.6 + 3.0) / 3)
     assert line["median"] == pytest.approx(0.6)
@@ -70,7 +82,9 @@ def test_columns_are_those_of_the_file_format():
     lines = table(runs, statuses_of(runs), 1, {"a": (1600.0, 12.5)})
     assert list(lines.columns) == COLUMNS
     assert (at(lines, 1)["fit_simulations"], at(lines, 1)["fit_seconds"]) == (1600.0, 12.5)
-    assert set(lines["metric"]) == {"param_abs_error"}, "no truth, no parameter error; no held-out runs, none shown"
+    assert set(lines["metric"]) == {"param_abs_error"}, (
+        "no truth, no parameter error; no held-out runs, none shown"
+    )
 
 
 def test_bootstrap_interval_matches_the_normal_one_and_covers():

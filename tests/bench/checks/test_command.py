@@ -36,7 +36,9 @@ def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
     code, said = checked(capsys, "shrinking", "--plugin", str(plugin))
     assert code == 0, said
     assert said.count("ok    ") == 15
-    assert said.endswith("tuner shrinking (simgap_plugin_shrinking.Shrinking): all 15 checks passed\n")
+    assert said.endswith(
+        "tuner shrinking (simgap_plugin_shrinking.Shrinking): all 15 checks passed\n"
+    )
 
 
 @pytest.mark.slow
@@ -44,12 +46,17 @@ def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
     ("name", "expected"),
     [
         ("chaos_raise", "found crashed: Traceback"),
-        ("chaos_exit", "expected to survive; found DeathError: the worker process exited with code 7"),
+        (
+            "chaos_exit",
+            "expected to survive; found DeathError: the worker process exited with code 7",
+        ),
         ("chaos_hang", "expected an end within 2 s; found none"),
         ("chaos_nan", "found diverged: the tuner gave proposals that are not finite"),
     ],
 )
-def test_chaos_tuner_fails_with_what_was_expected_and_where_to_look(name, expected, capsys, monkeypatch):
+def test_chaos_tuner_fails_with_what_was_expected_and_where_to_look(
+    name, expected, capsys, monkeypatch
+):
     monkeypatch.setattr("bench.checks.command.LIMIT", 2.0)
     monkeypatch.setattr("bench.runs.pools.GRACE", 0.0)
     code, said = checked(capsys, name, *CHAOS)
@@ -63,7 +70,10 @@ def test_chaos_tuner_fails_with_what_was_expected_and_where_to_look(name, expect
 @pytest.mark.slow
 def test_simulators_and_effects_are_checked_by_name(capsys):
     code, said = checked(capsys, "drag.linear")
-    assert (code, said.splitlines()[-1]) == (0, "effect drag.linear (sims.effects.drag.Linear): all 5 checks passed")
+    assert (code, said.splitlines()[-1]) == (
+        0,
+        "effect drag.linear (sims.effects.drag.Linear): all 5 checks passed",
+    )
     code, said = checked(capsys, "slider")
     assert (code, said.splitlines()[-1]) == (
         0, "simulator slider (sims.slider.simulator.Slider): all 8 checks passed"

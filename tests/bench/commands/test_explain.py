@@ -12,9 +12,20 @@ from tests.bench.gap import schema
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A swing with drag, made by another engine than the one that explains it, and what explain wrote about it."""
+    """A swing with drag, made by another engine than the one that explains it, and what explain
+    wrote about it.
+    """
     there = tmp_path_factory.mktemp("commands")
-    command = ["simulate", "pendulum", "--engine", "mujoco", "--effect", "drag.linear=1e-3", "--theta", "inertia=4e-3"]
+    command = [
+        "simulate",
+        "pendulum",
+        "--engine",
+        "mujoco",
+        "--effect",
+        "drag.linear=1e-3",
+        "--theta",
+        "inertia=4e-3",
+    ]
     command += ["--noise", "q=0.003", "qd=0.02", "--runs", "3", "--seconds", "1.5", "--rate", "60"]
     assert main([*command, "--out", str(there / "swing.csv")]) == 0
     assert main([*command, "--seed", "9", "--out", str(there / "other.csv")]) == 0
@@ -83,7 +94,9 @@ def test_the_account_says_what_was_found(folder, capsys, monkeypatch):
     assert "The simulation lacks linear drag" in told.out
     (made,) = (folder / "results").iterdir()
     assert f"report  results/{made.name}/report.html" in told.out
-    again, first = (json.loads((part / "verdict.json").read_text()) for part in (made, folder / "out"))
+    again, first = (
+        json.loads((part / "verdict.json").read_text()) for part in (made, folder / "out")
+    )
     assert again.pop("seconds") > 0
     first.pop("seconds")
     assert again == first, "the same seed says the same"
@@ -93,7 +106,10 @@ def test_the_account_says_what_was_found(folder, capsys, monkeypatch):
 def test_score_prints_json_with_the_keys_of_the_design(folder, capsys):
     for name in ("swing.csv", "other.csv"):
         capsys.readouterr()
-        assert main(["score", str(folder / "out" / "extended.toml"), str(folder / name), "--json"]) == 0
+        assert (
+            main(["score", str(folder / "out" / "extended.toml"), str(folder / name), "--json"])
+            == 0
+        )
         found = json.loads(capsys.readouterr().out)
         assert list(found) == ["rmse", "normalised_rmse", "runs", "samples"]
         assert set(found["rmse"]) == {"q", "qd"}
@@ -103,11 +119,23 @@ def test_score_prints_json_with_the_keys_of_the_design(folder, capsys):
 
 
 def test_score_says_it_to_a_person(folder, capsys):
-    assert main(["score", str(folder / "out" / "extended.toml"), str(folder / "other.csv"), "--held-out"]) == 0
+    assert (
+        main(
+            [
+                "score",
+                str(folder / "out" / "extended.toml"),
+                str(folder / "other.csv"),
+                "--held-out",
+            ]
+        )
+        == 0
+    )
     out = capsys.readouterr().out.splitlines()
     assert out[0].startswith("q: RMSE 0.00")
     assert out[0].endswith(" rad")
-    assert out[-1].endswith("times the noise; 1 runs, 90 samples") or out[-1].endswith("1 run, 90 samples")
+    assert out[-1].endswith("times the noise; 1 runs, 90 samples") or out[-1].endswith(
+        "1 run, 90 samples"
+    )
 
 
 def test_nothing_is_written_over(folder, capsys, tmp_path):
@@ -126,7 +154,10 @@ def test_nothing_is_written_over(folder, capsys, tmp_path):
         (["--system", "ball"], "unknown channel"),
         (["--system", "bal"], "unknown simulator 'bal'; there are: "),
         (["--engine", "ode"], "unknown engine 'ode'; there are: batch, mujoco, pybullet"),
-        (["--free", "weight"], "unknown constant of system pendulum 'weight'; there are: gravity, length, mass"),
+        (
+            ["--free", "weight"],
+            "unknown constant of system pendulum 'weight'; there are: gravity, length, mass",
+        ),
         (["--tuner", "magic"], "unknown tuner 'magic'; there are: "),
         (["--tuner", "tunenet"], "tuner tunenet must be trained first"),
         (["--plugin", "none.py"], "no such file"),
@@ -134,21 +165,41 @@ def test_nothing_is_written_over(folder, capsys, tmp_path):
     ],
 )
 def test_bad_options_are_one_line(folder, capsys, tmp_path, options, message):
-    assert message in faulty(capsys, "explain", folder / "swing.csv", "--out", tmp_path / "o", *options)
+    assert message in faulty(
+        capsys, "explain", folder / "swing.csv", "--out", tmp_path / "o", *options
+    )
     assert not (tmp_path / "o").exists()
 
 
 def test_bad_files_are_one_line(folder, capsys, tmp_path):
     model = folder / "out" / "extended.toml"
-    assert "none.csv" in faulty(capsys, "explain", tmp_path / "none.csv").replace("none.toml", "none.csv")
-    assert "expected a recording's table, NAME.csv" in faulty(capsys, "explain", folder / "swing.toml")
-    assert "none.toml: no such file" in faulty(capsys, "score", tmp_path / "none.toml", folder / "swing.csv")
+    assert "none.csv" in faulty(capsys, "explain", tmp_path / "none.csv").replace(
+        "none.toml", "none.csv"
+    )
+    assert "expected a recording's table, NAME.csv" in faulty(
+        capsys, "explain", folder / "swing.toml"
+    )
+    assert "none.toml: no such file" in faulty(
+        capsys, "score", tmp_path / "none.toml", folder / "swing.csv"
+    )
     assert "format" in faulty(capsys, "score", folder / "swing.toml", folder / "swing.csv")
     assert "none" in faulty(capsys, "score", model, tmp_path / "none.csv")
 
 
 def test_a_tuner_may_find_where_the_fit_begins(folder, capsys, tmp_path):
-    assert main(["explain", str(folder / "swing.csv"), "--tuner", "least_squares", "--out", str(tmp_path / "o")]) == 0
+    assert (
+        main(
+            [
+                "explain",
+                str(folder / "swing.csv"),
+                "--tuner",
+                "least_squares",
+                "--out",
+                str(tmp_path / "o"),
+            ]
+        )
+        == 0
+    )
     found = schema.check((tmp_path / "o" / "verdict.json").read_text())
     assert [cause["effect"] for cause in found["causes"]] == ["drag.linear"]
 

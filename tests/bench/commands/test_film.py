@@ -19,8 +19,27 @@ def drop(tmp_path_factory):
     folder = tmp_path_factory.mktemp("film")
     made = folder / "drop.csv"
     options = ["--runs", "1", "--theta", "0.7", "--observe", "z", "--rate", "60", "--seconds", "3"]
-    assert main(["simulate", "ball", *options, "--initial", "z=3.6", "vx=0", "vy=0", "--out", str(made)]) == 0
-    assert main(["film", str(made), "--out", str(folder / "drop.mp4"), "--camera-seed", "3", "--size", "200"]) == 0
+    assert (
+        main(
+            ["simulate", "ball", *options, "--initial", "z=3.6", "vx=0", "vy=0", "--out", str(made)]
+        )
+        == 0
+    )
+    assert (
+        main(
+            [
+                "film",
+                str(made),
+                "--out",
+                str(folder / "drop.mp4"),
+                "--camera-seed",
+                "3",
+                "--size",
+                "200",
+            ]
+        )
+        == 0
+    )
     return folder
 
 
@@ -37,13 +56,29 @@ def test_a_tracked_film_gives_the_heights_and_explain_reads_it_unedited(drop, tm
     assert 1e-4 < tracked.noise["z"] < 0.05
     assert out.with_suffix(".png").stat().st_size > 10_000
     assert main(["explain", str(out), "--out", str(tmp_path / "explained")]) == 0
-    found = json.loads((tmp_path / "explained" / "verdict.json").read_text())["parameters"]["restitution"]
+    found = json.loads((tmp_path / "explained" / "verdict.json").read_text())["parameters"][
+        "restitution"
+    ]
     assert abs(found["value"] - 0.7) < 0.03
 
 
 def test_without_the_camera_the_fall_gives_the_scale(drop, tmp_path, capsys):
     out = tmp_path / "scaled.csv"
-    assert main(["track", str(drop / "drop.mp4"), "--out", str(out), "--scale", "fall", "--ball-diameter", "1"]) == 0
+    assert (
+        main(
+            [
+                "track",
+                str(drop / "drop.mp4"),
+                "--out",
+                str(out),
+                "--scale",
+                "fall",
+                "--ball-diameter",
+                "1",
+            ]
+        )
+        == 0
+    )
     z = read_recording(out, BallSystem, whole=True).runs[0].channels["z"]
     assert np.nanmin(z) == pytest.approx(0.5, abs=0.15)
     assert np.nanmax(z) == pytest.approx(3.6, abs=0.4)
@@ -64,7 +99,10 @@ def test_a_film_and_its_camera_come_together_or_not_at_all(drop, tmp_path, monke
         raise InputError("disk full")
 
     monkeypatch.setattr(video, "publish", full)
-    assert main(["film", str(drop / "drop.csv"), "--out", str(tmp_path / "film.mp4"), "--size", "32"]) == 2
+    assert (
+        main(["film", str(drop / "drop.csv"), "--out", str(tmp_path / "film.mp4"), "--size", "32"])
+        == 2
+    )
     assert not list(tmp_path.iterdir())
 
 

@@ -28,14 +28,31 @@ def cache(tmp_path, monkeypatch, spring):
 
 @pytest.fixture
 def experiment(tmp_path):
-    document = {**SPRING, "training_budget": 56, "targets": 1, "seeds": 2, "tuners": {"small": TUNER}}
+    document = {
+        **SPRING,
+        "training_budget": 56,
+        "targets": 1,
+        "seeds": 2,
+        "tuners": {"small": TUNER},
+    }
     path = tmp_path / "ahead.toml"
     path.write_text(tomli_w.dumps(document))
     return path
 
 
 def ahead(experiment, *more):
-    return main(["train", "small", "spring", "--experiment", str(experiment), "--plugin", PLUGIN, *map(str, more)])
+    return main(
+        [
+            "train",
+            "small",
+            "spring",
+            "--experiment",
+            str(experiment),
+            "--plugin",
+            PLUGIN,
+            *map(str, more),
+        ]
+    )
 
 
 def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
@@ -51,8 +68,25 @@ def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
         ("0", "clean", "1"), ("0", "clean", "2"), ("0", "clean", "3"), ("0", "clean", "4"), ("0", "noisy", "1"),
     ]  # fmt: skip
     assert float(rows[3]["training_loss"]) < float(rows[0]["training_loss"])
-    assert {path.name for path in (tmp_path / "out" / "figures").iterdir()} == {"loss.png", "loss.pdf"}
-    assert main(["compare", str(experiment), "--plugin", PLUGIN, "--budget", "2", "--out", str(tmp_path / "c")]) == 0
+    assert {path.name for path in (tmp_path / "out" / "figures").iterdir()} == {
+        "loss.png",
+        "loss.pdf",
+    }
+    assert (
+        main(
+            [
+                "compare",
+                str(experiment),
+                "--plugin",
+                PLUGIN,
+                "--budget",
+                "2",
+                "--out",
+                str(tmp_path / "c"),
+            ]
+        )
+        == 0
+    )
     assert sorted(cache.iterdir()) == files
     assert [file.stat().st_mtime_ns for file in files] == stamps
     assert ahead(experiment) == 0
@@ -70,7 +104,9 @@ def test_hybrid_starts_from_the_same_network_as_tunenet(experiment):
 
 
 def test_looking_on_changes_nothing(experiment):
-    """Weights are the same whether somebody looks on, as `simgap train` does, or not, as `simgap compare`."""
+    """Weights are the same whether somebody looks on, as `simgap train` does, or not, as `simgap
+    compare`.
+    """
     from bench.commands.train import _Told
 
     settings, entry = load(str(experiment)), Entry("small", "tunenet", TUNER["options"])
@@ -78,7 +114,11 @@ def test_looking_on_changes_nothing(experiment):
     first = dict(np.load(watched.path))
     again = dict(np.load(train(settings, entry, 0, anew=True).path))
     assert watched.simulations == 56
-    assert all(np.array_equal(first[name], again[name]) for name in first if not name.startswith("__simulations"))
+    assert all(
+        np.array_equal(first[name], again[name])
+        for name in first
+        if not name.startswith("__simulations")
+    )
 
 
 def test_budget_and_seeds(experiment, cache, capsys):
@@ -152,7 +192,10 @@ def test_broken_weights_are_refused_with_one_line(experiment, cache, capsys, spo
     with pytest.raises(WeightsError):
         trained(entry, path)
     if spoil is truncated:
-        assert main(["compare", str(experiment), "--plugin", PLUGIN, "--out", str(cache.parent / "c")]) == 2
+        assert (
+            main(["compare", str(experiment), "--plugin", PLUGIN, "--out", str(cache.parent / "c")])
+            == 2
+        )
         assert capsys.readouterr().err.strip().splitlines()[-1] == said
         assert ahead(experiment, "--again") == 0
 
@@ -163,8 +206,14 @@ def test_broken_weights_are_refused_with_one_line(experiment, cache, capsys, spo
         (["cma_es", "slider"], "tuner cma_es does not learn: there is nothing to train"),
         (["tunenet", "slyder"], "unknown simulator 'slyder'"),
         (["tunnet", "slider"], "unknown tuner 'tunnet'"),
-        (["tunenet", "servo", "--experiment", "ball-drop"], "experiment ball-drop: its simulator is ball, not servo"),
-        (["tunenet", "ball"], "expected --experiment with simulator ball; there are: ball-crossengine, ball-drop"),
+        (
+            ["tunenet", "servo", "--experiment", "ball-drop"],
+            "experiment ball-drop: its simulator is ball, not servo",
+        ),
+        (
+            ["tunenet", "ball"],
+            "expected --experiment with simulator ball; there are: ball-crossengine, ball-drop",
+        ),
         (["tunenet", "slider", "--budget", "0"], "--budget: expected at least 1, found 0"),
     ],
 )
@@ -177,11 +226,28 @@ def test_faults_are_one_line(arguments, said, capsys):
 
 @pytest.mark.slow
 def test_an_interrupted_training_leaves_nothing(experiment, tmp_path, cache):
-    document = {**SPRING, "training_budget": 60, "tuners": {"small": {**TUNER, "options": {"epochs": 100_000}}}}
+    document = {
+        **SPRING,
+        "training_budget": 60,
+        "tuners": {"small": {**TUNER, "options": {"epochs": 100_000}}},
+    }
     experiment.write_text(tomli_w.dumps(document))
-    command = [sys.executable, "-m", "bench.cli", "train", "small", "spring", "--experiment", str(experiment)]
+    command = [
+        sys.executable,
+        "-m",
+        "bench.cli",
+        "train",
+        "small",
+        "spring",
+        "--experiment",
+        str(experiment),
+    ]
     process = subprocess.Popen(
-        [*command, "--plugin", PLUGIN], stderr=subprocess.PIPE, text=True, env={**os.environ}, start_new_session=True
+        [*command, "--plugin", PLUGIN],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ},
+        start_new_session=True,
     )
     assert process.stderr.read(1)  # the bar: it is in the midst of it
     time.sleep(0.5)

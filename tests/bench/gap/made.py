@@ -34,7 +34,9 @@ def recorded(simulator, theta, starts, times, noise=0.0, seed=0, stated=True):
         columns = dict(zip(names, seen.T.copy(), strict=True))
         runs.append(Run(str(number), times, columns, dict(scenario.inputs), {}, {}, False))
     kept = {n: float(s) for n, s in zip(names, sigma, strict=True) if s and stated}
-    return Recording(Path("made.csv"), simulator.name, "made", simulator.constant_values, kept, tuple(runs))
+    return Recording(
+        Path("made.csv"), simulator.name, "made", simulator.constant_values, kept, tuple(runs)
+    )
 
 
 def changed(run, **changes):
@@ -45,7 +47,9 @@ def changed(run, **changes):
 
 def with_runs(recorded, runs):
     """The recording with other runs, named in order."""
-    return replace(recorded, runs=tuple(replace(run, name=str(i)) for i, run in enumerate(runs, start=1)))
+    return replace(
+        recorded, runs=tuple(replace(run, name=str(i)) for i, run in enumerate(runs, start=1))
+    )
 
 
 def world(recorded, **options):
@@ -55,9 +59,9 @@ def world(recorded, **options):
 
 def white(world, sigma):
     """White noise of every channel, or of each its own."""
-    return Noise(np.broadcast_to(np.asarray(sigma, dtype=float), (len(world.channels),)).copy(), np.zeros(1)).coloured(
-        0.0
-    )
+    return Noise(
+        np.broadcast_to(np.asarray(sigma, dtype=float), (len(world.channels),)).copy(), np.zeros(1)
+    ).coloured(0.0)
 
 
 def marked(world, stated):
@@ -70,7 +74,9 @@ def searched(recorded, sigma, seed=0, stated=True, **options):
     there = world(recorded, **options)
     noise = white(there, sigma)
     base = fit_base(there, noise)
-    search = Search(there, noise, base.untouched, np.random.default_rng(seed), marked(there, stated))
+    search = Search(
+        there, noise, base.untouched, np.random.default_rng(seed), marked(there, stated)
+    )
     return search, search.enter(base.fit)
 
 
@@ -78,7 +84,15 @@ def linear_fit(jacobian, q, free=None):
     """A fit whose Jacobian (R, T, C, q + s) is given, for what needs nothing else of it."""
     runs, samples, channels, size = jacobian.shape
     places = np.arange(q) if free is None else np.asarray(free)
-    return Fit((), np.zeros(q), np.zeros((runs, size - q)), places, np.zeros((runs, samples, channels)), jacobian, 0.0)
+    return Fit(
+        (),
+        np.zeros(q),
+        np.zeros((runs, size - q)),
+        places,
+        np.zeros((runs, samples, channels)),
+        jacobian,
+        0.0,
+    )
 
 
 def correlated(rng, phi, sigma, shape):
@@ -90,8 +104,14 @@ def correlated(rng, phi, sigma, shape):
 
 
 def covariance_of(seen, phi):
-    """(n, n) correlations of the seen samples of one channel (R, T): each unbroken stretch is an autoregression."""
+    """(n, n) correlations of the seen samples of one channel (R, T): each unbroken stretch is an
+    autoregression.
+    """
     stretch = np.cumsum(~(seen & np.pad(seen, ((0, 0), (1, 0)))[:, :-1]).ravel())[seen.ravel()]
     time = np.tile(np.arange(seen.shape[1]), len(seen))[seen.ravel()]
     near = stretch[:, None] == stretch[None]
-    return np.where(near, float(phi) ** np.abs(time[:, None] - time), 0.0) if phi else np.eye(time.size)
+    return (
+        np.where(near, float(phi) ** np.abs(time[:, None] - time), 0.0)
+        if phi
+        else np.eye(time.size)
+    )

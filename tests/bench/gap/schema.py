@@ -1,4 +1,6 @@
-"""What verdict.json must look like, checked by hand: the design's keys and types, and no key besides."""
+"""What verdict.json must look like, checked by hand: the design's keys and types, and no key
+besides.
+"""
 
 import json
 from math import isfinite
@@ -59,7 +61,10 @@ def check(text):
     if found["heldout"] is not None:
         assert set(found["heldout"]) - {"unit"} == HELD_OUT
         for key in HELD_OUT:
-            maybe(found["heldout"][key], float("-inf") if key in ("gap_closed", "low", "high") else 0.0)
+            maybe(
+                found["heldout"][key],
+                float("-inf") if key in ("gap_closed", "low", "high") else 0.0,
+            )
     for candidate in found["candidates"]:
         assert set(candidate) == CANDIDATE
         assert isinstance(candidate["effect"], str)
@@ -75,5 +80,7 @@ def check(text):
     named, none = {"named", "ambiguous", "partial"}, {"adequate", "unidentifiable"}
     assert found["causes"] or found["verdict"] not in named, "a name needs a cause"
     assert not found["causes"] or found["verdict"] not in none
-    assert (found["verdict"] == "ambiguous") <= any(cause["alternatives"] for cause in found["causes"])
+    assert (found["verdict"] == "ambiguous") <= any(
+        cause["alternatives"] for cause in found["causes"]
+    )
     return found

@@ -1,4 +1,6 @@
-"""Invented stories: a damped swing that a frictionless pendulum cannot follow, with every verdict about it."""
+"""Invented stories: a damped swing that a frictionless pendulum cannot follow, with every verdict
+about it.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +25,9 @@ DRAG = {
     "effect": "drag.linear",
     "alternatives": [],
     "says": "motion is resisted in proportion to speed",
-    "coefficients": {"coefficient": {"value": 2.2e-4, "unit": "N*m*s/rad", "low": 2.0e-4, "high": 2.4e-4}},
+    "coefficients": {
+        "coefficient": {"value": 2.2e-4, "unit": "N*m*s/rad", "low": 2.0e-4, "high": 2.4e-4}
+    },
     "p_value": 1e-9,
 }
 TILT = {
@@ -34,7 +38,9 @@ TILT = {
     "p_value": 3e-5,
 }
 EITHER = {**DRAG, "alternatives": ["friction.coulomb"]}
-NEXT = {"says": "release it from 1.5 rad instead of 0.5 rad, where the two differ by 4 times the noise"}
+NEXT = {
+    "says": "release it from 1.5 rad instead of 0.5 rad, where the two differ by 4 times the noise"
+}
 
 
 def swing(runs, seed, gap):
@@ -65,7 +71,10 @@ def places(gap):
     rows = [("run", str(i), 800, big * (1 + 0.3 * i), 1.1) for i in range(1, 5)]
     rows += [("run", "held 1", 800, big * 1.5, 1.1), ("run", "held 2", 800, big * 2.1, 1.2)]
     rows += [("channel", "q", 2400, big * 1.4, 1.05), ("channel", "qd", 2400, big * 1.9, 1.15)]
-    rows += [("phase", "first third", 1600, big * 0.5, 1.0), ("phase", "last third", 1600, big * 2.6, 1.2)]
+    rows += [
+        ("phase", "first third", 1600, big * 0.5, 1.0),
+        ("phase", "last third", 1600, big * 2.6, 1.2),
+    ]
     return tuple(Place(*row) for row in rows)
 
 
@@ -73,7 +82,9 @@ def profiles(gap):
     x = np.linspace(-1.0, 1.0, 12)
     made = []
     for channel, sigma in zip(("q", "qd"), SIGMA, strict=True):
-        for i, (variable, unit) in enumerate((("time", "s"), ("position", "rad"), ("speed", "rad/s"))):
+        for i, (variable, unit) in enumerate(
+            (("time", "s"), ("position", "rad"), ("speed", "rad/s"))
+        ):
             error = np.full(12, sigma / 12)
             before = (3 + 4 * i) * sigma * np.sin((1 + i) * x) * gap
             before[3] = np.nan
@@ -82,7 +93,14 @@ def profiles(gap):
 
 
 def candidates():
-    names = ["drag.linear", "friction.coulomb", "drag.quadratic", "sensor.drift", "gravity.scale", "my.plugin"]
+    names = [
+        "drag.linear",
+        "friction.coulomb",
+        "drag.quadratic",
+        "sensor.drift",
+        "gravity.scale",
+        "my.plugin",
+    ]
     scores = [812.4, 807.1, 512.0, 9.7, 3.1, -0.2]
     gains = [0.9, 0.89, 0.66, 0.02, None, -0.01]
     p = [1e-9, 1e-7, 1e-6, 0.2, 0.6, 1.0]
@@ -96,13 +114,18 @@ def story(verdict="named", **changes):
     fitting, held_out = sides(gap)
     causes = {"named": [DRAG], "ambiguous": [EITHER], "partial": [DRAG]}.get(verdict, [])
     if not causes:
-        fitting, held_out = replace(fitting, after=fitting.before), replace(held_out, after=held_out.before)
+        fitting, held_out = (
+            replace(fitting, after=fitting.before),
+            replace(held_out, after=held_out.before),
+        )
     found = {
         "verdict": verdict,
         "system": "pendulum",
         "engine": "batch",
         "causes": causes,
-        "parameters": {"inertia": {"value": 0.00341, "unit": "kg*m^2", "low": 0.0034, "high": 0.00342}},
+        "parameters": {
+            "inertia": {"value": 0.00341, "unit": "kg*m^2", "low": 0.0034, "high": 0.00342}
+        },
         "heldout": HELD_OUT
         if causes
         else {**HELD_OUT, "rmse_extended": 0.37, "gap_closed": 0.0, "low": 0.0, "high": 0.0},
@@ -120,7 +143,9 @@ def story(verdict="named", **changes):
             "low": None,
             "high": None,
         }
-        found["candidates"] = [{**c, "score": c["score"] / 500, "p_value": 0.4} for c in candidates()]
+        found["candidates"] = [
+            {**c, "score": c["score"] / 500, "p_value": 0.4} for c in candidates()
+        ]
     bounded = (np.nan, np.nan) if verdict == "unidentifiable" else (0.00325, 0.00341)
     tuned = (
         Tuned(

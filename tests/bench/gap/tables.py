@@ -4,8 +4,17 @@ import numpy as np
 
 
 def table(folder, runs, channels=("q", "qd"), system="pendulum", noise=None, inputs=(), more=""):
-    """Write odd.csv and odd.toml; each run is its times and one column a channel, then a column an input."""
-    units = {"q": "rad", "qd": "rad/s", "x": "m", "v": "m/s", "z": "m", "u": "N*m" if system == "pendulum" else "N"}
+    """Write odd.csv and odd.toml; each run is its times and one column a channel, then a column an
+    input.
+    """
+    units = {
+        "q": "rad",
+        "qd": "rad/s",
+        "x": "m",
+        "v": "m/s",
+        "z": "m",
+        "u": "N*m" if system == "pendulum" else "N",
+    }
     rows = [",".join(["run", "t", *channels, *inputs])]
     for number, columns in enumerate(runs, start=1):
         for row in zip(*columns, strict=True):
@@ -13,7 +22,11 @@ def table(folder, runs, channels=("q", "qd"), system="pendulum", noise=None, inp
     (folder / "odd.csv").write_text("\n".join(rows) + "\n")
     lines = [f'system = "{system}"', more]
     for name in channels:
-        lines += [f"[channels.{name}]", f'unit = "{units[name]}"', f"noise = {noise[name]}" if noise else ""]
+        lines += [
+            f"[channels.{name}]",
+            f'unit = "{units[name]}"',
+            f"noise = {noise[name]}" if noise else "",
+        ]
     for name in inputs:
         lines += [f"[inputs.{name}]", f'unit = "{units[name]}"']
     (folder / "odd.toml").write_text("\n".join(lines) + "\n")
@@ -25,5 +38,8 @@ def swing(times, angle=0.8, pulse=8.17, decay=0.0, rng=None, sigma=(0.003, 0.02)
     envelope = angle * np.exp(-decay * times)
     q, qd = envelope * np.cos(pulse * times), -pulse * envelope * np.sin(pulse * times)
     if rng is not None:
-        q, qd = q + sigma[0] * rng.standard_normal(times.size), qd + sigma[1] * rng.standard_normal(times.size)
+        q, qd = (
+            q + sigma[0] * rng.standard_normal(times.size),
+            qd + sigma[1] * rng.standard_normal(times.size),
+        )
     return times, q, qd

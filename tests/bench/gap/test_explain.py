@@ -50,7 +50,9 @@ def swings(times=TIMES, count=3, effects=None, seed=0):
     """Real free swings with noise, as columns."""
     rng, runs = np.random.default_rng(seed), []
     for angle in np.linspace(0.4, 1.2, count):
-        seen = Pendulum(fixed=effects).simulate(np.array([[3.3e-3]]), Scenario(times, {"q": angle}))[0]
+        seen = Pendulum(fixed=effects).simulate(
+            np.array([[3.3e-3]]), Scenario(times, {"q": angle})
+        )[0]
         seen = seen + rng.standard_normal(seen.shape) * [0.003, 0.02]
         runs.append((times, *seen.T))
     return runs
@@ -59,9 +61,14 @@ def swings(times=TIMES, count=3, effects=None, seed=0):
 def test_too_short_a_recording_is_one_line(tmp_path):
     rng = np.random.default_rng(0)
     short = table(tmp_path, [swing(TIMES[:6], rng=rng)])
-    with pytest.raises(InputError, match=r"odd.csv: too short: 8 samples for fitting, expected at least 10 for 3 par"):
+    with pytest.raises(
+        InputError,
+        match=r"odd.csv: too short: 8 samples for fitting, expected at least 10 for 3 par",
+    ):
         explain(short)
-    with pytest.raises(InputError, match=r"odd.toml: the only run is too short to hold its last third out: 3 rows"):
+    with pytest.raises(
+        InputError, match=r"odd.toml: the only run is too short to hold its last third out: 3 rows"
+    ):
         explain(table(tmp_path, [swing(TIMES[:3], rng=rng)]))
 
 
@@ -87,7 +94,10 @@ def test_a_pendulum_that_is_held_aside_is_not_explained_by_one_name(tmp_path):
     found = explained(table(tmp_path, runs, noise=NOISE))
     assert found.verdict["verdict"] != "named"
     if found.verdict["causes"]:
-        assert {"force.bias", "input.bias"} <= {names(found)[0], *found.verdict["causes"][0]["alternatives"]}
+        assert {"force.bias", "input.bias"} <= {
+            names(found)[0],
+            *found.verdict["causes"][0]["alternatives"],
+        }
 
 
 def test_channels_without_samples_are_one_line(tmp_path):
@@ -101,7 +111,9 @@ def test_a_run_without_samples_is_one_line_and_one_without_a_channel_is_used(tmp
     empty = [runs[0], (TIMES, np.nan * TIMES, np.nan * TIMES), runs[2]]
     with pytest.raises(InputError, match="run '2' has no sample of any channel"):
         explain(table(tmp_path, empty, noise=NOISE))
-    found = explained(table(tmp_path, [runs[0], (*runs[1][:2], np.nan * TIMES), runs[2]], noise=NOISE))
+    found = explained(
+        table(tmp_path, [runs[0], (*runs[1][:2], np.nan * TIMES), runs[2]], noise=NOISE)
+    )
     assert found.verdict["parameters"]["inertia"]["value"] == pytest.approx(3.3e-3, rel=5e-3)
     assert found.verdict["verdict"] in ("adequate", "ambiguous")
 
@@ -124,7 +136,8 @@ def test_a_gain_of_a_thousand_is_not_named_wrongly(tmp_path):
 def test_values_that_cannot_be_are_one_line(tmp_path):
     runs = [(times, 1e12 * q, qd) for times, q, qd in swings()]
     with pytest.raises(
-        InputError, match=r"column q: expected values of about 1 rad, found 1.2e\+12; is the unit right"
+        InputError,
+        match=r"column q: expected values of about 1 rad, found 1.2e\+12; is the unit right",
     ):
         explain(table(tmp_path, runs))
 
@@ -173,7 +186,9 @@ def test_a_torque_that_is_known_fixes_gravity(tmp_path):
     rng, runs = np.random.default_rng(4), []
     for angle in (0.3, 0.5, -0.4):
         push = 0.05 * np.sign(np.sin(7 * TIMES + angle))
-        seen = Pendulum({"gravity": 8.0}).simulate(np.array([[3.3e-3]]), Scenario(TIMES, {"q": angle}, {"u": push}))[0]
+        seen = Pendulum({"gravity": 8.0}).simulate(
+            np.array([[3.3e-3]]), Scenario(TIMES, {"q": angle}, {"u": push})
+        )[0]
         runs.append((TIMES, *(seen + rng.standard_normal(seen.shape) * [0.003, 0.02]).T, push))
     found = explained(table(tmp_path, runs, noise=NOISE, inputs=("u",)), free=("gravity",))
     assert found.verdict["verdict"] == "adequate"
@@ -192,18 +207,34 @@ def test_other_engines_explain_too(tmp_path):
 
 def test_what_takes_no_effects_is_refused(tmp_path, spring):
     write(Wish("spring", runs=2, seconds=1), tmp_path / "spring.csv")
-    with pytest.raises(InputError, match="simulator spring takes no effects, so nothing can be missing from it"):
+    with pytest.raises(
+        InputError, match="simulator spring takes no effects, so nothing can be missing from it"
+    ):
         explain(tmp_path / "spring.csv")
 
 
 def test_a_plugins_simulator_without_forces_is_explained(tmp_path):
     pytest.importorskip("mujoco")
     load_plugins([EXAMPLES / "bob.py"])
-    truth = Wish("bob", ["damping=0.3"], ["input.gain=0.3"], [], ["0.001"], ["pull=square:0.5:1"], [], [], 3, 1.0, 50.0)
+    truth = Wish(
+        "bob",
+        ["damping=0.3"],
+        ["input.gain=0.3"],
+        [],
+        ["0.001"],
+        ["pull=square:0.5:1"],
+        [],
+        [],
+        3,
+        1.0,
+        50.0,
+    )
     write(truth, tmp_path / "bob.csv")
     found = explained(tmp_path / "bob.csv")
     assert found.verdict["engine"] == "its own"
-    assert {"drag.linear", "friction.coulomb"}.isdisjoint(c["effect"] for c in found.verdict["candidates"])
+    assert {"drag.linear", "friction.coulomb"}.isdisjoint(
+        c["effect"] for c in found.verdict["candidates"]
+    )
     cause = found.verdict["causes"][0]
     assert "input.gain" in (cause["effect"], *cause["alternatives"])
     assert {"stiffness", "damping"} == set(found.verdict["parameters"])
@@ -232,19 +263,30 @@ def test_an_extended_simulator_is_scored_and_explained_as_its_system(tmp_path):
     theta = np.array([[p.nominal for p in kind.parameters]])
     by_hand = Pendulum(found.extended.constants, engine="batch", effects=["drag.linear"])
     scenario = Scenario(TIMES, {"q": 0.7})
-    np.testing.assert_array_equal(kind().simulate(theta, scenario), by_hand.simulate(theta, scenario))
+    np.testing.assert_array_equal(
+        kind().simulate(theta, scenario), by_hand.simulate(theta, scenario)
+    )
     np.testing.assert_array_equal(
         load(model, simulators.get)().simulate(theta, scenario), by_hand.simulate(theta, scenario)
     )
-    made = make(Wish("pendulum_extended", noise=["q=0.003", "qd=0.02"], runs=3, seconds=1.5, rate=60)).recording
+    made = make(
+        Wish("pendulum_extended", noise=["q=0.003", "qd=0.02"], runs=3, seconds=1.5, rate=60)
+    ).recording
     columns = [(run.times, run.channels["q"], run.channels["qd"]) for run in made.runs]
     path = table(tmp_path, columns, system="pendulum_extended", noise=NOISE)
-    with pytest.raises(InputError, match="pendulum_extended is extended already; name the system it extends, pendulum"):
+    with pytest.raises(
+        InputError,
+        match="pendulum_extended is extended already; name the system it extends, pendulum",
+    ):
         explain(path)
     again = explained(path, system="pendulum")
     assert names(again) == ["drag.linear"]
     drag = again.verdict["causes"][0]["coefficients"]["coefficient"]
-    assert drag["low"] < found.verdict["causes"][0]["coefficients"]["coefficient"]["value"] < drag["high"]
+    assert (
+        drag["low"]
+        < found.verdict["causes"][0]["coefficients"]["coefficient"]["value"]
+        < drag["high"]
+    )
 
 
 def test_a_recording_is_not_changed(tmp_path):

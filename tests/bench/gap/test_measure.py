@@ -14,20 +14,29 @@ from tests.bench.gap.made import correlated, marked, recorded, recording, search
 
 def errors(rmse, runs=6, samples=200, seed=0):
     """Residuals (R, T, 1) with this root mean square over all of them, different in each run."""
-    made = np.random.default_rng(seed).normal(size=(runs, samples, 1)) * np.linspace(0.9, 1.1, runs)[:, None, None]
+    made = (
+        np.random.default_rng(seed).normal(size=(runs, samples, 1))
+        * np.linspace(0.9, 1.1, runs)[:, None, None]
+    )
     return made * rmse / np.sqrt(np.square(made).mean())
 
 
 def runs_of(observed):
     return SimpleNamespace(
-        observed=observed, tracks=[None] * len(observed), lengths=np.full(len(observed), observed.shape[1])
+        observed=observed,
+        tracks=[None] * len(observed),
+        lengths=np.full(len(observed), observed.shape[1]),
     )
 
 
 def test_the_share_of_the_gap_closed_is_that_of_the_design():
     there = runs_of(np.zeros((6, 200, 1)))
     found = gain(there, errors(0.37), errors(0.045, seed=1), [0], 0.01, np.random.default_rng(0))
-    assert (found.base, found.extended, found.floor) == (pytest.approx(0.37), pytest.approx(0.045), 0.01)
+    assert (found.base, found.extended, found.floor) == (
+        pytest.approx(0.37),
+        pytest.approx(0.045),
+        0.01,
+    )
     assert found.closed == pytest.approx((0.37 - 0.045) / (0.37 - 0.01), rel=1e-12)
     assert round(found.closed, 2) == 0.90
     assert 0.85 < found.low < found.closed < found.high < 0.95
@@ -38,7 +47,8 @@ def test_the_interval_contains_the_point(runs):
     there = runs_of(np.zeros((runs, 400, 2)))
     for seed in range(8):
         before, after = (
-            np.concatenate([errors(size, runs, 400, seed), 9 * errors(1, runs, 400)], 2) for size in (0.3, 0.1)
+            np.concatenate([errors(size, runs, 400, seed), 9 * errors(1, runs, 400)], 2)
+            for size in (0.3, 0.1)
         )
         after = after * np.random.default_rng(seed).uniform(0.6, 1.5, size=(runs, 400, 1))
         found = gain(there, before, after, [0], 0.02, np.random.default_rng(seed))
@@ -62,17 +72,23 @@ def test_missing_samples_do_not_count():
     observed[0, :50] = np.nan
     before = np.full((2, 100, 1), 0.2)
     before[0, :50] = 77.0
-    found = gain(runs_of(observed), before, np.full((2, 100, 1), 0.1), [0], 0.02, np.random.default_rng(0))
+    found = gain(
+        runs_of(observed), before, np.full((2, 100, 1), 0.1), [0], 0.02, np.random.default_rng(0)
+    )
     assert found.base == pytest.approx(0.2)
     assert found.closed == pytest.approx(0.1 / 0.18)
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.7])
 def test_intervals_cover_the_truth(phi):
-    """60 recordings of a driven slider with drag: 95 % intervals of mass and drag hold what made them."""
+    """60 recordings of a driven slider with drag: 95 % intervals of mass and drag hold what made
+    them.
+    """
     times, rng, held = np.arange(120) / 60, np.random.default_rng(20), []
     push = np.where(np.sin(5 * times) > 0, 1.0, -1.0)
-    made = recorded(Slider(fixed={"drag.linear": 0.4}, observe=["x"]), [1.3], [({}, {"u": push})], times)
+    made = recorded(
+        Slider(fixed={"drag.linear": 0.4}, observe=["x"]), [1.3], [({}, {"u": push})], times
+    )
     there = world(made, candidates=["drag.linear"])
     clean, noise = there.observed.copy(), white(there, 0.004).coloured(phi)
     theta = np.array([1.3, 0.4])
@@ -92,7 +108,9 @@ def test_the_covariance_is_that_of_all_unknowns_at_once():
     sigma = model.likelihood.sigma
     assert np.allclose(model.likelihood.phi, 0, atol=0.3)
     flat = Noise(sigma, np.zeros(2))
-    model = type(model)(model.fit, type(model.likelihood)(model.likelihood.value, sigma, flat.phi), model.merit)
+    model = type(model)(
+        model.fit, type(model.likelihood)(model.likelihood.value, sigma, flat.phi), model.merit
+    )
     jacobian = model.fit.jacobian / sigma[:, None]
     rows = np.zeros((2, jacobian[0, ..., 0].size, 5))
     for r in range(2):
@@ -103,8 +121,12 @@ def test_the_covariance_is_that_of_all_unknowns_at_once():
 
 
 def test_parameters_that_act_alike_have_no_interval():
-    """Inertia and gravity of a free swing: one-sided differences would tell them apart by their own error."""
-    made = recorded(Pendulum(), [3.3e-3], [{"q": 0.8}, {"q": 1.2}], np.arange(90) / 60, [0.003, 0.02], seed=5)
+    """Inertia and gravity of a free swing: one-sided differences would tell them apart by their own
+    error.
+    """
+    made = recorded(
+        Pendulum(), [3.3e-3], [{"q": 0.8}, {"q": 1.2}], np.arange(90) / 60, [0.003, 0.02], seed=5
+    )
     search, model = searched(made, [0.003, 0.02], candidates=[], free=["gravity"])
     spread = np.sqrt(np.diagonal(covariance(search, model))) / model.fit.theta[:2]
     assert (spread > 5).all()
@@ -125,10 +147,14 @@ def test_what_the_data_do_not_bound_has_no_interval():
 
 
 def test_held_out_runs_estimate_initial_states_and_nothing_else():
-    made = recording(theta=["4e-3"], runs=3, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"], held_out=0)
+    made = recording(
+        theta=["4e-3"], runs=3, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"], held_out=0
+    )
     there = world(made, candidates=["drag.linear"])
     held_out = HeldOut(there, white(there, [0.003, 0.02]))
-    right, wrong, failed = held_out.measure([np.array(theta) for theta in ([4e-3, 0.0], [3e-3, 0.0], [np.nan, 0.0])])
+    right, wrong, failed = held_out.measure(
+        [np.array(theta) for theta in ([4e-3, 0.0], [3e-3, 0.0], [np.nan, 0.0])]
+    )
     left = (there.observed - right.simulated) / [0.003, 0.02]
     assert np.sqrt(np.square(left).mean()) == pytest.approx(1.0, abs=0.1)
     assert np.sqrt(np.square((there.observed - wrong.simulated) / [0.003, 0.02]).mean()) > 10

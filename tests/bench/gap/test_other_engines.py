@@ -1,5 +1,5 @@
-"""The same cause is named whichever engine explains: two external simulators, on data that each system's batch engine
-did not make."""
+"""The same cause is named whichever engine explains: two external simulators, on data that each
+system's batch engine did not make."""
 
 import pytest
 

@@ -38,7 +38,9 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
     found = next_experiment(search, model, rival)
     assert found["apart"] > TELLING
     assert found["change"]
-    said = re.fullmatch(r"(.*): there drag.linear and drag.quadratic differ by (.*) times the noise", found["says"])
+    said = re.fullmatch(
+        r"(.*): there drag.linear and drag.quadratic differ by (.*) times the noise", found["says"]
+    )
     assert float(said[2]) == pytest.approx(found["apart"], rel=0.01)
     if free:
         return
@@ -51,9 +53,9 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
         times = np.arange(2 * times.size - 1) / 60
         assert found["change"]["seconds"] == pytest.approx(times[-1])
     seen = [
-        Pendulum(fixed={name: m.fit.theta[search.world.slots[name]].tolist()}, time_step=1e-3).simulate(
-            m.fit.theta[None, :1], Scenario(times, initial)
-        )[0]
+        Pendulum(
+            fixed={name: m.fit.theta[search.world.slots[name]].tolist()}, time_step=1e-3
+        ).simulate(m.fit.theta[None, :1], Scenario(times, initial))[0]
         for name, m in zip(effects, (model, rival), strict=True)
     ]
     apart = np.sqrt(np.square((seen[0] - seen[1]) / [0.003, 0.02]).mean())
@@ -71,7 +73,9 @@ def test_equal_models_are_not_told_apart_by_any_run():
 
 
 def test_what_is_not_recorded_is_proposed_where_no_run_would_do():
-    search, model, _ = rivals(small_swing(observe=["q"], noise=["0.003"]), 0.003, ("drag.linear", "drag.quadratic"))
+    search, model, _ = rivals(
+        small_swing(observe=["q"], noise=["0.003"]), 0.003, ("drag.linear", "drag.quadratic")
+    )
     assert next_experiment(search, model, model)["says"].endswith("record qd besides")
 
 
@@ -82,4 +86,6 @@ def test_an_input_is_made_smaller_or_larger():
     before = search.world.simulations
     found = next_experiment(search, model, rival)
     assert np.isfinite(found["apart"])
-    assert search.world.simulations - before == 2 * (1 + 6 + 2), "twice as long, each state three ways, the input two"
+    assert search.world.simulations - before == 2 * (1 + 6 + 2), (
+        "twice as long, each state three ways, the input two"
+    )

@@ -53,11 +53,16 @@ def test_a_wrong_model_errs_by_more(files):
     without = scored(model, recording)
     assert without["rmse"]["q"] > 0.015
     assert without["normalised_rmse"] == pytest.approx(
-        np.sqrt(np.mean([(without["rmse"]["q"] / 0.003) ** 2, (without["rmse"]["qd"] / 0.02) ** 2])), rel=1e-9
+        np.sqrt(
+            np.mean([(without["rmse"]["q"] / 0.003) ** 2, (without["rmse"]["qd"] / 0.02) ** 2])
+        ),
+        rel=1e-9,
     )
     write(replace(MODEL, constants={**MODEL.constants, "gravity": 1.6}), model)
     stated = scored(model, recording)
-    assert stated["normalised_rmse"] == pytest.approx(1.0, abs=0.06), "the recording states its own gravity"
+    assert stated["normalised_rmse"] == pytest.approx(1.0, abs=0.06), (
+        "the recording states its own gravity"
+    )
 
 
 def test_held_out_runs_alone(files):
@@ -95,7 +100,12 @@ def test_what_cannot_be_scored_is_one_line(files, tmp_path):
         with pytest.raises(InputError, match=message) as caught:
             scored(model, tmp_path / other)
         assert str(caught.value).isprintable()
-    write(replace(MODEL, effects={"drag.linear": {"coefficient": Number(1e6, "N*m*s/rad", None, None)}}), model)
+    write(
+        replace(
+            MODEL, effects={"drag.linear": {"coefficient": Number(1e6, "N*m*s/rad", None, None)}}
+        ),
+        model,
+    )
     with pytest.raises(InputError, match="the simulation failed with the parameters of"):
         scored(model, recording)
 
@@ -103,5 +113,7 @@ def test_what_cannot_be_scored_is_one_line(files, tmp_path):
 def test_another_system_is_refused(files, tmp_path):
     model, _ = files
     simulate(Wish("servo", runs=1, seconds=0.5), tmp_path / "arm.csv")
-    with pytest.raises(InputError, match=r"arm.csv: expected a recording of pendulum, as .* is; found one of servo"):
+    with pytest.raises(
+        InputError, match=r"arm.csv: expected a recording of pendulum, as .* is; found one of servo"
+    ):
         scored(model, tmp_path / "arm.csv")

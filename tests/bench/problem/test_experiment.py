@@ -45,10 +45,19 @@ def test_published_setting_of_ball_drop():
         ({"noise": {"x": "small"}}, r"noise.x: expected a number, found 'small'"),
         ({"initial": {"x": [2, 1]}}, r"initial.x: expected low < high, found \[2, 1\]"),
         ({"initial": {"x": [1, 2, 3]}}, r"initial.x: expected \[low, high\]"),
-        ({"parameters": {"rate": {"trainig": [2, 3]}}}, r"unknown entry of \[parameters.rate\].*'trainig'"),
+        (
+            {"parameters": {"rate": {"trainig": [2, 3]}}},
+            r"unknown entry of \[parameters.rate\].*'trainig'",
+        ),
         ({"sampling": {"rate": 20.0, "sample": 5}}, "'sample'"),
-        ({"tuners": {"random": {"seeds": 0}}}, r"tuners.random.seeds: expected at least 1, found 0"),
-        ({"tuners": {"random": {"option": {}}}}, "'option'; there are: budget, options, seeds, tuner"),
+        (
+            {"tuners": {"random": {"seeds": 0}}},
+            r"tuners.random.seeds: expected at least 1, found 0",
+        ),
+        (
+            {"tuners": {"random": {"option": {}}}},
+            "'option'; there are: budget, options, seeds, tuner",
+        ),
         ({"simulator": ""}, "expected simulator"),
     ],
 )
@@ -74,7 +83,9 @@ def test_seeds_on_the_command_line_never_exceed_an_entry_that_asks_for_fewer():
 
 
 def test_chosen_tuners_keep_their_entries_and_new_ones_get_one():
-    experiment = spring_experiment(tuners={"mine": {"tuner": "random", "seeds": 2}}).with_tuners(["cma_es", "mine"])
+    experiment = spring_experiment(tuners={"mine": {"tuner": "random", "seeds": 2}}).with_tuners(
+        ["cma_es", "mine"]
+    )
     assert [(e.label, e.tuner, e.seeds) for e in experiment.tuners] == [
         ("cma_es", "cma_es", None),
         ("mine", "random", 2),

@@ -35,11 +35,17 @@ def test_fisher_information_of_a_line_is_that_of_regression():
     design = np.stack([np.ones(20), times], axis=1)
     information = widths @ design.T @ design @ widths / sigma**2
     found = spectrum(line, np.array([0.2, -1.0]), LINE, np.array([sigma]))
-    np.testing.assert_allclose(found.vectors @ np.diag(found.values) @ found.vectors.T, information, rtol=1e-9)
+    np.testing.assert_allclose(
+        found.vectors @ np.diag(found.values) @ found.vectors.T, information, rtol=1e-9
+    )
     np.testing.assert_allclose(found.vectors.T @ found.vectors, np.eye(2), atol=1e-12)
     # the bound is what regression reaches: its covariance, along the directions
-    covariance = np.linalg.inv(widths) @ np.linalg.inv(design.T @ design / sigma**2) @ np.linalg.inv(widths)
-    np.testing.assert_allclose(found.sigmas**2, np.diagonal(found.vectors.T @ covariance @ found.vectors), rtol=1e-9)
+    covariance = (
+        np.linalg.inv(widths) @ np.linalg.inv(design.T @ design / sigma**2) @ np.linalg.inv(widths)
+    )
+    np.testing.assert_allclose(
+        found.sigmas**2, np.diagonal(found.vectors.T @ covariance @ found.vectors), rtol=1e-9
+    )
 
 
 def test_least_squares_estimates_scatter_as_the_bound_says():
@@ -56,14 +62,19 @@ def test_only_the_product_of_two_factors_is_stiff():
     def product(theta):
         return (theta[:, :1] * theta[:, 1:] * np.arange(1, 30))[:, :, None]
 
-    factors = (Parameter("a", "1", 1.0, (0.0, 8.0), (0.0, 4.0)), Parameter("b", "1", 1.0, (0.0, 2.0), (0.0, 1.0)))
+    factors = (
+        Parameter("a", "1", 1.0, (0.0, 8.0), (0.0, 4.0)),
+        Parameter("b", "1", 1.0, (0.0, 2.0), (0.0, 1.0)),
+    )
     found = spectrum(product, np.array([3.0, 0.5]), factors, np.array([0.01]))
     assert found.stiff.tolist() == [True, False]
     np.testing.assert_allclose(found.values[1], 0.0, atol=1e-9 * found.values[0])
     # d(ab) = 0: da / a = -db / b, in training ranges da = 4 x, db = y
     expected = np.array([3.0 / 4, -0.5]) / np.hypot(3.0 / 4, 0.5)
     np.testing.assert_allclose(found.vectors[:, 1], expected, atol=1e-6)
-    stiff, sloppy = found.errors(np.stack([0.3 * found.vectors[:, 1], 0.2 * found.vectors[:, 0], [0.5, 0.5]]))
+    stiff, sloppy = found.errors(
+        np.stack([0.3 * found.vectors[:, 1], 0.2 * found.vectors[:, 0], [0.5, 0.5]])
+    )
     np.testing.assert_allclose(stiff[:2], [0.0, 0.2], atol=1e-12)
     np.testing.assert_allclose(sloppy[:2], [0.3, 0.0], atol=1e-12)
     assert stiff[2] ** 2 + sloppy[2] ** 2 == pytest.approx(0.5)
@@ -94,7 +105,9 @@ def test_spring_against_its_derivatives():
     t, x0 = scenario.times, scenario.initial["x"]
     by_rate = -x0 * t * np.exp(-decay * t) * np.sin(rate * t)
     by_decay = -x0 * t * np.exp(-decay * t) * np.cos(rate * t)
-    expected = of_jacobian(np.stack([by_rate * 2.0, by_decay * 0.4], axis=1) / 0.05)  # training widths 2 and 0.4
+    expected = of_jacobian(
+        np.stack([by_rate * 2.0, by_decay * 0.4], axis=1) / 0.05
+    )  # training widths 2 and 0.4
     found = problem.spectrum(target)
     np.testing.assert_allclose(found.values, expected.values, rtol=1e-6)
     np.testing.assert_allclose(found.vectors, expected.vectors, atol=1e-6)
@@ -127,17 +140,25 @@ def test_pendulum_tells_no_common_factor_of_all_that_acts_on_it():
     target = problem.targets()[0]
     found = problem.spectrum(target)
     inertia, drag, friction, gain, gravity = target.truth
-    factor = np.array([inertia, drag, friction, 1 + gain, 1 + gravity]) / problem.cube.training_widths()
+    factor = (
+        np.array([inertia, drag, friction, 1 + gain, 1 + gravity]) / problem.cube.training_widths()
+    )
     assert found.values[-1] < 1e-9 * found.values[0]
-    assert abs(found.vectors[:, -1] @ factor) / np.linalg.norm(factor) == pytest.approx(1.0, abs=1e-4)
+    assert abs(found.vectors[:, -1] @ factor) / np.linalg.norm(factor) == pytest.approx(
+        1.0, abs=1e-4
+    )
     problem.close()
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     changes = {"held_out": {"scenarios": 2, "initial": {"x": 3.0}}, "noise": {"x": 0.05}}
-    experiment = spring_experiment(targets=2, budget=6, tuners={"random": {}, "nelder_mead": {}}, **changes)
-    folder, results = begin(experiment, PLUGIN_FILES, str(tmp_path_factory.mktemp("found") / "run"), 2)
+    experiment = spring_experiment(
+        targets=2, budget=6, tuners={"random": {}, "nelder_mead": {}}, **changes
+    )
+    folder, results = begin(
+        experiment, PLUGIN_FILES, str(tmp_path_factory.mktemp("found") / "run"), 2
+    )
     assert make(folder, results, PLUGIN_FILES, 2, lambda *_: lambda: None, None)
     return folder, results
 
@@ -151,7 +172,9 @@ def test_errors_along_directions_and_of_prediction_are_recorded(folder):
         delivered = np.array([row["recommendation_rate"], row["recommendation_decay"]])
         away = (delivered - target.truth) / [2.0, 0.4]
         for metric, mask in (("stiff_error", found.stiff), ("sloppy_error", ~found.stiff)):
-            expected = np.sqrt(np.mean((found.vectors[:, mask].T @ away) ** 2)) if mask.any() else np.nan
+            expected = (
+                np.sqrt(np.mean((found.vectors[:, mask].T @ away) ** 2)) if mask.any() else np.nan
+            )
             assert row[metric] == pytest.approx(expected, nan_ok=True, rel=1e-9)
         t = np.arange(60) / 20
 
@@ -187,21 +210,36 @@ def test_held_out_scenarios_change_nothing_else():
         np.testing.assert_array_equal(a.truth, b.truth)
         np.testing.assert_array_equal(a.sealed.start, b.sealed.start)
         np.testing.assert_array_equal(a.sealed.fitting.observed, b.sealed.fitting.observed)
-        starts = [s.initial["x"] for s in (*b.sealed.fitting.scenarios, *b.sealed.held_out.scenarios)]
+        starts = [
+            s.initial["x"] for s in (*b.sealed.fitting.scenarios, *b.sealed.held_out.scenarios)
+        ]
         assert len(set(starts)) == 4
         assert all(0.8 <= x <= 1.2 for x in starts)
         assert b.sealed.held_out.observed.shape == (180, 1)
-        first = starts[1] * np.exp(-b.truth[1] * np.arange(60) / 20) * np.cos(b.truth[0] * np.arange(60) / 20)
-        np.testing.assert_allclose(b.sealed.held_out.observed[:60, 0], first, atol=1e-12)  # without noise
+        first = (
+            starts[1]
+            * np.exp(-b.truth[1] * np.arange(60) / 20)
+            * np.cos(b.truth[0] * np.arange(60) / 20)
+        )
+        np.testing.assert_allclose(
+            b.sealed.held_out.observed[:60, 0], first, atol=1e-12
+        )  # without noise
 
 
 def test_the_page_s_own_example_is_an_experiment():
     page = (Path(__file__).parents[3] / "docs" / "problems.md").read_text()
     document = tomllib.loads(page.split("```toml")[1].split("```")[0])
     problem = Problem(parse("mine", document, Path("mine.toml")).chosen(targets=1))
-    assert [p.name for p in problem.cube.parameters] == ["inertia", "drag.linear", "friction.coulomb", "input.gain"]
+    assert [p.name for p in problem.cube.parameters] == [
+        "inertia",
+        "drag.linear",
+        "friction.coulomb",
+        "input.gain",
+    ]
     held_out = problem.targets()[0].sealed.held_out.scenarios
-    np.testing.assert_allclose(held_out[2].inputs["u"], 0.1 * np.sin(2 * np.pi * 0.7 * held_out[2].times))
+    np.testing.assert_allclose(
+        held_out[2].inputs["u"], 0.1 * np.sin(2 * np.pi * 0.7 * held_out[2].times)
+    )
     problem.close()
 
 
@@ -214,8 +252,14 @@ def test_it_can_be_switched_off():
     ("change", "message"),
     [
         ({"held_out": {"scenarios": 0}}, "scenarios of at least 1"),
-        ({"held_out": {"runs": 3}}, r"unknown entry of \[held_out\].*'runs'; there are: initial, inputs, scenarios"),
-        ({"held_out": {"initial": {"x": [2, 1]}}}, r"held_out.initial.x: expected low < high, found \[2, 1\]"),
+        (
+            {"held_out": {"runs": 3}},
+            r"unknown entry of \[held_out\].*'runs'; there are: initial, inputs, scenarios",
+        ),
+        (
+            {"held_out": {"initial": {"x": [2, 1]}}},
+            r"held_out.initial.x: expected low < high, found \[2, 1\]",
+        ),
         ({"held_out": {"inputs": {"u": 3}}}, "held_out.inputs.u: expected text, found 3"),
         ({"identifiability": 1}, "identifiability: expected a bool, found 1"),
     ],
@@ -231,7 +275,9 @@ def test_an_unknown_state_of_held_out_scenarios_is_refused():
 
 
 def test_what_nobody_could_know_decides_nothing():
-    runs = pd.DataFrame({"run": ["a", "a", "b"], "param_error": [0.3, 0.2, 0.4], "stiff_error": [0.1, 0.05, np.nan]})
+    runs = pd.DataFrame(
+        {"run": ["a", "a", "b"], "param_error": [0.3, 0.2, 0.4], "stiff_error": [0.1, 0.05, np.nan]}
+    )
     assert primary(runs.assign(sloppy_error=np.nan)).metric == "param_error"
     decisive = primary(runs.assign(sloppy_error=[0.5, 0.6, 0.7]))
     assert decisive.metric == "stiff_error"

@@ -1,4 +1,6 @@
-"""The problems of several parameters can be solved: least squares ends where the data's own noise lets it."""
+"""The problems of several parameters can be solved: least squares ends where the data's own noise
+lets it.
+"""
 
 import numpy as np
 import pytest

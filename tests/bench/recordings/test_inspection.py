@@ -23,7 +23,11 @@ def odd(tmp_path):
     """Runs of different length, rate and gain, with missing samples and a gap."""
     rows = ["run,t,goal,q"]
     rows += [f"slow,{0.02 * i:.2f},0.5,{np.sin(0.1 * i):.6f}" for i in range(50)]
-    rows += [f"fast,{0.005 * i:.3f},1,{'' if i in (7, 8) else 0.1}" for i in range(100) if not 40 <= i < 50]
+    rows += [
+        f"fast,{0.005 * i:.3f},1,{'' if i in (7, 8) else 0.1}"
+        for i in range(100)
+        if not 40 <= i < 50
+    ]
     rows += [f"last,{100 + 0.01 * i:.2f},1,{0.2 + 0.001 * i}" for i in range(30)]
     (tmp_path / "odd.csv").write_text("\n".join(rows))
     (tmp_path / "odd.toml").write_text(
@@ -61,7 +65,10 @@ def test_a_single_run_is_one_although_its_end_is_held_out(tmp_path):
     write(Wish("pendulum", runs=1), tmp_path / "a.csv")
     said = lines(tmp_path / "a.csv")
     assert said[1].endswith("system pendulum, 1 run (its last third held out), 400 samples, 3.98 s")
-    assert [line.split()[:4] for line in said[4:6]] == [["1", "fitting", "266", "2.65"], ["1", "held", "out", "134"]]
+    assert [line.split()[:4] for line in said[4:6]] == [
+        ["1", "fitting", "266", "2.65"],
+        ["1", "held", "out", "134"],
+    ]
 
 
 def test_many_runs_are_cut_short(tmp_path):
@@ -84,7 +91,9 @@ def test_noise_is_found_under_motion_and_uneven_sampling():
     noisy = clean + 0.01 * RNG.standard_normal(t.size)
     noisy[RNG.random(t.size) < 0.3] = np.nan
     noisy[500:510] += 40
-    assert estimated([(t[:2000], noisy[:2000]), (t[2000:], noisy[2000:])]).sigma == pytest.approx(0.01, rel=0.1)
+    assert estimated([(t[:2000], noisy[:2000]), (t[2000:], noisy[2000:])]).sigma == pytest.approx(
+        0.01, rel=0.1
+    )
     even = np.arange(1000) / 100
     rounded = estimated([(even, np.round(np.sin(even) / 0.01) * 0.01)])
     assert rounded.step == pytest.approx(0.01)
@@ -151,7 +160,9 @@ def test_faults_are_one_line(odd, tmp_path, capsys):
         captured = capsys.readouterr().err
         assert message in captured
         assert captured.count("\n") == 1
-    odd.with_suffix(".toml").write_text(odd.with_suffix(".toml").read_text().replace("servo", "sled"))
+    odd.with_suffix(".toml").write_text(
+        odd.with_suffix(".toml").read_text().replace("servo", "sled")
+    )
     with pytest.raises(InputError, match="unknown simulator 'sled'"):
         load(odd)
 

@@ -21,9 +21,22 @@ def read(path):
 
 def test_the_command_of_the_readme_just_works(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    command = ["simulate", "ball", "--effect", "drag.quadratic=0.05", "--noise", "0.005", "--runs", "4"]
+    command = [
+        "simulate",
+        "ball",
+        "--effect",
+        "drag.quadratic=0.05",
+        "--noise",
+        "0.005",
+        "--runs",
+        "4",
+    ]
     assert main([*command, "--out", "drop.csv"]) == 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["drop.csv", "drop.toml", "drop.truth.toml"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "drop.csv",
+        "drop.toml",
+        "drop.truth.toml",
+    ]
     assert "drop.csv: 4 runs of 4 s at 100 Hz, channels x, y, z" in capsys.readouterr().out
     recording = read(tmp_path / "drop.csv")
     assert [run.held_out for run in recording.runs] == [False, False, False, True]
@@ -46,7 +59,10 @@ def test_the_command_of_the_readme_just_works(tmp_path, capsys, monkeypatch):
 def test_the_recording_does_not_tell_the_truth(tmp_path):
     write(Wish("ball", ["restitution=0.7654"], ["drag.quadratic=0.0123"]), tmp_path / "a.csv")
     description = (tmp_path / "a.toml").read_text()
-    assert not any(secret in description for secret in ("0.7654", "0.0123", "drag", "restitution", "initial", "seed"))
+    assert not any(
+        secret in description
+        for secret in ("0.7654", "0.0123", "drag", "restitution", "initial", "seed")
+    )
     assert (tmp_path / "a.csv").read_text().startswith("run,t,x,y,z\n1,0,0,0,3.")
 
 
@@ -60,25 +76,40 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path):
 
 def test_draws_do_not_depend_on_what_else_is_asked():
     few = make(Wish("ball", runs=2, noise=["0.01"], seconds=0.3)).recording
-    many = make(Wish("ball", runs=3, noise=["0.01"], seconds=0.3, effects=["drag.linear=0"])).recording
+    many = make(
+        Wish("ball", runs=3, noise=["0.01"], seconds=0.3, effects=["drag.linear=0"])
+    ).recording
     for a, b in zip(few.runs, many.runs[:2], strict=True):
         np.testing.assert_array_equal(a.channels["z"], b.channels["z"])
     louder = make(Wish("ball", runs=2, noise=["z=0.02"], seconds=0.3)).recording
     quiet = make(Wish("ball", runs=2, seconds=0.3)).recording
     noise = few.runs[0].channels["z"] - quiet.runs[0].channels["z"]
-    np.testing.assert_allclose(louder.runs[0].channels["z"] - quiet.runs[0].channels["z"], 2 * noise, atol=1e-12)
+    np.testing.assert_allclose(
+        louder.runs[0].channels["z"] - quiet.runs[0].channels["z"], 2 * noise, atol=1e-12
+    )
     assert louder.noise == {"z": 0.02}
 
 
 def test_what_is_recorded_is_what_the_closed_form_says():
-    made = make(Wish("ball", initial=["z=100", "vx=2"], constants=["gravity=1.62"], runs=1, seconds=2, rate=50))
+    made = make(
+        Wish(
+            "ball",
+            initial=["z=100", "vx=2"],
+            constants=["gravity=1.62"],
+            runs=1,
+            seconds=2,
+            rate=50,
+        )
+    )
     (run,) = made.recording.runs
     np.testing.assert_allclose(run.channels["z"], 100 - 0.81 * run.times**2, rtol=1e-9)
     np.testing.assert_allclose(run.channels["x"], 2 * run.times, rtol=1e-9)
     assert made.recording.constants["gravity"] == 1.62
     assert not made.recording.held_out()
     made = make(Wish("slider", ["2"], inputs=["u=3"], observe=["v"], runs=1, seconds=1))
-    np.testing.assert_allclose(made.recording.runs[0].channels["v"], 1.5 * made.recording.runs[0].times, atol=1e-9)
+    np.testing.assert_allclose(
+        made.recording.runs[0].channels["v"], 1.5 * made.recording.runs[0].times, atol=1e-9
+    )
     assert list(made.recording.runs[0].channels) == ["v"]
 
 
@@ -95,7 +126,9 @@ def test_a_simulator_without_engines_is_a_system_too(tmp_path, spring):
     load_plugins([PLUGINS / "spring.py"])
     made = make(Wish("spring", ["3.5,0.2"], runs=1, seconds=1, observe=["x"]))
     t = made.recording.runs[0].times
-    np.testing.assert_allclose(made.recording.runs[0].channels["x"], np.exp(-0.2 * t) * np.cos(3.5 * t), rtol=1e-12)
+    np.testing.assert_allclose(
+        made.recording.runs[0].channels["x"], np.exp(-0.2 * t) * np.cos(3.5 * t), rtol=1e-12
+    )
     with pytest.raises(InputError, match="simulator spring takes neither effects nor an engine"):
         make(Wish("spring", effects=["drag.linear=1"]))
 
@@ -110,7 +143,10 @@ def test_a_simulator_without_engines_is_a_system_too(tmp_path, spring):
         ({"theta": ["restitution=high"]}, "--theta restitution=high: expected a number"),
         ({"theta": ["restitution=1", "restitution=1"]}, "restitution is given twice"),
         ({"effects": ["drag.cubic=1"]}, "unknown effect 'drag.cubic'; there are: .*drag.linear"),
-        ({"effects": ["input.delay=1"]}, "system ball cannot have effect input.delay: it has no input"),
+        (
+            {"effects": ["input.delay=1"]},
+            "system ball cannot have effect input.delay: it has no input",
+        ),
         ({"effects": ["drag.linear=1,2"]}, "effect drag.linear: expected up to 1 values"),
         ({"effects": ["drag.linear"]}, "--effect drag.linear: expected NAME=VALUE"),
         ({"effects": ["drag.linear=nan"]}, "--effect drag.linear=nan: expected a number"),

@@ -23,7 +23,9 @@ def started(tmp_path):
         yield running
 
 
-def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_nothing(started, tmp_path):
+def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_nothing(
+    started, tmp_path
+):
     experiment = write(tmp_path / "e.toml", tuners=TUNERS, targets=8, training_budget=60)
     common = ["compare", experiment, "--plugin", SPRING_PLUGIN]
     local = simgap(*common, "--jobs", 2, "--out", tmp_path / "local")
@@ -33,7 +35,11 @@ def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_no
     environment = {**os.environ, "SIMGAP_CACHE": str(tmp_path / "cache")}
     command = [sys.executable, "-m", "bench.cli", *map(str, common), "--cluster", started.address]
     process = subprocess.Popen(
-        [*command, "--out", str(folder)], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [*command, "--out", str(folder)],
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
     )
     deadline = time.monotonic() + 120
     while len(finished(folder)) < 10 and process.poll() is None and time.monotonic() < deadline:
@@ -46,13 +52,26 @@ def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_no
     same(folder, tmp_path / "local")
 
 
-def test_runs_are_isolated_there_too_and_a_lost_scheduler_leaves_a_folder_to_resume(started, tmp_path):
+def test_runs_are_isolated_there_too_and_a_lost_scheduler_leaves_a_folder_to_resume(
+    started, tmp_path
+):
     tuners = {"random": {}, "chaos_exit": {"seeds": 1}, "chaos_raise": {"seeds": 1}}
     experiment = write(tmp_path / "e.toml", tuners=tuners, targets=300)
     folder = tmp_path / "out"
     common = ["--plugin", SPRING_PLUGIN, "--plugin", CHAOS]
-    command = [sys.executable, "-m", "bench.cli", "compare", str(experiment), *common, "--cluster", started.address]
-    process = subprocess.Popen([*command, "--out", str(folder)], text=True, stdout=-1, stderr=subprocess.PIPE)
+    command = [
+        sys.executable,
+        "-m",
+        "bench.cli",
+        "compare",
+        str(experiment),
+        *common,
+        "--cluster",
+        started.address,
+    ]
+    process = subprocess.Popen(
+        [*command, "--out", str(folder)], text=True, stdout=-1, stderr=subprocess.PIPE
+    )
     deadline = time.monotonic() + 120
     while len(finished(folder)) < 12 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -66,12 +85,22 @@ def test_runs_are_isolated_there_too_and_a_lost_scheduler_leaves_a_folder_to_res
     assert 12 <= len(kept) < 2400
     ends = {(s.tuner, s.status) for s in kept.values()}
     assert ends == {("random", "done"), ("chaos_exit", "crashed"), ("chaos_raise", "crashed")}
-    assert {s.reason for s in kept.values() if s.tuner == "chaos_exit"} == {"the worker process exited with code 7"}
+    assert {s.reason for s in kept.values() if s.tuner == "chaos_exit"} == {
+        "the worker process exited with code 7"
+    }
 
 
 def test_nobody_there_is_one_line(tmp_path, capsys):
     experiment = write(tmp_path / "e.toml")
-    common = ["compare", str(experiment), "--plugin", SPRING_PLUGIN, "--out", str(tmp_path / "out"), "--cluster"]
+    common = [
+        "compare",
+        str(experiment),
+        "--plugin",
+        SPRING_PLUGIN,
+        "--out",
+        str(tmp_path / "out"),
+        "--cluster",
+    ]
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:notaport"):
         assert main([*common, address]) == 2
         error = capsys.readouterr().err

@@ -9,7 +9,15 @@ TRUTH = np.array([0.3, 0.6])
 
 def task(budget, dim=2):
     observed = np.zeros((5, 1))
-    return Task(dim, np.full(dim, 0.5), observed, np.ones(1), np.array([[0.0] * dim, [1.0] * dim]), budget, (5,))
+    return Task(
+        dim,
+        np.full(dim, 0.5),
+        observed,
+        np.ones(1),
+        np.array([[0.0] * dim, [1.0] * dim]),
+        budget,
+        (5,),
+    )
 
 
 class Counted:
@@ -51,7 +59,9 @@ def test_recommends_the_lowest_loss_by_default_even_inside_a_batch():
         yield points
 
     trace, _ = run(tune)
-    np.testing.assert_array_equal(trace.recommendations, [[0.5, 0.5], points[0], points[1], points[1], points[3]])
+    np.testing.assert_array_equal(
+        trace.recommendations, [[0.5, 0.5], points[0], points[1], points[1], points[3]]
+    )
     assert trace.status == "converged"
 
 
@@ -62,7 +72,9 @@ def test_recommendation_of_an_ask_is_what_the_tuner_would_deliver_after_what_it_
 
     trace, _ = run(tune, budget=3)
     np.testing.assert_allclose(trace.proposals[:, 0], [0.1, 0.2, 0.3])
-    np.testing.assert_allclose(trace.recommendations[:, 0], [0.1, 0.2, 0.3, 0.4])  # the newest guess, not simulated
+    np.testing.assert_allclose(
+        trace.recommendations[:, 0], [0.1, 0.2, 0.3, 0.4]
+    )  # the newest guess, not simulated
     assert trace.status == "done"
 
 

@@ -24,7 +24,9 @@ def test_loss_of_one_proposal_is_that_in_a_batch():
     simulated = problem.simulate(points, side.scenarios)
     expected = np.sqrt(((simulated - side.observed) ** 2).mean(axis=(1, 2))) / 0.1
     np.testing.assert_allclose(alone, expected, rtol=1e-12)
-    np.testing.assert_allclose(one.rmse(points, points[::-1])[:, 0], expected[::-1] * 0.1, rtol=1e-12)
+    np.testing.assert_allclose(
+        one.rmse(points, points[::-1])[:, 0], expected[::-1] * 0.1, rtol=1e-12
+    )
 
 
 def test_two_channels_weigh_by_their_scale_and_missing_samples_do_not_count():
@@ -34,12 +36,16 @@ def test_two_channels_weigh_by_their_scale_and_missing_samples_do_not_count():
     points = np.array([[0.3, 0.4]])
     _, loss = Evaluator(problem, Side(side.scenarios, observed))(points)
     difference = problem.simulate(points, side.scenarios)[0] - observed
-    expected = np.sqrt((np.nanmean(difference[:, 0] ** 2) / 0.01 + np.nanmean(difference[:, 1] ** 2) / 0.25) / 2)
+    expected = np.sqrt(
+        (np.nanmean(difference[:, 0] ** 2) / 0.01 + np.nanmean(difference[:, 1] ** 2) / 0.25) / 2
+    )
     assert loss[0] == pytest.approx(expected, rel=1e-12)
 
 
 def test_failed_simulation_has_an_infinite_loss(monkeypatch):
     problem, _, one = evaluator()
-    monkeypatch.setattr(problem, "simulate", lambda points, scenarios: np.full((len(points), 60, 1), np.nan))
+    monkeypatch.setattr(
+        problem, "simulate", lambda points, scenarios: np.full((len(points), 60, 1), np.nan)
+    )
     assert one(np.full((1, 2), 0.5))[1][0] == np.inf
     assert (one(np.full((3, 2), 0.5))[1] == np.inf).all()

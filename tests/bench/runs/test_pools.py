@@ -60,7 +60,12 @@ def made(calls, seconds=60.0, jobs=2, plugins=()):
 def test_a_death_costs_its_own_call_and_no_other(monkeypatch):
     monkeypatch.setattr("bench.runs.pools.GRACE", 0.0)
     calls = [(double, (i,)) for i in range(40)]
-    calls[3], calls[11], calls[12], calls[20] = (leave, (3,)), (leave, (0,)), (os.abort, ()), (double, ())
+    calls[3], calls[11], calls[12], calls[20] = (
+        (leave, (3,)),
+        (leave, (0,)),
+        (os.abort, ()),
+        (double, ()),
+    )
     results = made(calls)
     odd = {i: results[i] for i in (3, 11, 12, 20)}
     assert all(isinstance(odd[i], DeathError) for i in (3, 11, 12))
@@ -70,10 +75,14 @@ def test_a_death_costs_its_own_call_and_no_other(monkeypatch):
         "the worker process was killed by SIGABRT",
     ]
     assert isinstance(odd[20], TypeError)
-    assert [results[i] for i in range(40) if i not in odd] == [2 * i for i in range(40) if i not in odd]
+    assert [results[i] for i in range(40) if i not in odd] == [
+        2 * i for i in range(40) if i not in odd
+    ]
 
 
-def test_hanging_call_is_killed_at_its_limit_even_if_it_ignores_the_polite_signal(monkeypatch, tmp_path):
+def test_hanging_call_is_killed_at_its_limit_even_if_it_ignores_the_polite_signal(
+    monkeypatch, tmp_path
+):
     monkeypatch.setattr("bench.runs.pools.GRACE", 0.3)
     started = time.monotonic()
     results = made([(hang, (str(tmp_path / "pid"),)), (double, (1,))], seconds=1.0)
@@ -84,7 +93,9 @@ def test_hanging_call_is_killed_at_its_limit_even_if_it_ignores_the_polite_signa
 
 
 @pytest.mark.parametrize(("times", "expected"), [(RETRIES, RETRIES), (RETRIES + 5, DeathError)])
-def test_call_whose_worker_is_killed_from_outside_is_made_again_but_not_for_ever(tmp_path, times, expected):
+def test_call_whose_worker_is_killed_from_outside_is_made_again_but_not_for_ever(
+    tmp_path, times, expected
+):
     result = made([(killed_until, (str(tmp_path / "count"), times)), (double, (1,))])[0]
     if expected is DeathError:
         assert isinstance(result, DeathError)
@@ -127,14 +138,23 @@ def test_no_worker_outlives_its_parent(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(code)
     root = str(PLUGINS.parents[1])
-    parent = subprocess.Popen([sys.executable, str(script)], env={**os.environ, "PYTHONPATH": root}, cwd=root)
+    parent = subprocess.Popen(
+        [sys.executable, str(script)], env={**os.environ, "PYTHONPATH": root}, cwd=root
+    )
     deadline = time.monotonic() + 30
-    while not ((tmp_path / "pid").exists() and (tmp_path / "pid").read_text()) and time.monotonic() < deadline:
+    while (
+        not ((tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
+        and time.monotonic() < deadline
+    ):
         time.sleep(0.05)
     parent.kill()
     parent.wait()
     worker = int((tmp_path / "pid").read_text())
-    while psutil.pid_exists(worker) and psutil.Process(worker).status() != "zombie" and time.monotonic() < deadline:
+    while (
+        psutil.pid_exists(worker)
+        and psutil.Process(worker).status() != "zombie"
+        and time.monotonic() < deadline
+    ):
         time.sleep(0.05)
     assert not psutil.pid_exists(worker) or psutil.Process(worker).status() == "zombie"
 

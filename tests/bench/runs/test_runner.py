@@ -59,14 +59,20 @@ def two_workers():
 def test_table_does_not_depend_on_the_number_of_workers(two_workers, tmp_path):
     experiment = spring_experiment(tuners=EVERYTHING)
     first, second = (tables(experiment, tmp_path / str(jobs), jobs) for jobs in (1, 2))
-    pd.testing.assert_frame_equal(first.runs.drop(columns=MEASURED), second.runs.drop(columns=MEASURED))
+    pd.testing.assert_frame_equal(
+        first.runs.drop(columns=MEASURED), second.runs.drop(columns=MEASURED)
+    )
     unlike = ["seconds"]
-    pd.testing.assert_frame_equal(first.statuses.drop(columns=unlike), second.statuses.drop(columns=unlike))
+    pd.testing.assert_frame_equal(
+        first.statuses.drop(columns=unlike), second.statuses.drop(columns=unlike)
+    )
 
 
 def test_other_tuners_in_the_comparison_change_nothing(two_workers):
     alone = frame(compared(spring_experiment(tuners={"cma_es": {}}), jobs=2)).drop(columns=MEASURED)
-    among = frame(two_workers).drop(columns=MEASURED).query("tuner == 'cma_es'").reset_index(drop=True)
+    among = (
+        frame(two_workers).drop(columns=MEASURED).query("tuner == 'cma_es'").reset_index(drop=True)
+    )
     pd.testing.assert_frame_equal(alone, among)
 
 
@@ -84,7 +90,9 @@ def test_every_end_has_its_status_and_keeps_its_rows(two_workers):
     assert tuple(used.loc["dying"]) == (0, 0), "nothing comes back from a worker that died"
     rows = frame(two_workers)
     assert set(rows["run"]) == set(statuses["run"])
-    assert (rows.groupby("run")["k"].max() == statuses.set_index("run")["simulations"].sort_index()).all()
+    assert (
+        rows.groupby("run")["k"].max() == statuses.set_index("run")["simulations"].sort_index()
+    ).all()
 
 
 def test_pairing_all_tuners_share_target_start_and_truth(two_workers):
@@ -127,7 +135,9 @@ def test_obs_error_is_the_rmse_of_the_recommended_simulation(two_workers):
 
 def test_tuner_that_searches_everything_for_the_truth_finds_none(tmp_path, monkeypatch):
     monkeypatch.setenv("SNOOPED", str(tmp_path / "numbers.json"))
-    results = compared(spring_experiment(tuners={"snooping": {}}, targets=1, seeds=1, ranges=["in"]), jobs=1)
+    results = compared(
+        spring_experiment(tuners={"snooping": {}}, targets=1, seeds=1, ranges=["in"]), jobs=1
+    )
     assert next(iter(results.kept.statuses.values())).status == "converged"
     found = np.array(json.loads((tmp_path / "numbers.json").read_text()))
     found = found[np.isfinite(found)]
@@ -150,7 +160,9 @@ def test_snooping_would_find_a_truth_that_is_there():
 @pytest.mark.slow
 def test_hanging_tuner_is_killed_at_its_limit(monkeypatch):
     monkeypatch.setattr("bench.runs.pools.GRACE", 0.5)
-    results = compared(spring_experiment(tuners={"hanging": {}, "random": {}}, targets=1, seeds=1, timeout=1.0))
+    results = compared(
+        spring_experiment(tuners={"hanging": {}, "random": {}}, targets=1, seeds=1, timeout=1.0)
+    )
     statuses = {s.tuner: s for s in results.kept.statuses.values()}
     assert statuses["hanging"].status == "timeout"
     assert statuses["random"].status == "done"
@@ -161,10 +173,13 @@ def test_noise_is_added_to_the_target_only_and_sets_the_scale():
     problem = prepare(experiment).problem
     targets = problem.targets()
     residuals = [
-        t.sealed.fitting.observed - problem.simulate(problem.cube.inverse(t.truth)[None], t.sealed.fitting.scenarios)[0]
+        t.sealed.fitting.observed
+        - problem.simulate(problem.cube.inverse(t.truth)[None], t.sealed.fitting.scenarios)[0]
         for t in targets
     ]
     assert np.std(residuals) == pytest.approx(0.05, rel=0.1)
     assert problem.scale == pytest.approx([0.05])
     again = prepare(experiment).problem.targets()
-    np.testing.assert_array_equal(targets[3].sealed.fitting.observed, again[3].sealed.fitting.observed)
+    np.testing.assert_array_equal(
+        targets[3].sealed.fitting.observed, again[3].sealed.fitting.observed
+    )

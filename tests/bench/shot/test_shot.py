@@ -1,4 +1,6 @@
-"""Bounce-shot studies: Wilson's interval, what goes over from a drop to a shot, who hits, and the command."""
+"""Bounce-shot studies: Wilson's interval, what goes over from a drop to a shot, who hits, and the
+command.
+"""
 
 import importlib.util
 import json
@@ -26,7 +28,8 @@ from sims.recording.recording import read_recording
 from sims.shot.world import Ground, fly
 
 vision = pytest.mark.skipif(
-    not all(map(importlib.util.find_spec, ("av", "cv2"))), reason="PyAV and OpenCV are not installed: simgap[vision]"
+    not all(map(importlib.util.find_spec, ("av", "cv2"))),
+    reason="PyAV and OpenCV are not installed: simgap[vision]",
 )
 
 
@@ -53,9 +56,27 @@ def test_wilson_interval_of_known_counts():
 
 
 def test_table_counts_misses_that_never_met_the_plane():
-    row = {"method": "m", "simulations": 10, "seconds": 0.1, "status": "done", "prediction_error": 0.02}
-    rows = [{**row, "ball": b, "hit": o < 0.15, "off": o} for b, o in (("a", 0.1), ("a", 0.2), ("b", 0.05))]
-    rows.append({**row, "ball": "b", "hit": False, "off": math.nan, "prediction_error": math.nan, "status": "no plan"})
+    row = {
+        "method": "m",
+        "simulations": 10,
+        "seconds": 0.1,
+        "status": "done",
+        "prediction_error": 0.02,
+    }
+    rows = [
+        {**row, "ball": b, "hit": o < 0.15, "off": o}
+        for b, o in (("a", 0.1), ("a", 0.2), ("b", 0.05))
+    ]
+    rows.append(
+        {
+            **row,
+            "ball": "b",
+            "hit": False,
+            "off": math.nan,
+            "prediction_error": math.nan,
+            "status": "no plan",
+        }
+    )
     lines = table(pd.DataFrame(rows)).set_index("ball")
     assert lines.hits.to_dict() == {"a": 1, "b": 1, ALL: 2}
     assert lines.rate[ALL] == 0.5
@@ -95,7 +116,9 @@ def test_a_filmed_drop_is_tracked_to_millimetres(experiment, tmp_path, kind):
     recording = read_recording(path, Ball, whole=True)
     run = recording.runs[0]
     radius = recording.constants["radius"]
-    true = fly(dealt.ball, Ground(0.0, settings.friction), (0.0, 0.0, run.channels["z"][0]), run.times)[:, 2]
+    true = fly(
+        dealt.ball, Ground(0.0, settings.friction), (0.0, 0.0, run.channels["z"][0]), run.times
+    )[:, 2]
     rms = float(np.sqrt(np.nanmean((run.channels["z"] - true) ** 2)))
     assert np.isfinite(run.channels["z"]).mean() > 0.95
     assert rms < 4e-3
@@ -121,14 +144,20 @@ def test_recorded_drop_reads_as_any_recording_of_a_ball(experiment, tmp_path):
 
 
 @vision
-def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_camera_stood(tmp_path, monkeypatch):
+def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_camera_stood(
+    tmp_path, monkeypatch
+):
     monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path / "cache"))
     experiment = load("bounce-shot").with_tuners(["tunenet-vision", "least_squares"])
     experiment = experiment.chosen(training_budget=400)
     settings, path = settings_of(experiment), tmp_path / "drop.csv"
     assert settings.rows == ("tunenet-vision",)
     watching, metres = (tune.tuned_in(experiment, settings, entry) for entry in experiment.tuners)
-    assert (watching.simulator, watching.observe, metres.simulator) == ("ball-filmed", ("z", "v"), "ball")
+    assert (watching.simulator, watching.observe, metres.simulator) == (
+        "ball-filmed",
+        ("z", "v"),
+        "ball",
+    )
     weights = {"tunenet-vision": train(watching, experiment.tuners[0], 0).path}
     found = {}
     for kind in ("golf", "squash"):
@@ -139,13 +168,17 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
         assert np.isnan(seen.observed[:, 0]).all()
         # the ball lies on the ground at the end, lower in the picture than where it was let go
         assert np.isfinite(seen.observed[:, 1]).mean() > 0.9
-        assert np.nanmax(seen.observed[:, 1]) - seen.observed[np.isfinite(seen.observed[:, 1])][0, 1] > 100
+        assert (
+            np.nanmax(seen.observed[:, 1]) - seen.observed[np.isfinite(seen.observed[:, 1])][0, 1]
+            > 100
+        )
         for left in ("drop.camera.toml", "drop.mp4"):
             (tmp_path / left).unlink()
         known = Known(dealt.name, path, dealt.scene, weights)
         recording = read_recording(path, Ball, whole=True)
         by_rows, by_metres = (
-            tune._tuned(experiment, settings, entry, known, recording, {}) for entry in experiment.tuners
+            tune._tuned(experiment, settings, entry, known, recording, {})
+            for entry in experiment.tuners
         )
         assert by_rows.restitution == pytest.approx(by_metres.restitution, abs=0.06)
         assert by_rows.simulations <= experiment.budget
@@ -165,7 +198,9 @@ shot = {{ balls = ["golf"], filmed = 16 }}
 """
     (tmp_path / "small.toml").write_text(text)
     out = tmp_path / "out"
-    assert cli.main(["compare", str(tmp_path / "small.toml"), "--jobs", "1", "--out", str(out)]) == 0
+    assert (
+        cli.main(["compare", str(tmp_path / "small.toml"), "--jobs", "1", "--out", str(out)]) == 0
+    )
     rows = pd.read_csv(out / "status.csv")
     assert set(rows["status"]) == {"no recording"}
     assert rows["reason"].str.contains("no ball found").all()
@@ -189,7 +224,10 @@ def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp
     dealt = deal(experiment, settings, "rubber", 1)
     path = tmp_path / "drop.csv"
     record(experiment, dealt, settings, path)
-    made = {row["method"]: Model(**row) for row in models(experiment, settings, Known("x", path, dealt.scene, {}))}
+    made = {
+        row["method"]: Model(**row)
+        for row in models(experiment, settings, Known("x", path, dealt.scene, {}))
+    }
     assert list(made) == ["nominal", "least_squares", "explain"]
     assert made["nominal"].restitution == 0.5
     assert made["least_squares"].restitution == pytest.approx(dealt.ball.restitution, abs=0.03)
@@ -225,7 +263,9 @@ def test_faults_of_the_table_are_one_line(experiment, change, message):
         settings_of(replace(experiment, shot=change))
 
 
-def test_world_that_cannot_be_had_is_skipped_with_its_reason(experiment, tmp_path, monkeypatch, capsys):
+def test_world_that_cannot_be_had_is_skipped_with_its_reason(
+    experiment, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(study.world, "missing", lambda: "the world needs mujoco")
     assert cli.main(["compare", "bounce-shot", "--out", str(tmp_path / "out")]) == 0
     assert "skipped: the world needs mujoco" in capsys.readouterr().out
@@ -245,7 +285,12 @@ shot = {{ balls = ["golf"] }}
     out = tmp_path / "out"
     assert cli.main(["compare", str(tmp_path / "mine.toml"), "--jobs", "1", "--out", str(out)]) == 0
     lines = pd.read_csv(out / "table.csv").set_index(["method", "ball"])
-    assert list(lines.index.unique("method")) == ["nominal", "least_squares", "explain", "least_squares + explain"]
+    assert list(lines.index.unique("method")) == [
+        "nominal",
+        "least_squares",
+        "explain",
+        "least_squares + explain",
+    ]
     assert lines.loc[("least_squares", "golf"), "shots"] == 1
     assert lines.loc[("least_squares", ALL), "simulations"] <= 6
     assert set(pd.read_csv(out / "status.csv")["status"]) <= {"done", "converged"}

@@ -10,7 +10,11 @@ from sims.base import InputError
 
 
 def columns(place, k=3):
-    return {"run": [f"t/{place}"] * (k + 1), "k": np.arange(k + 1), "loss": place + np.arange(k + 1) / 7}
+    return {
+        "run": [f"t/{place}"] * (k + 1),
+        "k": np.arange(k + 1),
+        "loss": place + np.arange(k + 1) / 7,
+    }
 
 
 def status(place):
@@ -22,7 +26,9 @@ def closed(monkeypatch):
     """Journals that a test leaves open, as a kill does."""
     opened = []
     begin = Journal.__init__
-    monkeypatch.setattr(Journal, "__init__", lambda self, *a, **k: (opened.append(self), begin(self, *a, **k))[1])
+    monkeypatch.setattr(
+        Journal, "__init__", lambda self, *a, **k: (opened.append(self), begin(self, *a, **k))[1]
+    )
     yield
     for journal in opened:
         if hasattr(journal, "_file"):
@@ -42,7 +48,10 @@ def everything(journal, runs=2000):
 
 def expected(places):
     wanted = [columns(p) for p in sorted(places)]
-    return {name: [x for c in wanted for x in (c[name] if name == "run" else c[name].tolist())] for name in wanted[0]}
+    return {
+        name: [x for c in wanted for x in (c[name] if name == "run" else c[name].tolist())]
+        for name in wanted[0]
+    }
 
 
 @pytest.mark.parametrize("runs", [1, 3, 2000])
@@ -108,7 +117,9 @@ def test_damaged_part_is_one_line(tmp_path):
     filled(tmp_path, range(4)).close()
     path = tmp_path / FOLDER / "000001.parquet"
     path.write_bytes(path.read_bytes()[:-7])
-    with pytest.raises(InputError, match=r"000001.parquet: expected a part of a comparison, found damage") as caught:
+    with pytest.raises(
+        InputError, match=r"000001.parquet: expected a part of a comparison, found damage"
+    ) as caught:
         Journal(tmp_path)
     assert "\n" not in str(caught.value)
 

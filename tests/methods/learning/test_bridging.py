@@ -1,4 +1,6 @@
-"""Gaps bridged through the map from a simulation to a sensor: exact for a camera, whatever the gap, and honest else."""
+"""Gaps bridged through the map from a simulation to a sensor: exact for a camera, whatever the gap,
+and honest else.
+"""
 
 import numpy as np
 import pytest
@@ -26,7 +28,9 @@ def test_a_gap_is_bridged_to_what_a_pinhole_camera_would_have_shown(gap):
     keep = np.isfinite(seen)
     assert (whole[keep] == true[keep]).all()
     held = np.interp(np.arange(120), np.flatnonzero(keep), seen[keep])
-    assert np.abs(held[gap] - true[gap]).max() > 5  # what holding or drawing a line through the gap would be off by
+    assert (
+        np.abs(held[gap] - true[gap]).max() > 5
+    )  # what holding or drawing a line through the gap would be off by
 
 
 def test_a_model_that_agrees_only_at_first_bridges_the_beginning():

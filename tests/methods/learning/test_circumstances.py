@@ -16,7 +16,9 @@ STEP, SAMPLES = 0.05, 120
 
 
 def driven(points, force):
-    """(n, 120, 1): q'' = gain u - damping q' - 4 q from rest; damping 0.2 to 1.2, gain 0.5 to 2.5, input (120, 1)."""
+    """(n, 120, 1): q'' = gain u - damping q' - 4 q from rest; damping 0.2 to 1.2, gain 0.5 to 2.5,
+    input (120, 1).
+    """
     damping, gain = 0.2 + points[:, :1], 0.5 + 2.0 * points[:, 1:2]
     q, rate, out = np.zeros((len(points), 1)), np.zeros((len(points), 1)), []
     for u in force[:, 0]:
@@ -85,8 +87,12 @@ def test_responses_hardly_depend_on_the_input_and_samples_do():
 
 def test_each_run_has_its_own_and_a_short_one_none():
     both = np.concatenate([force(0), force(1)[:5]])
-    seen = np.concatenate([driven(np.full((1, 2), 0.5), part) for part in (force(0), force(1)[:5])], axis=1)
-    assert np.array_equal(responses(seen, both, (SAMPLES, 5)), responses(seen[:, :SAMPLES], force(0), (SAMPLES,)))
+    seen = np.concatenate(
+        [driven(np.full((1, 2), 0.5), part) for part in (force(0), force(1)[:5])], axis=1
+    )
+    assert np.array_equal(
+        responses(seen, both, (SAMPLES, 5)), responses(seen[:, :SAMPLES], force(0), (SAMPLES,))
+    )
 
 
 def test_a_network_that_is_told_the_inputs_beats_one_that_is_not(told, blind):
@@ -97,7 +103,9 @@ def test_a_network_that_is_told_the_inputs_beats_one_that_is_not(told, blind):
 
 
 def test_so_does_the_regressor():
-    knows, guesses = (errors(trained(Regressor, told), Driven(), budget=1)[1] for told in (True, False))
+    knows, guesses = (
+        errors(trained(Regressor, told), Driven(), budget=1)[1] for told in (True, False)
+    )
     assert knows < 0.02 < guesses / 2
 
 
@@ -106,7 +114,9 @@ def test_missing_samples_leave_the_truth_where_it_was(told):
         observed[30:40] = np.nan
 
     ends = [errors(told, Driven(), seeds=[seed], spoil=spoil)[10] for seed in range(10)]
-    assert sorted(ends)[8] < 1e-6  # bridged gaps are new to the network: one of ten stays away from the root
+    assert (
+        sorted(ends)[8] < 1e-6
+    )  # bridged gaps are new to the network: one of ten stays away from the root
 
 
 def test_state_survives_and_is_checked(told, blind):
@@ -163,7 +173,9 @@ def test_experiments_tell_what_observations_do_not_show(name, initial, inputs):
         assert np.array_equal(scene.inputs[:, 1], scenarios[0].inputs["u2"])
     practice = problem.practice(4)
     practice.simulate(np.random.default_rng(0), practice.sample(np.random.default_rng(1), 2))
-    assert np.array_equal(practice.scene.inputs, scene.inputs)  # told the scenario in which was simulated
+    assert np.array_equal(
+        practice.scene.inputs, scene.inputs
+    )  # told the scenario in which was simulated
     problem.close()
 
 

@@ -8,7 +8,9 @@ from sims.camera.camera import Camera
 
 
 def level(**changes):
-    """A camera 5 m along x from the target's vertical and at the target's height: all distances are plain to see."""
+    """A camera 5 m along x from the target's vertical and at the target's height: all distances are
+    plain to see.
+    """
     return Camera(**{"azimuth": 0.0, "distance": 5.0, "height": 2.0, "size": (201, 101), **changes})
 
 
@@ -17,7 +19,12 @@ def test_projection_by_hand():
     focal = 50.5 / math.tan(math.radians(20))
     assert camera.focal == pytest.approx(focal, rel=1e-14)
     points = [[0, 0, 2], [0, 1, 2], [0, 0, 3], [3, -1, 1]]
-    pixels = [[100, 50], [100 + focal / 5, 50], [100, 50 - focal / 5], [100 - focal / 2, 50 + focal / 2]]
+    pixels = [
+        [100, 50],
+        [100 + focal / 5, 50],
+        [100, 50 - focal / 5],
+        [100 - focal / 2, 50 + focal / 2],
+    ]
     np.testing.assert_allclose(camera.project(points), pixels, rtol=0, atol=1e-12)
     np.testing.assert_allclose(camera.depth(points), [5, 5, 5, 2], atol=1e-14)
     assert np.isnan(camera.project([6, 0, 2])).all()
@@ -29,29 +36,35 @@ def test_a_turned_camera_sees_the_turned_world():
     c, s = math.cos(1.2), math.sin(1.2)
     rotated = points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     np.testing.assert_allclose(turned.project(rotated), plain.project(points), atol=1e-10)
-    np.testing.assert_allclose(np.linalg.norm(turned.position - (0, 0, 2)), math.hypot(7, 4), rtol=1e-14)
+    np.testing.assert_allclose(
+        np.linalg.norm(turned.position - (0, 0, 2)), math.hypot(7, 4), rtol=1e-14
+    )
 
 
 def test_the_middle_of_the_picture_is_the_target_and_its_edge_the_field_of_view():
     camera = Camera(0.7, 6.0, 7.0, size=(640, 480))
     np.testing.assert_allclose(camera.project(camera.target), [319.5, 239.5], atol=1e-10)
-    edge = np.array(camera.target) - camera.axes[1] * np.linalg.norm(camera.position - camera.target) * math.tan(
-        math.radians(20)
-    )
+    edge = np.array(camera.target) - camera.axes[1] * np.linalg.norm(
+        camera.position - camera.target
+    ) * math.tan(math.radians(20))
     np.testing.assert_allclose(camera.project(edge), [319.5, -0.5], atol=1e-9)
 
 
 def test_outline_of_a_sphere_by_hand_and_by_its_surface():
     camera = level()
     centre, axes = camera.outline([0.0, 0.0, 2.0], 0.5)
-    radius = camera.focal * 0.5 / math.sqrt(25 - 0.25)  # straight ahead: a circle, tangents from the camera
+    radius = (
+        camera.focal * 0.5 / math.sqrt(25 - 0.25)
+    )  # straight ahead: a circle, tangents from the camera
     np.testing.assert_allclose(centre, [100, 50], atol=1e-12)
     np.testing.assert_allclose(axes, [radius, radius], rtol=1e-12)
     assert camera.apparent_radius([0.0, 0.0, 2.0], 0.5) == pytest.approx(radius, rel=1e-12)
     camera = Camera(0.3, 5.5, 7.5, size=(400, 400))
     ball = np.array([0.6, 0.4, 4.6])
     rng = np.random.default_rng(1)
-    surface = ball + 0.5 * (points := rng.normal(size=(400_000, 3))) / np.linalg.norm(points, axis=1, keepdims=True)
+    surface = ball + 0.5 * (points := rng.normal(size=(400_000, 3))) / np.linalg.norm(
+        points, axis=1, keepdims=True
+    )
     pixels = camera.project(surface)
     (u, v), (longer, shorter) = camera.outline(ball, 0.5)
     direction = np.array([u, v]) - camera.middle
@@ -67,7 +80,9 @@ def test_heights_come_back_from_outlines():
         camera = Camera.published(np.random.default_rng(seed))
         z = np.linspace(0.5, 5.0, 50)
         points = np.stack([np.full(50, 0.2), np.full(50, -0.1), z], axis=1)
-        np.testing.assert_allclose(camera.heights(camera.outline(points, 0.5)[0], 0.2, -0.1, 0.5), z, atol=1e-6)
+        np.testing.assert_allclose(
+            camera.heights(camera.outline(points, 0.5)[0], 0.2, -0.1, 0.5), z, atol=1e-6
+        )
 
 
 def test_published_cameras_lie_in_the_published_ranges():
@@ -76,10 +91,14 @@ def test_published_cameras_lie_in_the_published_ranges():
         values = np.array([getattr(c, name) for c in cameras])
         assert low <= values.min() < low + 0.05 * (high - low)
         assert high - 0.05 * (high - low) < values.max() <= high
-    assert {(c.field_of_view, c.target, c.size) for c in cameras} == {(40.0, (0.0, 0.0, 2.0), (100, 100))}
+    assert {(c.field_of_view, c.target, c.size) for c in cameras} == {
+        (40.0, (0.0, 0.0, 2.0), (100, 100))
+    }
 
 
-@pytest.mark.parametrize("change", [{"distance": 0.0}, {"field_of_view": 180.0}, {"height": np.nan}, {"size": (1, 9)}])
+@pytest.mark.parametrize(
+    "change", [{"distance": 0.0}, {"field_of_view": 180.0}, {"height": np.nan}, {"size": (1, 9)}]
+)
 def test_impossible_cameras_are_refused(change):
     with pytest.raises(InputError, match="camera"):
         level(**change)

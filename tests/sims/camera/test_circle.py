@@ -10,11 +10,15 @@ TRUE = (21.3, 17.8, 7.4)
 
 
 def edge(spoilt=0, seed=0):
-    """Points of the true circle, the first `spoilt` of them on a larger one beside it, as at a shadow's rim."""
+    """Points of the true circle, the first `spoilt` of them on a larger one beside it, as at a
+    shadow's rim.
+    """
     points = np.array(TRUE[:2]) + TRUE[2] * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
     points += 0.05 * np.random.default_rng(seed).standard_normal(points.shape)
     aside = np.array([3.0, 4.0]) + np.array(TRUE[:2])
-    points[:spoilt] = aside + 1.2 * TRUE[2] * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)[:spoilt]
+    points[:spoilt] = (
+        aside + 1.2 * TRUE[2] * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)[:spoilt]
+    )
     return points
 
 
@@ -33,7 +37,9 @@ def test_the_arc_finds_the_ball_where_its_shadow_spoils_a_side(seed):
     by_arc = circle.fit(points, circle.through_an_arc(points))
     best = circle.better(plain, by_arc)
     assert best[0] == pytest.approx(TRUE, abs=0.1)
-    assert np.abs(np.array(plain[0]) - TRUE).max() > 0.5, "a subject that the plain fit gets right shows nothing"
+    assert np.abs(np.array(plain[0]) - TRUE).max() > 0.5, (
+        "a subject that the plain fit gets right shows nothing"
+    )
 
 
 def test_no_circle_is_none():

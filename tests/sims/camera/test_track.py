@@ -47,7 +47,9 @@ def test_centres_are_within_half_a_pixel_of_the_truth_after_compression(seed, tm
     apart = np.linalg.norm(np.stack([found.u, found.v], axis=1) - camera.project(points), axis=1)
     assert np.isfinite(apart).mean() > 0.9
     assert np.sqrt(np.nanmean(apart**2)) < 0.5
-    np.testing.assert_allclose(np.nanmedian(found.radius / camera.apparent_radius(points, 0.5)), 1, atol=0.06)
+    np.testing.assert_allclose(
+        np.nanmedian(found.radius / camera.apparent_radius(points, 0.5)), 1, atol=0.06
+    )
 
 
 def bouncing(times, top=4.4, restitution=0.55):
@@ -99,7 +101,9 @@ def test_the_picture_is_where_the_camera_model_says():
     apart = np.abs(scene.frame(point).astype(float) - scene.frame(away)).max(axis=2) > 60
     v, u = np.nonzero(apart)
     np.testing.assert_allclose([u.mean(), v.mean()], camera.outline(point, 0.5)[0], atol=0.35)
-    np.testing.assert_allclose(np.sqrt(apart.sum() / np.pi), camera.apparent_radius(point, 0.5), rtol=0.06)
+    np.testing.assert_allclose(
+        np.sqrt(apart.sum() / np.pi), camera.apparent_radius(point, 0.5), rtol=0.06
+    )
 
 
 def test_a_short_film_is_decoded_once_and_a_long_one_each_time_with_the_same_track(monkeypatch):
@@ -176,7 +180,9 @@ def test_uneven_time_stamps_come_back(tmp_path):
     write_video(tmp_path / "uneven.mp4", scene.film(upright(fall())), times)
     read = [t for t, _ in Video(tmp_path / "uneven.mp4")]
     np.testing.assert_allclose(read, times, atol=1e-5)
-    np.testing.assert_allclose([t for t, _ in Video(tmp_path / "uneven.mp4", fps=30)], np.arange(60) / 30, atol=1e-12)
+    np.testing.assert_allclose(
+        [t for t, _ in Video(tmp_path / "uneven.mp4", fps=30)], np.arange(60) / 30, atol=1e-12
+    )
 
 
 def test_a_truncated_film_is_read_as_far_as_it_goes(tmp_path):
@@ -189,7 +195,9 @@ def test_a_truncated_film_is_read_as_far_as_it_goes(tmp_path):
     assert "truncated" in film.notes[0]
 
 
-@pytest.mark.parametrize(("data", "says"), [(b"run,t\n1,0\n" * 9, "text file"), (b"", "empty file")])
+@pytest.mark.parametrize(
+    ("data", "says"), [(b"run,t\n1,0\n" * 9, "text file"), (b"", "empty file")]
+)
 def test_what_is_no_video_is_one_line(data, says, tmp_path):
     (tmp_path / "no.mp4").write_bytes(data)
     with pytest.raises(InputError, match=says):

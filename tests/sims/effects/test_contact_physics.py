@@ -20,7 +20,11 @@ def first_rebound(heights, fixed, e):
     for row in z:
         up = int(np.argmax(np.diff(row) > 0)) + 1
         top = up + int(np.argmax(np.diff(row[up:]) < 0))
-        apexes.append(np.polyval(np.polyfit(times[top - 5 : top + 6] - times[top], row[top - 5 : top + 6], 2), 0.0))
+        apexes.append(
+            np.polyval(
+                np.polyfit(times[top - 5 : top + 6] - times[top], row[top - 5 : top + 6], 2), 0.0
+            )
+        )
     return (2 * G * np.array(heights)) ** 0.5, (2 * G * (np.array(apexes) - RADIUS)) ** 0.5
 
 

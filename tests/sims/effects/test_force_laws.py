@@ -12,7 +12,9 @@ ROLL = {"x": [[0.5]], "v": [[-2.0]], "theta": [2.0]}
 
 def force(name, now, *c):
     effect = effects.get(name)
-    return effect().force(lanes(*c, *[0.0] * (len(effect.coefficients) - len(c)), count=len(now.x)), now)[0]
+    return effect().force(
+        lanes(*c, *[0.0] * (len(effect.coefficients) - len(c)), count=len(now.x)), now
+    )[0]
 
 
 def limit(name, now, *c):
@@ -65,7 +67,9 @@ def test_gravity_on_a_pendulum():
 
 def test_lift_does_no_work():
     now = moment("ball", [[0.0, 0.0, 0.0]], [[1.0, 2.0, 3.0]])
-    assert force("lift.magnus", now, 0.3, -0.8) == pytest.approx(np.cross([0.0, -0.3, -0.8], now.v[0]))
+    assert force("lift.magnus", now, 0.3, -0.8) == pytest.approx(
+        np.cross([0.0, -0.3, -0.8], now.v[0])
+    )
     assert force("lift.magnus", now, 0.3, -0.8) @ now.v[0] == pytest.approx(0.0, abs=1e-12)
 
 
@@ -83,16 +87,26 @@ def test_stribeck_lies_between_its_levels():
 def test_dry_friction_never_drives():
     now = moment("slider", **ROLL, inputs=[3.0])
     assert limit("friction.coulomb", now, 0.4) == 0.4
-    for name, c in (("friction.coulomb", [-0.4]), ("friction.stribeck", [-1, -1, 1]), ("friction.load", [-0.1])):
+    for name, c in (
+        ("friction.coulomb", [-0.4]),
+        ("friction.stribeck", [-1, -1, 1]),
+        ("friction.load", [-0.1]),
+    ):
         assert limit(name, now, *c) == 0.0
 
 
 def test_load_counts_both_sides_of_the_transmission():
-    assert limit("friction.load", moment("slider", **ROLL, inputs=[-3.0]), 0.1) == pytest.approx(0.3)
+    assert limit("friction.load", moment("slider", **ROLL, inputs=[-3.0]), 0.1) == pytest.approx(
+        0.3
+    )
     # Held still, the drive carries the weight: both sides of the gear feel it.
-    held = moment("pendulum", [[0.5]], [[0.0]], inputs=[np.sin(0.5)], mass=0.2, length=0.5, gravity=10.0)
+    held = moment(
+        "pendulum", [[0.5]], [[0.0]], inputs=[np.sin(0.5)], mass=0.2, length=0.5, gravity=10.0
+    )
     assert limit("friction.load", held, 0.1) == pytest.approx(0.2 * np.sin(0.5))
-    driven = moment("pendulum", [[0.5]], [[0.0]], inputs=[-np.sin(0.5)], mass=0.2, length=0.5, gravity=10.0)
+    driven = moment(
+        "pendulum", [[0.5]], [[0.0]], inputs=[-np.sin(0.5)], mass=0.2, length=0.5, gravity=10.0
+    )
     assert limit("friction.load", driven, 0.1) == 0.0
 
 

@@ -19,7 +19,9 @@ def slide(times, fixed, mass=1.0, u=0.0, **initial):
 
 def swing(times, fixed, inertia=3.3e-3, u=0.0, **initial):
     """q and qd, each (T,)."""
-    return run("pendulum", times, fixed, [inertia], {"u": np.broadcast_to(u, times.shape)}, **initial).T
+    return run(
+        "pendulum", times, fixed, [inertia], {"u": np.broadcast_to(u, times.shape)}, **initial
+    ).T
 
 
 def fly(times, fixed, constants=None, **initial):
@@ -47,7 +49,9 @@ def test_quadratic_drag_ends_at_the_terminal_speed():
     times, k = np.arange(0, 12, 0.05), 0.05
     terminal = (G / k) ** 0.5
     x, y, z, accel = fly(times, {"drag.quadratic": k}, z=500.0)
-    assert z == pytest.approx(500 - terminal**2 / G * np.log(np.cosh(G * times / terminal)), abs=1e-5)
+    assert z == pytest.approx(
+        500 - terminal**2 / G * np.log(np.cosh(G * times / terminal)), abs=1e-5
+    )
     assert (z[-2] - z[-1]) / 0.05 == pytest.approx(terminal, rel=1e-4)
     assert accel[-1] == pytest.approx(G, rel=1e-4)
     assert not x.any()
@@ -57,7 +61,9 @@ def test_quadratic_drag_ends_at_the_terminal_speed():
 def test_wind_carries_a_weightless_ball_with_the_air():
     times, k, w = np.arange(0, 5, 0.05), 0.1, np.array([6.0, -8.0])
     x, y, _, _ = fly(times, {"wind": [k, *w]}, FREE, z=50.0)
-    carried = times - np.log1p(k * 10 * times) / (k * 10)  # u' = -k |u| u for the velocity relative to the air
+    carried = times - np.log1p(k * 10 * times) / (
+        k * 10
+    )  # u' = -k |u| u for the velocity relative to the air
     assert x == pytest.approx(6 * carried, abs=1e-6)
     assert y == pytest.approx(-8 * carried, abs=1e-6)
 
@@ -127,7 +133,9 @@ def test_stribeck_friction_holds_up_to_its_greatest_level():
     assert not slide(times, c, 1.0, 1.49)[0].any()
     _, v = slide(times, c, 1.0, 1.51)
     assert v[-1] > 0.3
-    assert np.diff(v)[-10:] / 0.01 == pytest.approx(0.51, abs=1e-3)  # only the Coulomb level is left
+    assert np.diff(v)[-10:] / 0.01 == pytest.approx(
+        0.51, abs=1e-3
+    )  # only the Coulomb level is left
 
 
 def test_load_friction_takes_a_share_of_the_drive():
@@ -148,7 +156,9 @@ def test_load_friction_holds_in_the_band_of_equilibrium(factor, holds):
 def test_gravity_scale_shows_in_the_period():
     times, c = np.arange(0, 8, 0.002), 0.15
     q, _ = swing(times, {"gravity.scale": c}, q=1e-3)
-    assert period(times, q) == pytest.approx(2 * np.pi * (3.3e-3 / (WEIGHT * (1 + c))) ** 0.5, rel=1e-6)
+    assert period(times, q) == pytest.approx(
+        2 * np.pi * (3.3e-3 / (WEIGHT * (1 + c))) ** 0.5, rel=1e-6
+    )
 
 
 def test_gravity_scale_shows_in_the_fall():
@@ -171,8 +181,12 @@ def test_tilt_pulls_ball_and_slider_sideways():
     times = np.arange(0, 0.8, 0.02)
     x, y, z, _ = fly(times, {"gravity.tilt": [0.1, -0.2]}, z=5.0)
     half = times**2 / 2
-    assert np.stack([x, y, z - 5]) == pytest.approx(G * np.stack([0.1 * half, -0.2 * half, -half]), abs=1e-9)
-    assert slide(times, {"gravity.tilt": 0.1}, 3.0)[0] == pytest.approx(0.1 * 9.80665 * half, abs=1e-9)
+    assert np.stack([x, y, z - 5]) == pytest.approx(
+        G * np.stack([0.1 * half, -0.2 * half, -half]), abs=1e-9
+    )
+    assert slide(times, {"gravity.tilt": 0.1}, 3.0)[0] == pytest.approx(
+        0.1 * 9.80665 * half, abs=1e-9
+    )
 
 
 def test_magnus_flight_is_a_circle_of_radius_speed_over_coefficient():
@@ -204,14 +218,18 @@ def test_linear_spring_oscillates_at_its_frequency():
 def test_springs_act_on_an_angle_as_on_a_length():
     times, inertia = np.arange(0, 4, 0.002), 3.3e-3
     q, _ = swing(times, {"spring.linear": 0.3}, inertia, q=1e-3)
-    assert period(times, q) == pytest.approx(2 * np.pi * (inertia / (WEIGHT + 0.3)) ** 0.5, rel=1e-6)
+    assert period(times, q) == pytest.approx(
+        2 * np.pi * (inertia / (WEIGHT + 0.3)) ** 0.5, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("amplitude", [0.1, 0.5])
 def test_purely_cubic_spring_has_the_elliptic_period(amplitude):
     times, c, mass = np.arange(0, 40, 0.01), 30.0, 1.2
     x, _ = slide(times, {"spring.cubic": c}, mass, x=amplitude)
-    assert period(times, x) == pytest.approx(4 * ellipk(0.5) / (amplitude * (c / mass) ** 0.5), rel=1e-5)
+    assert period(times, x) == pytest.approx(
+        4 * ellipk(0.5) / (amplitude * (c / mass) ** 0.5), rel=1e-5
+    )
 
 
 def test_softening_spring_slows_down_by_the_expansion():
@@ -225,7 +243,9 @@ def test_softening_spring_slows_down_by_the_expansion():
 def test_bias_accelerates():
     times = np.arange(0, 0.8, 0.02)
     assert slide(times, {"force.bias": 1.5}, 3.0)[0] == pytest.approx(0.5 * times**2 / 2, abs=1e-9)
-    assert fly(times, {"force.bias": 1.5}, z=5.0)[2] == pytest.approx(5 - (G - 1.5) * times**2 / 2, abs=1e-9)
+    assert fly(times, {"force.bias": 1.5}, z=5.0)[2] == pytest.approx(
+        5 - (G - 1.5) * times**2 / 2, abs=1e-9
+    )
 
 
 def test_ripple_keeps_energy_and_slows_by_its_amplitude():

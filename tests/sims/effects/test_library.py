@@ -1,4 +1,6 @@
-"""The library as a whole: complete, small, declared for what it fits, off at zero, and its page is current."""
+"""The library as a whole: complete, small, declared for what it fits, off at zero, and its page is
+current.
+"""
 
 import inspect
 from importlib.metadata import entry_points
@@ -51,7 +53,9 @@ def test_units_parse_and_ranges_hold_zero_or_begin_above_it(name):
     assert any(effect.coefficients[0].unit(kind) is not None for kind in KINDS)
     assert len({c.name for c in effect.coefficients}) == len(effect.coefficients)
     first = effect.coefficients[0]
-    assert all(first.range(kind)[0] <= 0 for kind in KINDS), "the first coefficient must be able to switch it off"
+    assert all(first.range(kind)[0] <= 0 for kind in KINDS), (
+        "the first coefficient must be able to switch it off"
+    )
 
 
 @pytest.mark.parametrize(("name", "system"), PAIRS)
@@ -67,7 +71,11 @@ def test_units_of_input_and_reading_are_those_of_the_system():
     def unit(name, system, observed=()):
         return effect_parameters(effects.get(name), SYSTEMS[system], observed)[0].unit
 
-    assert (unit("input.bias", "servo"), unit("input.bias", "pendulum"), unit("backlash", "slider")) == (
+    assert (
+        unit("input.bias", "servo"),
+        unit("input.bias", "pendulum"),
+        unit("backlash", "slider"),
+    ) == (
         "rad",
         "N*m",
         "N",
@@ -80,7 +88,13 @@ def test_units_of_input_and_reading_are_those_of_the_system():
 def test_what_fits_what():
     there = {system: {name for name in NAMES if (name, system) in PAIRS} for system in SYSTEMS}
     impact, flight = {"restitution.speed", "contact.friction"}, {"lift.magnus"}
-    guided = {"friction.coulomb", "friction.stribeck", "spring.linear", "spring.cubic", "force.ripple"}
+    guided = {
+        "friction.coulomb",
+        "friction.stribeck",
+        "spring.linear",
+        "spring.cubic",
+        "force.ripple",
+    }
     inputs = {name for name in NAMES if name.startswith("input.")} | {"backlash", "friction.load"}
     assert there["ball"] == set(NAMES) - guided - inputs
     assert there["slider"] == set(NAMES) - impact - flight - {"gravity.scale"}
@@ -109,10 +123,17 @@ def test_zero_gives_nothing_and_shapes_are_those_of_the_lanes(name, system, coun
     effect = effects.get(name)()
     rng = np.random.default_rng(7)
     size = len(SYSTEMS[system].coordinates)
-    now = moment(system, rng.normal(size=(count, size)), rng.normal(size=(count, size)), inputs=[0.7], t=0.3)
+    now = moment(
+        system, rng.normal(size=(count, size)), rng.normal(size=(count, size)), inputs=[0.7], t=0.3
+    )
     off = lanes(*[0.0] * len(effect.coefficients), count=count)
     on = lanes(*[0.1] * len(effect.coefficients), count=count)
-    signal = Signal(rng.normal(size=(count, 6)), np.full((count, 6), 0.01), np.zeros((count, 1)), np.ones((count, 6)))
+    signal = Signal(
+        rng.normal(size=(count, 6)),
+        np.full((count, 6), 0.01),
+        np.zeros((count, 1)),
+        np.ones((count, 6)),
+    )
     if isinstance(effect, Force):
         assert not effect.force(off, now).any()
         assert effect.force(on, now).shape == (count, size)
@@ -142,7 +163,12 @@ def test_friction_and_forces_are_safe_at_rest(name, system):
             assert np.isfinite(given).all()
 
 
-INITIAL = {"ball": {"z": 1.5, "vx": 1.0}, "pendulum": {"qd": 1.0}, "servo": {"q": 0.3}, "slider": {"v": 0.5}}
+INITIAL = {
+    "ball": {"z": 1.5, "vx": 1.0},
+    "pendulum": {"qd": 1.0},
+    "servo": {"q": 0.3},
+    "slider": {"v": 0.5},
+}
 
 
 @pytest.mark.parametrize(("name", "system"), PAIRS)
@@ -181,7 +207,9 @@ def test_a_third_party_effect_registers_once_and_is_usable_by_name():
     try:
         assert effects.get("drag.mine") is Mine
         assert "drag.mine" in effects.library(SYSTEMS["ball"])
-        assert [p.name for p in SIMULATORS["ball"](engine="batch", effects=["drag.mine"]).parameters][-1] == "drag.mine"
+        assert [
+            p.name for p in SIMULATORS["ball"](engine="batch", effects=["drag.mine"]).parameters
+        ][-1] == "drag.mine"
         with pytest.raises(InputError, match=r"effect 'drag\.mine' exists already"):
             effects.register(Mine)
     finally:

@@ -53,13 +53,17 @@ def test_delays_look_back_and_a_negative_one_ahead(name):
 
 
 def test_a_slow_clock_lets_more_time_pass_between_its_stamps():
-    assert effects.get("clock.skew")().times(lanes(0.25), np.array([[0.0, 1.0, 4.0]])).tolist() == [[0.0, 1.25, 5.0]]
+    assert effects.get("clock.skew")().times(lanes(0.25), np.array([[0.0, 1.0, 4.0]])).tolist() == [
+        [0.0, 1.25, 5.0]
+    ]
 
 
 def test_backlash_plays_its_width():
     there_and_back = np.concatenate([np.linspace(0, 2, 21), np.linspace(1.9, -2, 40)])
     felt = through("backlash", 0.6, there_and_back)
-    assert felt[:21] == pytest.approx(np.maximum(np.linspace(0, 2, 21) - 0.3, 0))  # starts in the middle
+    assert felt[:21] == pytest.approx(
+        np.maximum(np.linspace(0, 2, 21) - 0.3, 0)
+    )  # starts in the middle
     still = there_and_back[21:] > 2 - 0.6 - 1e-9
     assert felt[21:][still] == pytest.approx(1.7)  # a reversal costs the whole width
     assert felt[21:][~still] == pytest.approx(there_and_back[21:][~still] + 0.3)
@@ -75,7 +79,9 @@ def test_input_lag_is_the_exact_mean_of_a_step_response(step, lag):
     ends = step * np.arange(1, 9)
     begins = ends - step
     integral = [t - lag * -np.expm1(-t / lag) for t in (begins, ends)]  # of 1 - exp(-t / lag)
-    assert through("input.lag", lag, np.ones(8), step) == pytest.approx((integral[1] - integral[0]) / step, abs=1e-9)
+    assert through("input.lag", lag, np.ones(8), step) == pytest.approx(
+        (integral[1] - integral[0]) / step, abs=1e-9
+    )
 
 
 def test_input_lag_does_not_depend_on_how_the_time_is_divided():
@@ -110,7 +116,9 @@ def test_lags_stand_still_while_a_lane_waits(name):
     assert felt[1] < felt[2] < 1 if name == "input.lag" else felt[1] == felt[2] < 1
 
 
-@pytest.mark.parametrize("name", ["input.lag", "sensor.lag", "input.deadband", "backlash", "input.saturation"])
+@pytest.mark.parametrize(
+    "name", ["input.lag", "sensor.lag", "input.deadband", "backlash", "input.saturation"]
+)
 def test_lanes_that_are_off_keep_every_bit_beside_lanes_that_are_on(name):
     effect = effects.get(name)()
     given = signal(np.random.default_rng(5).normal(size=(3, 40)))

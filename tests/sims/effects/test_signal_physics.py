@@ -19,9 +19,13 @@ def felt(fixed, u, times=TIMES):
     return 2.0 * np.diff(slide(fixed, u, times)[1]) / np.diff(times)
 
 
-@pytest.mark.parametrize(("delay", "within"), [(0.1, 1e-9), (0.1234, 0.02**2 / 8), (0.003, 0.02**2 / 8)])
+@pytest.mark.parametrize(
+    ("delay", "within"), [(0.1, 1e-9), (0.1234, 0.02**2 / 8), (0.003, 0.02**2 / 8)]
+)
 def test_input_delay_is_an_exact_shift(delay, within):
-    """Exact in the impulse; the position is off by how the step in which the jump arrives shares out its mean."""
+    """Exact in the impulse; the position is off by how the step in which the jump arrives shares
+    out its mean.
+    """
     x, v = slide({"input.delay": delay}, STEP)
     since = np.maximum(TIMES - 0.5 - delay, 0.0)
     assert v == pytest.approx(since, abs=1e-9)  # 2 N on 2 kg
@@ -41,7 +45,9 @@ def test_input_gain_and_bias():
 
 
 def test_a_chain_starts_settled():
-    """A lag behind a gain and a bias begins at what they make of the first value, not at the command's."""
+    """A lag behind a gain and a bias begins at what they make of the first value, not at the
+    command's.
+    """
     fixed = {"input.gain": 0.5, "input.bias": 0.2, "input.lag": 0.3}
     assert felt(fixed, 2.0) == pytest.approx(3.2, abs=1e-9)
     readings, _ = slide({"sensor.gain": 0.5, "sensor.bias": 0.2, "sensor.lag": 0.3}, x=2.0)
@@ -52,12 +58,16 @@ def test_deadband_and_saturation():
     wave = 2 * np.sin(4 * TIMES)
     expected = np.sign(wave) * np.maximum(np.abs(wave) - 0.5, 0)
     assert felt({"input.deadband": 0.5}, wave) == pytest.approx(expected[:-1], abs=1e-9)
-    assert felt({"input.saturation": 0.5}, wave) == pytest.approx(np.clip(wave, -0.5, 0.5)[:-1], abs=1e-9)
+    assert felt({"input.saturation": 0.5}, wave) == pytest.approx(
+        np.clip(wave, -0.5, 0.5)[:-1], abs=1e-9
+    )
 
 
 def test_the_width_of_backlash_shows_at_a_reversal():
     width = 0.6
-    triangle = 2 * np.abs((TIMES + 0.5) % 2 - 1)  # falls from 1 to 0 at 0.5 s, rises to 2 at 1.5 s, falls again
+    triangle = 2 * np.abs(
+        (TIMES + 0.5) % 2 - 1
+    )  # falls from 1 to 0 at 0.5 s, rises to 2 at 1.5 s, falls again
     given, got = triangle[:-1], felt({"backlash": width}, triangle)
     top = int(np.argmax(given))
     rising = given[:top] > width
@@ -66,7 +76,9 @@ def test_the_width_of_backlash_shows_at_a_reversal():
     )
     falling = slice(top, top + 40)
     assert got[falling] == pytest.approx(np.minimum(got[top], given[falling] + width / 2), abs=1e-9)
-    assert np.ptp(got[TIMES[:-1] > 0.5]) == pytest.approx(np.ptp(given[TIMES[:-1] > 0.5]) - width, abs=0.05)
+    assert np.ptp(got[TIMES[:-1] > 0.5]) == pytest.approx(
+        np.ptp(given[TIMES[:-1] > 0.5]) - width, abs=0.05
+    )
 
 
 @pytest.mark.parametrize("delay", [0.1, 0.1234])
@@ -75,7 +87,9 @@ def test_sensor_delay_is_an_exact_shift(delay):
     late = run("pendulum", times, {"sensor.delay": delay}, q=0.8, qd=1.0)
     shifted = times[times >= delay] - delay
     prompt = run("pendulum", np.concatenate([[0.0], shifted[shifted > 0]]), q=0.8, qd=1.0)
-    assert late[times < delay] == pytest.approx(np.tile(prompt[0], (int((times < delay).sum()), 1)), abs=0)
+    assert late[times < delay] == pytest.approx(
+        np.tile(prompt[0], (int((times < delay).sum()), 1)), abs=0
+    )
     assert late[times > delay] == pytest.approx(prompt[1:], abs=1e-7)
 
 

@@ -15,7 +15,12 @@ from sims.slider.system import SliderSystem
 from sims.system import Moment
 
 SIMULATORS = {"ball": Ball, "pendulum": Pendulum, "servo": Servo, "slider": Slider}
-SYSTEMS = {"ball": BallSystem, "pendulum": PendulumSystem, "servo": ServoSystem, "slider": SliderSystem}
+SYSTEMS = {
+    "ball": BallSystem,
+    "pendulum": PendulumSystem,
+    "servo": ServoSystem,
+    "slider": SliderSystem,
+}
 NAMES = [
     "drag.linear",
     "drag.quadratic",
@@ -47,7 +52,12 @@ NAMES = [
     "sensor.drift",
     "clock.skew",
 ]
-PAIRS = [(name, system) for name in NAMES for system in SYSTEMS if effects.get(name).fits(SYSTEMS[system])]
+PAIRS = [
+    (name, system)
+    for name in NAMES
+    for system in SYSTEMS
+    if effects.get(name).fits(SYSTEMS[system])
+]
 
 
 def lanes(*values, count=1):
@@ -56,13 +66,21 @@ def lanes(*values, count=1):
 
 
 def moment(system, x, v, theta=None, inputs=(), t=0.0, **constants):
-    """A moment of `system` at positions and velocities (L, D); every lane has the same of everything else."""
+    """A moment of `system` at positions and velocities (L, D); every lane has the same of
+    everything else.
+    """
     declared = SYSTEMS[system]
     x, v = np.array(x, dtype=float), np.array(v, dtype=float)
     count = len(x)
     theta = [p.nominal for p in declared.parameters] if theta is None else theta
     known = {c.name: constants.get(c.name, c.value) for c in declared.constants}
-    felt = dict(zip([c.name for c in declared.inputs], [*inputs, *[0.0] * len(declared.inputs)], strict=False))
+    felt = dict(
+        zip(
+            [c.name for c in declared.inputs],
+            [*inputs, *[0.0] * len(declared.inputs)],
+            strict=False,
+        )
+    )
     return Moment(
         declared(),
         np.tile(np.array(theta, dtype=float), (count, 1)),
@@ -74,7 +92,9 @@ def moment(system, x, v, theta=None, inputs=(), t=0.0, **constants):
     )
 
 
-def run(system, times, fixed=None, theta=None, inputs=None, constants=None, observe=None, **initial):
+def run(
+    system, times, fixed=None, theta=None, inputs=None, constants=None, observe=None, **initial
+):
     """One run on the batch engine: observations (T, C)."""
     simulator = SIMULATORS[system](constants, observe, engine="batch", fixed=fixed or {})
     theta = [p.nominal for p in simulator.parameters] if theta is None else theta

@@ -1,4 +1,6 @@
-"""Thousands of spoilt recordings: each gives one clear line or a sound recording; never a traceback, never a hang."""
+"""Thousands of spoilt recordings: each gives one clear line or a sound recording; never a
+traceback, never a hang.
+"""
 
 import csv
 import datetime
@@ -21,11 +23,17 @@ SETTINGS = settings(
     deadline=4000,  # milliseconds; a few are usual
     derandomize=True,
     database=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
+    suppress_health_check=[
+        HealthCheck.function_scoped_fixture,
+        HealthCheck.too_slow,
+        HealthCheck.data_too_large,
+    ],
 )
 HEADER = ["run", "t", "u", "q", "qd"]
 ROWS = [
-    [str(run), f"{0.1 * i:.1f}", "0.5", f"{run + i}", "" if i == 2 else "1e-3"] for run in (1, 2, 3) for i in range(5)
+    [str(run), f"{0.1 * i:.1f}", "0.5", f"{run + i}", "" if i == 2 else "1e-3"]
+    for run in (1, 2, 3)
+    for i in range(5)
 ]
 TOML = {
     "system": "swing",
@@ -67,7 +75,9 @@ leaves = st.one_of(
     st.just(10**400), st.just(datetime.date(2020, 2, 29)),
 )  # fmt: skip
 values = st.recursive(
-    leaves, lambda v: st.lists(v, max_size=2) | st.dictionaries(st.text(max_size=4), v, max_size=2), max_leaves=4
+    leaves,
+    lambda v: st.lists(v, max_size=2) | st.dictionaries(st.text(max_size=4), v, max_size=2),
+    max_leaves=4,
 )
 
 
@@ -77,7 +87,10 @@ def spoilt_tables(draw):
     header, rows = list(HEADER), [list(row) for row in ROWS]
     mark, end = ",", "\n"
     for _ in range(draw(st.integers(1, 3))):
-        column, row = draw(st.integers(0, len(header) - 1)), draw(st.integers(0, len(rows) - 1)) if rows else 0
+        column, row = (
+            draw(st.integers(0, len(header) - 1)),
+            draw(st.integers(0, len(rows) - 1)) if rows else 0,
+        )
         act = draw(st.integers(0, 15))
         if act == 0 and len(header) > 1:
             del header[column]
@@ -116,7 +129,9 @@ def spoilt_tables(draw):
 def spoilt_bytes(draw, text):
     """The text in some encoding, perhaps cut off, perhaps with bytes in it that do not belong."""
     encoding = draw(
-        st.sampled_from(["utf-8"] * 8 + ["utf-8-sig", "utf-16", "utf-16-le", "latin-1", "cp1252", "utf-32"])
+        st.sampled_from(
+            ["utf-8"] * 8 + ["utf-8-sig", "utf-16", "utf-16-le", "latin-1", "cp1252", "utf-32"]
+        )
     )
     data = text.encode(encoding, errors="replace")
     act = draw(st.integers(0, 12))
@@ -128,7 +143,9 @@ def spoilt_bytes(draw, text):
     elif act == 2:
         place = draw(st.integers(0, len(data)))
         data = (
-            data[:place] + draw(st.sampled_from([b'"', b"\x00", b"\xff", b"\n", b",", b"\xef\xbb\xbf"])) + data[place:]
+            data[:place]
+            + draw(st.sampled_from([b'"', b"\x00", b"\xff", b"\n", b",", b"\xef\xbb\xbf"]))
+            + data[place:]
         )
     return data
 
@@ -149,9 +166,13 @@ def spoilt_descriptions(draw):
             document[draw(st.sampled_from([key, "oops", "a\nb", "Channels"]))] = draw(values)
         elif act in (2, 3) and isinstance(document.get("channels"), dict):
             channel = draw(st.sampled_from(["q", "qd", "nope"]))
-            document["channels"][channel] = {"unit": draw(st.sampled_from(UNITS) | st.text(max_size=12))}
+            document["channels"][channel] = {
+                "unit": draw(st.sampled_from(UNITS) | st.text(max_size=12))
+            }
         elif act == 4 and isinstance(inner, dict) and inner:
-            inner[draw(st.sampled_from([*map(str, inner), "mass", "held_out", "initial", "7"]))] = draw(values)
+            inner[draw(st.sampled_from([*map(str, inner), "mass", "held_out", "initial", "7"]))] = (
+                draw(values)
+            )
         elif act == 5 and isinstance(inner, dict) and inner:
             inner.pop(draw(st.sampled_from(sorted(map(str, inner)))), None)
         elif act == 6 and isinstance(document.get("channels"), dict):
@@ -203,7 +224,11 @@ def outcome(folder, table_bytes, description_bytes):
         assert all(np.isfinite(v).all() for v in run.inputs.values())
         assert all(k == "mass" and v > 0 for k, v in run.constants.items())
     runs = [
-        (r.name, r.held_out, *(v.tolist() for v in (r.times, *r.channels.values(), *r.inputs.values())))
+        (
+            r.name,
+            r.held_out,
+            *(v.tolist() for v in (r.times, *r.channels.values(), *r.inputs.values())),
+        )
         for r in recording.runs
     ]
     return repr((recording.system, recording.constants, recording.noise, runs))
@@ -259,4 +284,6 @@ def test_huge_and_empty_files(folder, size):
         assert "log.csv" in outcome(folder, data, GOOD_TOML)
         if piece != b"[" or size < 10:
             outcome(folder, GOOD_TABLE, data[: size // 10])
-    assert "row 3, column t" in outcome(folder, b"run,t,u,q,qd\n" + b"1,0,0,0,0\n" * 300_000, GOOD_TOML)
+    assert "row 3, column t" in outcome(
+        folder, b"run,t,u,q,qd\n" + b"1,0,0,0,0\n" * 300_000, GOOD_TOML
+    )

@@ -46,7 +46,9 @@ def written(tmp_path, csv=CSV, toml=TOML, name="log"):
 
 
 def test_reads_runs_of_different_length_missing_samples_and_marks(tmp_path):
-    recording = read_recording(written(tmp_path, toml=TOML + "[runs.b]\nheld_out = true\nmass = 3.0\n"), Cart)
+    recording = read_recording(
+        written(tmp_path, toml=TOML + "[runs.b]\nheld_out = true\nmass = 3.0\n"), Cart
+    )
     first, second = recording.runs
     np.testing.assert_array_equal(first.times, [0.0, 0.5, 1.0])
     np.testing.assert_array_equal(first.channels["x"], [0.0, 0.1, np.nan])
@@ -80,22 +82,40 @@ def test_without_marks_a_single_run_loses_its_last_third(tmp_path):
 @pytest.mark.parametrize(
     ("csv", "message"),
     [
-        (CSV.replace("0.5,0.1", "0.5,abc"), "log.csv, row 3, column x: expected a finite number, found 'abc'"),
-        (CSV.replace("0.5,0.1", "0.5,inf"), "row 3, column x: expected a finite number, found 'inf'"),
-        (CSV.replace("0.5,0.1", "0.5,nan"), "row 3, column x: expected a finite number, found 'nan'"),
+        (
+            CSV.replace("0.5,0.1", "0.5,abc"),
+            "log.csv, row 3, column x: expected a finite number, found 'abc'",
+        ),
+        (
+            CSV.replace("0.5,0.1", "0.5,inf"),
+            "row 3, column x: expected a finite number, found 'inf'",
+        ),
+        (
+            CSV.replace("0.5,0.1", "0.5,nan"),
+            "row 3, column x: expected a finite number, found 'nan'",
+        ),
         (CSV.replace("1,0.5,", "1,,"), "row 3, column t: expected a finite number, found ''"),
         (CSV.replace("1,0.5,", "1,0,"), "row 3, column t: expected more than 0 s, found 0 s"),
         (CSV.replace("1,1.0,", "1,0.2,"), "row 4, column t: expected more than 0.5 s, found 0.2 s"),
         (CSV.replace(",,0\n", ",,\n"), "row 4, column u: expected a finite number, found ''"),
         (CSV.replace(",,0\n", ",,\n"), "an input has no missing samples"),
-        (CSV.replace("run,t,x,u", "run,time,x,u"), "expected column 't', found columns run, time, x, u"),
-        (CSV.replace(",", ";"), "row 1: expected columns run, t, u, x between commas, found semicolons"),
+        (
+            CSV.replace("run,t,x,u", "run,time,x,u"),
+            "expected column 't', found columns run, time, x, u",
+        ),
+        (
+            CSV.replace(",", ";"),
+            "row 1: expected columns run, t, u, x between commas, found semicolons",
+        ),
         (CSV.replace(",", "\t"), "between commas, found tabs"),
         ("run,t,x,u\n", "expected rows of data, found none"),
         ("", "row 1: expected columns run, t, u, x between commas, found ''"),
         (CSV + "b,1,2,3,4,5\n", "row 7: expected 4 cells as in the header, found 6"),
         (CSV + "b,1,2\n", "row 7: expected 4 cells as in the header, found 3"),
-        (CSV.replace("\nb,0,", "\n\n\nb,x,"), "row 7, column t: expected a finite number, found 'x'"),
+        (
+            CSV.replace("\nb,0,", "\n\n\nb,x,"),
+            "row 7, column t: expected a finite number, found 'x'",
+        ),
         (CSV.replace("0.1", "1_0"), "row 3, column x: expected a finite number, found '1_0'"),
         (CSV.replace("0.1", "٣"), "row 3, column x: expected a finite number, found '٣'"),
         (CSV.replace("0.1", "1e999"), "row 3, column x: expected a finite number, found '1e999'"),
@@ -103,7 +123,10 @@ def test_without_marks_a_single_run_loses_its_last_third(tmp_path):
         (CSV.replace("0.1", "a\x1b[31m"), r"found 'a\\x1b\[31m'"),
         (CSV.replace("run,t,x,u", "run,t,x,x"), "row 1: column 'x' stands twice"),
         (CSV.replace("run,t,x,u", "run,t,x,"), "row 1: column 4 has no name"),
-        (CSV.replace("x,u", "x,u,v").replace("\n1,", "\n1,0,"), "column 'v' is not declared; log.toml declares u, x"),
+        (
+            CSV.replace("x,u", "x,u,v").replace("\n1,", "\n1,0,"),
+            "column 'v' is not declared; log.toml declares u, x",
+        ),
         (CSV + "1,2,3,4\n", "row 7, column run: run '1' goes on after another began"),
         (CSV + ",2,3,4\n,3,3,4\n", "row 7, column run: expected the name of a run, found none"),
         (CSV + "c,2,3,4\n", "row 7, column run: run 'c' has one row; expected at least two"),
@@ -121,33 +144,81 @@ def test_faulty_table_is_one_line_that_says_where(tmp_path, csv, message):
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
-        (TOML.replace('unit = "m"', 'unit = "kg"'), "channel x: expected a unit that converts to m, found 'kg'"),
-        (TOML.replace('unit = "m"', 'unit = "ftt"'), "channel x: unknown unit 'ftt'; expected one that converts to m"),
-        (TOML.replace('unit = "m"', 'unit = "degC"'), "channel x: expected a unit that converts to m, found 'degC'"),
-        (TOML.replace('unit = "m"', 'unit = "9**9**9"'), "channel x: expected a unit that converts to m, found '9"),
-        (TOML.replace('unit = "m"', 'unit = "m\\u0000"'), r"channel x: expected a unit .*, found 'm\\x00'"),
-        (TOML.replace('unit = "N"', 'unit = "m"'), "input u: expected a unit that converts to N, found 'm'"),
-        (TOML.replace('unit = "m"\n', ""), 'channel x: expected unit = "m" or one that converts to it, found None'),
-        (TOML.replace('[channels.x]\nunit = "m"\nnoise = 0.01', '[channels]\nx = "m"'), "expected a table with unit"),
-        (TOML.replace("noise", "nosie"), r"unknown entry in \[channels.x\] of .*'nosie'; there are: noise, unit"),
-        (TOML.replace("0.01", "0"), r"channels.x.noise: expected more than 0 \(leave it out if unknown\), found 0"),
+        (
+            TOML.replace('unit = "m"', 'unit = "kg"'),
+            "channel x: expected a unit that converts to m, found 'kg'",
+        ),
+        (
+            TOML.replace('unit = "m"', 'unit = "ftt"'),
+            "channel x: unknown unit 'ftt'; expected one that converts to m",
+        ),
+        (
+            TOML.replace('unit = "m"', 'unit = "degC"'),
+            "channel x: expected a unit that converts to m, found 'degC'",
+        ),
+        (
+            TOML.replace('unit = "m"', 'unit = "9**9**9"'),
+            "channel x: expected a unit that converts to m, found '9",
+        ),
+        (
+            TOML.replace('unit = "m"', 'unit = "m\\u0000"'),
+            r"channel x: expected a unit .*, found 'm\\x00'",
+        ),
+        (
+            TOML.replace('unit = "N"', 'unit = "m"'),
+            "input u: expected a unit that converts to N, found 'm'",
+        ),
+        (
+            TOML.replace('unit = "m"\n', ""),
+            'channel x: expected unit = "m" or one that converts to it, found None',
+        ),
+        (
+            TOML.replace('[channels.x]\nunit = "m"\nnoise = 0.01', '[channels]\nx = "m"'),
+            "expected a table with unit",
+        ),
+        (
+            TOML.replace("noise", "nosie"),
+            r"unknown entry in \[channels.x\] of .*'nosie'; there are: noise, unit",
+        ),
+        (
+            TOML.replace("0.01", "0"),
+            r"channels.x.noise: expected more than 0 \(leave it out if unknown\), found 0",
+        ),
         (TOML.replace("2.0", "-1"), "constants.mass: expected more than 0 kg, found -1"),
         (TOML.replace("2.0", "9" * 400), "constants.mass: expected a number, found 9999"),
         (TOML.replace("2.0", "true"), "constants.mass: expected a number, found True"),
-        (TOML + "[runs.b]\nmass = 1\nconstants = {mass = 2}\n", "runs.b: constant mass stands twice"),
+        (
+            TOML + "[runs.b]\nmass = 1\nconstants = {mass = 2}\n",
+            "runs.b: constant mass stands twice",
+        ),
         (TOML + "[runs.b]\nmass = 0\n", "runs.b.mass: expected more than 0 kg, found 0"),
-        (TOML + "[runs.b.initial]\nv = 0\n", r"unknown entry in \[runs.b.initial\] of .*'v'; there are: x"),
+        (
+            TOML + "[runs.b.initial]\nv = 0\n",
+            r"unknown entry in \[runs.b.initial\] of .*'v'; there are: x",
+        ),
         (TOML + "[runs]\nb = 3\n", "runs.b: expected a table, found 3"),
         ("title = 3\n" + TOML, "title: expected text, found 3"),
         ("a = " + "[" * 100_000, "not valid TOML"),
         ('"a\\nb" = 1', r"unknown entry of .*'a\\nb'"),
-        (TOML.replace("channels.x", "channels.y"), "unknown channel in .*log.toml 'y'; there are: x"),
-        (TOML.replace("mass", "mas"), r"unknown entry in \[constants\] of .*'mas'; there are: drift, mass"),
+        (
+            TOML.replace("channels.x", "channels.y"),
+            "unknown channel in .*log.toml 'y'; there are: x",
+        ),
+        (
+            TOML.replace("mass", "mas"),
+            r"unknown entry in \[constants\] of .*'mas'; there are: drift, mass",
+        ),
         (TOML.replace("2.0", '"heavy"'), "constants.mass: expected a number, found 'heavy'"),
         (TOML.replace("0.01", "nan"), "channels.x.noise: expected a number, found nan"),
         (TOML + "[runs.7]\nheld_out = true\n", r"unknown entry in \[runs\].*'7'; there are: 1, b"),
-        (TOML + '[runs.b]\nheld_out = "yes"\n', "runs.b.held_out: expected true or false, found 'yes'"),
-        (TOML + "[runs.b]\nheldout = true\n", "'heldout'; there are: constants, drift, held_out, initial, mass"),
+        (
+            TOML + '[runs.b]\nheld_out = "yes"\n',
+            "runs.b.held_out: expected true or false, found 'yes'",
+        ),
+        (
+            TOML + "[runs.b]\nheldout = true\n",
+            "'heldout'; there are: constants, drift, held_out, initial, mass",
+        ),
         (TOML.replace('system = "cart"', ""), 'expected system = "NAME", found None'),
         (TOML + "[oops]\n", "unknown entry of .*'oops'"),
         ("system = ", "not valid TOML"),
@@ -177,7 +248,9 @@ def test_units_convert_with_the_noise(tmp_path):
     assert recording.noise == {"x": pytest.approx(1e-4, rel=1e-15)}
     assert recording.constants == {"mass": 2.0}, "constants are plain SI numbers"
     toml = TOML.replace('unit = "m"', 'unit = "km"')
-    with pytest.raises(InputError, match=r"log.csv: run '1', column x: a value is too large to convert"):
+    with pytest.raises(
+        InputError, match=r"log.csv: run '1', column x: a value is too large to convert"
+    ):
         read_recording(written(tmp_path, CSV.replace("0.1", "1e308"), toml), Cart)
 
 
@@ -209,7 +282,9 @@ def test_system_of_and_names_that_cannot_be_a_table(tmp_path):
 
 
 def test_a_run_too_short_to_split(tmp_path):
-    with pytest.raises(InputError, match=r"log.toml: the only run is too short .* 3 rows; expected at least 4"):
+    with pytest.raises(
+        InputError, match=r"log.toml: the only run is too short .* 3 rows; expected at least 4"
+    ):
         read_recording(written(tmp_path, "run,t,x,u\n1,0,0,0\n1,1,0,0\n1,2,0,0\n"), Cart)
 
 
@@ -218,7 +293,10 @@ def test_large_tables_are_read_fast_and_the_same(tmp_path, monkeypatch):
     rows = ["run,t,x,u"]
     for run in range(4):
         values = rng.standard_normal((60, 2)) * 10.0 ** rng.integers(-300, 300, size=(60, 1))
-        rows += [f"r{run},{i / 7!r},{'' if i % 11 == 3 else repr(x)},{u!r}" for i, (x, u) in enumerate(values.tolist())]
+        rows += [
+            f"r{run},{i / 7!r},{'' if i % 11 == 3 else repr(x)},{u!r}"
+            for i, (x, u) in enumerate(values.tolist())
+        ]
     path = written(tmp_path, "\n".join(rows) + "\n")
     slow = read_recording(path, Cart)
     monkeypatch.setattr("sims.recording.table.WORTHWHILE", 0)
@@ -230,31 +308,52 @@ def test_large_tables_are_read_fast_and_the_same(tmp_path, monkeypatch):
         np.testing.assert_array_equal(a.channels["x"], b.channels["x"])
         np.testing.assert_array_equal(a.inputs["u"], b.inputs["u"])
     path.write_text(path.read_text().replace("\nr2,", "\nr2,0x", 1))
-    with pytest.raises(InputError, match=r"row 122, column t: expected a finite number, found '0x0.0'"):
+    with pytest.raises(
+        InputError, match=r"row 122, column t: expected a finite number, found '0x0.0'"
+    ):
         read_recording(path, Cart)
 
 
 def test_what_is_written_reads_the_same(tmp_path):
     recording = read_recording(
-        written(tmp_path, toml=TOML + "[runs.b]\nheld_out = true\nmass = 3.0\ninitial = {x = 0.125}\n"), Cart
+        written(
+            tmp_path, toml=TOML + "[runs.b]\nheld_out = true\nmass = 3.0\ninitial = {x = 0.125}\n"
+        ),
+        Cart,
     )
     write_recording(tmp_path / "again.csv", recording, Cart)
     again = read_recording(tmp_path / "again.csv", Cart)
-    assert (again.system, again.title, again.constants, again.noise) == ("cart", "log", {"mass": 2.0}, {"x": 0.01})
+    assert (again.system, again.title, again.constants, again.noise) == (
+        "cart",
+        "log",
+        {"mass": 2.0},
+        {"x": 0.01},
+    )
     for a, b in zip(recording.runs, again.runs, strict=True):
-        assert (a.name, a.constants, a.initial, a.held_out) == (b.name, b.constants, b.initial, b.held_out)
+        assert (a.name, a.constants, a.initial, a.held_out) == (
+            b.name,
+            b.constants,
+            b.initial,
+            b.held_out,
+        )
         np.testing.assert_array_equal(a.times, b.times)
         np.testing.assert_array_equal(a.channels["x"], b.channels["x"])
         np.testing.assert_array_equal(a.inputs["u"], b.inputs["u"])
     before = sorted((p.name, p.read_bytes()) for p in tmp_path.iterdir())
-    for name, message in (("again", "exists already"), ("none/new", "cannot be written"), ("new.txt", "ends in .csv")):
+    for name, message in (
+        ("again", "exists already"),
+        ("none/new", "cannot be written"),
+        ("new.txt", "ends in .csv"),
+    ):
         with pytest.raises(InputError, match=message):
             write_recording(tmp_path / f"{name}{'' if '.' in name else '.csv'}", recording, Cart)
     (tmp_path / "half.toml").touch()
     with pytest.raises(InputError, match=r"half.toml: exists already"):
         write_recording(tmp_path / "half.csv", recording, Cart)
     (tmp_path / "half.toml").unlink()
-    assert before == sorted((p.name, p.read_bytes()) for p in tmp_path.iterdir()), "nothing is left behind"
+    assert before == sorted((p.name, p.read_bytes()) for p in tmp_path.iterdir()), (
+        "nothing is left behind"
+    )
 
 
 def test_a_failed_write_takes_back_what_it_had_written(tmp_path, monkeypatch):
@@ -295,7 +394,9 @@ def test_real_pendulum(recordings):
 def test_real_servo_with_its_gain_by_run(recordings):
     path = recordings / "servo_pendulum" / "recording.csv"
     recording = read_recording(path, ServoSystem)
-    assert [run.constants["kp"] for run in recording.runs] == [100.0] * 4 + [200.0] * 4 + [400.0] * 4 + [800.0] * 4
+    assert [run.constants["kp"] for run in recording.runs] == [100.0] * 4 + [200.0] * 4 + [
+        400.0
+    ] * 4 + [800.0] * 4
     assert sum(run.times.size for run in recording.runs) == 19452
     assert recording.runs[0].inputs["goal"][1] == 0.00839795
     assert len(recording.training()) == 8

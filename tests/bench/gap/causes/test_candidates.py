@@ -24,7 +24,12 @@ def of(found, effect):
 
 @pytest.mark.parametrize(
     ("effect", "size"),
-    [("drag.linear", 1e-6), ("drag.quadratic", 1e-7), ("spring.linear", 1e-6), ("sensor.bias", 1e-4)],
+    [
+        ("drag.linear", 1e-6),
+        ("drag.quadratic", 1e-7),
+        ("spring.linear", 1e-6),
+        ("sensor.bias", 1e-4),
+    ],
 )
 def test_a_direction_is_the_derivative_of_the_trajectory(swing, effect, size):
     there, fit = swing
@@ -34,18 +39,34 @@ def test_a_direction_is_the_derivative_of_the_trajectory(swing, effect, size):
         initial = dict(zip(there.states, fit.states[r].tolist(), strict=True))
         scenario = Scenario(track.scenario.times, initial)
         with_it, without = (
-            Pendulum(fixed={effect: c}, time_step=1e-3).simulate(fit.theta[None, :1], scenario)[0] for c in (size, 0.0)
+            Pendulum(fixed={effect: c}, time_step=1e-3).simulate(fit.theta[None, :1], scenario)[0]
+            for c in (size, 0.0)
         )
         expected = (with_it - without) / size
-        np.testing.assert_allclose(found.values[r, :, :, column], expected, atol=0.01 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            found.values[r, :, :, column], expected, atol=0.01 * np.abs(expected).max()
+        )
 
 
 def test_effects_that_change_nothing_here_have_no_direction(swing):
     there, fit = swing
     found = directions(there, fit, there.library)
     acting = {probe.effect for probe in found.probes}
-    assert not acting & {"input.gain", "input.delay", "input.lag", "input.saturation", "input.deadband", "backlash"}
-    assert {"drag.linear", "friction.coulomb", "gravity.scale", "sensor.delay", "clock.skew"} <= acting
+    assert not acting & {
+        "input.gain",
+        "input.delay",
+        "input.lag",
+        "input.saturation",
+        "input.deadband",
+        "backlash",
+    }
+    assert {
+        "drag.linear",
+        "friction.coulomb",
+        "gravity.scale",
+        "sensor.delay",
+        "clock.skew",
+    } <= acting
     assert found.values.shape == (*there.observed.shape, len(found.probes))
     assert np.isfinite(found.values).all()
     assert (np.abs(found.values).max(axis=(0, 1, 2)) > 0).all()
@@ -55,13 +76,17 @@ def test_driven_runs_try_limits_of_the_input():
     made = recording("slider", runs=2, seconds=1, rate=50, inputs=["u=sine:2:1"], noise=["0.003"])
     there = world(made, candidates=["input.gain", "input.saturation", "input.deadband"])
     found = directions(there, fitted(there), there.library)
-    limits = sorted(found.probes[i].c[0] for i in of(found, "input.saturation") if found.probes[i].fixed)
+    limits = sorted(
+        found.probes[i].c[0] for i in of(found, "input.saturation") if found.probes[i].fixed
+    )
     np.testing.assert_allclose(limits, [0.3, 0.7, 1.2, 1.7, 1.9, 1.98], rtol=2e-3)
     (gain,) = of(found, "input.gain")
     assert found.probes[gain].signed
     x = found.values[0, :, there.channels.index("x"), gain]
     expected = there.tracks[0].observed[:, there.channels.index("x")]
-    np.testing.assert_allclose(x, expected, atol=0.02)  # what the input does to a slider at rest, once more
+    np.testing.assert_allclose(
+        x, expected, atol=0.02
+    )  # what the input does to a slider at rest, once more
 
 
 def test_shapes_are_laid_on_a_grid_and_those_of_one_shape_act_together(swing):
@@ -83,7 +108,10 @@ def test_shapes_are_laid_on_a_grid_and_those_of_one_shape_act_together(swing):
 
 def test_what_modifies_an_effect_is_tried_beside_it():
     search, model = searched(
-        recording("ball", runs=1, seconds=0.8, rate=50, noise=["0.005"], initial=["z=4", "vx=1", "vy=0.5"]), 0.005
+        recording(
+            "ball", runs=1, seconds=0.8, rate=50, noise=["0.005"], initial=["z=4", "vx=1", "vy=0.5"]
+        ),
+        0.005,
     )
     found = directions(search.world, model.fit, ["wind"])
     columns = of(found, "wind")
@@ -98,7 +126,9 @@ def test_what_modifies_an_effect_is_tried_beside_it():
 
 def test_an_effect_added_to_a_model_is_simulated_with_what_the_model_has(swing):
     there, fit = swing
-    changed = simulate_with(there, fit, [("drag.linear", np.array([0.0])), ("sensor.bias", np.array([0.25]))])
+    changed = simulate_with(
+        there, fit, [("drag.linear", np.array([0.0])), ("sensor.bias", np.array([0.25]))]
+    )
     seen = np.isfinite(there.observed)
     np.testing.assert_allclose(changed[0][seen], fit.simulated[seen], atol=1e-4)
     q = there.channels.index("q")

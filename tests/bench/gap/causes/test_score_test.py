@@ -25,7 +25,8 @@ def problem(seed=0, holes=0.0):
 
 
 def dense(jacobian, seen, phi, *values):
-    """Values (R, T, C, ...) as independent numbers (n, ...), less what parameters and initial states absorb.
+    """Values (R, T, C, ...) as independent numbers (n, ...), less what parameters and initial
+    states absorb.
 
     The square root of the inverse covariance of each run and channel, taken of the whole matrix.
     """
@@ -69,14 +70,22 @@ def log_likelihood(residual, seen, phi):
     """Twice it, the common sigma estimated, up to a constant."""
     count = int(seen.sum())
     determinants = sum(
-        np.linalg.slogdet(covariance_of(seen[r, :, c][None], phi))[1] for r in range(RUNS) for c in range(2)
+        np.linalg.slogdet(covariance_of(seen[r, :, c][None], phi))[1]
+        for r in range(RUNS)
+        for c in range(2)
     )
     return -count * np.log(residual @ residual) - determinants
 
 
 def test_scores_are_gains_in_log_likelihood_at_the_best_correlation():
     jacobian, directions, residual, seen = problem(2)
-    found = score(linear_fit(jacobian, Q), residual, Directions(probes(), directions), seen, Noise(SIGMA, np.zeros(2)))
+    found = score(
+        linear_fit(jacobian, Q),
+        residual,
+        Directions(probes(), directions),
+        seen,
+        Noise(SIGMA, np.zeros(2)),
+    )
     nothing, best = -np.inf, dict.fromkeys("abcd", -np.inf)
     for phi in GRID:
         d, r = dense(jacobian, seen, phi, directions, residual)
@@ -128,9 +137,17 @@ def test_a_large_group_is_one_regression_and_equal_columns_count_once():
 def test_what_the_model_absorbs_is_no_evidence():
     jacobian, directions, residual, seen = problem(5)
     directions[..., 0] = 3.0 * jacobian[..., 0] - jacobian[..., 3]
-    found = score(linear_fit(jacobian, Q), residual, Directions(probes(), directions), seen, Noise(SIGMA, np.zeros(2)))
+    found = score(
+        linear_fit(jacobian, Q),
+        residual,
+        Directions(probes(), directions),
+        seen,
+        Noise(SIGMA, np.zeros(2)),
+    )
     assert found.score[found.effects.index("a")] == pytest.approx(0.0, abs=1e-6)
-    directions[..., 1] = 1e9 * jacobian[..., 1] + directions[..., 2]  # of two alike little but rounding is left
+    directions[..., 1] = (
+        1e9 * jacobian[..., 1] + directions[..., 2]
+    )  # of two alike little but rounding is left
     directions[..., 3] = 1e9 * jacobian[..., 1] + directions[..., 2]
     products = Products(linear_fit(jacobian, Q), residual[..., None], directions, seen, SIGMA)
     for phi in GRID:
@@ -153,10 +170,14 @@ def test_directions_of_an_effect_act_together_within_a_group():
 
 @pytest.mark.parametrize("phi", [0.0, 0.8])
 def test_p_values_of_clean_residuals_are_uniform(phi):
-    """200 residuals of noise alone: as many below each level as the level says, within three standard errors."""
+    """200 residuals of noise alone: as many below each level as the level says, within three
+    standard errors.
+    """
     rng = np.random.default_rng(6)
     times = np.linspace(0, 1, 150)
-    jacobian = np.stack([times, np.ones(150), np.sin(5 * times)], axis=1)[None, :, None].repeat(2, axis=0)
+    jacobian = np.stack([times, np.ones(150), np.sin(5 * times)], axis=1)[None, :, None].repeat(
+        2, axis=0
+    )
     smooth = np.stack([np.cos(k * times + k) for k in range(1, 9)], axis=1)
     directions = Directions(
         tuple(Probe("abcdefgh"[k], 0, 0, np.ones(1), k % 2 == 0) for k in range(8)),
@@ -169,11 +190,17 @@ def test_p_values_of_clean_residuals_are_uniform(phi):
             j = jacobian[r, :, 0, 1:]
             residual[r, :, 0] -= j @ np.linalg.lstsq(j, residual[r, :, 0], rcond=None)[0]
         like = surrogates(residual, seen, 60, rng)
-        p.append(score(fit, residual, directions, seen, Noise(np.array([0.1]), np.zeros(1)), like).p_value)
+        p.append(
+            score(
+                fit, residual, directions, seen, Noise(np.array([0.1]), np.zeros(1)), like
+            ).p_value
+        )
     p = np.array(p)
     assert (p < 0.01).mean() <= 0.03
     for level in (0.1, 0.3, 0.5):
-        assert (p < level).mean() == pytest.approx(level, abs=3 * np.sqrt(level * (1 - level) / 200) + 0.03), level
+        assert (p < level).mean() == pytest.approx(
+            level, abs=3 * np.sqrt(level * (1 - level) / 200) + 0.03
+        ), level
 
 
 def test_a_cause_has_a_small_p_value():
@@ -195,18 +222,27 @@ def test_the_tail_beyond_the_surrogates_is_exponential():
     for value in (1.0, 4.0, 12.0, 40.0):
         assert np.log(tail(drawn, np.array([value]))) == pytest.approx(-value / 2, rel=0.12)
     assert tail(drawn, np.zeros(0)) == 1.0
-    assert tail(np.zeros((1, 10)), np.array([5.0])) == pytest.approx(1 / 11), "ten surrogates cannot say more"
+    assert tail(np.zeros((1, 10)), np.array([5.0])) == pytest.approx(1 / 11), (
+        "ten surrogates cannot say more"
+    )
 
 
 def test_an_effect_of_many_shapes_keeps_the_best_that_beat_their_neighbours():
     rng = np.random.default_rng(8)
     t = np.arange(400) / 100.0
     frequencies = np.linspace(0.5, 8.0, 40)
-    waves = np.stack([f(2 * np.pi * hertz * t) for hertz in frequencies for f in (np.sin, np.cos)], axis=-1)
-    made = 0.5 * np.sin(2 * np.pi * frequencies[10] * t) + 0.3 * np.cos(2 * np.pi * frequencies[30] * t)
+    waves = np.stack(
+        [f(2 * np.pi * hertz * t) for hertz in frequencies for f in (np.sin, np.cos)], axis=-1
+    )
+    made = 0.5 * np.sin(2 * np.pi * frequencies[10] * t) + 0.3 * np.cos(
+        2 * np.pi * frequencies[30] * t
+    )
     residual = (made + 0.1 * rng.standard_normal(400))[None, :, None]
     seen = np.ones(residual.shape, dtype=bool)
-    found = Directions(tuple(Probe("wave", k // 2, k % 2, np.ones(3), True) for k in range(80)), waves[None, :, None])
+    found = Directions(
+        tuple(Probe("wave", k // 2, k % 2, np.ones(3), True) for k in range(80)),
+        waves[None, :, None],
+    )
     fit = linear_fit(1e-9 * rng.standard_normal((1, 400, 1, 2)), 1)
     (peaks,) = score(fit, residual, found, seen, Noise(np.array([0.1]), np.zeros(1))).peaks
     by_place = {group.columns[0] // 2: c for group, c in peaks}

@@ -86,12 +86,21 @@ def test_hats_cover_time_position_and_speed():
     search, model = searched(made, 0.003, extra=[Hat])
     found = hats(search.world, model)
     labels = {probe.effect for probe in found.probes}
-    assert {"time, along x", "position x, against the motion", "speed, against the motion", "speed, dry"} <= labels
+    assert {
+        "time, along x",
+        "position x, against the motion",
+        "speed, against the motion",
+        "speed, dry",
+    } <= labels
     centres = sorted(p.c[2] for p in found.probes if p.effect == "time, along x")
     assert centres[0] == pytest.approx(0.0)
     assert centres[-1] <= TIMES[-1] + 1e-9
     np.testing.assert_allclose(np.diff(centres), TIMES[-1] / 6)
-    first = next(i for i, p in enumerate(found.probes) if p.effect == "time, along x" and p.c[2] == centres[2])
+    first = next(
+        i
+        for i, p in enumerate(found.probes)
+        if p.effect == "time, along x" and p.c[2] == centres[2]
+    )
     x = found.values[0, :, search.world.channels.index("x"), first]
     begins = TIMES[np.flatnonzero(np.abs(x) > 1e-6)[0]]
     assert begins == pytest.approx(centres[1], abs=0.06), "nothing moves before the hat does"

@@ -13,7 +13,9 @@ TIMES = np.arange(90) / 60
 
 @pytest.mark.parametrize("inertia", [1.0e-3, 1.7e-3, 3.0e-3, 5.0e-3, 7.5e-3, 1.0e-2])
 def test_any_inertia_in_the_bounds_is_found(inertia):
-    made = recorded(Pendulum(), [inertia], [{"q": 0.9}, {"q": -2.0, "qd": 4.0}], TIMES, [0.003, 0.02], seed=1)
+    made = recorded(
+        Pendulum(), [inertia], [{"q": 0.9}, {"q": -2.0, "qd": 4.0}], TIMES, [0.003, 0.02], seed=1
+    )
     there = world(made, candidates=[])
     base = fit_base(there, white(there, [0.003, 0.02]))
     assert base.fit.theta[0] == pytest.approx(inertia, rel=3e-3)
@@ -33,15 +35,27 @@ def test_restitution_is_found_through_many_bounces(restitution):
 
 
 def test_restitution_that_a_fall_does_not_touch_is_reported_and_stays_nominal():
-    made = recorded(Ball(observe=["x", "z"]), [0.9], [{"z": 20.0, "vx": 1.0}, {"z": 25.0}], np.arange(60) / 60, 0.005)
+    made = recorded(
+        Ball(observe=["x", "z"]),
+        [0.9],
+        [{"z": 20.0, "vx": 1.0}, {"z": 25.0}],
+        np.arange(60) / 60,
+        0.005,
+    )
     there = world(made, candidates=[])
     base = fit_base(there, white(there, 0.005))
     assert base.untouched == frozenset({0})
     assert base.fit.theta[0] == there.nominal()[0] == 0.5
     assert base.fit.free.size == 0
     assert base.fit.cost / np.isfinite(there.observed).sum() == pytest.approx(1.0, abs=0.2)
-    hit = replace(made, runs=made.runs + recorded(Ball(observe=["x", "z"]), [0.9], [{"z": 1.0}], TIMES, 0.005).runs)
-    again = world(replace(hit, runs=tuple(replace(r, name=str(i)) for i, r in enumerate(hit.runs))), candidates=[])
+    hit = replace(
+        made,
+        runs=made.runs + recorded(Ball(observe=["x", "z"]), [0.9], [{"z": 1.0}], TIMES, 0.005).runs,
+    )
+    again = world(
+        replace(hit, runs=tuple(replace(r, name=str(i)) for i, r in enumerate(hit.runs))),
+        candidates=[],
+    )
     touched = fit_base(again, white(again, 0.005))
     assert not touched.untouched
     assert touched.fit.theta[0] == pytest.approx(0.9, abs=5e-3)

@@ -67,13 +67,20 @@ def test_the_jacobian_is_the_derivative():
         forward = (4 * one - two - 3 * fit.simulated) / (2 * step)
         near = np.isfinite(forward)
         scale = np.abs(forward[near]).max()
-        np.testing.assert_allclose(fit.jacobian[..., column][near], forward[near], atol=0.02 * scale)
+        np.testing.assert_allclose(
+            fit.jacobian[..., column][near], forward[near], atol=0.02 * scale
+        )
 
 
 def test_several_models_in_one_call_equal_one_by_one():
     there = world(swings(), candidates=["drag.linear", "friction.coulomb", "sensor.delay"])
     starts = []
-    for effects, inertia in (((), 2e-3), (("drag.linear",), 4e-3), (("sensor.delay",), 3e-3), ((), 6e-3)):
+    for effects, inertia in (
+        ((), 2e-3),
+        (("drag.linear",), 4e-3),
+        (("sensor.delay",), 3e-3),
+        ((), 6e-3),
+    ):
         theta = there.nominal()
         theta[0] = inertia
         starts.append(Start(effects, theta, there.guess))
@@ -119,14 +126,20 @@ def test_bounds_are_kept():
     theta[1] = 1e-4
     fit = fitted(there, theta, effects=("drag.linear",))
     assert fit.theta[1] == 0.0, "drag that pushes is none"
-    heavy = recorded(Pendulum({"gravity": 0.981}), [6e-3], [{"q": 0.8}, {"q": 1.3}], np.arange(80) / 60)
+    heavy = recorded(
+        Pendulum({"gravity": 0.981}), [6e-3], [{"q": 0.8}, {"q": 1.3}], np.arange(80) / 60
+    )
     there = world(replace(heavy, constants={**heavy.constants, "gravity": 9.81}))
-    assert fitted(there, np.array([8e-3, *there.nominal()[1:]])).theta[0] == 1e-2, "an inertia of 6e-2 would be needed"
+    assert fitted(there, np.array([8e-3, *there.nominal()[1:]])).theta[0] == 1e-2, (
+        "an inertia of 6e-2 would be needed"
+    )
 
 
 def test_frozen_parameters_and_known_initial_states_stay():
     made = swings()
-    told = tuple(replace(run, initial={"q": q}) for run, q in zip(made.runs, (0.71, -1.2, 2.2), strict=True))
+    told = tuple(
+        replace(run, initial={"q": q}) for run, q in zip(made.runs, (0.71, -1.2, 2.2), strict=True)
+    )
     there = world(replace(made, runs=told))
     fit = fitted(there)
     np.testing.assert_array_equal(fit.states[:, 0], [0.71, -1.2, 2.2])
@@ -169,7 +182,10 @@ def dense_step(residual, jacobian, q, drift, prior, known):
 @pytest.mark.parametrize("known", [[False, False], [True, False], [True, True]])
 def test_a_step_is_that_of_all_unknowns_at_once(known):
     rng = np.random.default_rng(5)
-    residual, jacobian = rng.normal(size=(4, 9, 2)), rng.normal(size=(4, 9, 2, 3 + 2)) * [1, 10, 0.1, 3, 0.5]
+    residual, jacobian = (
+        rng.normal(size=(4, 9, 2)),
+        rng.normal(size=(4, 9, 2, 3 + 2)) * [1, 10, 0.1, 3, 0.5],
+    )
     drift, prior = rng.normal(size=(4, 2)), np.array([3.0, 0.7])
     drift[:, known] = 0.0
     known = np.tile(known, (4, 1))

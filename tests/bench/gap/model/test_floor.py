@@ -25,7 +25,9 @@ def test_stated_noise_is_believed_and_the_rest_estimated():
 def test_held_out_runs_tell_of_the_sensor_too():
     made = recording(runs=2, seconds=1, rate=100, noise=["q=0.004", "qd=0.03"], seed=4)
     few = replace(made, noise={})
-    louder = changed(made.runs[1], qd=lambda v: v + 0.3 * np.random.default_rng(0).normal(size=v.size))
+    louder = changed(
+        made.runs[1], qd=lambda v: v + 0.3 * np.random.default_rng(0).normal(size=v.size)
+    )
     assert floor_of(few).sigma[1] == pytest.approx(0.03, rel=0.2)
     assert floor_of(replace(few, runs=(made.runs[0], louder))).sigma[1] > 0.06
 
@@ -53,5 +55,7 @@ def test_a_channel_without_samples_still_has_a_floor():
     made = recording(runs=2, seconds=1, rate=50, noise=["0.01"])
     empty = tuple(changed(run, qd=lambda v: np.full_like(v, np.nan)) for run in made.runs)
     found = floor_of(replace(made, runs=empty, noise={}))
-    assert found.sigma[1] == pytest.approx(1e-3 * 10.0), "a thousandth of the channel's typical size"
+    assert found.sigma[1] == pytest.approx(1e-3 * 10.0), (
+        "a thousandth of the channel's typical size"
+    )
     assert found.sigma[0] == pytest.approx(0.01, rel=0.3)

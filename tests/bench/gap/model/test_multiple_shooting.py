@@ -13,7 +13,9 @@ from sims.pendulum.simulator import Pendulum
 from tests.bench.gap.made import recorded, searched, white, with_runs, world
 
 TIMES = np.arange(0, 12.0, 0.02)
-LONG = recorded(Pendulum(), [0.0035], [{"q": 1.2}, {"q": -0.8, "qd": 2.0}], TIMES, noise=[0.002, 0.01])
+LONG = recorded(
+    Pendulum(), [0.0035], [{"q": 1.2}, {"q": -0.8, "qd": 2.0}], TIMES, noise=[0.002, 0.01]
+)
 
 
 def test_pieces_are_the_runs_cut_up_and_nothing_else():
@@ -22,7 +24,10 @@ def test_pieces_are_the_runs_cut_up_and_nothing_else():
     assert len(cut.tracks) == 2 * PIECES
     again = np.concatenate([t.scenario.times for t in cut.tracks[:PIECES]])
     assert again.tolist() == TIMES.tolist(), "time goes on, as what is periodic must"
-    assert np.concatenate([t.observed for t in cut.tracks[PIECES:]]).tolist() == there.tracks[1].observed.tolist()
+    assert (
+        np.concatenate([t.observed for t in cut.tracks[PIECES:]]).tolist()
+        == there.tracks[1].observed.tolist()
+    )
     assert [p.name for p in cut.parameters] == [p.name for p in there.parameters]
     assert (cut.longest, cut.travel) == (there.longest, there.travel)
 
@@ -53,7 +58,9 @@ def test_over_pieces_the_sum_of_squares_has_one_minimum_where_whole_runs_have_ma
             starts.append(Start((), theta, some.guess))
         fits = Fitter(some, white(some, sigma), parameters=False).fit(starts, 8)
         cost = np.array([f.cost for f in fits])
-        return int(((cost[1:-1] < cost[:-2]) & (cost[1:-1] < cost[2:])).sum()), inertias[cost.argmin()]
+        return int(((cost[1:-1] < cost[:-2]) & (cost[1:-1] < cost[2:])).sum()), inertias[
+            cost.argmin()
+        ]
 
     many, _ = minima(there)
     one, best = minima(cut)
@@ -80,9 +87,19 @@ def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkey
     monkeypatch.setattr(search, "NOMINATED", 1)
     dragged = Pendulum(effects=["drag.quadratic"])
     data = recorded(
-        dragged, [0.0035, 4e-7], [{"q": 1.2}, {"q": -0.8, "qd": 2.0}, {"q": 2.0}], TIMES[:250], [0.002, 0.01]
+        dragged,
+        [0.0035, 4e-7],
+        [{"q": 1.2}, {"q": -0.8, "qd": 2.0}, {"q": 2.0}],
+        TIMES[:250],
+        [0.002, 0.01],
     )
-    library = ["drag.linear", "drag.quadratic", "friction.coulomb", "friction.load", "spring.linear"]
+    library = [
+        "drag.linear",
+        "drag.quadratic",
+        "friction.coulomb",
+        "friction.load",
+        "spring.linear",
+    ]
     looking, _ = searched(data, [0.002, 0.01], candidates=library)
     found = name.settled(looking, looking.run())
     tried = {n for names in looking.models for n in names}
@@ -91,5 +108,7 @@ def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkey
 
 
 def test_what_bounces_is_left_whole():
-    falls = recorded(Ball(observe=["z"]), [0.6], [{"z": 2.0}, {"z": 3.0}], np.arange(200) * 0.02, noise=0.002)
+    falls = recorded(
+        Ball(observe=["z"]), [0.6], [{"z": 2.0}, {"z": 3.0}], np.arange(200) * 0.02, noise=0.002
+    )
     assert pieces(world(falls)) is None

@@ -27,7 +27,9 @@ def test_whitening_makes_noise_that_remembers_independent_and_of_variance_one(ph
         assert white[:, :, c].std() == pytest.approx(1.0, abs=0.015)
     for lag in (1, 2, 3):
         assert abs(autocorrelation(white, lag)) < 0.015
-    assert white[:, 0].std() == pytest.approx(1.0, abs=0.2), "the first sample counts as much as the others"
+    assert white[:, 0].std() == pytest.approx(1.0, abs=0.2), (
+        "the first sample counts as much as the others"
+    )
 
 
 def test_whitening_by_hand_starts_anew_across_a_hole():
@@ -35,12 +37,17 @@ def test_whitening_by_hand_starts_anew_across_a_hole():
     values = np.array([1.0, 2.0, 99.0, 4.0, 5.0]).reshape(1, 5, 1)
     seen = np.array([1, 1, 0, 1, 1], dtype=bool).reshape(1, 5, 1)
     white = whitened(values, seen, noise)[0, :, 0]
-    np.testing.assert_allclose(white, [0.5, (1.0 - 0.3) / 0.8, 0.0, 2.0, (2.5 - 1.2) / 0.8], rtol=1e-14)
+    np.testing.assert_allclose(
+        white, [0.5, (1.0 - 0.3) / 0.8, 0.0, 2.0, (2.5 - 1.2) / 0.8], rtol=1e-14
+    )
 
 
 def test_whitening_treats_derivatives_like_the_samples():
     rng = np.random.default_rng(3)
-    values, noise = rng.normal(size=(3, 20, 2, 4)), Noise(np.array([0.1, 3.0]), np.array([0.5, -0.2]))
+    values, noise = (
+        rng.normal(size=(3, 20, 2, 4)),
+        Noise(np.array([0.1, 3.0]), np.array([0.5, -0.2])),
+    )
     seen = holes((3, 20, 2), 0.2, 5)
     together = whitened(values, seen, noise)
     for k in range(4):
@@ -56,12 +63,19 @@ def test_likelihood_is_that_of_the_normal_distribution(share):
     correlation = covariance_of(seen[:, :, 0], phi)
     variance = float(r @ np.linalg.solve(correlation, r)) / count
     assert found.sigma[0] == pytest.approx(variance**0.5, rel=1e-9)
-    assert found.value == pytest.approx(-count * np.log(variance) - np.linalg.slogdet(correlation)[1], rel=1e-9)
+    assert found.value == pytest.approx(
+        -count * np.log(variance) - np.linalg.slogdet(correlation)[1], rel=1e-9
+    )
     half = log_determinant(seen, phi)
     assert 2 * half == pytest.approx(-np.linalg.slogdet(correlation)[1], rel=1e-9)
-    for other in np.linspace(-0.4, 0.98, 70):  # nowhere is it higher by more than its grid is coarse
+    for other in np.linspace(
+        -0.4, 0.98, 70
+    ):  # nowhere is it higher by more than its grid is coarse
         correlation = covariance_of(seen[:, :, 0], other)
-        there = -count * np.log(r @ np.linalg.solve(correlation, r) / count) - np.linalg.slogdet(correlation)[1]
+        there = (
+            -count * np.log(r @ np.linalg.solve(correlation, r) / count)
+            - np.linalg.slogdet(correlation)[1]
+        )
         assert there < found.value + 0.1
 
 
@@ -80,7 +94,9 @@ def test_each_channel_has_its_own_noise_and_holes_do_not_spoil_it():
     found = likelihood(np.where(seen, made, 0.0), seen)
     np.testing.assert_allclose(found.phi, phi, atol=0.03)
     np.testing.assert_allclose(found.sigma, sigma, rtol=0.06)
-    apart = [likelihood(np.where(seen, made, 0.0)[..., [c]], seen[..., [c]]).value for c in range(2)]
+    apart = [
+        likelihood(np.where(seen, made, 0.0)[..., [c]], seen[..., [c]]).value for c in range(2)
+    ]
     assert found.value == pytest.approx(sum(apart), rel=1e-12)
 
 
@@ -121,7 +137,9 @@ def test_surrogates_keep_variance_and_autocorrelation():
 def test_surrogates_are_the_same_for_a_seed_and_zero_where_nothing_was_seen():
     made = correlated(np.random.default_rng(13), 0.6, 1.0, (3, 100, 1))
     seen = holes(made.shape, 0.2, 14)
-    one, two, other = (surrogates(np.where(seen, made, 0.0), seen, 7, np.random.default_rng(s)) for s in (5, 5, 6))
+    one, two, other = (
+        surrogates(np.where(seen, made, 0.0), seen, 7, np.random.default_rng(s)) for s in (5, 5, 6)
+    )
     np.testing.assert_array_equal(one, two)
     assert not np.array_equal(one, other)
     assert (one[:, ~seen] == 0).all()
@@ -131,7 +149,9 @@ def test_surrogates_are_the_same_for_a_seed_and_zero_where_nothing_was_seen():
 def test_surrogates_of_nothing_are_nothing():
     seen = np.ones((1, 30, 1), dtype=bool)
     assert not surrogates(np.zeros((1, 30, 1)), seen, 5, np.random.default_rng(0)).any()
-    few = surrogates(np.array([1.0, -2.0, 3.0]).reshape(1, 3, 1), seen[:, :3], 9, np.random.default_rng(0))
+    few = surrogates(
+        np.array([1.0, -2.0, 3.0]).reshape(1, 3, 1), seen[:, :3], 9, np.random.default_rng(0)
+    )
     assert set(np.abs(few).ravel()) <= {1.0, 2.0, 3.0}
 
 
@@ -141,7 +161,9 @@ def test_first_order_noise_is_told_from_structure_that_is_as_large():
     for seed in range(40):
         rng = np.random.default_rng(seed)
         noise = correlated(rng, 0.7, np.array([1.0, 5.0]), seen.shape)
-        wave = np.sin(np.arange(300) / 15.0 + rng.uniform(0, 6))[None, :, None] * np.ones(seen.shape)
+        wave = np.sin(np.arange(300) / 15.0 + rng.uniform(0, 6))[None, :, None] * np.ones(
+            seen.shape
+        )
         mixed = rng.standard_normal(seen.shape) * np.array([1.0, 5.0]) + 1.2 * wave
         for name, values in (("noise", noise), ("structure", mixed)):
             chances[name].append(forgets(values, seen, likelihood(values, seen)))

@@ -13,7 +13,9 @@ from tests.bench.gap.made import changed, recorded, recording, with_runs, world
 
 def test_a_vector_holds_parameters_constants_set_free_and_coefficients():
     there = world(
-        recording(runs=2, seconds=0.5, rate=50), free=["length", "mass"], candidates=["drag.linear", "spring.linear"]
+        recording(runs=2, seconds=0.5, rate=50),
+        free=["length", "mass"],
+        candidates=["drag.linear", "spring.linear"],
     )
     assert [p.name for p in there.parameters[:3]] == ["inertia", "length", "mass"]
     assert there.slots["drag.linear"] == slice(3, 4)
@@ -25,9 +27,14 @@ def test_a_vector_holds_parameters_constants_set_free_and_coefficients():
 
 def test_lanes_are_what_the_simulator_gives():
     made = [
-        recorded(Pendulum(), [3e-3], [{"q": q}], np.arange(n) / rate) for q, rate, n in ((1.0, 50, 40), (0.4, 80, 90))
+        recorded(Pendulum(), [3e-3], [{"q": q}], np.arange(n) / rate)
+        for q, rate, n in ((1.0, 50, 40), (0.4, 80, 90))
     ]
-    there = world(with_runs(made[0], [part.runs[0] for part in made]), candidates=["drag.linear"], free=["gravity"])
+    there = world(
+        with_runs(made[0], [part.runs[0] for part in made]),
+        candidates=["drag.linear"],
+        free=["gravity"],
+    )
     theta = np.array([[3e-3, 9.81, 0.0], [4e-3, 5.0, 1e-3], [2e-3, 12.0, 5e-4]])
     runs, states = np.array([0, 1, 1]), np.array([[1.0, 0.0], [0.4, 0.5], [-2.0, 0.0]])
     before = there.simulations
@@ -37,7 +44,9 @@ def test_lanes_are_what_the_simulator_gives():
     for lane in range(3):
         times = there.tracks[runs[lane]].scenario.times
         scenario = Scenario(
-            times, dict(zip(("q", "qd"), states[lane], strict=True)), constants={"gravity": theta[lane, 1]}
+            times,
+            dict(zip(("q", "qd"), states[lane], strict=True)),
+            constants={"gravity": theta[lane, 1]},
         )
         fine = Pendulum(fixed={"drag.linear": theta[lane, 2]}, time_step=1e-3).simulate(
             theta[lane : lane + 1, :1], scenario
@@ -55,7 +64,10 @@ def test_first_samples_tell_place_and_slope():
     times = 5.0 + np.arange(20) / 100
     values = 2.0 - 3.0 * (times - 5.0) + 4.0 * (times - 5.0) ** 2
     assert beginning(times, values) == (pytest.approx(2.0), pytest.approx(-3.0))
-    assert beginning(times[:3], values[:3]) == (pytest.approx(2.0, abs=1e-3), pytest.approx(-2.92, abs=0.01))
+    assert beginning(times[:3], values[:3]) == (
+        pytest.approx(2.0, abs=1e-3),
+        pytest.approx(-2.92, abs=0.01),
+    )
     assert beginning(times[:1], values[:1]) == (2.0, 0.0)
     assert beginning(times, np.full(20, np.nan)) == (0.0, 0.0)
     late = np.where(times < 5.04, np.nan, values)
@@ -65,7 +77,13 @@ def test_first_samples_tell_place_and_slope():
 
 
 def test_guesses_are_near_stated_states_are_kept_and_hidden_axes_stay():
-    made = recorded(Ball(observe=["x", "z"]), [0.7], [{"z": 3.0, "vx": 2.0, "vz": 1.0}] * 2, np.arange(50) / 100, 0.001)
+    made = recorded(
+        Ball(observe=["x", "z"]),
+        [0.7],
+        [{"z": 3.0, "vx": 2.0, "vz": 1.0}] * 2,
+        np.arange(50) / 100,
+        0.001,
+    )
     made = replace(made, runs=(made.runs[0], replace(made.runs[1], initial={"z": 2.5, "vx": 7.0})))
     there = world(made, candidates=[])
     assert there.states == ["x", "y", "z", "vx", "vy", "vz"]
@@ -79,7 +97,10 @@ def test_a_ball_whose_height_is_not_recorded_begins_too_high_for_an_impact():
     there = world(made, candidates=[])
     z = there.states.index("z")
     assert there.guess[0, z] > 0.5 * 9.81 * 2.0**2 + 10
-    assert there.known[0, z] or there.simulate(there.nominal()[None], np.array([0]), there.guess)[0, -1, 0] > 3.5
+    assert (
+        there.known[0, z]
+        or there.simulate(there.nominal()[None], np.array([0]), there.guess)[0, -1, 0] > 3.5
+    )
 
 
 def test_a_later_clock_changes_nothing():
@@ -92,10 +113,15 @@ def test_a_later_clock_changes_nothing():
 
 
 def test_effects_may_grow_beyond_what_is_plausible_but_not_change_their_meaning():
-    there = world(recording(runs=1, seconds=0.5), candidates=["drag.linear", "spring.linear", "friction.stribeck"])
+    there = world(
+        recording(runs=1, seconds=0.5),
+        candidates=["drag.linear", "spring.linear", "friction.stribeck"],
+    )
     for name in there.library:
         plausible = [p.bounds for p in there.parameters[there.slots[name]]]
-        for (low, high), (wide_low, wide_high) in zip(plausible, coefficient_bounds(there, name), strict=True):
+        for (low, high), (wide_low, wide_high) in zip(
+            plausible, coefficient_bounds(there, name), strict=True
+        ):
             beyond = DRY if name.startswith("friction") else BEYOND
             assert wide_high in (beyond * high, high)
             assert wide_low == (low if low >= 0 else BEYOND * low)
@@ -105,8 +131,14 @@ def test_effects_may_grow_beyond_what_is_plausible_but_not_change_their_meaning(
 @pytest.mark.parametrize(
     ("free", "message"),
     [
-        (["weight"], "unknown constant of system pendulum 'weight'; there are: gravity, length, mass"),
-        (["gravity"], "--free gravity: expected a constant that is not zero and the same in every run"),
+        (
+            ["weight"],
+            "unknown constant of system pendulum 'weight'; there are: gravity, length, mass",
+        ),
+        (
+            ["gravity"],
+            "--free gravity: expected a constant that is not zero and the same in every run",
+        ),
     ],
 )
 def test_constants_that_cannot_be_free(free, message):
@@ -120,7 +152,9 @@ def test_constants_of_a_run_are_its_own():
     made = recording(runs=2, seconds=0.5, initial=["q=0.5"])
     made = replace(made, runs=(made.runs[0], replace(made.runs[1], constants={"gravity": 0.001})))
     there = world(made, candidates=[])
-    seen = there.simulate(np.tile(there.nominal(), (2, 1)), np.arange(2), np.array([[0.5, 0.0]] * 2))
+    seen = there.simulate(
+        np.tile(there.nominal(), (2, 1)), np.arange(2), np.array([[0.5, 0.0]] * 2)
+    )
     assert np.ptp(seen[0, :, 0]) > 0.9
     assert np.ptp(seen[1, :, 0]) < 1e-3
 

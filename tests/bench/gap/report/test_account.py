@@ -4,9 +4,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.gap.report.account import absorbed, account, following, gain, headline, heldout_unit, hidden, shift
+from bench.gap.report.account import (
+    absorbed,
+    account,
+    following,
+    gain,
+    headline,
+    heldout_unit,
+    hidden,
+    shift,
+)
 from bench.gap.report.story import Shown, Side, Tuned
-from bench.gap.report.words import estimate, joined, noun, number, percent, pretty, probability, sentence
+from bench.gap.report.words import (
+    estimate,
+    joined,
+    noun,
+    number,
+    percent,
+    pretty,
+    probability,
+    sentence,
+)
 from tests.bench.gap.stories import DRAG, EITHER, HELD_OUT, NEXT, TILT, evil, story
 
 VERDICTS = ("adequate", "named", "ambiguous", "partial", "unknown", "unidentifiable")
@@ -21,10 +39,22 @@ def text(told):
     [
         ("adequate", "Nothing is missing from the simulation that these data can show."),
         ("named", "The simulation lacks linear drag: motion is resisted in proportion to speed."),
-        ("ambiguous", "The simulation lacks linear drag or Coulomb friction: these data cannot tell which."),
-        ("partial", "The simulation lacks linear drag, and something else that no known cause explains."),
-        ("unknown", "Something is missing from the simulation, and none of the 6 known causes explains it."),
-        ("unidentifiable", "These data cannot fix inertia: what the simulation lacks cannot be told from them."),
+        (
+            "ambiguous",
+            "The simulation lacks linear drag or Coulomb friction: these data cannot tell which.",
+        ),
+        (
+            "partial",
+            "The simulation lacks linear drag, and something else that no known cause explains.",
+        ),
+        (
+            "unknown",
+            "Something is missing from the simulation, and none of the 6 known causes explains it.",
+        ),
+        (
+            "unidentifiable",
+            "These data cannot fix inertia: what the simulation lacks cannot be told from them.",
+        ),
     ],
 )
 def test_each_verdict_has_its_headline(verdict, said):
@@ -47,14 +77,14 @@ def test_several_causes_are_named_together():
 
 def test_an_ambiguous_cause_beside_a_certain_one():
     told = story("ambiguous", causes=[EITHER, TILT])
-    expected = (
-        "The simulation lacks a tilt of gravity, and linear drag or Coulomb friction: these data cannot tell which."
-    )
+    expected = "The simulation lacks a tilt of gravity, and linear drag or Coulomb friction: these data cannot tell which."
     assert headline(told) == expected
 
 
 def test_a_partial_verdict_keeps_what_cannot_be_told_apart():
-    assert "linear drag or Coulomb friction, and something else" in headline(story("partial", causes=[EITHER]))
+    assert "linear drag or Coulomb friction, and something else" in headline(
+        story("partial", causes=[EITHER])
+    )
 
 
 def test_the_gain_of_a_partial_verdict_is_that_of_the_named_cause():
@@ -90,16 +120,22 @@ def test_nothing_is_called_closed_where_no_share_is_known():
 
 
 def test_a_weak_cause_under_unknown_is_not_sold_as_the_answer():
-    told = story("unknown", causes=[DRAG], heldout={**HELD_OUT, "gap_closed": 0.3, "low": 0.1, "high": 0.5})
+    told = story(
+        "unknown", causes=[DRAG], heldout={**HELD_OUT, "gap_closed": 0.3, "low": 0.1, "high": 0.5}
+    )
     assert headline(told).startswith("Something is missing")
-    assert gain(told).startswith("The best of them, linear drag, closes only 30 % of the gap (10 to 50 %)")
+    assert gain(told).startswith(
+        "The best of them, linear drag, closes only 30 % of the gap (10 to 50 %)"
+    )
 
 
 def test_adequate_says_what_was_looked_for_and_what_could_hide():
     said = " ".join(following(story("adequate")))
     assert "6 possible causes were looked for" in said
     assert "p = 0.4" in said
-    assert re.search(r"A gap of up to 0\.00\d+ rad in q .* and 0\.0\d+ rad/s in qd .* could still hide", said)
+    assert re.search(
+        r"A gap of up to 0\.00\d+ rad in q .* and 0\.0\d+ rad/s in qd .* could still hide", said
+    )
 
 
 def test_a_gap_that_hides_is_smaller_with_more_samples_and_larger_than_a_true_one():
@@ -107,9 +143,13 @@ def test_a_gap_that_hides_is_smaller_with_more_samples_and_larger_than_a_true_on
 
     def limit(samples, true, stated=True):
         times = np.arange(samples) / 100.0
-        residual = rng.normal(size=(1, samples, 1)) + true * np.sqrt(2) * np.sin(times)[None, :, None]
+        residual = (
+            rng.normal(size=(1, samples, 1)) + true * np.sqrt(2) * np.sin(times)[None, :, None]
+        )
         side = Side(("1",), (times,), residual, np.zeros_like(residual), np.zeros_like(residual))
-        return hidden(story(fitting=side, held_out=None, channels=(Shown("q", "rad", 1.0, stated, 0.0),)))[0]
+        return hidden(
+            story(fitting=side, held_out=None, channels=(Shown("q", "rad", 1.0, stated, 0.0),))
+        )[0]
 
     assert 0.1 < limit(10_000, 0.0) < limit(300, 0.0) < 0.6
     assert limit(300, 0.0, stated=False) > limit(300, 0.0)
@@ -133,7 +173,8 @@ def test_the_unit_of_the_gain_is_that_of_the_channels_whose_noise_is_its_floor()
 def test_parameters_tell_what_they_had_absorbed():
     said = text(story())
     assert (
-        "inertia 0.00333 (0.00325 to 0.00341) kg·m² before, 0.00351 (0.00345 to 0.00357) kg·m² after (+5.4 %)" in said
+        "inertia 0.00333 (0.00325 to 0.00341) kg·m² before, 0.00351 (0.00345 to 0.00357) kg·m² after (+5.4 %)"
+        in said
     )
     assert "it had absorbed part of the gap" in said
     assert "restitution is not touched by these data and stays at its nominal 0.7." in said
@@ -183,7 +224,12 @@ def test_numbers_read_well():
         "−20 %",
         "–",
     ]
-    assert [probability(p) for p in (0.03, 1e-9, 0.0, None)] == ["p = 0.03", "p = 1×10⁻⁹", "p < 1×10⁻¹²", "p unknown"]
+    assert [probability(p) for p in (0.03, 1e-9, 0.0, None)] == [
+        "p = 0.03",
+        "p = 1×10⁻⁹",
+        "p < 1×10⁻¹²",
+        "p unknown",
+    ]
 
 
 def test_estimates_have_the_digits_of_their_intervals():
@@ -195,7 +241,12 @@ def test_estimates_have_the_digits_of_their_intervals():
 
 
 def test_units_and_names_read_well():
-    assert [pretty(u) for u in ("kg*m^2", "1/(m^2*s^2)", "m*s^-2", "1")] == ["kg·m²", "1/(m²·s²)", "m·s⁻²", ""]
+    assert [pretty(u) for u in ("kg*m^2", "1/(m^2*s^2)", "m*s^-2", "1")] == [
+        "kg·m²",
+        "1/(m²·s²)",
+        "m·s⁻²",
+        "",
+    ]
     assert noun("drag.linear+wind") == "linear drag and wind"
     assert noun("my.plugin") == "my.plugin"
     assert joined(["a", "b", "c"], "or") == "a, b or c"

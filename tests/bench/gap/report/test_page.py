@@ -53,7 +53,9 @@ class Reader(HTMLParser):
 @pytest.fixture
 def figures(tmp_path):
     paths = [
-        tmp_path / f"{name}{ending}" for name in ("overview", "where", "candidates") for ending in (".png", ".pdf")
+        tmp_path / f"{name}{ending}"
+        for name in ("overview", "where", "candidates")
+        for ending in (".png", ".pdf")
     ]
     for path in paths:
         path.write_bytes(PIXEL + path.name.encode())
@@ -62,8 +64,13 @@ def figures(tmp_path):
 
 def cells(text, first):
     """The cells of the first table row that begins with a text."""
-    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr[^>]*>(.*?)</tr>", text, re.DOTALL)]
-    return next([unescape(c).replace("\xa0", " ") for c in row] for row in rows if row and row[0] == first)
+    rows = [
+        re.findall(r"<td[^>]*>(.*?)</td>", row)
+        for row in re.findall(r"<tr[^>]*>(.*?)</tr>", text, re.DOTALL)
+    ]
+    return next(
+        [unescape(c).replace("\xa0", " ") for c in row] for row in rows if row and row[0] == first
+    )
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
@@ -87,7 +94,9 @@ def test_it_needs_neither_network_nor_scripts(figures):
     assert not set(reader.tags) & {"script", "link", "iframe", "object", "base", "form"}
     assert not re.search(r"https?:|//[a-z]|@import|url\(", re.sub(r"base64,[^\"]*", "", html))
     assert all(
-        value.startswith("data:image/png;base64,") for _, name, value in reader.attributes if name in ("src", "href")
+        value.startswith("data:image/png;base64,")
+        for _, name, value in reader.attributes
+        if name in ("src", "href")
     )
 
 
@@ -105,7 +114,9 @@ def test_texts_from_files_and_plugins_are_escaped(figures):
 def test_attributes_cannot_be_escaped_from(figures):
     quote = '" onerror="alert(1)'
     told = story()
-    named = replace(told, parameters=tuple(replace(p, name=quote) for p in told.parameters), title=quote)
+    named = replace(
+        told, parameters=tuple(replace(p, name=quote) for p in told.parameters), title=quote
+    )
     named = replace(named, channels=tuple(replace(c, name=quote) for c in told.channels))
     assert not [a for a in Reader(page(named, figures)).attributes if a[1].startswith("on")]
 
@@ -159,7 +170,10 @@ def test_errors_of_channels_are_recomputed_from_the_runs(figures):
 
 def test_sets_that_cannot_be_told_apart_come_with_reason_and_experiment(figures):
     text = Reader(page(story("ambiguous"), figures)).text
-    assert "linear drag (score 812, held-out gain 0.9) and Coulomb friction (score 807, held-out gain 0.89)" in text
+    assert (
+        "linear drag (score 812, held-out gain 0.9) and Coulomb friction (score 807, held-out gain 0.89)"
+        in text
+    )
     assert text.count("Release it from 1.5 rad instead of 0.5 rad") >= 2
 
 
@@ -171,31 +185,58 @@ def test_after_is_not_shown_where_nothing_was_found(figures):
 
 
 def test_it_says_what_remains(figures):
-    assert "The noise of qd is estimated from the data, not stated." in Reader(page(story(), figures)).text
+    assert (
+        "The noise of qd is estimated from the data, not stated."
+        in Reader(page(story(), figures)).text
+    )
     text = Reader(page(story(remains=()), figures)).text
     assert re.search(r"the residual of the held-out runs is 1 times the noise", text)
 
 
 def test_what_is_open_is_not_called_settled(figures):
-    assert "Structure that no known cause explains: the residual" in Reader(page(story("unknown"), figures)).text
-    assert "Structure that no known cause" in Reader(page(story("partial", remains=()), figures)).text
+    assert (
+        "Structure that no known cause explains: the residual"
+        in Reader(page(story("unknown"), figures)).text
+    )
+    assert (
+        "Structure that no known cause" in Reader(page(story("partial", remains=()), figures)).text
+    )
     assert "Nothing that stands out" in Reader(page(story("adequate"), figures)).text
 
 
 def test_gaps_in_what_is_known_do_not_break_the_page():
     bare = story(
-        "unidentifiable", heldout=None, held_out=None, candidates=[], places=(), profiles=(), parameters=(), why=()
+        "unidentifiable",
+        heldout=None,
+        held_out=None,
+        candidates=[],
+        places=(),
+        profiles=(),
+        parameters=(),
+        why=(),
     )
     reader = Reader(page(bare, []))
     assert "No candidate was tried." in reader.text
     assert "img" not in reader.tags
-    nothing = {**HELD_OUT, "rmse_base": None, "rmse_extended": None, "gap_closed": None, "low": None, "high": None}
+    nothing = {
+        **HELD_OUT,
+        "rmse_base": None,
+        "rmse_extended": None,
+        "gap_closed": None,
+        "low": None,
+        "high": None,
+    }
     assert "tuned simulation – rad" in Reader(page(story(heldout=nothing), [])).text
 
 
 def test_many_runs_are_cut_to_the_worst():
     told = story()
-    many = replace(told, places=tuple(replace(told.places[0], label=f"r{i}", before=float(i)) for i in range(1, 500)))
+    many = replace(
+        told,
+        places=tuple(
+            replace(told.places[0], label=f"r{i}", before=float(i)) for i in range(1, 500)
+        ),
+    )
     html = page(many, [])
     assert "The 40 worst of 499." in html
     assert cells(html, "run r499")[2] == "499.00"

@@ -6,13 +6,22 @@ import numpy as np
 import pytest
 
 from bench.gap.report.page import write_report
-from bench.gap.report.panels import MOST_CANDIDATES, chosen_places, profile_panel, ranked, standing, telling
+from bench.gap.report.panels import (
+    MOST_CANDIDATES,
+    chosen_places,
+    profile_panel,
+    ranked,
+    standing,
+    telling,
+)
 from bench.gap.report.pictures import draw, kept, worst
 from bench.gap.report.story import Place
 from sims.base import InputError
 from tests.bench.gap.stories import evil, story
 
-NAMES = [f"{name}{ending}" for name in ("overview", "where", "candidates") for ending in (".png", ".pdf")]
+NAMES = [
+    f"{name}{ending}" for name in ("overview", "where", "candidates") for ending in (".png", ".pdf")
+]
 
 
 def pixels(path):
@@ -65,7 +74,9 @@ def test_any_text_can_be_a_label(tmp_path):
 
 
 def test_what_is_not_there_is_not_drawn(tmp_path):
-    bare = story("unidentifiable", candidates=[], places=(), profiles=(), held_out=None, heldout=None)
+    bare = story(
+        "unidentifiable", candidates=[], places=(), profiles=(), held_out=None, heldout=None
+    )
     assert [p.name for p in draw(bare, tmp_path)] == NAMES[:2]
 
 
@@ -136,7 +147,9 @@ def test_bars_of_a_profile_are_two_standard_errors_long():
 
 
 def test_the_worst_places_are_shown_in_their_order():
-    places = [Place("run", str(i), 100, float(i % 10), 1.0) for i in range(30)] + [Place("run", "x", 0, 99.0, 1.0)]
+    places = [Place("run", str(i), 100, float(i % 10), 1.0) for i in range(30)] + [
+        Place("run", "x", 0, 99.0, 1.0)
+    ]
     shown = chosen_places(places)
     assert [p.label for p in shown] == ["7", "8", "9", "17", "18", "19", "28", "29"]
 
@@ -145,7 +158,8 @@ def test_what_is_found_is_among_the_candidates_shown_although_it_scores_low():
     names = [f"e{i}" for i in range(40)] + ["drag.linear"]
     told = story(
         candidates=[
-            {"effect": n, "score": 100.0 - i, "p_value": 0.5, "heldout_gain": None} for i, n in enumerate(names)
+            {"effect": n, "score": 100.0 - i, "p_value": 0.5, "heldout_gain": None}
+            for i, n in enumerate(names)
         ]
     )
     shown = [c["effect"] for c in ranked(told)]
@@ -155,7 +169,12 @@ def test_what_is_found_is_among_the_candidates_shown_although_it_scores_low():
 
 
 def test_the_standing_of_a_candidate():
-    assert [standing(story(), n) for n in ("drag.linear", "friction.coulomb")] == ["found", "not needed"]
+    assert [standing(story(), n) for n in ("drag.linear", "friction.coulomb")] == [
+        "found",
+        "not needed",
+    ]
     told = story("ambiguous")
-    assert {standing(told, n) for n in ("drag.linear", "friction.coulomb")} == {"found, but cannot be told apart"}
+    assert {standing(told, n) for n in ("drag.linear", "friction.coulomb")} == {
+        "found, but cannot be told apart"
+    }
     assert standing(told, "my.plugin") == "not needed"
