@@ -15,8 +15,7 @@ from bench.figures.style import Styles
 from bench.problem.experiment import Entry, Experiment
 from bench.report import NEEDED
 from bench.store.folder import read
-from methods.base import Array
-from sims.base import InputError
+from sims.base import Array, InputError
 
 
 def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bench.analysis.curves import Curves
 from bench.analysis.runtimes import Effort, effort, percentile_interval, resampled
-from methods.base import Array
+from sims.base import Array
 
 EVEN_COLUMNS = [
     "experiment",

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from methods.base import Array
+from sims.base import Array
 
 FAILED = ("crashed", "timeout", "diverged")
 

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from bench.analysis.curves import Curves, mean_over_seeds
-from methods.base import Array
+from sims.base import Array
 
 PAIR_COLUMNS = [
     "experiment",

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bench.analysis.curves import Curves
 from bench.problem.seeds import rng_for
-from methods.base import Array
+from sims.base import Array
 
 THRESHOLDS: Array = np.logspace(0, -8, 51)
 """Of the runtime distribution, in training widths; as many as COCO's."""

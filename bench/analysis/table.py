@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bench.analysis.curves import Curves, Rows, mean_over_seeds
 from bench.problem.seeds import rng_for
-from methods.base import Array
+from sims.base import Array
 
 CHECKPOINTS = (0, 1, 2, 3, 5, 10, 20, 50, 100)
 METRICS = (

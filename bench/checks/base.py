@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from methods.base import Array
+from sims.base import Array
 
 
 class CheckError(AssertionError):

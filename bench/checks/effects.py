@@ -12,9 +12,8 @@ import numpy as np
 
 from bench.checks.base import CheckError, require, same_bits
 from bench.registry import SkippedError, simulators
-from methods.base import Array
 from sims import effects
-from sims.base import InputError, Scenario
+from sims.base import Array, InputError, Scenario
 from sims.own import OwnSimulator
 from sims.simulated import Simulated
 from sims.system import Contact, Effect, Force, Friction, Input, Moment, Sensor, Signal, System

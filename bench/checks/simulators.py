@@ -8,8 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bench.checks.base import CheckError, require, same_bits
-from methods.base import Array
-from sims.base import Channel, Constant, InputError, Parameter, Scenario, Simulator, UnitCube
+from sims.base import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator, UnitCube
 
 _NAME = re.compile(r"[a-z][a-z0-9_.]*$")
 

@@ -14,7 +14,8 @@ import numpy as np
 from bench.checks.base import CheckError, global_random_state_untouched, require, same_bits
 from bench.checks.processes import elsewhere
 from bench.runs.drive import Trace, drive
-from methods.base import NOTHING, Array, Ask, BudgetExceededError, Evaluation, Steps, Task, Tuner
+from methods.base import NOTHING, Ask, BudgetExceededError, Evaluation, Steps, Task, Tuner
+from sims.base import Array
 
 _TIMES = np.linspace(0.0, 3.0, 40)
 _FIT_BUDGET = 240

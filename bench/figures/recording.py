@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from bench.recordings.inspection import declared
-from methods.base import Array
-from sims.base import InputError, Simulator
+from sims.base import Array, InputError, Simulator
 from sims.recording.recording import Recording, Run
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from bench.analysis.runtimes import percentile_interval, resampled, solved
 from bench.analysis.table import checkpoints
 from bench.figures.style import Styles, canvas, finish, save
 from bench.problem.experiment import Experiment
-from methods.base import Array
+from sims.base import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

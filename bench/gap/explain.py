@@ -26,10 +26,9 @@ from bench.gap.report.story import Shown, Story, Tuned
 from bench.gap.verdict import Answer
 from bench.problem.seeds import rng_for
 from bench.recordings.inspection import load
-from methods.base import Array
 from sims import effects as library
 from sims import extended as extend
-from sims.base import InputError
+from sims.base import Array, InputError
 from sims.extended import Extended, Number
 from sims.own import OwnSimulator
 from sims.simulated import Simulated

@@ -15,7 +15,7 @@ from bench.gap.model.fit import RESPONSE, Fit, Fitter, Start, prior_of
 from bench.gap.model.models import Model, freedom
 from bench.gap.model.noise import Noise, likelihood, whitened
 from bench.gap.model.world import Mask, World
-from methods.base import Array
+from sims.base import Array
 
 Z95 = 1.959964
 RESAMPLES = 2000

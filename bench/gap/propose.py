@@ -17,8 +17,7 @@ import numpy as np
 from bench.gap.causes.search import Search
 from bench.gap.model.models import Model
 from bench.gap.model.world import World
-from methods.base import Array
-from sims.base import Scenario
+from sims.base import Array, Scenario
 
 TELLING = 2.0
 """Two models that differ by less than this many sigmas, RMS, would not be told apart by one more

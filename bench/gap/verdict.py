@@ -18,7 +18,7 @@ from bench.gap.model.floor import Floor
 from bench.gap.model.models import Model
 from bench.gap.model.world import World
 from bench.gap.propose import next_experiment
-from methods.base import Array
+from sims.base import Array
 from sims.extended import Number
 from sims.recording.recording import Recording
 

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from methods.base import Array
-from sims.base import Parameter
+from sims.base import Array, Parameter
 
 STIFF = 0.1
 """A direction is stiff where its 1 sigma (Cramer-Rao bound) is below this share of the training

@@ -19,8 +19,8 @@ from bench.problem.recorded import Side, measured
 from bench.problem.seeds import rng_for
 from bench.problem.signals import signal
 from bench.registry import simulators
-from methods.base import Array, BudgetExceededError, Scene
-from sims.base import InputError, Scenario, Simulator, UnitCube, adjusted, unknown
+from methods.base import BudgetExceededError, Scene
+from sims.base import Array, InputError, Scenario, Simulator, UnitCube, adjusted, unknown
 
 
 @dataclass(frozen=True)

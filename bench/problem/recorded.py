@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from methods.base import Array
-from sims.base import InputError, Scenario, Simulator, unknown
+from sims.base import Array, InputError, Scenario, Simulator, unknown
 from sims.recording.recording import Recording, Run, read_recording
 
 

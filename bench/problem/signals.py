@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from methods.base import Array
-from sims.base import InputError, unknown
+from sims.base import Array, InputError, unknown
 
 _TAU = 2 * np.pi
 

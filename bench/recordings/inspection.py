@@ -9,8 +9,7 @@ import numpy as np
 
 from bench.recordings.noise import Noise, estimated, gaps
 from bench.registry import simulators
-from methods.base import Array
-from sims.base import Channel, InputError, Simulator
+from sims.base import Array, Channel, InputError, Simulator
 from sims.recording.recording import Recording, Run, read_recording, system_of
 
 _MOST_RUNS = 40

@@ -19,8 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from methods.base import Array
-from sims.base import InputError
+from sims.base import Array, InputError
 from sims.camera.files import Filmed
 from sims.camera.track import Track
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from methods.base import Array
+from sims.base import Array
 
 _MAD = 1.4826  # times the median magnitude of a normal variable is its standard deviation
 _GAP = 1.75

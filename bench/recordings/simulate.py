@@ -16,8 +16,7 @@ import numpy as np
 from bench.problem.seeds import rng_for
 from bench.problem.signals import signal
 from bench.registry import simulators
-from methods.base import Array
-from sims.base import InputError, Scenario, Simulator, unknown
+from sims.base import Array, InputError, Scenario, Simulator, unknown
 from sims.own import OwnSimulator
 from sims.recording.recording import Recording, Run
 from sims.recording.write import refuse_existing, write_recording

@@ -13,7 +13,8 @@ from time import perf_counter
 
 import numpy as np
 
-from methods.base import Array, Ask, Evaluation, Task, Tuner
+from methods.base import Ask, Evaluation, Task, Tuner
+from sims.base import Array
 
 Evaluate = Callable[[Array], "tuple[Array, Array]"]
 """Unit-cube points (n, dim) -> observations (n, T, C), losses (n,)."""

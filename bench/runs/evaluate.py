@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from methods.base import Array
+from sims.base import Array
 
 if TYPE_CHECKING:
     from bench.problem.problem import Problem

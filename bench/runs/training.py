@@ -32,8 +32,8 @@ from bench.problem.problem import Problem
 from bench.problem.recorded import find_recording
 from bench.problem.seeds import rng_for
 from bench.registry import simulators, tuners
-from methods.base import Array, Tuner, Watch
-from sims.base import InputError
+from methods.base import Tuner, Watch
+from sims.base import Array, InputError
 
 _COUNTS = "__simulations_and_seconds__"
 _KEY = "__key__"

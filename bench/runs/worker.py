@@ -18,7 +18,8 @@ from bench.runs.drive import Trace, drive
 from bench.runs.evaluate import Evaluator
 from bench.runs.guard import memory_limit
 from bench.runs.training import build, trained
-from methods.base import Array, Task
+from methods.base import Task
+from sims.base import Array
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,8 @@ from bench.shot.pictures import end_of, label_of, shot_panel
 from bench.shot.settings import Settings
 from bench.shot.throw import RATE, throw
 from bench.shot.tune import Model
-from methods.base import Array
 from sims.ball.simulator import Ball
-from sims.base import InputError
+from sims.base import Array, InputError
 from sims.camera.render import Image
 from sims.camera.video import Video
 from sims.recording.recording import read_recording

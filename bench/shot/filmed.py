@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.recordings import tracking
-from methods.base import Array
+from sims.base import Array
 from sims.camera.camera import Camera
 from sims.camera.files import Filmed, beside, described
 from sims.camera.look import Look

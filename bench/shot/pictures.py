@@ -19,7 +19,7 @@ from bench.shot.settings import Settings
 from bench.shot.table import ALL
 from bench.shot.throw import Throw, throw
 from bench.shot.tune import AFTER, EXPLAINED, NOMINAL, Model
-from methods.base import Array
+from sims.base import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,8 +15,7 @@ from bench.problem.experiment import Experiment
 from bench.problem.recorded import Side
 from bench.shot.filmed import AIM, DISTANCE, HEIGHT
 from bench.shot.settings import Settings
-from methods.base import Array
-from sims.base import Scenario
+from sims.base import Array, Scenario
 from sims.recording.recording import Recording
 from sims.shot.balls import ball_named
 

@@ -12,7 +12,7 @@ import numpy as np
 from bench.shot.deal import Deal
 from bench.shot.settings import Settings
 from bench.shot.tune import Model, constants_of, simulator_of, theta_of
-from methods.base import Array
+from sims.base import Array
 from sims.shot.planner import flights
 from sims.shot.scene import crossings
 from sims.shot.world import Ground, fly

@@ -24,9 +24,8 @@ from bench.problem.recorded import Side, scenario_of
 from bench.runs.worker import Order, perform, problem_of
 from bench.shot.rows import before_a_camera, rows_of
 from bench.shot.settings import Settings
-from methods.base import Array
 from sims.ball.simulator import Ball as BallSimulator
-from sims.base import InputError, Scenario
+from sims.base import Array, InputError, Scenario
 from sims.recording.recording import Recording, read_recording
 from sims.shot.planner import Plan, plan
 from sims.shot.scene import Scene

@@ -237,7 +237,7 @@ def test_same_seed_gives_the_same_weights_and_touches_no_global_state():
         torch.get_rng_state(),
         np.random.get_state()[1].copy(),  # noqa: NPY002
         torch.get_num_threads(),
-    )  # noqa: NPY002
+    )
     first, second = (trained(Toy(budget=64), epochs=3).state() for _ in range(2))
     other = trained(Toy(budget=64), seed=1, epochs=3).state()
     assert all(np.array_equal(first[name], second[name]) for name in first)

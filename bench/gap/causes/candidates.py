@@ -17,8 +17,7 @@ import numpy as np
 from bench.gap.model.bounds import CYCLES
 from bench.gap.model.fit import Fit, Start
 from bench.gap.model.world import Mask, World
-from methods.base import Array
-from sims.base import Parameter
+from sims.base import Array, Parameter
 from sims.simulated import effect_parameters
 
 SMALL = 1e-4

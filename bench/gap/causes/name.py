@@ -16,7 +16,7 @@ from bench.gap.causes.structure import Remains, remains
 from bench.gap.measure import HeldOut, Measured, covariance
 from bench.gap.model.models import Model, Names
 from bench.gap.model.noise import Noise
-from methods.base import Array
+from sims.base import Array
 from sims.simulated import effect_parameters
 
 EXPLAINED = 0.7

@@ -16,7 +16,7 @@ from bench.gap.model.fit import Start
 from bench.gap.model.models import Model, Names
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
-from methods.base import Array
+from sims.base import Array
 
 WHITE = 3
 """So many of the best by sum of squares alone are refitted besides: far from the data, noise that

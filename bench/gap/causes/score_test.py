@@ -22,7 +22,7 @@ import numpy as np
 from bench.gap.causes.candidates import Directions
 from bench.gap.model.fit import Fit
 from bench.gap.model.noise import GRID, Mask, Noise, log_determinant
-from methods.base import Array
+from sims.base import Array
 
 SMALL = 4
 """Groups of more columns are taken as they are, without a choice of columns."""

@@ -21,7 +21,7 @@ from bench.gap.model.fit import Start
 from bench.gap.model.models import Model, Models
 from bench.gap.model.multiple_shooting import pieces, whole
 from bench.gap.model.noise import forgets, surrogates
-from methods.base import Array
+from sims.base import Array
 
 SURROGATES = 120
 ALPHA = 0.003

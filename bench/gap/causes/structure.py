@@ -20,7 +20,7 @@ from bench.gap.causes.search import Search
 from bench.gap.model.models import Model
 from bench.gap.model.noise import surrogates
 from bench.gap.model.world import World
-from methods.base import Array
+from sims.base import Array
 from sims.system import Coefficient, Force, Moment
 
 BINS = 7

@@ -12,8 +12,7 @@ import numpy as np
 from bench.gap.model.fit import Fit, Fitter, Start
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
-from methods.base import Array
-from sims.base import Parameter
+from sims.base import Array, Parameter
 
 STARTS, KEPT = 15, 3
 HORIZONS = ((0.2, 6), (0.45, 6), (1.0, 20))

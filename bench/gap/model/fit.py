@@ -18,7 +18,7 @@ import numpy as np
 from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.noise import Noise, whitened
 from bench.gap.model.world import Indices, Mask, World
-from methods.base import Array
+from sims.base import Array
 
 RESPONSE = 0.1
 """Finite differences move a parameter until the observation changes by this share of its noise,

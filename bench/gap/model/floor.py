@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bench.gap.model.world import World
 from bench.recordings.noise import estimated
-from methods.base import Array
+from sims.base import Array
 from sims.recording.recording import Recording
 
 PRECISION = 1e-4

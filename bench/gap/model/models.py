@@ -11,7 +11,7 @@ from bench.gap.model.base_fit import HORIZONS
 from bench.gap.model.fit import Fit, Fitter, Start, prior_of
 from bench.gap.model.noise import Likelihood, Noise, likelihood
 from bench.gap.model.world import Mask, World
-from methods.base import Array
+from sims.base import Array
 
 Names = tuple[str, ...]
 

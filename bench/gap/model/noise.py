@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from methods.base import Array
+from sims.base import Array
 
 Mask = NDArray[np.bool_]
 

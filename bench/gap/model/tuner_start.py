@@ -11,8 +11,8 @@ from bench.gap.model.world import World
 from bench.problem.seeds import rng_for
 from bench.registry import tuners
 from bench.runs.drive import drive
-from methods.base import Array, Task
-from sims.base import InputError, UnitCube
+from methods.base import Task
+from sims.base import Array, InputError, UnitCube
 
 BUDGET, SECONDS = 60, 300.0
 

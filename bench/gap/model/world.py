@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from methods.base import Array
 from sims import effects as library
-from sims.base import InputError, Parameter, Scenario, unknown
+from sims.base import Array, InputError, Parameter, Scenario, unknown
 from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 from sims.system import Effect, Input, Sensor

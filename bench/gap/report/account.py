@@ -24,7 +24,7 @@ from bench.gap.report.words import (
     sentence,
     with_unit,
 )
-from methods.base import Array
+from sims.base import Array
 
 WIDTH = 100
 ESTIMATED = 1.2

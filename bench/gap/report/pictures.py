@@ -33,8 +33,7 @@ from bench.gap.report.panels import (
     telling,
 )
 from bench.gap.report.story import Side, Story
-from methods.base import Array
-from sims.base import InputError
+from sims.base import Array, InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

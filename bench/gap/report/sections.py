@@ -25,7 +25,7 @@ from bench.gap.report.words import (
     sentence,
     with_unit,
 )
-from methods.base import Array
+from sims.base import Array
 
 MOST_ROWS = 40
 """Rows of a table of places; of more, the worst are shown."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from bench.gap.model.world import Mask, World
 from bench.gap.report.story import Place, Profile, Side
-from methods.base import Array
+from sims.base import Array
 
 BINS = 12
 SLOW, QUIET = 0.05, 0.01

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from methods.base import Array
+from sims.base import Array
 
 
 @dataclass(frozen=True)
