@@ -37,21 +37,6 @@ _WORLD = (
     "inputs",
     "sampling",
 )
-_RUN_MAKING = (
-    "drive",
-    "evaluate",
-    "experiment",
-    "guard",
-    "identifiability",
-    "measured",
-    "problem",
-    "scores",
-    "seeds",
-    "signals",
-    "tables",
-    "training",
-    "worker",
-)
 _PACKAGES = (
     "cma",
     "mujoco",
@@ -83,10 +68,8 @@ def code() -> str:
     and scores them.
     """
     project = Path(__file__).resolve().parents[2]
-    files = [project / "bench" / f"{name}.py" for name in _RUN_MAKING]
-    files += [
-        file for part in ("methods", "sims") for file in sorted((project / part).rglob("*.py"))
-    ]
+    rooms = ("methods", "sims", "bench/problem", "bench/runs")
+    files = [file for room in rooms for file in sorted((project / room).rglob("*.py"))]
     return digest(__version__, [[str(f.relative_to(project)), f.read_bytes()] for f in files])
 
 

@@ -129,7 +129,7 @@ def source(kind: type) -> str:
     """Digest of the source of the package folder (or plugin file) that a class comes from."""
     path = Path(inspect.getfile(kind))
     files = (
-        sorted(path.parent.glob("*.py"))
+        sorted(path.parent.rglob("*.py"))
         if kind.__module__.split(".")[0] in ("methods", "sims")
         else [path]
     )

@@ -10,7 +10,7 @@ from bench.analysis.amortisation import Price, break_even, break_even_table, pri
 from bench.analysis.curves import Rows
 from bench.analysis.paired import nemenyi, pairs, ranks
 from bench.analysis.runtimes import Effort, effort, ert_table, reached, solved
-from tests.bench.test_stats import runs_of, statuses_of
+from tests.bench.analysis.test_table import runs_of, statuses_of
 
 
 def curves_of(errors, budget=4, failed=(), seconds=None):

@@ -11,8 +11,8 @@ import pytest
 from bench.gap.report.page import page, write_report
 from bench.gap.report.sections import errors_of
 from sims.base import InputError
+from tests.bench.gap.report.test_account import VERDICTS
 from tests.bench.gap.stories import DRAG, EVIL, HELD_OUT, TILT, evil, story
-from tests.bench.gap.test_account import VERDICTS
 
 VOID = {"meta", "img", "br", "link", "input", "line", "circle"}
 PIXEL = b"\x89PNG\r\n\x1a\n-not-really-an-image"
