@@ -1,0 +1,45 @@
+"""What stands on the pages: fenced blocks, tables, links and headings."""
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+FENCE = re.compile(r"^```(?P<language>\w*) ?(?P<name>[^\n`]*)\n(?P<text>.*?)^```$", re.M | re.S)
+
+
+def text_of(page):
+    """The text of a page below docs/."""
+    return (DOCS / page).read_text(encoding="utf-8")
+
+
+def blocks(text, language=None):
+    """Fenced blocks, (name, text) each; the name stands behind the language."""
+    found = [m for m in FENCE.finditer(text) if language in (None, m["language"])]
+    return [(m["name"], m["text"]) for m in found]
+
+
+def section(text, heading):
+    """What stands below a heading, up to the next of its rank."""
+    marks = heading.split(" ")[0]
+    start = text.index(f"\n{heading}\n") + len(heading) + 2
+    end = re.search(rf"^#{{1,{len(marks)}}} ", text[start:], re.M)
+    return text[start : start + end.start()] if end else text[start:]
+
+
+def tables(text):
+    """Each table as a list of rows, each a list of cells; the header is the first row."""
+    found = [[]]
+    for line in FENCE.sub("", text).splitlines():
+        if line.startswith("|"):
+            cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+            if not all(set(cell) <= set("-:") for cell in cells):
+                found[-1].append(cells)
+        elif found[-1]:
+            found.append([])
+    return [table for table in found if table]
+
+
+def quoted(cell):
+    """What stands in backquotes in a cell."""
+    return re.findall(r"`([^`]+)`", cell)

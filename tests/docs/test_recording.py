@@ -1,0 +1,90 @@
+"""The page on recordings: the real reader reads its example and tells its messages."""
+
+import re
+
+import pytest
+
+from bench.recordings.inspection import summary
+from sims.base import InputError
+from sims.pendulum.simulator import Pendulum
+from sims.recording.recording import read_recording, system_of
+from tests.docs.pages import blocks, quoted, section, tables, text_of
+
+PAGE = text_of("recording.md")
+BLOCKS = dict(blocks(PAGE))
+FAULTS = tables(section(PAGE, "## What a fault is told"))[0][1:]
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """The folder of the page's example, and it is where one stands."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("swing.toml", "swing.csv", "small.toml"):
+        (tmp_path / name).write_text(BLOCKS[name], encoding="utf-8")
+    return tmp_path
+
+
+def test_the_example_reads_as_the_page_says(files):
+    recording = read_recording("swing.csv", Pendulum)
+    light, heavy, last = recording.runs
+    assert system_of("swing.csv") == "pendulum"
+    assert recording.noise == {"q": pytest.approx(0.2 * 3.141592653589793 / 180)}
+    assert recording.extra == {"temperature": "degC"}
+    assert light.inputs["u"].tolist() == pytest.approx([0, 0, 0.05, 0.05])
+    assert heavy.constants == {"mass": 0.25}
+    assert last.initial == {"q": 0.7854, "qd": 0.0}
+    assert [run.held_out for run in recording.runs] == [False, False, True]
+
+
+def test_inspect_says_what_the_page_shows(files):
+    lines = [*summary(read_recording("swing.csv", Pendulum), Pendulum)]
+    assert "\n".join(lines) + "\n" == BLOCKS["inspect"]
+
+
+def test_the_smallest_description_is_enough(files):
+    (files / "small.csv").write_text("run,t,q\na,0,1\na,1,0.5\na,2,0.1\na,3,0\n", encoding="utf-8")
+    fitting, measuring = read_recording("small.csv", Pendulum).runs
+    assert (fitting.times.size, measuring.times.size) == (2, 2)
+
+
+@pytest.mark.parametrize("row", FAULTS, ids=[quoted(row[2])[0] for row in FAULTS])
+def test_a_fault_is_told_what_the_page_says(files, row):
+    (name,), (before,), (after,), (message,) = map(quoted, row)
+    (files / name).write_text(BLOCKS[name].replace(before, after, 1), encoding="utf-8")
+    assert before in BLOCKS[name]
+    with pytest.raises(InputError) as raised:
+        read_recording("swing.csv", Pendulum)
+    assert str(raised.value) == message
+
+
+PLACES = {
+    "": "",
+    "channels.NAME.": "channels.q",
+    "inputs.NAME.": "inputs.u",
+    "extra.NAME.": "extra.temperature",
+    "runs.NAME.": "runs.heavy",
+}
+"""Where keys stand in the page's table, and the example's table of that kind."""
+CONSTANTS = {"gravity", "length", "mass"}
+"""Of the system: a run may name them directly, which the page writes as `runs.NAME.CONSTANT`."""
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_every_key_that_the_reader_knows_stands_on_the_page_and_none_else(files, place):
+    table = PLACES[place]
+    spoilt = {"": "nonsense = 1\n" + BLOCKS["swing.toml"]}.get(
+        table, BLOCKS["swing.toml"].replace(f"[{table}]", f"[{table}]\nnonsense = 1", 1)
+    )
+    (files / "swing.toml").write_text(spoilt, encoding="utf-8")
+    with pytest.raises(InputError, match=r"'nonsense'; there are: ") as raised:
+        read_recording("swing.csv", Pendulum)
+    known = set(str(raised.value).partition("there are: ")[2].split(", ")) - CONSTANTS
+    rows = tables(section(PAGE, "## The description"))[0][1:]
+    keys = {name for row in rows for name in quoted(row[0])}
+    if place:
+        told = {key.removeprefix(place) for key in keys if key.startswith(place)} - {"CONSTANT"}
+    else:
+        told = {
+            key.strip("[]").removesuffix(".NAME") for key in keys if not re.search(r"NAME\.", key)
+        }
+    assert told == known
