@@ -16,6 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
+from types import MappingProxyType
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
@@ -98,6 +99,28 @@ class Moment:
         return result
 
 
+@dataclass(frozen=True)
+class UsualRecording:
+    """What a simulated recording of a system shows where the user does not say.
+
+    Attributes:
+        observe: channels to record; all that the system has where empty.
+        initial: by state, the lowest and the highest value from which each run draws, SI units; a
+            state that is not named begins at its default.
+        inputs: by input, the text of a signal (`bench.problem.signals`), as ``steps:2:0.5``; an
+            input that is not named is zero.
+    """
+
+    observe: tuple[str, ...] = ()
+    initial: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        # One declaration serves every recording of the process: nobody may write into it.
+        object.__setattr__(self, "initial", MappingProxyType(dict(self.initial)))
+        object.__setattr__(self, "inputs", MappingProxyType(dict(self.inputs)))
+
+
 class System(ABC):
     """A physical system, declared once for every engine.
 
@@ -116,6 +139,7 @@ class System(ABC):
         primary: index of the coordinate that biases and springs act on.
         uniform: whether its own force is the same everywhere and always, so that it moves along
             parabolas.
+        usual_recording: what its simulated recordings show where the user does not say.
     """
 
     name: ClassVar[str]
@@ -132,6 +156,7 @@ class System(ABC):
     primary: ClassVar[int] = 0
     bounces: ClassVar[bool] = False
     uniform: ClassVar[bool] = False
+    usual_recording: ClassVar[UsualRecording] = UsualRecording()
 
     @classmethod
     def reading(cls, observed: Sequence[str]) -> str:

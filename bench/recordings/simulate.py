@@ -21,25 +21,9 @@ from sims.own import OwnSimulator
 from sims.recording.recording import Recording, Run
 from sims.recording.write import refuse_existing, write_recording
 from sims.simulated import Simulated
+from sims.system import UsualRecording
 
 _DIGITS = 9
-
-
-@dataclass(frozen=True)
-class Defaults:
-    """What a system's recordings show where the user does not say."""
-
-    observe: tuple[str, ...] = ()
-    initial: tuple[str, ...] = ()
-    inputs: tuple[str, ...] = ()
-
-
-_DEFAULTS = {
-    "ball": Defaults(("x", "y", "z"), ("z=3:5", "vx=-1:1", "vy=-1:1")),
-    "pendulum": Defaults(initial=("q=0.5:1.5",)),
-    "slider": Defaults(inputs=("u=steps:2:0.5",)),
-    "servo": Defaults(initial=("q=-0.5:0.5",), inputs=("goal=steps:1:1", "torque_enable=1")),
-}
 
 
 @dataclass(frozen=True)
@@ -138,14 +122,12 @@ class _Maker:
             self.engine = "batch"
         self.simulator = self._simulator()
         self.noise = _noise(wish.noise, [c.name for c in self.simulator.channels])
-        initial = {
-            **_pairs("", self.usual.initial),
-            **_pairs("--initial", wish.initial, kind.states, "initial state"),
-        }
-        self.ranges = {name: _range(name, text) for name, text in initial.items()}
+        initial = _pairs("--initial", wish.initial, kind.states, "initial state")
+        given = {name: _range(name, text) for name, text in initial.items()}
+        self.ranges = {**self.usual.initial, **given}
         known = [c.name for c in kind.inputs]
         self.inputs = {
-            **_pairs("", self.usual.inputs),
+            **self.usual.inputs,
             **_pairs("--input", wish.inputs, known, "input"),
         }
         self.times = _times(wish)
@@ -263,11 +245,11 @@ def _noise(texts: Sequence[str], channels: Sequence[str]) -> dict[str, float]:
     return values
 
 
-def _usual(kind: type[Simulator]) -> Defaults:
+def _usual(kind: type[Simulator]) -> UsualRecording:
     """Of its system; an extended simulator shows what the recording had that it was fitted to."""
     if not issubclass(kind, Simulated):
-        return Defaults()
-    usual = _DEFAULTS.get(kind.system.name, Defaults())
+        return UsualRecording()
+    usual = kind.system.usual_recording
     return usual if kind.name == kind.system.name else replace(usual, observe=())
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.base import Array, Channel, Constant, Parameter
-from sims.system import Kind, Moment, System
+from sims.system import Kind, Moment, System, UsualRecording
 
 
 class BallSystem(System):
@@ -55,6 +55,10 @@ class BallSystem(System):
         {"x": 0.0, "y": 0.0, "z": 4.5, "vx": 0.0, "vy": 0.0, "vz": 0.0}
     )
     sensed = ("z", "accel_z", "x", "y")
+    usual_recording = UsualRecording(
+        observe=("x", "y", "z"),
+        initial={"z": (3.0, 5.0), "vx": (-1.0, 1.0), "vy": (-1.0, 1.0)},
+    )
     primary = 2
     bounces = True
     uniform = True

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.base import Array, Channel, Constant, Parameter
-from sims.system import Kind, Moment, System
+from sims.system import Kind, Moment, System, UsualRecording
 
 
 class PendulumSystem(System):
@@ -45,6 +45,7 @@ class PendulumSystem(System):
     rates = ("qd",)
     states: ClassVar[Mapping[str, float]] = MappingProxyType({"q": 0.5, "qd": 0.0})
     sensed = ("q", "qd")
+    usual_recording = UsualRecording(initial={"q": (0.5, 1.5)})
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """(L, 1) kg m^2 about the hinge."""

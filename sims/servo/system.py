@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.base import Array, Channel, Constant, Parameter
-from sims.system import Kind, Moment, System
+from sims.system import Kind, Moment, System, UsualRecording
 
 _KT, _RESISTANCE, _ARMATURE = (slice(i, i + 1) for i in range(3))
 
@@ -68,6 +68,10 @@ class ServoSystem(System):
     rates = ("qd",)
     states: ClassVar[Mapping[str, float]] = MappingProxyType({"q": 0.0, "qd": 0.0})
     sensed = ("q",)
+    usual_recording = UsualRecording(
+        initial={"q": (-0.5, 0.5)},
+        inputs={"goal": "steps:1:1", "torque_enable": "1"},
+    )
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """(L, 1) kg m^2 about the joint."""

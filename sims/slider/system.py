@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.base import Array, Channel, Parameter
-from sims.system import Kind, Moment, System
+from sims.system import Kind, Moment, System, UsualRecording
 
 
 class SliderSystem(System):
@@ -28,6 +28,7 @@ class SliderSystem(System):
     rates = ("v",)
     states: ClassVar[Mapping[str, float]] = MappingProxyType({"x": 0.0, "v": 0.0})
     sensed = ("x", "v")
+    usual_recording = UsualRecording(inputs={"u": "steps:2:0.5"})
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """(L, 1) kg."""
