@@ -4,10 +4,8 @@ steps in order.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,7 @@ import numpy as np
 from bench.gap.causes.name import Finding, name
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import CHANCE, Hat, Remains
+from bench.gap.explanation import Explanation
 from bench.gap.measure import HeldOut
 from bench.gap.model.base_fit import Base, fit_base
 from bench.gap.model.floor import Floor, noise_floor
@@ -40,34 +39,6 @@ HUGE = 1e9
 STILL = 6.0
 """A channel whose range is below so many sigmas shows no motion."""
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """The result.
-
-    Attributes:
-        verdict: as verdict.json.
-        story: everything a person is told.
-        extended: the extended simulator.
-    """
-
-    verdict: dict[str, Any]
-    story: Story
-    extended: Extended
-
-    def write(self, folder: Path) -> list[Path]:
-        """Write verdict.json, extended.toml, figures and report.html into a folder that exists."""
-        from bench.gap.report.page import write_report
-        from bench.gap.report.pictures import draw
-
-        paths = [folder / "verdict.json", folder / "extended.toml"]
-        paths[0].write_text(
-            json.dumps(self.verdict, indent=1, allow_nan=False) + "\n", encoding="utf-8"
-        )
-        extend.write(self.extended, paths[1])
-        figures = draw(self.story, folder)
-        return [*paths, *figures, write_report(self.story, folder, figures)]
 
 
 def explain(

@@ -184,13 +184,11 @@ def _explained(recording: Path) -> tuple[Model, Effects]:
         for name, numbers in found.extended.effects.items()
     }
     carried = carry(acting, found.extended.constants.get("gravity", 9.81))
-    verdict = found.verdict
-    reason = f"{verdict['verdict']}: {', '.join(acting) or 'nothing'}"
+    reason = f"{found.verdict}: {', '.join(acting) or 'nothing'}"
     restitution = found.extended.parameters["restitution"].value
     seconds = perf_counter() - started
-    model = Model(
-        EXPLAINED, restitution, carried, int(verdict["simulations"]), seconds, "done", reason
-    )
+    simulations = int(found.answer["simulations"])
+    model = Model(EXPLAINED, restitution, carried, simulations, seconds, "done", reason)
     return model, acting
 
 

@@ -12,7 +12,7 @@ def sees_nothing(path, system=None, engine="batch"):
     """Everything is adequate."""
     assert path.exists()
     assert path.with_suffix(".toml").exists()
-    return SimpleNamespace(verdict=ADEQUATE)
+    return SimpleNamespace(answer=ADEQUATE)
 
 
 def crashes(path, system=None, engine="batch"):

@@ -8,7 +8,8 @@ plugin passes `safe`.
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
 from math import isfinite
 from pathlib import Path
 
@@ -55,15 +56,29 @@ def write_report(story: Story, folder: Path, figures: Sequence[Path]) -> Path:
     path = folder / "report.html"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        path.write_text(page(story, figures), encoding="utf-8")
+        drawn = {p.stem: p.read_bytes() for p in figures if p.suffix == ".png"}
+        path.write_text(page(story, drawn), encoding="utf-8")
     except OSError as error:
-        raise InputError(f"--out {folder}: cannot be written ({error.strerror})") from None
+        raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
     return path
 
 
-def page(story: Story, figures: Sequence[Path]) -> str:
-    """The page as HTML."""
-    pictures = {p.stem: _figure(story, p) for p in figures if p.suffix == ".png"}
+def framed(html: str) -> str:
+    """A page as an element of another one: neither's styles reach the other, and no script runs."""
+    source = escape(html, quote=True)
+    style = "width: 100%; height: 46rem; border: 0"
+    return f'<iframe title="report" sandbox="" style="{style}" srcdoc="{source}"></iframe>'
+
+
+def page(story: Story, drawn: Mapping[str, bytes], for_print: bool = True) -> str:
+    """The page as HTML.
+
+    Args:
+        story: what is told.
+        drawn: the figures as PNG, by name.
+        for_print: name the PDF that lies beside the page under each figure.
+    """
+    pictures = {name: _figure(story, name, png, for_print) for name, png in drawn.items()}
     style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
     parts = [
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
@@ -118,20 +133,22 @@ def _gain(story: Story) -> Iterator[str]:
     yield "</section>"
 
 
-def _figure(story: Story, path: Path) -> str:
-    data = b64encode(path.read_bytes()).decode("ascii")
-    alt = safe(_alternative(story, path.stem), 700)
-    caption = f"{_CAPTIONS.get(path.stem, '')} <span>For print: {safe(path.with_suffix('.pdf').name)}</span>"
+def _figure(story: Story, name: str, png: bytes, for_print: bool) -> str:
+    data = b64encode(png).decode("ascii")
+    alt = safe(_alternative(story, name), 700)
+    caption = _CAPTIONS.get(name, "")
+    if for_print:
+        caption += f" <span>For print: {safe(name)}.pdf</span>"
     image = f'<img src="data:image/png;base64,{data}" alt="{alt}">'
     return f"<figure>\n{image}\n<figcaption>{caption}</figcaption>\n</figure>"
 
 
-def _alternative(story: Story, stem: str) -> str:
+def _alternative(story: Story, name: str) -> str:
     """What a figure shows, for those who do not see it."""
-    if stem == "overview":
+    if name == "overview":
         names = joined([clean(c.name, 30) for c in story.channels])
         return f"Measured and simulated {names} of the run that fits worst, with the residual. {headline(story)}"
-    if stem == "where":
+    if name == "where":
         parts = [
             f"{p.kind} {clean(p.label, 30)} {number(p.before, 2)}"
             for p in worst_first(story.places)[:5]

@@ -8,7 +8,9 @@ mathematics.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -33,7 +35,7 @@ from bench.gap.report.panels import (
     telling,
 )
 from bench.gap.report.story import Side, Story
-from sims.base import Array, InputError
+from sims.base import Array, InputError, unknown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,6 +55,41 @@ _STYLE: dict[Any, Any] = {
 }
 
 
+def names(story: Story) -> tuple[str, ...]:
+    """The figures that a story has: without places or candidates there is nothing to draw of them."""
+    there = {
+        "overview": True,
+        "where": bool(chosen_places(story.places)),
+        "candidates": bool(ranked(story)),
+    }
+    return tuple(name for name, drawn in there.items() if drawn)
+
+
+def figure(story: Story, name: str) -> Figure:
+    """One figure.
+
+    Raises:
+        InputError: the story has none of that name.
+    """
+    known = names(story)
+    if name not in known:
+        raise unknown("figure", name, known)
+    makers = {"overview": _overview, "where": _where, "candidates": _candidates}
+    with _style():
+        made = makers[name](story)
+        # Ticks take their looks from the settings of the moment that they are first needed.
+        made.draw_without_rendering()
+    return made
+
+
+def png(story: Story, name: str) -> bytes:
+    """One figure as the bytes of a PNG file."""
+    file = BytesIO()
+    with _style():
+        _save_png(figure(story, name), file)
+    return file.getvalue()
+
+
 def draw(story: Story, folder: Path) -> list[Path]:
     """Draw what there is to see into `folder`, each figure as PNG and PDF; returns the files, PNG
     before PDF.
@@ -60,32 +97,35 @@ def draw(story: Story, folder: Path) -> list[Path]:
     Raises:
         InputError: the folder cannot be made or written to.
     """
+    paths = []
+    with _style():
+        for name in names(story):
+            paths += _save(figure(story, name), folder, name)
+    return paths
+
+
+@contextmanager
+def _style() -> Iterator[None]:
     from matplotlib import rc_context
 
-    makers: dict[str, Callable[[Story], Figure | None]] = {
-        "overview": _overview,
-        "where": _where,
-        "candidates": _candidates,
-    }
-    made = []
     with rc_context(_STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # a title may be in any script
-        for name, maker in makers.items():
-            figure = maker(story)
-            if figure is not None:
-                made += _save(figure, folder, name)
-    return made
+        yield
 
 
 def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
     paths = [folder / f"{name}.png", folder / f"{name}.pdf"]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        figure.savefig(paths[0], dpi=DPI, pil_kwargs={"compress_level": 3})
+        _save_png(figure, paths[0])
         figure.savefig(paths[1], metadata={"CreationDate": None})
     except OSError as error:
-        raise InputError(f"--out {folder}: cannot be written ({error.strerror})") from None
+        raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
     return paths
+
+
+def _save_png(figure: Figure, file: Path | BytesIO) -> None:
+    figure.savefig(file, format="png", dpi=DPI, pil_kwargs={"compress_level": 3})
 
 
 class Shot(NamedTuple):
@@ -198,10 +238,8 @@ def _at_least(axis: Axes, size: float) -> None:
     axis.set_ylim(min(low, -size), max(high, size))
 
 
-def _where(story: Story) -> Figure | None:
+def _where(story: Story) -> Figure:
     places, profiles = chosen_places(story.places), telling(story.profiles)
-    if not places:
-        return None
     columns, rows = -(-len(profiles) // 2), min(2, len(profiles))
     width, tall = (
         5.2 + (3.1 * columns if columns != 1 else 4.4),
@@ -241,10 +279,8 @@ def _where(story: Story) -> Figure | None:
     return figure
 
 
-def _candidates(story: Story) -> Figure | None:
+def _candidates(story: Story) -> Figure:
     found, total = ranked(story), len(story.verdict["candidates"])
-    if not found:
-        return None
     tall = 1.75 + 0.28 * len(found)
     figure, axes = _canvas(1, 2, (9.4, tall), sharey=True, width_ratios=(3, 2))
     scores_panel(axes[0][0], story, found)

@@ -31,7 +31,7 @@ def test_the_same_cause_is_named(system, engine, tmp_path):
     )
     path = tmp_path / "data.csv"
     write(wish, path)
-    verdict = explain(path, engine=engine).verdict
+    verdict = explain(path, engine=engine).answer
     assert verdict["engine"] == engine
     (cause,) = verdict["causes"]
     name, size = effect.split("=")

@@ -3,12 +3,11 @@ from base64 import b64decode
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bench.gap.report.page import page, write_report
+from bench.gap.report.page import framed, page, write_report
 from bench.gap.report.sections import errors_of
 from sims.base import InputError
 from tests.bench.gap.report.test_account import VERDICTS
@@ -51,15 +50,8 @@ class Reader(HTMLParser):
 
 
 @pytest.fixture
-def figures(tmp_path):
-    paths = [
-        tmp_path / f"{name}{ending}"
-        for name in ("overview", "where", "candidates")
-        for ending in (".png", ".pdf")
-    ]
-    for path in paths:
-        path.write_bytes(PIXEL + path.name.encode())
-    return paths
+def figures():
+    return {name: PIXEL + name.encode() for name in ("overview", "where", "candidates")}
 
 
 def cells(text, first):
@@ -125,7 +117,7 @@ def test_figures_are_embedded_with_alternatives_that_say_what_they_show(figures)
     html = page(story(), figures)
     found = re.findall(r'src="data:image/png;base64,([^"]+)" alt="([^"]+)"', html)
     data = [b64decode(part) for part, _ in found]
-    assert data == [PIXEL + name for name in (b"overview.png", b"where.png", b"candidates.png")]
+    assert data == [PIXEL + name for name in (b"overview", b"where", b"candidates")]
     overview, where, candidates = (alt for _, alt in found)
     assert "q and qd" in overview
     assert "linear drag" in overview
@@ -215,7 +207,7 @@ def test_gaps_in_what_is_known_do_not_break_the_page():
         parameters=(),
         why=(),
     )
-    reader = Reader(page(bare, []))
+    reader = Reader(page(bare, {}))
     assert "No candidate was tried." in reader.text
     assert "img" not in reader.tags
     nothing = {
@@ -226,7 +218,7 @@ def test_gaps_in_what_is_known_do_not_break_the_page():
         "low": None,
         "high": None,
     }
-    assert "tuned simulation – rad" in Reader(page(story(heldout=nothing), [])).text
+    assert "tuned simulation – rad" in Reader(page(story(heldout=nothing), {})).text
 
 
 def test_many_runs_are_cut_to_the_worst():
@@ -237,17 +229,35 @@ def test_many_runs_are_cut_to_the_worst():
             replace(told.places[0], label=f"r{i}", before=float(i)) for i in range(1, 500)
         ),
     )
-    html = page(many, [])
+    html = page(many, {})
     assert "The 40 worst of 499." in html
     assert cells(html, "run r499")[2] == "499.00"
     assert "run r459<" not in html
 
 
 def test_it_is_written_as_utf_8_or_refused_in_one_line(tmp_path, figures):
-    path = write_report(story(), tmp_path / "new", figures)
+    paths = [tmp_path / f"{name}{ending}" for name in figures for ending in (".png", ".pdf")]
+    for path in paths:
+        path.write_bytes(figures[path.stem])
+    path = write_report(story(), tmp_path / "new", paths)
     assert path == tmp_path / "new" / "report.html"
+    assert path.read_text(encoding="utf-8") == page(story(), figures)
     assert "kg·m²" in path.read_bytes().decode("utf-8")
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.raises(InputError, match="cannot be written"):
-        write_report(story(), Path(blocked), figures)
+        write_report(story(), blocked, paths)
+
+
+def test_a_pdf_is_named_only_where_one_lies_beside_the_page(figures):
+    assert "For print: where.pdf" in Reader(page(story(), figures)).text
+    assert "For print" not in Reader(page(story(), figures, for_print=False)).text
+
+
+def test_in_a_frame_the_page_stays_whole(figures):
+    html = page(evil(), figures)
+    reader = Reader(framed(html))
+    attributes = {name: value for _, name, value in reader.attributes}
+    assert reader.tags == ["iframe"]
+    assert attributes["srcdoc"] == html
+    assert attributes["sandbox"] == ""

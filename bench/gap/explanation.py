@@ -1,0 +1,123 @@
+"""The result of `explain`: to look at in a notebook, to ask for its parts, to write into a folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from bench.gap.report import pictures
+from bench.gap.report.account import closes, interval
+from bench.gap.report.page import framed, page, write_report
+from bench.gap.report.story import Story
+from bench.gap.report.words import clean, estimate, joined, percent, with_unit
+from sims import extended as extending
+from sims.base import InputError
+from sims.extended import Extended
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WIDEST = 160
+"""Characters of a line when the result is shown as text; what is longer is cut."""
+
+
+@dataclass(frozen=True, repr=False)
+class Explanation:
+    """The result of `explain`.
+
+    Attributes:
+        answer: as verdict.json.
+        story: everything a person is told.
+        extended: the extended simulator.
+    """
+
+    answer: Mapping[str, Any]
+    story: Story
+    extended: Extended
+
+    @property
+    def verdict(self) -> str:
+        """``adequate``, ``named``, ``ambiguous``, ``partial``, ``unknown`` or ``unidentifiable``."""
+        return str(self.answer["verdict"])
+
+    @property
+    def causes(self) -> Sequence[Mapping[str, Any]]:
+        """What the simulation lacks, as in verdict.json; empty where nothing was found."""
+        causes: Sequence[Mapping[str, Any]] = self.answer["causes"]
+        return causes
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        """Names of the figures that there are: ``overview``, ``where`` and ``candidates`` at most."""
+        return pictures.names(self.story)
+
+    def figure(self, name: str) -> Figure:
+        """One of the report's figures, made anew.
+
+        Raises:
+            InputError: there is none of that name.
+        """
+        return pictures.figure(self.story, name)
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write verdict.json, extended.toml, the figures and report.html: all of them or none.
+
+        The folder is made where it is missing; files of these names in it are replaced.
+
+        Returns:
+            The files in the order above, each figure as PNG before PDF.
+
+        Raises:
+            InputError: the folder cannot be made or written to.
+        """
+        folder = Path(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            # Drawn first and moved last: what fails on the way leaves no half of an answer.
+            with TemporaryDirectory(prefix=".unfinished-", dir=folder) as drafts:
+                paths = self._write_each(Path(drafts))
+                return [path.replace(folder / path.name) for path in paths]
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
+
+    def _write_each(self, folder: Path) -> list[Path]:
+        verdict, extended = folder / "verdict.json", folder / "extended.toml"
+        text = json.dumps(self.answer, indent=1, allow_nan=False)
+        verdict.write_text(text + "\n", encoding="utf-8")
+        extending.write(self.extended, extended)
+        figures = pictures.draw(self.story, folder)
+        return [verdict, extended, *figures, write_report(self.story, folder, figures)]
+
+    def __repr__(self) -> str:
+        lines = [f"{self.verdict}: {self.story.title}", self._causes_in_words(), self._gain()]
+        return "\n".join(clean(line, WIDEST) for line in lines if line)
+
+    def _causes_in_words(self) -> str:
+        return "; ".join(_in_words(cause) for cause in self.causes)
+
+    def _gain(self) -> str:
+        """The share of the gap that is closed; empty where nothing was found or measured."""
+        held_out = self.answer["heldout"]
+        if not self.causes or not closes(held_out):
+            return ""
+        share = percent(held_out["gap_closed"])
+        return f"{share} of the gap closed{interval(held_out)} on held-out runs"
+
+    def _repr_html_(self) -> str:
+        """The report for a cell of a notebook, in a frame of its own so that its styles stay there."""
+        drawn = {name: pictures.png(self.story, name) for name in self.figures}
+        return framed(page(self.story, drawn, for_print=False))
+
+
+def _in_words(cause: Mapping[str, Any]) -> str:
+    """``drag.linear or friction.coulomb: coefficient 2.2×10⁻⁴ (2.0×10⁻⁴ to 2.4×10⁻⁴) N·m·s/rad``."""
+    effects = joined([cause["effect"], *cause["alternatives"]], "or")
+    numbers = [
+        f"{name} {with_unit(estimate(c['value'], c['low'], c['high']), c['unit'])}"
+        for name, c in cause["coefficients"].items()
+    ]
+    return f"{effects}: {joined(numbers)}"
