@@ -9,12 +9,13 @@ import numpy as np
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
 from bench.problem.seeds import rng_for
-from bench.registry import tuners
-from bench.runs.drive import drive
-from methods.base import Task
-from sims.base import Array, InputError, UnitCube
+from bench.runs.standalone import Standalone, recommended
+from sims.base import Array
 
-BUDGET, SECONDS = 60, 300.0
+BUDGET = 60
+"""Simulations of all runs that the tuner may use."""
+SECONDS = 300.0
+"""Time after which the tuner is stopped, seconds."""
 
 
 def tuned(name: str, world: World, noise: Noise, seed: int) -> Array:
@@ -24,41 +25,37 @@ def tuned(name: str, world: World, noise: Noise, seed: int) -> Array:
     Raises:
         InputError: no such tuner, or one that must be trained first.
     """
-    kind = tuners.get(name)
-    if kind.learned:
-        raise InputError(
-            f"tuner {name} must be trained first; expected one that searches, such as least_squares"
-        )
-    cube = UnitCube([world.parameters[i] for i in world.base])
-    runs = np.arange(len(world.tracks))
-    seen = np.isfinite(world.observed)
-
-    def evaluate(points: Array) -> tuple[Array, Array]:
-        theta = np.tile(world.nominal(), (len(points), 1))
-        theta[:, world.base] = cube.physical(points)
-        lanes = world.simulate(
-            np.repeat(theta, len(runs), axis=0),
-            np.tile(runs, len(points)),
-            np.tile(world.guess, (len(points), 1)),
-        )
-        shown = lanes.reshape(len(points), -1, world.observed.shape[2])
-        left = np.where(
-            seen.reshape(shown.shape[1:]), shown - world.observed.reshape(shown.shape[1:]), 0.0
-        )
-        with np.errstate(invalid="ignore"):
-            losses = np.sqrt(np.square(left / noise.sigma).mean(axis=(1, 2)))
-        return shown, np.where(np.isfinite(losses), losses, np.inf)
-
-    observed = world.observed.reshape(-1, world.observed.shape[2])
-    task = Task(
-        dim=cube.dim,
-        start=cube.inverse(world.nominal()[world.base]),
+    channels = world.observed.shape[2]
+    # a tuner knows one table: the runs follow one another, all of them padded to one length
+    observed = world.observed.reshape(-1, channels)
+    problem = Standalone(
+        parameters=[world.parameters[i] for i in world.base],
+        start=world.nominal()[world.base],
         observed=observed,
         scale=noise.sigma,
-        training=cube.training,
-        budget=BUDGET,
-        lengths=(world.observed.shape[1],) * len(runs),
+        lengths=(world.observed.shape[1],) * len(world.tracks),
+        evaluate=lambda base: _evaluated(world, noise, observed, base),
     )
-    trace = drive(kind(), task, evaluate, rng_for("explain", name, seed), SECONDS)
-    best: Array = cube.physical(trace.recommendations[-1])
-    return best
+    return recommended(name, problem, BUDGET, SECONDS, rng_for("explain", name, seed))
+
+
+def _evaluated(world: World, noise: Noise, observed: Array, base: Array) -> tuple[Array, Array]:
+    """Observations (n, T, C) of base parameters (n, b), and their losses (n,).
+
+    The loss is the root mean square of scaled residuals, as in a comparison; what cannot be
+    simulated is infinitely far.
+    """
+    count, runs = len(base), len(world.tracks)
+    theta = np.tile(world.nominal(), (count, 1))
+    theta[:, world.base] = base
+    simulated = world.simulate(
+        np.repeat(theta, runs, axis=0),
+        np.tile(np.arange(runs), count),
+        np.tile(world.guess, (count, 1)),
+    ).reshape(count, -1, observed.shape[1])
+
+    residuals = np.where(np.isfinite(observed), simulated - observed, 0.0)
+    # a lane that was given up is NaN, which is no news here
+    with np.errstate(invalid="ignore"):
+        losses = np.sqrt(np.square(residuals / noise.sigma).mean(axis=(1, 2)))
+    return simulated, np.where(np.isfinite(losses), losses, np.inf)
