@@ -1,105 +1,41 @@
 """Finds tuners, simulators and effects: the project's own, installed plugins' and those of
 `--plugin FILE`.
 
-All come in the same way, through the entry-point groups `simgap.tuners` and `simgap.simulators`,
-and are imported only when asked for. What cannot be imported is listed as skipped, with the reason.
+All come in the same way (`sims.registry.Registry`), through the entry-point groups `simgap.tuners`,
+`simgap.simulators` and `simgap.effects`.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import inspect
-import re
 import sys
 from collections.abc import Iterable
-from functools import lru_cache
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from methods.base import Tuner
-from sims import effects
-from sims.base import InputError, Simulator, unknown
+from sims.base import InputError, Simulator
+from sims.effects import registry as effects
 from sims.extended import load as load_extended
-from sims.system import Effect
+from sims.registry import Registry, SkippedError
 
-T = TypeVar("T", bound="Tuner | Simulator")
-
-
-class SkippedError(InputError):
-    """A registered part cannot be used here; the message says why."""
-
-
-class Registry(Generic[T]):
-    """The registered parts of one kind, by name."""
-
-    def __init__(self, kind: str, group: str, base: type[T]) -> None:
-        self.kind, self.group, self.base = kind, group, base
-        self._from_files: dict[str, type[T]] = {}
-
-    @lru_cache(maxsize=1)  # noqa: B019 - the two registries live as long as the process
-    def _entries(self) -> dict[str, EntryPoint]:
-        return {entry.name: entry for entry in entry_points(group=self.group)}
-
-    def names(self) -> list[str]:
-        """All registered names, sorted."""
-        return sorted({*self._entries(), *self._from_files})
-
-    def get(self, name: str) -> type[T]:
-        """The class registered as `name`.
-
-        Raises:
-            InputError: no such name.
-            SkippedError: it cannot be imported or lacks a package.
-        """
-        if name in self._from_files:
-            found: Any = self._from_files[name]
-        elif name in self._entries():
-            try:
-                found = self._entries()[name].load()
-            except Exception as error:
-                raise SkippedError(f"{type(error).__name__}: {error}") from error
-        else:
-            raise unknown(self.kind, name, self.names())
-        if not (inspect.isclass(found) and issubclass(found, self.base)):
-            raise SkippedError(f"{name} is not a {self.base.__name__}: {found!r}")
-        missing = [
-            package for package in found.requires if importlib.util.find_spec(package) is None
-        ]
-        if missing:
-            raise SkippedError(
-                f"needs {', '.join(missing)}, not installed (pip install {' '.join(missing)})"
-            )
-        result: type[T] = found
-        return result
-
-    def describe(self, name: str) -> str:
-        """One line for a list: what it is, or why it is skipped."""
-        try:
-            found = self.get(name)
-        except SkippedError as reason:
-            return f"skipped: {reason}"
-        says = getattr(found, "says", "") or (inspect.getdoc(found) or "").split("\n\n")[0]
-        return " ".join(says.split())
-
-    def add(self, found: type[T], path: Path) -> None:
-        """Register a class of the plugin file `path`.
-
-        Raises:
-            InputError: the name is taken.
-        """
-        if found.name in self.names():
-            raise InputError(
-                f"plugin {path}: {self.kind} '{found.name}' exists already; give it another name"
-            )
-        self._from_files[found.name] = found
-
+__all__ = [
+    "REGISTRIES",
+    "Registry",
+    "SkippedError",
+    "effects",
+    "load_plugins",
+    "simulators",
+    "tuners",
+]
 
 tuners: Registry[Tuner] = Registry("tuner", "simgap.tuners", Tuner)
 simulators: Registry[Simulator] = Registry("simulator", "simgap.simulators", Simulator)  # type: ignore[type-abstract]
 
-_loaded: set[Path] = set()
+REGISTRIES: tuple[Registry[Any], ...] = (tuners, simulators, effects)
+"""Of each kind of part, in the order in which a plugin's class is tried."""
 
 
 def load_plugins(paths: Iterable[str | Path]) -> None:
@@ -109,56 +45,48 @@ def load_plugins(paths: Iterable[str | Path]) -> None:
     it may extend.
 
     Raises:
-        InputError: a file is missing, does not run, or defines none of them.
+        InputError: a file is missing, does not run, or defines none of them; of this file nothing
+            is registered then.
     """
     for path in sorted((Path(p).resolve() for p in paths), key=lambda p: p.suffix == ".toml"):
-        if path in _loaded:
+        if any(path in registry.paths() for registry in REGISTRIES):
             continue
-        if path.suffix == ".toml":
-            simulators.add(load_extended(path, simulators.get), path)
-            _loaded.add(path)
-            continue
-        module = _run(path)
-        found = [
-            c
-            for c in vars(module).values()
-            if inspect.isclass(c) and c.__module__ == module.__name__
-        ]
-        parts = [
-            c
-            for c in found
-            if issubclass(c, (Tuner, Simulator, Effect)) and not inspect.isabstract(c)
-        ]
-        if not parts:
-            raise InputError(
-                f"plugin {path}: defines neither a Tuner nor a Simulator nor an Effect"
-            )
-        for part in parts:
-            _named(part, path)
-            if issubclass(part, Tuner):
-                tuners.add(part, path)
-            elif issubclass(part, Simulator):
-                simulators.add(part, path)
-            else:
-                effects.register(part)
-        _loaded.add(path)
+        before = [registry.snapshot() for registry in REGISTRIES]
+        try:
+            _load(path)
+        except InputError:
+            # Half a plugin would count as loaded, and its error would be said only once.
+            for registry, snapshot in zip(REGISTRIES, before, strict=True):
+                registry.restore(snapshot)
+            raise
 
 
-_NAME = re.compile(r"[A-Za-z0-9][\w.+-]{0,60}$")
+def _load(path: Path) -> None:
+    if path.suffix == ".toml":
+        simulators.register(load_extended(path, simulators.get), path)
+        return
+    parts = _parts(_run(path))
+    if not parts:
+        raise InputError(f"plugin {path}: defines neither a Tuner nor a Simulator nor an Effect")
+    for registry, part in parts:
+        registry.register(part, path)
 
 
-def _named(part: type, path: Path) -> None:
-    """Refuse a name that tables, files and command lines could not hold."""
-    name = getattr(part, "name", None)
-    if not (isinstance(name, str) and _NAME.match(name)):
-        raise InputError(
-            f"plugin {path}: class {part.__name__}: expected name = 'plain_name', found {name!r:.80}"
-        )
-    requires = getattr(part, "requires", ())
-    if not (isinstance(requires, tuple | list) and all(isinstance(r, str) for r in requires)):
-        raise InputError(
-            f"plugin {path}: class {part.__name__}: expected requires = ('package', ...)"
-        )
+def _parts(module: ModuleType) -> list[tuple[Registry[Any], type]]:
+    """The module's own complete classes of any kind, each with its registry."""
+    own = [
+        value
+        for value in vars(module).values()
+        # what it imports belongs to others
+        if inspect.isclass(value) and value.__module__ == module.__name__
+    ]
+    return [
+        (registry, part)
+        for part in own
+        if not inspect.isabstract(part)
+        for registry in REGISTRIES
+        if registry.accepts(part)
+    ]
 
 
 def _run(path: Path) -> ModuleType:
@@ -168,6 +96,7 @@ def _run(path: Path) -> ModuleType:
     if spec is None or spec.loader is None:
         raise InputError(f"plugin {path}: expected a Python file ending in .py")
     module = importlib.util.module_from_spec(spec)
+    # Dataclasses look their module up while they are made.
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)

@@ -37,13 +37,23 @@ def recordings():
 @pytest.fixture(scope="module", autouse=True)
 def registries_as_before():
     """What a module's tests register is gone after it, but for the test simulator."""
-    from bench import registry
-    from sims import effects
+    from bench.registry import REGISTRIES, simulators
 
-    parts = (registry.tuners._from_files, registry.simulators._from_files, effects._from_files)
-    before, loaded = [dict(p) for p in parts], set(registry._loaded)
+    before = [registry.snapshot() for registry in REGISTRIES]
     yield
-    for part, kept in zip(parts, before, strict=True):
-        for name in [n for n in part if n not in kept and n != "spring"]:
-            del part[name]
-    registry._loaded.intersection_update(loaded | {PLUGINS / "spring.py"})
+    # Other modules hold the class that the session's fixture registered.
+    shared = {name: part for name, part in simulators.snapshot().items() if name == "spring"}
+    for registry, snapshot in zip(REGISTRIES, before, strict=True):
+        registry.restore(snapshot)
+    simulators.restore({**simulators.snapshot(), **shared})
+
+
+@pytest.fixture
+def fresh_registries():
+    """What a test registers is gone after it."""
+    from bench.registry import REGISTRIES
+
+    before = [registry.snapshot() for registry in REGISTRIES]
+    yield
+    for registry, snapshot in zip(REGISTRIES, before, strict=True):
+        registry.restore(snapshot)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from bench.problem import experiment
 from bench.registry import SkippedError, simulators, tuners
 from sims import effects
-from sims.base import Channel, InputError, Simulator
+from sims.base import Channel, Simulator
 from sims.system import KINDS
 
 
@@ -35,8 +35,8 @@ def _systems() -> list[str]:
     for name in simulators.names():
         try:
             result += _system(simulators.get(name))
-        except SkippedError as reason:
-            result.append(f"{name}: skipped: {reason}")
+        except SkippedError as error:
+            result.append(f"{name}: skipped: {error.reason}")
     return result
 
 
@@ -66,8 +66,8 @@ def _effects() -> list[str]:
     for name in effects.names():
         try:
             effect = effects.get(name)
-        except InputError as reason:
-            result.append(f"{name}: skipped: {reason}")
+        except SkippedError as error:
+            result.append(f"{name}: skipped: {error.reason}")
             continue
         result.append(f"{name} ({effect.hook}): {effect.says}")
         for c in effect.coefficients:

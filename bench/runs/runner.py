@@ -112,8 +112,8 @@ def check(experiment: Experiment) -> dict[str, str]:
     for entry in experiment.tuners:
         try:
             build(entry)
-        except SkippedError as reason:
-            skipped[entry.label] = str(reason)
+        except SkippedError as error:
+            skipped[entry.label] = error.reason
     return skipped
 
 

@@ -354,10 +354,11 @@ BROKEN_EFFECTS = {
 
 
 @pytest.mark.parametrize("check", EFFECT_CHECKS, ids=lambda check: check.__name__)
-def test_effect_check_rejects_its_broken_subject_and_no_sound_one(check, monkeypatch):
+def test_effect_check_rejects_its_broken_subject_and_no_sound_one(
+    check, monkeypatch, fresh_registries
+):
     from sims import effects
 
-    monkeypatch.setattr(effects, "_from_files", {})
     check(Breeze)
     broken = BROKEN_EFFECTS[check.__name__]
     if broken is Elsewhere:

@@ -222,8 +222,9 @@ class Coulomb(effects.get("friction.coulomb")):
 
 
 @pytest.fixture
-def elsewhere(monkeypatch):
-    monkeypatch.setattr(effects, "_from_files", {e.name: e for e in (Linear, Quadratic, Coulomb)})
+def elsewhere(fresh_registries):
+    for effect in (Linear, Quadratic, Coulomb):
+        effects.register(effect)
 
 
 @pytest.mark.parametrize("engine", OTHERS)
@@ -272,8 +273,9 @@ class Rising(Friction):
 
 
 @pytest.mark.parametrize("engine", OTHERS)
-def test_any_effect_runs_on_any_engine(engine, monkeypatch):
-    monkeypatch.setattr(effects, "_from_files", {Stop.name: Stop, Rising.name: Rising})
+def test_any_effect_runs_on_any_engine(engine, fresh_registries):
+    effects.register(Stop)
+    effects.register(Rising)
     fixed = {"test.stop": 200.0, "test.rising": 1.5}
     exact = motion("slider", "batch", fixed, time_step=5e-4)
     errors = [apart(motion("slider", engine, fixed, time_step=h), exact) for h in STEPS["slider"]]

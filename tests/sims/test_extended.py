@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench import registry
 from bench.checks import SIMULATOR_CHECKS
 from bench.cli import main
 from bench.recordings.simulate import Wish, make
@@ -23,11 +22,7 @@ MODEL = Extended(
 )  # fmt: skip
 
 
-@pytest.fixture(autouse=True)
-def forgotten(monkeypatch):
-    """Simulators that a test registers are gone after it."""
-    monkeypatch.setattr(simulators, "_from_files", dict(simulators._from_files))
-    monkeypatch.setattr(registry, "_loaded", set(registry._loaded))
+pytestmark = pytest.mark.usefixtures("fresh_registries")
 
 
 @pytest.fixture

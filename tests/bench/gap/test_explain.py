@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench import registry
 from bench.gap.explain import explain
 from bench.recordings.simulate import Wish, make, write
 from bench.registry import load_plugins, simulators
@@ -22,11 +21,7 @@ TIMES = np.arange(90) / 60
 NOISE = {"q": 0.003, "qd": 0.02}
 
 
-@pytest.fixture(autouse=True)
-def forgotten(monkeypatch):
-    """Simulators that a test registers are gone after it."""
-    monkeypatch.setattr(simulators, "_from_files", dict(simulators._from_files))
-    monkeypatch.setattr(registry, "_loaded", set(registry._loaded))
+pytestmark = pytest.mark.usefixtures("fresh_registries")
 
 
 def explained(path, **options):
