@@ -1,8 +1,8 @@
 """Bullet as an engine: forces through its torque and force interfaces, impacts through its contact
 solver.
 
-The world that carries a system is built by the module ``bullet_world`` beside the system's own:
-`build` makes it and, for a system of one coordinate, `load` gives it its inertia.
+The world that carries a system is built by the module ``bullet_world`` beside the system's own;
+`sims.engines.worlds` states what such a module must have.
 """
 
 from __future__ import annotations
@@ -10,14 +10,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 from sims import bullet
 from sims.base import InputError
 from sims.engines import flight, joint, native
-from sims.engines.external import Lane, Path, checked_time_step, integrate, world_module
+from sims.engines.external import Lane, Path, checked_time_step, integrate
 from sims.engines.point import State, Vector
+from sims.engines.worlds import (
+    BulletBallModule,
+    BulletJointModule,
+    BulletModule,
+    world_module,
+)
 from sims.system import Engine, Lanes, Motion, System
 
 REQUIRES = ("pybullet",)
@@ -87,29 +92,33 @@ class BulletEngine:
         self, system: type[System], largest_step: float, own: Mapping[str, float] | None = None
     ) -> None:
         self.largest_step = largest_step
-        module = world_module(system, "bullet_world")
-        if module is None:
-            self._rollout: Callable[[Lane], Path] | None = None
-            return
-        build = module.build if own is None else partial(module.build_native, settings=own)
-        self._world = bullet.World(build)
+        self._rollout: Callable[[Lane], Path] | None = None
+        asked = BulletModule if system.bounces else BulletJointModule
         if own is not None:
+            asked = BulletBallModule
+        module, self._reason = world_module(system, "bullet_world", asked)
+        if module is None:
+            return
+        if own is not None:
+            build = partial(cast(BulletBallModule, module).build_native, settings=own)
+            self._world = bullet.World(build)
             self._rollout = partial(native.rollout, NativeBall(self._world, own))
         elif system.bounces:
+            self._world = bullet.World(cast(BulletModule, module).build)
             self._rollout = partial(flight.rollout, Ball(self._world))
         else:
-            self._rollout = partial(joint.rollout, Joint(self._world, module))
+            body = cast(BulletJointModule, module)
+            self._world = bullet.World(body.build)
+            self._rollout = partial(joint.rollout, Joint(self._world, body))
 
     def integrate(self, lanes: Lanes) -> Motion:
         """See `Engine`."""
         assert self._rollout is not None, "a system that the engine refuses"
         return integrate(lanes, self._rollout, self._world.discard)
 
-    def refuses(self, system: type[System]) -> str:
+    def refuses(self, system: type[System]) -> str:  # noqa: ARG002
         """See `Engine`."""
-        if self._rollout is None:
-            return f"no module bullet_world beside {system.__module__} builds it"
-        return ""
+        return self._reason
 
     def close(self) -> None:
         """Give back the Bullet world; the next integration opens a new one."""
@@ -120,7 +129,7 @@ class BulletEngine:
 class Joint:
     """A body on one hinge or guide; see `sims.engines.joint.Joint`."""
 
-    def __init__(self, world: bullet.World, module: ModuleType) -> None:
+    def __init__(self, world: bullet.World, module: BulletJointModule) -> None:
         self._world = world
         self._load, self._gravity = module.load, module.gravity
         self.open_loop: bool = module.OPEN_LOOP

@@ -17,9 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.util import find_spec
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -283,11 +280,3 @@ def checked_time_step(time_step: float | None, system: type[System]) -> float:
     ):
         raise InputError(f"time_step must be a positive number of seconds, found {time_step}")
     return float(time_step)
-
-
-def world_module(system: type[System], name: str) -> ModuleType | None:
-    """The module `name` beside the module that declares `system`; None where there is none."""
-    package = system.__module__.rpartition(".")[0]
-    if not package or find_spec(f"{package}.{name}") is None:
-        return None
-    return import_module(f"{package}.{name}")

@@ -1,7 +1,7 @@
 """MuJoCo as an engine: forces through ``qfrc_applied``, impacts through its contact solver.
 
-The world that carries a system is written by the module ``mujoco_world`` beside the system's own:
-`model` gives it as MJCF and, for a system of one coordinate, `load` gives it its inertia.
+The world that carries a system is written by the module ``mujoco_world`` beside the system's own;
+`sims.engines.worlds` states what such a module must have.
 """
 
 from __future__ import annotations
@@ -10,11 +10,13 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import cast
 
 from sims.base import InputError
 from sims.engines import flight, joint, native
-from sims.engines.external import Lane, Path, checked_time_step, integrate, world_module
+from sims.engines.external import Lane, Path, checked_time_step, integrate
 from sims.engines.mujoco_bodies import Ball, Joint, SoftBall, World, library
+from sims.engines.worlds import MujocoJointModule, MujocoModule, world_module
 from sims.system import Engine, Lanes, Motion, System
 
 REQUIRES = ("mujoco",)
@@ -70,17 +72,20 @@ class MujocoEngine:
         self, system: type[System], largest_step: float, stiffness: float | None = None
     ) -> None:
         self.largest_step = largest_step
-        module = world_module(system, "mujoco_world")
+        self._rollout: Callable[[Lane], Path] | None = None
+        asked = MujocoModule if system.bounces else MujocoJointModule
+        module, self._reason = world_module(system, "mujoco_world", asked)
         if module is None:
-            self._rollout: Callable[[Lane], Path] | None = None
             return
-        self._world = World(module.model)
+        self._world = World(cast(MujocoModule, module).model)
         if stiffness is not None:
             self._rollout = partial(native.rollout, SoftBall(self._world, stiffness))
         elif system.bounces:
             self._rollout = partial(flight.rollout, Ball(self._world))
         else:
-            self._rollout = partial(joint.rollout, Joint(self._world, module))
+            self._rollout = partial(
+                joint.rollout, Joint(self._world, cast(MujocoJointModule, module))
+            )
 
     def integrate(self, lanes: Lanes) -> Motion:
         """See `Engine`."""
@@ -88,11 +93,9 @@ class MujocoEngine:
         with _quiet():
             return integrate(lanes, self._rollout, self._world.close)
 
-    def refuses(self, system: type[System]) -> str:
+    def refuses(self, system: type[System]) -> str:  # noqa: ARG002
         """See `Engine`."""
-        if self._rollout is None:
-            return f"no module mujoco_world beside {system.__module__} builds it"
-        return ""
+        return self._reason
 
     def close(self) -> None:
         """Give back the MuJoCo world; the next integration makes a new one."""

@@ -21,11 +21,11 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from types import ModuleType
 from typing import Any
 
 from sims.engines import flight
 from sims.engines.point import State, Vector
+from sims.engines.worlds import MujocoJointModule
 
 _IMPACT = 1e-4  # seconds: step of an impact; MuJoCo takes accelerations above 1e10 for a failure
 _IMPEDANCE = 0.9999  # the largest MuJoCo allows
@@ -83,7 +83,7 @@ class World:
 class Joint:
     """A body on one hinge or guide; see `sims.engines.joint.Joint`."""
 
-    def __init__(self, world: World, module: ModuleType) -> None:
+    def __init__(self, world: World, module: MujocoJointModule) -> None:
         self._world = world
         self._load, self._gravity = module.load, module.gravity
         self.open_loop: bool = module.OPEN_LOOP
@@ -99,8 +99,7 @@ class Joint:
         """Step in seconds, generalised inertia, joint damping."""
         self._model.opt.timestep = step
         self._model.dof_damping[0] = damping
-        loaded: bool = self._load(self._model, inertia, self._constants)
-        return loaded
+        return self._load(self._model, inertia, self._constants)
 
     def place(self, x: float, w: float) -> None:
         """The joint's position and velocity."""
