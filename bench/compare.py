@@ -48,7 +48,7 @@ def resume(folder: Path, plugins: Sequence[str]) -> tuple[list[str], Results]:
             it was begun.
     """
     from bench.registry import load_plugins
-    from bench.runs.identity import fingerprint
+    from bench.runs.identity import fingerprint, refuse_changes
     from bench.runs.runner import prepare
 
     held = configuration(folder)
@@ -82,25 +82,6 @@ def only_resume(options: object) -> None:
     if given:
         raise InputError(
             f"--resume takes the configuration of its folder as it is; leave out {', '.join(given)}"
-        )
-
-
-def refuse_changes(folder: Path, before: dict[str, str], now: dict[str, str]) -> None:
-    """Refuse to mix runs of two configurations.
-
-    Raises:
-        InputError: something changed since the folder was begun.
-    """
-    if not before:
-        raise InputError(
-            f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison"
-        )
-    changed = [what for what in now if before.get(what) != now[what]]
-    if changed:
-        what = changed[0]
-        raise InputError(
-            f"{folder}: its {what} changed since it was begun ({before.get(what)} then, {now[what]} now); runs of two "
-            "kinds are not mixed: put it back as it was, or start a new comparison"
         )
 
 

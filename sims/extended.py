@@ -8,6 +8,7 @@ tuner take it.
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -70,6 +71,11 @@ class Extended:
 
 def write(extended: Extended, path: Path) -> None:
     """Write the file."""
+    path.write_text(_written(extended), encoding="utf-8")
+
+
+def _written(extended: Extended) -> str:
+    """The content of the file."""
     import tomli_w
 
     document = {
@@ -86,7 +92,7 @@ def write(extended: Extended, path: Path) -> None:
             for name, numbers in extended.effects.items()
         },
     }
-    path.write_text(tomli_w.dumps(document), encoding="utf-8")
+    return tomli_w.dumps(document)
 
 
 def read(path: Path) -> Extended:
@@ -220,7 +226,15 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
         kind.__init__(self, known, observe or observed, effects=names, **{**engine_of, **settings})
         self.parameters = (*own, *added)
 
-    body = {"__init__": __init__, "system": kind.system, "extends": extended.system}
+    body = {
+        "__init__": __init__,
+        "system": kind.system,
+        "extends": extended.system,
+        # All such classes come from this one text and may have one name: their numbers tell them
+        # apart, or a tuner trained in the one would be taken for trained in the other.
+        "source_digest": hashlib.sha256(_written(extended).encode()).hexdigest(),
+        "made_of": tuple(library.get(name) for name in names),
+    }
     made: type[Simulated] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
     made.name = extended.name
     made.says = (

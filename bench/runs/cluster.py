@@ -20,8 +20,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bench.runs.identity import code, versions
 from bench.runs.pools import Call, LocalPool, LostError
+from bench.runs.sources import rooms, versions
 from bench.runs.training import Training, folder, train
 from bench.runs.worker import Order
 from sims.base import InputError
@@ -75,7 +75,7 @@ class ClusterPool:
             raise InputError(
                 f"--cluster {self.address}: has no workers; start some: dask worker {self.address}"
             )
-        here = (code(), versions())
+        here = (rooms(), versions())
         try:
             others = [w for w, there in self._client.run(_identity).items() if there != here]
         except Exception as error:
@@ -224,7 +224,7 @@ def _itself(content: tuple[str, bytes]) -> tuple[str, bytes]:
 
 def _identity() -> tuple[str, str]:
     """Hashes of the code and the package versions of a worker."""
-    return code(), versions()
+    return rooms(), versions()
 
 
 _pools: dict[tuple[int, Files], LocalPool] = {}

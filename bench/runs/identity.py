@@ -8,75 +8,40 @@ versions.
 
 from __future__ import annotations
 
-import hashlib
-import json
-import platform
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from bench import __version__
 from bench.problem.experiment import Entry, Experiment
 from bench.problem.problem import SealedTarget
-from bench.registry import simulators, tuners
-from bench.runs.training import package_version, recording_digest, source
-
-_WORLD = (
-    "simulator",
-    "observe",
-    "error_channel",
-    "timeout",
-    "memory",
-    "noise",
-    "settings",
-    "world",
-    "constants",
-    "parameters",
-    "initial",
-    "inputs",
-    "sampling",
+from bench.registry import SkippedError, simulators, tuners
+from bench.runs.sources import (
+    digest,
+    effect_sources,
+    plugin_files,
+    recording_digest,
+    rooms,
+    source,
+    versions,
+    what_matters,
 )
-_PACKAGES = (
-    "cma",
-    "mujoco",
-    "nlopt",
-    "numpy",
-    "pybullet",
-    "scikit-learn",
-    "scikit-optimize",
-    "scipy",
-    "torch",
-)
+from sims.base import InputError
 
-
-def digest(*parts: Any, length: int = 10) -> str:
-    """A short hexadecimal hash of plain values, arrays' bytes among them."""
-    text = json.dumps(parts, sort_keys=True, default=_plainly)
-    return hashlib.sha256(text.encode()).hexdigest()[:length]
-
-
-def _plainly(value: Any) -> Any:
-    if isinstance(value, bytes):
-        return hashlib.sha256(value).hexdigest()
-    return dict(value) if isinstance(value, Mapping) else str(value)
-
-
-@cache
-def code() -> str:
-    """Hash of the code that makes runs: methods, worlds, and the part of the harness that drives
-    and scores them.
-    """
-    project = Path(__file__).resolve().parents[2]
-    rooms = ("methods", "sims", "bench/problem", "bench/runs")
-    files = [file for room in rooms for file in sorted((project / room).rglob("*.py"))]
-    return digest(__version__, [[str(f.relative_to(project)), f.read_bytes()] for f in files])
-
-
-@cache
-def versions() -> str:
-    """Hash of the versions of Python and the packages that compute."""
-    return digest(platform.python_version(), [package_version(name) for name in _PACKAGES])
+NOT_OF_A_RUN = {
+    "title": "words",
+    "says": "words",
+    "ranges": "which targets there are; each run's id has its own",
+    "targets": "how many there are",
+    "same_targets_as": "which targets there are; their scenarios and observations are hashed",
+    "held_out": "scenarios and observations of the held-out side are hashed with the target",
+    "seeds": "how many there are; each run's id has its own",
+    "budget": "each run's id has its own, which the tuner's entry may change",
+    "training_budget": "matters to learned tuners alone, and is hashed with their entries",
+    "identifiability": "is found beside the runs, which know nothing of it",
+    "recording": "where it lies; what it holds is hashed",
+    "shot": "what is done with a tuned model afterwards",
+    "tuners": "who else runs; each run's id has its own tuner with its options",
+}
+"""Keys of an experiment that change no run by themselves, each with the reason; all others do."""
 
 
 def fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
@@ -86,23 +51,54 @@ def fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str
     return {
         "configuration": digest(experiment.name, experiment.document()),
         "recording": digest(recording_digest(experiment)),
-        "plugins": digest([[Path(p).name, Path(p).read_bytes()] for p in plugins]),
-        "code": code(),
+        "plugins": plugin_files(plugins),
+        "code": rooms(),
         "package versions": versions(),
+        "simulator and tuners": digest(_classes(experiment)),
     }
+
+
+def _classes(experiment: Experiment) -> list[str]:
+    """Sources of an experiment's simulator and tuners; a notebook's are in no plugin file."""
+    sources = [source(simulators.get(experiment.simulator))]
+    for entry in experiment.tuners:
+        try:
+            sources.append(source(tuners.get(entry.tuner)))
+        except SkippedError:
+            sources.append("skipped")
+    return sources
+
+
+def refuse_changes(folder: Path, before: dict[str, str], now: dict[str, str]) -> None:
+    """Refuse to mix runs of two configurations.
+
+    Raises:
+        InputError: something changed since the folder was begun.
+    """
+    if not before:
+        raise InputError(
+            f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison"
+        )
+    for what, hashed in now.items():
+        if before.get(what) != hashed:
+            raise InputError(
+                f"{folder}: its {what} changed since it was begun ({before.get(what)} then, "
+                f"{hashed} now); runs of two kinds are not mixed: put it back as it was, or start "
+                "a new comparison"
+            )
 
 
 class Identities:
     """Ids of an experiment's runs."""
 
     def __init__(self, experiment: Experiment) -> None:
-        document = experiment.document()
         self._experiment = experiment
         self._world = digest(
-            experiment.name,
-            {name: document[name] for name in _WORLD},
+            what_matters(experiment, NOT_OF_A_RUN),
+            recording_digest(experiment),
             source(simulators.get(experiment.simulator)),
-            code(),
+            effect_sources(experiment.settings, experiment.world),
+            rooms(),
             versions(),
         )
         self._entries: dict[str, str] = {}

@@ -1,26 +1,21 @@
 """Trains learned tuners once for each simulator and seed, and keeps what they learned as plain
 tensors.
 
-The file's name is a hash of everything that went in: the tuner's and simulator's source and
-options, the training range and scenarios, budget, seed, the versions of the packages that compute
-and the device. The file holds the same hash, so that one which was put in another's place is
+The file's name is a hash of everything that went in: the code that makes runs, the tuner's and
+simulator's source and options, the training range and scenarios, budget, seed, the versions of the
+packages that compute and the device (`bench.runs.sources`). The file holds the same hash, so that one which was put in another's place is
 noticed. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
-import inspect
-import json
 import os
-import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import perf_counter
 
@@ -29,9 +24,17 @@ from numpy.typing import NDArray
 
 from bench.problem.experiment import Entry, Experiment
 from bench.problem.problem import Problem
-from bench.problem.recorded import find_recording
 from bench.problem.seeds import rng_for
 from bench.registry import simulators, tuners
+from bench.runs.sources import (
+    digest,
+    effect_sources,
+    recording_digest,
+    rooms,
+    source,
+    versions,
+    what_matters,
+)
 from methods.base import Tuner, Watch
 from sims.base import Array, InputError
 
@@ -75,36 +78,48 @@ def folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "simgap"
 
 
+NOT_OF_A_TRAINING = {
+    "title": "words",
+    "says": "words",
+    "error_channel": "what is reported of runs",
+    "ranges": "targets are met after the training",
+    "targets": "targets are met after the training",
+    "same_targets_as": "targets are met after the training",
+    "held_out": "targets are met after the training",
+    "world": "makes the targets; tuners train in the simulator that they tune",
+    "seeds": "how many trainings there are; each key has its own seed",
+    "budget": "of a run",
+    "timeout": "of a run",
+    "memory": "of a run",
+    "identifiability": "is found beside the runs",
+    "recording": "where it lies; what it holds is hashed",
+    "shot": "what is done with a tuned model afterwards",
+    "tuners": "who else trains; the key has its own tuner with its options",
+}
+"""Keys of an experiment that change no trained weights, each with the reason; all others do."""
+
+
 def key(experiment: Experiment, entry: Entry, seed: int) -> str:
-    """The hash of everything that determines the trained weights."""
-    document = experiment.document()
-    training = (
-        "simulator",
-        "observe",
-        "noise",
-        "settings",
-        "constants",
-        "parameters",
-        "initial",
-        "inputs",
-        "sampling",
+    """The hash of everything that determines the trained weights.
+
+    Raises:
+        InputError: the source of the tuner or the simulator cannot be told.
+    """
+    simulator = simulators.get(experiment.simulator)
+    hashed = digest(
+        what_matters(experiment, NOT_OF_A_TRAINING),
+        recording_digest(experiment),
+        entry.tuner,
+        dict(entry.options),
+        seed,
+        [source(tuners.get(entry.tuner)), source(simulator)],
+        effect_sources(experiment.settings),
+        rooms(),
+        versions(),
+        device(),
+        length=16,
     )
-    what = {name: document[name] for name in training} | {
-        "experiment": experiment.name,  # the seed's stream depends on it
-        "recording": recording_digest(experiment),
-        "tuner": entry.tuner,
-        "options": dict(entry.options),
-        "budget": experiment.training_budget,
-        "seed": seed,
-        "source": [source(tuners.get(entry.tuner)), source(simulators.get(experiment.simulator))],
-        "versions": [sys.version, *(package_version(name) for name in _PACKAGES)],
-        "device": device(),
-    }
-    text = json.dumps(what, sort_keys=True, default=str)
-    return f"{entry.tuner}-{experiment.simulator}-{seed}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
-
-
-_PACKAGES = ("mujoco", "numpy", "pybullet", "sbi", "scipy", "torch")
+    return f"{entry.tuner}-{experiment.simulator}-{seed}-{hashed}"
 
 
 @cache
@@ -115,33 +130,6 @@ def device() -> str:
     import torch
 
     return str(torch.cuda.get_device_name()) if torch.cuda.is_available() else "cpu"
-
-
-def recording_digest(experiment: Experiment) -> str:
-    """Hash of the recording's two files; empty where the experiment has none."""
-    if experiment.recording is None:
-        return ""
-    table = find_recording(experiment.recording.path)
-    return hashlib.sha256(table.read_bytes() + table.with_suffix(".toml").read_bytes()).hexdigest()
-
-
-def source(kind: type) -> str:
-    """Digest of the source of the package folder (or plugin file) that a class comes from."""
-    path = Path(inspect.getfile(kind))
-    files = (
-        sorted(path.parent.rglob("*.py"))
-        if kind.__module__.split(".")[0] in ("methods", "sims")
-        else [path]
-    )
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
-
-
-def package_version(name: str) -> str:
-    """Name and version of an installed package, or that it is absent."""
-    try:
-        return f"{name} {version(name)}"
-    except PackageNotFoundError:
-        return f"{name} absent"
 
 
 def train(

@@ -94,8 +94,7 @@ def make(folder: Path, plugins: Sequence[str], jobs: int, bar: Progress, say: Sa
 
 def _unchanged(folder: Path, plugins: Sequence[str]) -> None:
     """Refuse to mix shots of two configurations."""
-    from bench.compare import refuse_changes
-    from bench.runs.identity import fingerprint
+    from bench.runs.identity import fingerprint, refuse_changes
 
     held = configuration(folder)
     everything = held.plugins + sorted(

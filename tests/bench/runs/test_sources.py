@@ -1,0 +1,321 @@
+"""Whatever makes a run or trains a tuner changes the run's id and the key of the weights."""
+
+import shutil
+import sys
+import textwrap
+from dataclasses import fields, replace
+from importlib import import_module
+
+import pytest
+
+from bench import registry
+from bench.problem.experiment import Entry, Experiment, parse
+from bench.registry import load_plugins, simulators, tuners
+from bench.runs.runner import prepare
+from bench.runs.training import key
+from methods.base import Tuner
+from sims.base import InputError
+from sims.extended import Extended, Number, write
+from tests.experiments import SPRING, spring_experiment
+
+REGRESSOR = Entry("regressor", "regressor")
+PLUGIN = """
+from methods.base import Tuner
+
+class Mine(Tuner):
+    name = "mine"
+    learned = True
+    step = {step}
+
+    def tune(self, task, rng):
+        yield task.start
+"""
+
+
+@pytest.fixture(autouse=True)
+def forgotten(monkeypatch, spring):
+    """What a test registers is gone after it."""
+    for parts in (simulators, tuners):
+        monkeypatch.setattr(parts, "_from_files", dict(parts._from_files))
+    monkeypatch.setattr(registry, "_loaded", set(registry._loaded))
+
+
+def extended(path, scale):
+    """A fitted pendulum, every number of it times `scale`."""
+    model = Extended(
+        "pendulum_extended", "pendulum", "batch", "A swing, measured",
+        {"inertia": Number(3.1e-3 * scale, "kg*m^2", 3.0e-3 * scale, 3.2e-3 * scale)},
+        {"drag.linear": {"coefficient": Number(7e-4 * scale, "N*m*s/rad", None, None)}},
+        {"mass": 0.2 * scale}, ["q"],
+    )  # fmt: skip
+    write(model, path)
+    return path
+
+
+def swing(path):
+    document = {**SPRING, "simulator": "pendulum_extended", "observe": ["q"], "initial": {"q": 1.0}}
+    return parse("swing", document, path)
+
+
+def names_with(plugin, experiment, entry, monkeypatch):
+    """Training key and run ids with this plugin alone loaded."""
+    with monkeypatch.context() as patch:
+        for parts in (simulators, tuners):
+            patch.setattr(parts, "_from_files", dict(parts._from_files))
+        patch.setattr(registry, "_loaded", set(registry._loaded))
+        load_plugins([plugin])
+        plan = prepare(replace(experiment, tuners=(entry,))).plan
+        return key(experiment, entry, 0), {job.order.run for job in plan}
+
+
+def test_extended_simulators_of_one_name_and_other_numbers_share_no_weights_and_no_run(
+    tmp_path, monkeypatch
+):
+    names = []
+    for folder, scale in (("a", 1.0), ("b", 1.5), ("c", 1.0)):
+        (tmp_path / folder).mkdir()
+        path = extended(tmp_path / folder / "extended.toml", scale)
+        names.append(names_with(path, swing(path), REGRESSOR, monkeypatch))
+    (one, runs), (other, other_runs), again = names
+    assert one != other
+    assert not runs & other_runs
+    assert again == (one, runs), "the same content elsewhere is the same simulator"
+
+
+def test_the_system_that_a_plugin_declares_is_part_of_what_extends_it(tmp_path, monkeypatch):
+    source = """
+    from sims.pendulum.simulator import Pendulum
+    from sims.pendulum.system import PendulumSystem
+
+    class System(PendulumSystem):
+        name = "swing"
+
+    class Swing(Pendulum):
+        system = System
+        number = {number}
+    """
+    keys = []
+    for number in (1, 2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        (folder / "swing.py").write_text(textwrap.dedent(source.format(number=number)))
+        path = extended(folder / "extended.toml", 1.0)
+        path.write_text(path.read_text().replace('system = "pendulum"', 'system = "swing"'))
+        with monkeypatch.context() as patch:
+            patch.setattr(simulators, "_from_files", dict(simulators._from_files))
+            patch.setattr(registry, "_loaded", set(registry._loaded))
+            load_plugins([folder / "swing.py", path])
+            keys.append(key(swing(path), REGRESSOR, 0))
+    assert keys[0] != keys[1]
+
+
+def test_plugin_file_is_part_of_the_names_wherever_it_lies(tmp_path, monkeypatch):
+    names = []
+    for folder, step in (("a", 1), ("b", 2), ("c", 1)):
+        (tmp_path / folder).mkdir()
+        path = tmp_path / folder / "mine.py"
+        path.write_text(PLUGIN.format(step=step))
+        names.append(names_with(path, spring_experiment(), Entry("mine", "mine"), monkeypatch))
+    assert names[0][0] != names[1][0]
+    assert not names[0][1] & names[1][1]
+    assert names[0] == names[2]
+
+
+def test_effect_of_a_plugin_file_is_part_of_what_names_it(tmp_path, monkeypatch):
+    source = """
+    from sims.effects.drag import Linear
+
+    class Mine(Linear):
+        name = "drag.mine"
+        number = {number}
+    """
+    from sims import effects
+
+    keys = []
+    for number in (1, 2):
+        path = tmp_path / f"effect{number}.py"
+        path.write_text(textwrap.dedent(source.format(number=number)))
+        with monkeypatch.context() as patch:
+            patch.setattr(effects, "_from_files", {})
+            patch.setattr(registry, "_loaded", set(registry._loaded))
+            load_plugins([path])
+            settings = {"engine": "batch", "fixed": {"drag.mine": 1e-4}}
+            document = {**SPRING, "simulator": "pendulum", "observe": ["q"], "initial": {"q": 1.0}}
+            experiment = parse("swing", {**document, "settings": settings}, path)
+            keys.append(key(experiment, REGRESSOR, 0))
+    assert keys[0] != keys[1]
+
+
+def test_any_file_of_the_rooms_that_make_runs_changes_keys_and_ids(tmp_path, monkeypatch):
+    from bench.runs import sources
+
+    for room in sources.ROOMS:
+        shutil.copytree(
+            sources.ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__")
+        )
+    experiment = spring_experiment()
+    before = key(experiment, REGRESSOR, 0)
+
+    def names():
+        sources.rooms.cache_clear()
+        ids = {job.order.run for job in prepare(experiment).plan}
+        return sources.rooms(), key(experiment, REGRESSOR, 0), ids
+
+    monkeypatch.setattr(sources, "ROOT", tmp_path)
+    try:
+        whole, _, ids = names()
+        files = [file for file in tmp_path.rglob("*") if file.is_file()]
+        for told in (
+            "methods/learning/reader.py",
+            "sims/engines/mujoco.py",
+            "bench/problem/seeds.py",
+        ):
+            assert tmp_path / told in files
+        changed = set()
+        for file in files:
+            text = file.read_bytes()
+            file.write_bytes(text + b"\n")
+            sources.rooms.cache_clear()
+            changed.add(sources.rooms())
+            file.write_bytes(text)
+        assert len(changed - {whole}) == len(files)
+        for file in files[:: len(files) // 5]:
+            text = file.read_bytes()
+            file.write_bytes(text + b"\n")
+            _, now, now_ids = names()
+            assert now != before
+            assert not now_ids & ids
+            file.write_bytes(text)
+    finally:
+        monkeypatch.undo()
+        sources.rooms.cache_clear()
+    assert key(experiment, REGRESSOR, 0) == before
+
+
+def test_a_new_file_in_a_room_counts_and_what_python_compiles_does_not(tmp_path, monkeypatch):
+    from bench.runs import sources
+
+    monkeypatch.setattr(sources, "ROOT", tmp_path)
+    monkeypatch.setattr(sources, "ROOMS", ("room",))
+    (tmp_path / "room" / "__pycache__").mkdir(parents=True)
+    (tmp_path / "room" / "a.py").write_text("a")
+    rooms = sources.rooms.__wrapped__
+    before = rooms()
+    (tmp_path / "room" / "__pycache__" / "a.pyc").write_text("c")
+    assert rooms() == before
+    (tmp_path / "room" / "table.csv").write_text("1")
+    assert rooms() != before
+
+
+def test_class_of_a_script_or_a_notebook_takes_the_digest_of_its_text(monkeypatch):
+    """As IPython does it: a cell's text is known to linecache and its classes are __main__'s."""
+    import linecache
+
+    from bench.runs.sources import in_workers, source
+
+    main = sys.modules["__main__"]
+
+    def cell(number, step):
+        text = PLUGIN.format(step=step)
+        file = f"<cell {number}>"
+        linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
+        space = {"__name__": "__main__"}
+        exec(compile(text, file, "exec"), space)
+        monkeypatch.setattr(main, "Mine", space["Mine"], raising=False)
+        monkeypatch.setattr(main, "__file__", file, raising=False)
+        return space["Mine"]
+
+    one, two = cell(1, 1), cell(2, 2)
+    with pytest.raises(InputError, match="whose source cannot be told"):
+        source(one)  # the name is another class's by now
+    digests = [source(cell(number, step)) for number, step in ((3, 1), (4, 2), (5, 1))]
+    assert digests[0] == digests[2] != digests[1]
+    assert digests[1] == source(cell(6, 2))
+    assert not in_workers(two)
+    assert in_workers(tuners.get("random"))
+    assert in_workers(simulators.get("spring"))
+
+
+def made(number):
+    class Local(Tuner):
+        step = number
+
+    return Local
+
+
+@pytest.mark.parametrize(
+    "kind", [made(1), type("Nobody", (Tuner,), {}), type("Random", (tuners.get("random"),), {})]
+)
+def test_class_whose_source_cannot_be_told_is_refused_with_one_line(kind, monkeypatch):
+    from bench.runs.sources import source
+
+    monkeypatch.setitem(tuners._from_files, "nobody", kind)
+    monkeypatch.setattr(kind, "name", "nobody")
+    for ask in (
+        lambda: source(kind),
+        lambda: key(spring_experiment(), Entry("nobody", "nobody"), 0),
+        lambda: prepare(spring_experiment(tuners={"nobody": {}})),
+    ):
+        with pytest.raises(InputError, match="whose source cannot be told") as error:
+            ask()
+        assert "\n" not in str(error.value)
+
+
+def test_class_made_at_run_time_carries_its_digest_and_a_subclass_does_not_inherit_it():
+    from bench.runs.sources import source
+
+    one, two, again = (
+        type("Made", (Tuner,), {"source_digest": text}) for text in ("one", "two", "one")
+    )
+    assert source(one) == source(again) != source(two)
+    with pytest.raises(InputError, match="cannot be told"):
+        source(type("Sub", (one,), {}))
+
+
+CHANGES = {
+    "name": "another",
+    "simulator": "pendulum",
+    "observe": ("x", "v"),
+    "error_channel": "v",
+    "timeout": 61.0,
+    "memory": 99,
+    "noise": {"x": 0.1},
+    "settings": {"engine": "batch"},
+    "world": {"engine": "batch"},
+    "constants": {"mass": 2.0},
+    "parameters": {"rate": {"training": (2.0, 3.0)}},
+    "initial": {"x": (0.8, 1.3)},
+    "inputs": {"u": "sine:2:0.5"},
+    "sampling": type(Experiment("x").sampling)(20.0, 61),
+    "training_budget": 99,
+}
+"""A change to every key of an experiment that determines a run or a training."""
+
+
+@pytest.mark.parametrize(("module", "but"), [("identity", "NOT_OF_A_RUN"), ("training", "NOT_OF_A_TRAINING")])  # fmt: skip
+def test_every_key_of_an_experiment_matters_or_has_its_reason(module, but):
+    """A new key that nobody gives a reason for must stand in CHANGES, and is seen to matter."""
+    from bench.runs.sources import what_matters
+
+    reasons = getattr(import_module(f"bench.runs.{module}"), but)
+    names = {field.name for field in fields(Experiment)}
+    assert set(reasons) <= names
+    assert all(reason.strip() for reason in reasons.values())
+    mattering = names - set(reasons)
+    assert mattering <= set(CHANGES), "say in CHANGES how it changes, or why it does not matter"
+    plain = spring_experiment()
+    before = what_matters(plain, reasons)
+    for name in mattering:
+        changed = what_matters(replace(plain, **{name: CHANGES[name]}), reasons)
+        assert changed != before, name
+        assert {key for key in changed if changed[key] != before.get(key)} == {name}
+
+
+def test_keys_that_do_not_matter_to_a_training_do_not_change_its_key():
+    plain = spring_experiment()
+    before = key(plain, REGRESSOR, 0)
+    for change in ({"title": "words"}, {"targets": 9}, {"timeout": 9.0}, {"error_channel": "x"}):
+        assert key(replace(plain, **change), REGRESSOR, 0) == before, change
+    for change in ({"noise": {"x": 0.1}}, {"training_budget": 7}, {"name": "another"}):
+        assert key(replace(plain, **change), REGRESSOR, 0) != before, change
+    assert key(plain, REGRESSOR, 1) != before
