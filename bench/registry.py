@@ -89,10 +89,22 @@ def _parts(module: ModuleType) -> list[tuple[Registry[Any], type]]:
     ]
 
 
+def _module_name(path: Path) -> str:
+    """How the module of a plugin file is called."""
+    name = f"simgap_plugin_{path.stem}"
+    number = 1
+    # Two files of one name in two folders are two modules: a class is traced to its source by its
+    # module, and must not be taken for one of the other file.
+    while getattr(sys.modules.get(name), "__file__", str(path)) != str(path):
+        number += 1
+        name = f"simgap_plugin_{path.stem}_{number}"
+    return name
+
+
 def _run(path: Path) -> ModuleType:
     if not path.is_file():
         raise InputError(f"plugin {path}: no such file")
-    spec = importlib.util.spec_from_file_location(f"simgap_plugin_{path.stem}", path)
+    spec = importlib.util.spec_from_file_location(_module_name(path), path)
     if spec is None or spec.loader is None:
         raise InputError(f"plugin {path}: expected a Python file ending in .py")
     module = importlib.util.module_from_spec(spec)

@@ -127,22 +127,27 @@ def source(kind: type) -> str:
     Raises:
         InputError: it has none of these, so that nobody could tell a changed class from this one.
     """
-    return digest([(name, _place(one)) for name, one in sorted(_parts(kind).items())])
+    return digest([(_name(part), _place(part)) for part in _parts(kind)])
 
 
-def _parts(kind: type) -> dict[str, type]:
-    """A class, its bases, and the classes it says it is made of, by their full names."""
-    parts: dict[str, type] = {}
+def _name(kind: type) -> str:
+    """The full name of a class; how a plugin file's module is called depends on what is loaded."""
+    plugin = kind.__module__.startswith(_PLUGIN)
+    return f"{'plugin' if plugin else kind.__module__}.{kind.__qualname__}"
+
+
+def _parts(kind: type) -> list[type]:
+    """A class, its bases, and the classes it says it is made of."""
+    parts: list[type] = []
     waiting = [kind]
     while waiting:
-        for one in waiting.pop().__mro__:
-            name = f"{one.__module__}.{one.__qualname__}"
+        for part in waiting.pop().__mro__:
             # The standard library is in the version of Python. A base that only describes an
             # interface is found there; a class that a metaclass made merely says it is there.
-            if name in parts or (_of_python(one) and _under_its_name(one)):
+            if part in parts or (_of_python(part) and _under_its_name(part)):
                 continue
-            parts[name] = one
-            waiting += vars(one).get("made_of", ())
+            parts.append(part)
+            waiting += vars(part).get("made_of", ())
     return parts
 
 
@@ -219,13 +224,6 @@ def _installed() -> frozenset[str]:
     """Top-level packages of installed plugins, this project's own among them."""
     entries = [entry for group in _GROUPS for entry in entry_points(group=group)]
     return frozenset(entry.module.partition(".")[0] for entry in entries)
-
-
-def in_workers(kind: type) -> bool:
-    """Whether a process that starts afresh, and loads the plugin files, has this class too."""
-    if "source_digest" in vars(kind) or kind.__module__.startswith(_PLUGIN):
-        return True
-    return _top(kind) in _installed()
 
 
 def effect_sources(*settings: Mapping[str, Any]) -> list[str]:

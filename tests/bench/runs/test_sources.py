@@ -3,15 +3,16 @@
 import shutil
 import sys
 import textwrap
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from importlib import import_module
 
 import pytest
 
-from bench import registry
 from bench.problem.experiment import Entry, Experiment, parse
-from bench.registry import load_plugins, simulators, tuners
+from bench.registry import REGISTRIES, load_plugins, tuners
 from bench.runs.runner import prepare
+from bench.runs.sources import source
 from bench.runs.training import key
 from methods.base import Tuner
 from sims.base import InputError
@@ -32,12 +33,17 @@ class Mine(Tuner):
 """
 
 
-@pytest.fixture(autouse=True)
-def forgotten(monkeypatch, spring):
-    """What a test registers is gone after it."""
-    for parts in (simulators, tuners):
-        monkeypatch.setattr(parts, "_from_files", dict(parts._from_files))
-    monkeypatch.setattr(registry, "_loaded", set(registry._loaded))
+pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
+
+
+@contextmanager
+def alone(*plugins):
+    """These plugins are loaded, and gone again."""
+    before = [registry.snapshot() for registry in REGISTRIES]
+    load_plugins(plugins)
+    yield
+    for registry, snapshot in zip(REGISTRIES, before, strict=True):
+        registry.restore(snapshot)
 
 
 def extended(path, scale):
@@ -57,13 +63,9 @@ def swing(path):
     return parse("swing", document, path)
 
 
-def names_with(plugin, experiment, entry, monkeypatch):
+def names_with(plugin, experiment, entry):
     """Training key and run ids with this plugin alone loaded."""
-    with monkeypatch.context() as patch:
-        for parts in (simulators, tuners):
-            patch.setattr(parts, "_from_files", dict(parts._from_files))
-        patch.setattr(registry, "_loaded", set(registry._loaded))
-        load_plugins([plugin])
+    with alone(plugin):
         plan = prepare(replace(experiment, tuners=(entry,))).plan
         return key(experiment, entry, 0), {job.order.run for job in plan}
 
@@ -75,15 +77,15 @@ def test_extended_simulators_of_one_name_and_other_numbers_share_no_weights_and_
     for folder, scale in (("a", 1.0), ("b", 1.5), ("c", 1.0)):
         (tmp_path / folder).mkdir()
         path = extended(tmp_path / folder / "extended.toml", scale)
-        names.append(names_with(path, swing(path), REGRESSOR, monkeypatch))
+        names.append(names_with(path, swing(path), REGRESSOR))
     (one, runs), (other, other_runs), again = names
     assert one != other
     assert not runs & other_runs
     assert again == (one, runs), "the same content elsewhere is the same simulator"
 
 
-def test_the_system_that_a_plugin_declares_is_part_of_what_extends_it(tmp_path, monkeypatch):
-    source = """
+def test_the_system_that_a_plugin_declares_is_part_of_what_extends_it(tmp_path):
+    text = """
     from sims.pendulum.simulator import Pendulum
     from sims.pendulum.system import PendulumSystem
 
@@ -98,47 +100,54 @@ def test_the_system_that_a_plugin_declares_is_part_of_what_extends_it(tmp_path, 
     for number in (1, 2):
         folder = tmp_path / str(number)
         folder.mkdir()
-        (folder / "swing.py").write_text(textwrap.dedent(source.format(number=number)))
+        (folder / "swing.py").write_text(textwrap.dedent(text.format(number=number)))
         path = extended(folder / "extended.toml", 1.0)
         path.write_text(path.read_text().replace('system = "pendulum"', 'system = "swing"'))
-        with monkeypatch.context() as patch:
-            patch.setattr(simulators, "_from_files", dict(simulators._from_files))
-            patch.setattr(registry, "_loaded", set(registry._loaded))
-            load_plugins([folder / "swing.py", path])
+        with alone(folder / "swing.py", path):
             keys.append(key(swing(path), REGRESSOR, 0))
     assert keys[0] != keys[1]
 
 
-def test_plugin_file_is_part_of_the_names_wherever_it_lies(tmp_path, monkeypatch):
+def test_plugin_file_is_part_of_the_names_wherever_it_lies(tmp_path):
     names = []
     for folder, step in (("a", 1), ("b", 2), ("c", 1)):
         (tmp_path / folder).mkdir()
         path = tmp_path / folder / "mine.py"
         path.write_text(PLUGIN.format(step=step))
-        names.append(names_with(path, spring_experiment(), Entry("mine", "mine"), monkeypatch))
+        names.append(names_with(path, spring_experiment(), Entry("mine", "mine")))
     assert names[0][0] != names[1][0]
     assert not names[0][1] & names[1][1]
     assert names[0] == names[2]
 
 
-def test_effect_of_a_plugin_file_is_part_of_what_names_it(tmp_path, monkeypatch):
-    source = """
+def test_plugin_files_of_one_name_in_two_folders_are_told_apart(tmp_path):
+    for step, folder in enumerate(("a", "b")):
+        (tmp_path / folder).mkdir()
+        text = PLUGIN.format(step=step).replace('"mine"', f'"mine_{folder}"')
+        (tmp_path / folder / "mine.py").write_text(text)
+
+    def digests(*folders):
+        with alone(*(tmp_path / folder / "mine.py" for folder in folders)):
+            return {folder: source(tuners.get(f"mine_{folder}")) for folder in folders}
+
+    together = digests("a", "b")
+    assert together["a"] != together["b"]
+    assert {**digests("a"), **digests("b")} == together, "what else is loaded does not matter"
+
+
+def test_effect_of_a_plugin_file_is_part_of_what_names_it(tmp_path):
+    text = """
     from sims.effects.drag import Linear
 
     class Mine(Linear):
         name = "drag.mine"
         number = {number}
     """
-    from sims import effects
-
     keys = []
     for number in (1, 2):
         path = tmp_path / f"effect{number}.py"
-        path.write_text(textwrap.dedent(source.format(number=number)))
-        with monkeypatch.context() as patch:
-            patch.setattr(effects, "_from_files", {})
-            patch.setattr(registry, "_loaded", set(registry._loaded))
-            load_plugins([path])
+        path.write_text(textwrap.dedent(text.format(number=number)))
+        with alone(path):
             settings = {"engine": "batch", "fixed": {"drag.mine": 1e-4}}
             document = {**SPRING, "simulator": "pendulum", "observe": ["q"], "initial": {"q": 1.0}}
             experiment = parse("swing", {**document, "settings": settings}, path)
@@ -211,8 +220,6 @@ def test_class_of_a_script_or_a_notebook_takes_the_digest_of_its_text(monkeypatc
     """As IPython does it: a cell's text is known to linecache and its classes are __main__'s."""
     import linecache
 
-    from bench.runs.sources import in_workers, source
-
     main = sys.modules["__main__"]
 
     def cell(number, step):
@@ -225,15 +232,13 @@ def test_class_of_a_script_or_a_notebook_takes_the_digest_of_its_text(monkeypatc
         monkeypatch.setattr(main, "__file__", file, raising=False)
         return space["Mine"]
 
-    one, two = cell(1, 1), cell(2, 2)
+    one = cell(1, 1)
+    cell(2, 2)
     with pytest.raises(InputError, match="whose source cannot be told"):
         source(one)  # the name is another class's by now
     digests = [source(cell(number, step)) for number, step in ((3, 1), (4, 2), (5, 1))]
     assert digests[0] == digests[2] != digests[1]
     assert digests[1] == source(cell(6, 2))
-    assert not in_workers(two)
-    assert in_workers(tuners.get("random"))
-    assert in_workers(simulators.get("spring"))
 
 
 def made(number):
@@ -247,10 +252,8 @@ def made(number):
     "kind", [made(1), type("Nobody", (Tuner,), {}), type("Random", (tuners.get("random"),), {})]
 )
 def test_class_whose_source_cannot_be_told_is_refused_with_one_line(kind, monkeypatch):
-    from bench.runs.sources import source
-
-    monkeypatch.setitem(tuners._from_files, "nobody", kind)
-    monkeypatch.setattr(kind, "name", "nobody")
+    monkeypatch.setattr(kind, "name", "nobody", raising=False)
+    tuners.register(kind)
     for ask in (
         lambda: source(kind),
         lambda: key(spring_experiment(), Entry("nobody", "nobody"), 0),
@@ -262,8 +265,6 @@ def test_class_whose_source_cannot_be_told_is_refused_with_one_line(kind, monkey
 
 
 def test_class_made_at_run_time_carries_its_digest_and_a_subclass_does_not_inherit_it():
-    from bench.runs.sources import source
-
     one, two, again = (
         type("Made", (Tuner,), {"source_digest": text}) for text in ("one", "two", "one")
     )
@@ -292,7 +293,9 @@ CHANGES = {
 """A change to every key of an experiment that determines a run or a training."""
 
 
-@pytest.mark.parametrize(("module", "but"), [("identity", "NOT_OF_A_RUN"), ("training", "NOT_OF_A_TRAINING")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("module", "but"), [("identity", "NOT_OF_A_RUN"), ("training", "NOT_OF_A_TRAINING")]
+)
 def test_every_key_of_an_experiment_matters_or_has_its_reason(module, but):
     """A new key that nobody gives a reason for must stand in CHANGES, and is seen to matter."""
     from bench.runs.sources import what_matters
