@@ -1,5 +1,15 @@
 """What lies between the commanded input and the one the plant feels; acts on the first input.
 
+With u the command, w what the plant feels and c the coefficient:
+
+* (1) gain: w = (1 + c) u
+* (2) bias: w = u + c
+* (3) delay: w(t) = u(t - c)
+* (4) lag: c dw/dt = u - w; the plant feels its mean over each step (`sims.effects.lag`)
+* (5) dead band: w = u - clip(u, -c, c)
+* (6) saturation: w = clip(u, -c, c)
+* (7) backlash: w stays while |u - w| <= c / 2, else it is pushed along by the nearer flank
+
 A negative delay leads; a negative lag, width or limit is none.
 """
 
@@ -12,116 +22,147 @@ from sims.effects.lag import before, recur, response
 from sims.system import Coefficient, Input, Signal
 
 _USUAL = ("m/s^2", "N", "N*m")
+"""Units of an input that is a force, on the three kinds of system; an input may have another."""
 _TIME = ("s", "s", "s")
+"""Seconds, on every kind of system."""
+_PURE = ("1", "1", "1")
+"""A pure number, on every kind of system."""
+_SHARE = ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
+"""Plausible gains: half as much more or less."""
+_OFFSET = ((-2, 2), (-2, 2), (-0.2, 0.2))
+"""Plausible biases, in the units of `_USUAL`."""
+_WIDTH = ((0, 2), (0, 2), (0, 0.2))
+"""Plausible widths of dead band and play, in the units of `_USUAL`."""
+_LIMIT = ((0, 10), (0, 10), (0, 2))
+"""Plausible limits, in the units of `_USUAL`."""
 _FEEDBACK = "K. J. Astrom, R. M. Murray, Feedback Systems (2008)"
 _NONLINEAR = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
+_PLAY = "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
 
 
 class Gain(Input):
     """The input times 1 + c."""
 
     name = "input.gain"
+    noun = "an input gain"
     says = "the input acts more strongly or weakly than commanded"
     source = _FEEDBACK
-    coefficients = (
-        Coefficient("coefficient", ("1", "1", "1"), ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))),
-    )
+    coefficients = (Coefficient("coefficient", _PURE, _SHARE),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """In proportion."""
-        return signal.values * (1.0 + c[0])
+        return signal.values * (1.0 + c[0])  # (1)
 
 
 class Bias(Input):
     """The input plus c."""
 
     name = "input.bias"
+    noun = "an input bias"
     says = "a constant is added to the input"
     source = _FEEDBACK
-    coefficients = (
-        Coefficient("coefficient", _USUAL, ((-2, 2), (-2, 2), (-0.2, 0.2)), of="input"),
-    )
+    coefficients = (Coefficient("coefficient", _USUAL, _OFFSET, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Shifted."""
-        return signal.values + c[0]
+        return signal.values + c[0]  # (2)
 
 
 class Delay(Input):
     """The input of c seconds ago."""
 
     name = "input.delay"
+    noun = "an input delay"
     says = "the input acts later than commanded"
     source = _FEEDBACK
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
 
     def times(self, c: Array, t: Array) -> Array:
         """Earlier instants."""
-        return t - c[0]
+        return t - c[0]  # (3)
 
 
 class Lag(Input):
     """The input through a first-order lag with time constant c, settled at its first value."""
 
     name = "input.lag"
+    noun = "an input lag"
     says = "the input builds up gradually instead of at once"
     source = _FEEDBACK
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.5), (0, 0.5), (0, 0.5))),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """The lagged input's mean over each step."""
-        decay, mean = response(signal.steps, c[0])
-        ends = recur(decay, (1.0 - decay) * signal.values, signal.start)
-        lagged = signal.values + (before(ends, signal.start) - signal.values) * mean
-        return np.where(c[0] > 0, lagged, signal.values)
+        # (4); without a lag the command itself, bit for bit
+        return np.where(c[0] > 0, _lagged(signal, c[0]), signal.values)
 
 
 class Deadband(Input):
     """Nothing while the input is within c of zero, the excess beyond."""
 
     name = "input.deadband"
+    noun = "an input dead band"
     says = "small inputs have no effect"
     source = _NONLINEAR
-    coefficients = (Coefficient("coefficient", _USUAL, ((0, 2), (0, 2), (0, 0.2)), of="input"),)
+    coefficients = (Coefficient("coefficient", _USUAL, _WIDTH, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """What exceeds the half width."""
-        return np.where(
-            c[0] > 0,
-            signal.values - np.clip(signal.values, -np.abs(c[0]), np.abs(c[0])),
-            signal.values,
-        )
+        half = np.abs(c[0])
+        # what exceeds, not what passes a gate: felt input stays continuous at the border
+        beyond = signal.values - np.clip(signal.values, -half, half)  # (5)
+        return np.where(c[0] > 0, beyond, signal.values)
 
 
 class Saturation(Input):
     """The input limited to c either way; a limit of zero is none."""
 
     name = "input.saturation"
+    noun = "input saturation"
     says = "the input is cut off at a limit"
     source = _NONLINEAR
-    coefficients = (Coefficient("coefficient", _USUAL, ((0, 10), (0, 10), (0, 2)), of="input"),)
+    coefficients = (Coefficient("coefficient", _USUAL, _LIMIT, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """What stays within the limit."""
-        return np.where(
-            c[0] > 0, np.clip(signal.values, -np.abs(c[0]), np.abs(c[0])), signal.values
-        )
+        limit = np.abs(c[0])
+        limited = np.clip(signal.values, -limit, limit)  # (6)
+        # a limit of zero is off, as every effect's zero: it does not cut everything
+        return np.where(c[0] > 0, limited, signal.values)
 
 
 class Backlash(Input):
     """Play of full width c, at its middle when the run starts."""
 
     name = "backlash"
+    noun = "backlash"
     says = "there is play: after a reversal the input acts only once the play is used up"
-    source = (
-        "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
-    )
-    coefficients = (Coefficient("coefficient", _USUAL, ((0, 2), (0, 2), (0, 0.2)), of="input"),)
+    source = _PLAY
+    coefficients = (Coefficient("coefficient", _USUAL, _WIDTH, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """What the far side of the play does."""
-        low, high = signal.values - c[0] / 2, signal.values + c[0] / 2
-        result, state = np.empty_like(low), signal.start[:, 0]
-        for k in range(low.shape[1]):
-            state = result[:, k] = np.clip(state, low[:, k], high[:, k])
-        return np.where(c[0] > 0, result, signal.values)
+        played = _pushed(signal, c[0] / 2)
+        return np.where(c[0] > 0, played, signal.values)
+
+
+def _lagged(signal: Signal, lag: Array) -> Array:
+    """Means (L, S) over each step of (4), `lag` (L, 1) in seconds."""
+    # the command is constant over a step, so (2) of sims.effects.lag leads from end to end
+    decay, mean = response(signal.steps, lag)
+    ends = recur(decay, (1.0 - decay) * signal.values, signal.start)
+    # engines hold the input over a step: its mean gives the momentum that the lagged one gives
+    return signal.values + (before(ends, signal.start) - signal.values) * mean
+
+
+def _pushed(signal: Signal, half: Array) -> Array:
+    """What is pushed to and fro (L, S) by (7), `half` (L, 1) the play to either side."""
+    low = signal.values - half
+    high = signal.values + half
+    result = np.empty_like(low)
+    # where in its play a drive rests is not recorded: the middle favours neither direction
+    state: Array = signal.start[:, 0]
+    for k in range(low.shape[1]):
+        state = np.clip(state, low[:, k], high[:, k])  # (7)
+        result[:, k] = state
+    return result

@@ -1,7 +1,13 @@
 """Dry friction: opposes motion, and holds still at rest what pulls less than its limit.
 
 Each law gives its limit; the engine adds the limits up and applies one force, so that sticking
-sticks. A negative coefficient is none.
+sticks. With v the velocity, limits are
+
+* (1) Coulomb: c
+* (2) Stribeck: coulomb + extra exp(-(v / speed)^2)
+* (3) load: c |drive - load|, each counted as it pushes the joint
+
+A negative limit is none.
 """
 
 from __future__ import annotations
@@ -14,41 +20,43 @@ from sims.system import Coefficient, Friction, Moment
 _SURVEY = (
     "B. Armstrong-Helouvry et al., Automatica 30(7), 1083 (1994), doi:10.1016/0005-1098(94)90209-7"
 )
-_SMALLEST = 1e-9  # Stribeck speed that stands for zero, so that 0 / 0 never comes up
+_SMALLEST = 1e-9
+"""m/s or rad/s; the Stribeck speed that stands for zero, so that 0 / 0 never comes up."""
+_USUAL = ("m/s^2", "N", "N*m")
+"""Units of a force on the three kinds of system."""
 
 
 class Coulomb(Friction):
     """Friction that does not depend on speed: c sign(v)."""
 
     name = "friction.coulomb"
+    noun = "Coulomb friction"
     says = "a constant friction opposes motion, and holds still what pulls less"
     source = _SURVEY
     needs = "guide"
-    coefficients = (Coefficient("coefficient", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),)
+    coefficients = (Coefficient("coefficient", _USUAL, ((0, 5), (0, 5), (0, 0.5))),)
 
     def limit(self, c: Array, moment: Moment) -> Array:  # noqa: ARG002
         """The coefficient."""
-        return np.maximum(c[0], 0.0)
+        return np.maximum(c[0], 0.0)  # (1)
 
 
 class Stribeck(Friction):
     """Friction that falls as motion picks up: coulomb + extra exp(-(v / speed)^2)."""
 
     name = "friction.stribeck"
+    noun = "Stribeck friction"
     says = "friction is greatest at rest and falls as motion picks up"
-    source = _SURVEY
-    needs, contains = "guide", ("friction.coulomb",)
+    needs, contains, source = "guide", ("friction.coulomb",), _SURVEY
     coefficients = (
-        Coefficient("coulomb", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),
-        Coefficient("extra", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),
+        Coefficient("coulomb", _USUAL, ((0, 5), (0, 5), (0, 0.5))),
+        Coefficient("extra", _USUAL, ((0, 5), (0, 5), (0, 0.5))),
         Coefficient("speed", ("m/s", "m/s", "rad/s"), ((0.005, 0.5), (0.005, 0.5), (0.02, 2))),
     )
 
     def limit(self, c: Array, moment: Moment) -> Array:
         """`coulomb` in fast motion, `coulomb` + `extra` at rest."""
-        return np.maximum(
-            c[0] + c[1] * np.exp(-np.square(moment.speed / np.maximum(c[2], _SMALLEST))), 0.0
-        )
+        return np.maximum(c[0] + c[1] * _falling(moment.speed, c[2]), 0.0)  # (2)
 
 
 class Load(Friction):
@@ -57,6 +65,7 @@ class Load(Friction):
     """
 
     name = "friction.load"
+    noun = "load-dependent friction"
     says = "friction grows with the load that the drive carries"
     source = "M. Duclusaud et al. (2024), arXiv:2410.08650, model M3"
     needs = "input"
@@ -64,4 +73,10 @@ class Load(Friction):
 
     def limit(self, c: Array, moment: Moment) -> Array:
         """In proportion to the load."""
-        return np.maximum(c[0], 0.0) * moment.load
+        return np.maximum(c[0], 0.0) * moment.load  # (3)
+
+
+def _falling(speed: Array, scale: Array) -> Array:
+    """(L, 1) share of the extra friction of (2) that is left at a speed."""
+    ratio = speed / np.maximum(scale, _SMALLEST)
+    return np.asarray(np.exp(-np.square(ratio)), dtype=np.float64)

@@ -1,4 +1,7 @@
-"""Lift: force across the direction of flight."""
+"""Lift: force across the direction of flight.
+
+(1) F = s x v with s = c (0, -1, 0) + vertical (0, 0, 1), x the vector product.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +10,27 @@ import numpy as np
 from sims.base import Array
 from sims.system import Coefficient, Force, Moment
 
+_SPINNING = "G. Robinson, I. Robinson, Physica Scripta 88, 018101 (2013), "
+_SPINNING += "doi:10.1088/0031-8949/88/01/018101"
+_FLYING = ("1/s", None, None)
+"""Units: only what flies freely is lifted."""
+_EITHER_WAY = ((-1, 1), (0, 0), (0, 0))
+"""Plausible lift, 1/s; spin has two senses."""
+
 
 class Magnus(Force):
     """Lift of a spinning ball: c times spin axis x velocity, about -y (backspin lifts) and z."""
 
     name = "lift.magnus"
+    noun = "Magnus lift"
     says = "spin makes it swerve, across its direction of flight"
-    source = "G. Robinson, I. Robinson, Physica Scripta 88, 018101 (2013), doi:10.1088/0031-8949/88/01/018101"
-    needs = "space"
+    needs, source = "space", _SPINNING
     coefficients = (
-        Coefficient("coefficient", ("1/s", None, None), ((-1, 1), (0, 0), (0, 0))),
-        Coefficient("vertical", ("1/s", None, None), ((-1, 1), (0, 0), (0, 0))),
+        Coefficient("coefficient", _FLYING, _EITHER_WAY),
+        Coefficient("vertical", _FLYING, _EITHER_WAY),
     )
 
     def force(self, c: Array, moment: Moment) -> Array:
         """Across the velocity, so that it does no work."""
         (level, upright), (vx, vy, vz) = c[:, :, 0], moment.v.T
-        return np.stack([-level * vz - upright * vy, upright * vx, level * vx], axis=1)
+        return np.stack([-level * vz - upright * vy, upright * vx, level * vx], axis=1)  # (1)

@@ -1,15 +1,28 @@
-"""Springs: forces of the primary coordinate, towards its zero."""
+"""Springs: forces of the primary coordinate x, towards its zero.
+
+* (1) linear: F = -c x
+* (2) cubic: F = -c x^3
+"""
 
 from __future__ import annotations
 
 from sims.base import Array
 from sims.system import Coefficient, Force, Moment
 
+_DUFFING = (
+    "I. Kovacic, M. J. Brennan (eds.), The Duffing Equation (2011), doi:10.1002/9780470977859"
+)
+_CUBIC = ("1/(m^2*s^2)", "N/m^3", "N*m/rad^3")
+"""Units of a force by a cube of position."""
+_EITHER_WAY = ((-5, 5), (-50, 50), (-0.5, 0.5))
+"""Plausible cubic terms, in the units of `_CUBIC`: springs harden or soften."""
+
 
 class Linear(Force):
     """A spring that keeps Hooke's law: -c x."""
 
     name = "spring.linear"
+    noun = "a linear spring"
     says = "a spring pulls back in proportion to the distance from zero"
     source = "J. R. Taylor, Classical Mechanics (2005), section 5.1"
     needs = "guide"
@@ -19,24 +32,20 @@ class Linear(Force):
 
     def force(self, c: Array, moment: Moment) -> Array:
         """Towards zero."""
-        return moment.along_primary(-c[0] * moment.primary)
+        return moment.along_primary(-c[0] * moment.primary)  # (1)
 
 
 class Cubic(Force):
     """The cubic term of a spring that hardens (or softens, c < 0): -c x^3."""
 
     name = "spring.cubic"
+    noun = "a cubic spring"
     says = "a spring pulls back in proportion to the cube of the distance from zero"
-    source = (
-        "I. Kovacic, M. J. Brennan (eds.), The Duffing Equation (2011), doi:10.1002/9780470977859"
-    )
+    source = _DUFFING
     needs = "guide"
-    coefficients = (
-        Coefficient(
-            "coefficient", ("1/(m^2*s^2)", "N/m^3", "N*m/rad^3"), ((-5, 5), (-50, 50), (-0.5, 0.5))
-        ),
-    )
+    coefficients = (Coefficient("coefficient", _CUBIC, _EITHER_WAY),)
 
     def force(self, c: Array, moment: Moment) -> Array:
         """Towards zero where c > 0."""
-        return moment.along_primary(-c[0] * moment.primary * moment.primary * moment.primary)
+        x = moment.primary
+        return moment.along_primary(-c[0] * x * x * x)  # (2); a power would be slower

@@ -14,9 +14,11 @@ def table() -> str:
     """The table, in Markdown: an effect's sentence, then a row for each coefficient with its
     plausible ranges.
     """
-    rows = ["| effect, hook | coefficient | " + " | ".join(KINDS) + " |", "|---|---|---|---|---|"]
+    head = "| effect, hook | coefficient | " + " | ".join(KINDS) + " |"
+    rows = [head, "|---|---|---|---|---|"]
     for name in effects.names():
         effect = effects.get(name)
+        # installed plugins' effects come by the same entry points and have pages of their own
         if effect.__module__.startswith("sims.effects."):
             rows += _rows(effect)
     return "\n".join(rows) + "\n"
@@ -26,18 +28,21 @@ def _rows(effect: type[Effect]) -> list[str]:
     head = f"`{effect.name}` ({effect.hook}): {effect.says}"
     rows = []
     for c in effect.coefficients:
-        rows.append(
-            f"| {head} | {c.name} | " + " | ".join(_range(c, i) for i in range(len(KINDS))) + " |"
-        )
-        head = ""
+        ranges = [_range(c, place) for place in range(len(KINDS))]
+        rows.append(f"| {head} | {c.name} | " + " | ".join(ranges) + " |")
+        head = ""  # further coefficients stand below the first
     return rows
 
 
 def _range(c: Coefficient, place: int) -> str:
-    unit, (low, high) = c.units[place], c.plausible[place]
+    unit = c.units[place]
     if unit is None:
         return "–"
-    return f"{low:g} … {high:g}" + ("" if unit == "1" else f" {unit}") + (" (*)" if c.of else "")
+    low, high = c.plausible[place]
+    text = f"{low:g} … {high:g}"
+    if unit != "1":
+        text += f" {unit}"
+    return text + (" (*)" if c.of else "")
 
 
 if __name__ == "__main__":

@@ -3,40 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import floor, isfinite, log10
 
-_NOUNS: Mapping[str, str] = {
-    "backlash": "backlash",
-    "clock.skew": "a clock skew",
-    "contact.friction": "friction at impacts",
-    "drag.linear": "linear drag",
-    "drag.quadratic": "quadratic drag",
-    "force.bias": "a constant force",
-    "force.periodic": "a force periodic in time",
-    "force.ripple": "a force periodic in position",
-    "friction.coulomb": "Coulomb friction",
-    "friction.load": "load-dependent friction",
-    "friction.stribeck": "Stribeck friction",
-    "gravity.scale": "a correction of gravity",
-    "gravity.tilt": "a tilt of gravity",
-    "input.bias": "an input bias",
-    "input.deadband": "an input dead band",
-    "input.delay": "an input delay",
-    "input.gain": "an input gain",
-    "input.lag": "an input lag",
-    "input.saturation": "input saturation",
-    "lift.magnus": "Magnus lift",
-    "restitution.speed": "speed-dependent restitution",
-    "sensor.bias": "a sensor bias",
-    "sensor.delay": "a sensor delay",
-    "sensor.drift": "a sensor drift",
-    "sensor.gain": "a sensor gain",
-    "sensor.lag": "a sensor lag",
-    "spring.cubic": "a cubic spring",
-    "spring.linear": "a linear spring",
-    "wind": "wind",
-}
+from sims import effects
+from sims.base import InputError
+
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _SMALL, _LARGE = 1e-3, 1e5
 """Magnitudes beyond which numbers are written with a power of ten."""
@@ -61,7 +33,20 @@ def noun(effect: str) -> str:
     """An effect as a noun, e.g. ``linear drag``; effects joined by + as ``a and b``; unknown ones
     keep their name.
     """
-    return joined([_NOUNS.get(part.strip(), clean(part, 60)) for part in effect.split("+")])
+    return joined([_noun(part.strip()) for part in effect.split("+")])
+
+
+def _noun(name: str) -> str:
+    """The effect's own noun; for one without, its name and the first clause of what it says."""
+    try:
+        effect = effects.get(name)
+    except InputError:
+        # a verdict may name an effect of a plugin that is not loaded here
+        return clean(name, 60)
+    if effect.noun:
+        return clean(effect.noun, 60)
+    clause = re.split(r"[,:;]", effect.says, maxsplit=1)[0]
+    return clean(f"{name} ({clause})", 60)
 
 
 def name_of(effect: str) -> str:

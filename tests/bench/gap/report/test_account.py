@@ -18,6 +18,7 @@ from bench.gap.report.story import Shown, Side, Tuned
 from bench.gap.report.words import (
     estimate,
     joined,
+    name_of,
     noun,
     number,
     percent,
@@ -252,6 +253,26 @@ def test_units_and_names_read_well():
     assert joined(["a", "b", "c"], "or") == "a, b or c"
     assert sentence("drag.linear wins") == "drag.linear wins."
     assert sentence("no other does!") == "No other does!"
+
+
+def test_a_plugin_says_its_own_noun_or_stands_with_what_it_says(fresh_registries):
+    from sims import effects
+    from sims.effects.spring import Linear
+
+    class Magnet(Linear):
+        name = "spring.magnet"
+        noun = "a magnet's pull"
+        says = "a magnet holds it near zero, and lets go further away"
+
+    class Plain(Magnet):
+        name = "spring.plain"
+        noun = ""
+
+    effects.register(Magnet)
+    effects.register(Plain)
+    assert noun("spring.magnet+wind") == "a magnet's pull and wind"
+    assert name_of("spring.magnet") == "magnet's pull"
+    assert noun("spring.plain") == "spring.plain (a magnet holds it near zero)"
 
 
 def test_every_registered_effect_has_a_noun():
