@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.commands.options import add_plugin, positive
+from bench.commands.options import add_plugin, names, positive
+from bench.commands.wishes import wish
 
 
 def add_simulate(simulate: argparse.ArgumentParser) -> None:
@@ -74,28 +75,32 @@ def add_inspect(inspect: argparse.ArgumentParser) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    from bench.recordings.simulate import Wish, write
+    from bench.api.recordings import simulate
+    from bench.recordings.simulate import ready
     from bench.registry import load_plugins
 
     load_plugins(options.plugin)
-    wish = Wish(
+    ready(options.out)
+    simulated = simulate(
         options.system,
-        options.theta,
-        options.effect,
-        options.constant,
-        options.noise,
-        options.input,
-        options.initial,
-        [name.strip() for name in options.observe.split(",")] if options.observe else [],
-        options.runs,
-        options.seconds,
-        options.rate,
-        options.engine,
-        options.seed,
-        options.held_out,
+        observe=names(options.observe or ""),
+        runs=options.runs,
+        seconds=options.seconds,
+        rate=options.rate,
+        engine=options.engine,
+        seed=options.seed,
+        held_out=options.held_out,
+        **wish(
+            options.theta,
+            options.effect,
+            options.constant,
+            options.noise,
+            options.input,
+            options.initial,
+        ),
     )
-    made = write(wish, options.out)
-    channels = ", ".join(made.recording.runs[0].channels)
+    simulated.write(options.out)
+    channels = ", ".join(simulated.recording.runs[0].channels)
     runs = f"{options.runs} run{'s' * (options.runs > 1)}"
     print(
         f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels {channels}"

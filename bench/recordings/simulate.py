@@ -16,6 +16,7 @@ import numpy as np
 from bench.problem.seeds import rng_for
 from bench.problem.signals import signal
 from bench.registry import simulators
+from sims import effects as library
 from sims.base import Array, InputError, Scenario, Simulator, unknown
 from sims.own import OwnSimulator
 from sims.recording.recording import Recording, Run
@@ -24,21 +25,28 @@ from sims.simulated import Simulated
 from sims.system import UsualRecording
 
 _DIGITS = 9
+"""Significant digits of a number in the table: finer than any sensor, and files stay small."""
+_MOST_SAMPLES = 1e8
+"""Samples of a run beyond which a length or a rate is a slip of the pen."""
+EVERY = "*"
+"""The name that stands for every channel that is not named."""
+
+Coefficients = float | Sequence[float] | Mapping[str, float]
+"""Of one effect: the first, several in order, or some by name."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """A recording to make; texts are ``NAME=VALUE`` as on the command line.
+    """A recording to make; all numbers SI.
 
     Attributes:
         system: registered name.
-        theta: parameters other than their nominal values, or all of them in order with commas
-            between.
-        effects: coefficients, several with commas between.
+        parameters: other than their nominal values, by name; or all of them in order.
+        effects: that act, with their coefficients.
         constants: other than the defaults.
-        noise: 1 sigma, of every channel or by name.
-        inputs: signals by name; see `bench.problem.signals`.
-        initial: a value, or ``LOW:HIGH`` from which each run draws.
+        noise: 1 sigma of every channel, or by channel; ``*`` names those that are not named.
+        inputs: by name, a constant or the text of a signal (`bench.problem.signals`).
+        initial: initial states by name, a value or (low, high) from which each run draws.
         observe: channels to record; the system's usual ones where empty.
         runs: how many.
         seconds: length of a run.
@@ -50,12 +58,12 @@ class Wish:
     """
 
     system: str
-    theta: Sequence[str] = ()
-    effects: Sequence[str] = ()
-    constants: Sequence[str] = ()
-    noise: Sequence[str] = ()
-    inputs: Sequence[str] = ()
-    initial: Sequence[str] = ()
+    parameters: Mapping[str, float] | Sequence[float] = field(default_factory=dict)
+    effects: Mapping[str, Coefficients] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    noise: float | Mapping[str, float] = 0.0
+    inputs: Mapping[str, float | str] = field(default_factory=dict)
+    initial: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
     observe: Sequence[str] = ()
     runs: int = 4
     seconds: float = 4.0
@@ -66,33 +74,53 @@ class Wish:
 
 
 @dataclass(frozen=True)
-class Made:
-    """A simulated recording, its truth as TOML tables, and the simulator that made it."""
+class SimulatedRecording:
+    """A recording made by simulation.
+
+    Attributes:
+        recording: what a real one would tell.
+        truth: what made it, as TOML tables.
+        simulator: that made it.
+    """
 
     recording: Recording
     truth: Mapping[str, Any] = field(repr=False)
-    simulator: Simulator
+    simulator: Simulator = field(repr=False)
+
+    def write(self, path: str | Path) -> list[Path]:
+        """Write the table, its description and its truth: all three or none; returns their paths.
+
+        Args:
+            path: ``NAME.csv``; the others are NAME.toml and NAME.truth.toml beside it.
+
+        Raises:
+            InputError: a file exists already, or cannot be written.
+        """
+        import tomli_w
+
+        out = Path(path)
+        truth = _truth_of(out)
+        beside = {truth: tomli_w.dumps(dict(self.truth))}
+        write_recording(out, self.recording, type(self.simulator), digits=_DIGITS, beside=beside)
+        return [out, out.with_suffix(".toml"), truth]
 
 
-def write(wish: Wish, out: Path) -> Made:
-    """Simulate, and write `out`, its description and its truth: all three or none.
+def ready(out: Path) -> None:
+    """Refuse a path that cannot be written to, before the work, which may take minutes.
 
     Raises:
-        InputError: something in the wish cannot be, or a file exists already.
+        InputError: it is no ``NAME.csv``, or a file exists already.
     """
-    import tomli_w
+    refuse_existing([out, out.with_suffix(".toml"), _truth_of(out)])
 
+
+def _truth_of(out: Path) -> Path:
     if out.suffix != ".csv":
-        raise InputError(f"--out {out}: expected a name that ends in .csv")
-    truth = out.with_suffix(".truth.toml")
-    refuse_existing([out, out.with_suffix(".toml"), truth])
-    made = make(wish)
-    beside = {truth: tomli_w.dumps(made.truth)}
-    write_recording(out, made.recording, type(made.simulator), digits=_DIGITS, beside=beside)
-    return made
+        raise InputError(f"{out}: expected a name that ends in .csv")
+    return out.with_suffix(".truth.toml")
 
 
-def make(wish: Wish) -> Made:
+def make(wish: Wish) -> SimulatedRecording:
     """Simulate the recording.
 
     Raises:
@@ -102,37 +130,29 @@ def make(wish: Wish) -> Made:
 
 
 class _Maker:
+    """A wish, checked."""
+
     def __init__(self, wish: Wish) -> None:
         self.wish = wish
         self.kind = kind = simulators.get(wish.system)
         self.usual = _usual(kind)
-        self.held_out = max(1, wish.runs // 3) if wish.held_out is None else wish.held_out
-        if wish.held_out is None and wish.runs == 1:
-            self.held_out = 0
-        if not 0 <= self.held_out < wish.runs:
-            raise InputError(
-                f"--held-out {self.held_out}: expected fewer than the {wish.runs} runs"
-            )
-        self.theta = _theta(wish.theta, kind)
-        self.effects = {
-            n: _list("--effect", n, text) for n, text in _pairs("--effect", wish.effects).items()
-        }
+        self.held_out = _held_out(wish)
+        self.theta = _theta(wish.parameters, kind)
+        self.effects = {name: _coefficients(name, c, kind) for name, c in wish.effects.items()}
         self.engine = wish.engine
         if not self.engine and issubclass(kind, Simulated) and not issubclass(kind, OwnSimulator):
             self.engine = "batch"
         self.simulator = self._simulator()
         self.noise = _noise(wish.noise, [c.name for c in self.simulator.channels])
-        initial = _pairs("--initial", wish.initial, kind.states, "initial state")
-        given = {name: _range(name, text) for name, text in initial.items()}
+        _known("initial state", wish.initial, list(kind.states))
+        given = {name: _range(name, value) for name, value in wish.initial.items()}
         self.ranges = {**self.usual.initial, **given}
-        known = [c.name for c in kind.inputs]
-        self.inputs = {
-            **self.usual.inputs,
-            **_pairs("--input", wish.inputs, known, "input"),
-        }
+        _known("input", wish.inputs, [c.name for c in kind.inputs])
+        inputs = {**self.usual.inputs, **wish.inputs}
+        self.inputs = {name: _signal_text(name, value) for name, value in inputs.items()}
         self.times = _times(wish)
 
-    def make(self) -> Made:
+    def make(self) -> SimulatedRecording:
         scenarios = {str(number): self._scenario(number) for number in range(1, self.wish.runs + 1)}
         runs = tuple(self._run(int(name), scenario) for name, scenario in scenarios.items())
         stated = {name: sigma for name, sigma in self.noise.items() if sigma}
@@ -150,13 +170,11 @@ class _Maker:
             "runs": {name: {"initial": dict(s.initial)} for name, s in scenarios.items()},
         }
         self.simulator.close()
-        return Made(recording, truth, self.simulator)
+        return SimulatedRecording(recording, truth, self.simulator)
 
     def _simulator(self) -> Simulator:
-        constants = _pairs(
-            "--constant", self.wish.constants, [c.name for c in self.kind.constants], "constant"
-        )
-        values = {name: _number("--constant", name, text) for name, text in constants.items()}
+        _known("constant", self.wish.constants, [c.name for c in self.kind.constants])
+        values = {n: _number("constant", n, value) for n, value in self.wish.constants.items()}
         observe = list(self.wish.observe) or list(self.usual.observe) or None
         if issubclass(self.kind, Simulated):
             return self.kind(values, observe, engine=self.engine, fixed=self.effects)
@@ -173,8 +191,8 @@ class _Maker:
             for name, (low, high) in self.ranges.items()
         }
         inputs = {
-            n: signal(text, self.times, self._rng("input", n, number))
-            for n, text in self.inputs.items()
+            name: signal(text, self.times, self._rng("input", name, number))
+            for name, text in self.inputs.items()
         }
         return Scenario(self.times, initial, inputs)
 
@@ -182,67 +200,17 @@ class _Maker:
         observed = self.simulator.simulate(np.array([list(self.theta.values())]), scenario)[0]
         if not np.isfinite(observed).all():
             raise InputError(
-                f"run {number}: the simulation failed; check --theta, --effect and --initial"
+                f"run {number}: the simulation failed; check parameters, effects and initial states"
             )
         channels = {}
-        for name, values in zip(self.noise, observed.T, strict=True):
-            channels[name] = values + self.noise[name] * self._rng(
-                "noise", name, number
-            ).standard_normal(values.size)
+        for (name, sigma), values in zip(self.noise.items(), observed.T, strict=True):
+            rng = self._rng("noise", name, number)
+            channels[name] = values + sigma * rng.standard_normal(values.size)
         held_out = number > self.wish.runs - self.held_out
         return Run(str(number), self.times, channels, scenario.inputs, {}, {}, held_out)
 
     def _rng(self, what: str, name: str, number: int) -> np.random.Generator:
         return rng_for("simulate", self.wish.system, what, name, self.wish.seed, number)
-
-
-def _times(wish: Wish) -> Array:
-    samples = round(wish.seconds * wish.rate) if 0 < wish.seconds * wish.rate < 1e8 else 0
-    if samples < 2:
-        raise InputError(
-            f"--seconds {wish.seconds:g} --rate {wish.rate:g}: expected at least 2 samples and below 1e8"
-        )
-    return np.array([float(f"{t:.{_DIGITS}g}") for t in (np.arange(samples) / wish.rate).tolist()])
-
-
-def _theta(texts: Sequence[str], kind: type[Simulator]) -> dict[str, float]:
-    names = [p.name for p in kind.parameters]
-    if len(texts) == 1 and "=" not in texts[0]:
-        cells = texts[0].split(",")
-        if len(cells) != len(names):
-            raise InputError(
-                f"--theta {texts[0]}: expected {len(names)} values ({', '.join(names)}), found {len(cells)}"
-            )
-        given = dict(zip(names, cells, strict=True))
-    else:
-        given = _pairs("--theta", texts, names, "parameter")
-    theta = {
-        p.name: _number("--theta", p.name, given.get(p.name, str(p.nominal)))
-        for p in kind.parameters
-    }
-    for p in kind.parameters:
-        low, high = p.bounds
-        if not low <= theta[p.name] <= high:
-            raise InputError(
-                f"--theta {p.name}={theta[p.name]:g}: expected {low:g} to {high:g} {p.unit}"
-            )
-    return theta
-
-
-def _noise(texts: Sequence[str], channels: Sequence[str]) -> dict[str, float]:
-    plain = [text for text in texts if "=" not in text]
-    if len(plain) > 1:
-        raise InputError(
-            f"--noise {' '.join(plain)}: expected one number for all channels, or NAME=VALUE"
-        )
-    named = _pairs("--noise", [text for text in texts if "=" in text], channels, "recorded channel")
-    values = {
-        name: _number("--noise", name, named.get(name, (plain or ["0"])[0])) for name in channels
-    }
-    for name, value in values.items():
-        if value < 0:
-            raise InputError(f"--noise {name}={value:g}: expected at least 0")
-    return values
 
 
 def _usual(kind: type[Simulator]) -> UsualRecording:
@@ -253,38 +221,103 @@ def _usual(kind: type[Simulator]) -> UsualRecording:
     return usual if kind.name == kind.system.name else replace(usual, observe=())
 
 
-def _pairs(option: str, texts: Sequence[str], known: Any = None, kind: str = "") -> dict[str, str]:
-    """NAME=VALUE texts as a dictionary; names must be among `known` unless that is None."""
-    pairs: dict[str, str] = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals or not name or not value:
-            raise InputError(f"{option} {text}: expected NAME=VALUE")
-        if known is not None and name not in known:
-            raise unknown(kind, name, list(known) or ["none"])
-        if name in pairs:
-            raise InputError(f"{option}: {name} is given twice")
-        pairs[name] = value
-    return pairs
+def _held_out(wish: Wish) -> int:
+    """How many of the last runs are marked."""
+    if wish.runs < 1:
+        raise InputError(f"runs = {wish.runs}: expected at least 1")
+    if wish.held_out is None:
+        # A single run is divided by whoever reads it.
+        return 0 if wish.runs == 1 else max(1, wish.runs // 3)
+    if not 0 <= wish.held_out < wish.runs:
+        raise InputError(f"held_out = {wish.held_out}: expected fewer than the {wish.runs} runs")
+    return wish.held_out
 
 
-def _number(option: str, name: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
+def _times(wish: Wish) -> Array:
+    product = wish.seconds * wish.rate
+    samples = round(product) if 0 < product < _MOST_SAMPLES else 0
+    if samples < 2:
+        raise InputError(
+            f"seconds = {wish.seconds:g}, rate = {wish.rate:g}: expected at least 2 samples "
+            f"and below {_MOST_SAMPLES:g}"
+        )
+    # Rounded as they will stand in the table, so that what is read back is what was simulated.
+    return np.array([float(f"{t:.{_DIGITS}g}") for t in (np.arange(samples) / wish.rate).tolist()])
+
+
+def _theta(given: Mapping[str, float] | Sequence[float], kind: type[Simulator]) -> dict[str, float]:
+    """Every parameter's value by name, in the simulator's order."""
+    names = [p.name for p in kind.parameters]
+    if not isinstance(given, Mapping):
+        if len(given) != len(names):
+            raise InputError(
+                f"parameters: expected {len(names)} values ({', '.join(names)}), found {len(given)}"
+            )
+        given = dict(zip(names, given, strict=True))
+    _known("parameter", given, names)
+    theta = {
+        p.name: _number("parameter", p.name, given.get(p.name, p.nominal)) for p in kind.parameters
+    }
+    for p in kind.parameters:
+        low, high = p.bounds
+        if not low <= theta[p.name] <= high:
+            raise InputError(
+                f"parameter {p.name} = {theta[p.name]:g}: expected {low:g} to {high:g} {p.unit}"
+            )
+    return theta
+
+
+def _coefficients(name: str, given: Coefficients, kind: type[Simulator]) -> list[float]:
+    """An effect's coefficients in order; those that are not named are zero."""
+    if isinstance(given, Mapping):
+        names = [c.name for c in library.get(name).on(kind.system)] if _has_system(kind) else []
+        _known(f"coefficient of effect {name}", given, names)
+        return [_number(f"effect {name}:", c, given.get(c, 0.0)) for c in names]
+    values = [given] if isinstance(given, int | float) else list(given)
+    return [_number("effect", name, value) for value in values]
+
+
+def _has_system(kind: type[Simulator]) -> bool:
+    return issubclass(kind, Simulated)
+
+
+def _noise(given: float | Mapping[str, float], channels: Sequence[str]) -> dict[str, float]:
+    """1 sigma of every recorded channel."""
+    named = given if isinstance(given, Mapping) else {EVERY: given}
+    _known("recorded channel", [name for name in named if name != EVERY], channels)
+    rest = named.get(EVERY, 0.0)
+    values = {name: _number("noise of", name, named.get(name, rest)) for name in channels}
+    for name, value in values.items():
+        if value < 0:
+            raise InputError(f"noise of {name} = {value:g}: expected at least 0")
+    return values
+
+
+def _range(name: str, given: float | tuple[float, float]) -> tuple[float, float]:
+    """Lowest and highest initial value."""
+    ends = (given, given) if isinstance(given, int | float) else tuple(given)
+    if len(ends) != 2:
+        raise InputError(f"initial state {name}: expected a value or (low, high), found {given!r}")
+    low, high = (_number("initial state", name, end) for end in ends)
+    if low > high:
+        raise InputError(f"initial state {name} = {low:g}:{high:g}: expected low <= high")
+    return low, high
+
+
+def _signal_text(name: str, given: float | str) -> str:
+    return given if isinstance(given, str) else f"{_number('input', name, given):.17g}"
+
+
+def _number(what: str, name: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise InputError(f"{what} {name}: expected a number, found {value!r:.60}")
     if not np.isfinite(value):
-        raise InputError(f"{option} {name}={text}: expected a number")
-    return value
+        raise InputError(f"{what} {name} = {value}: expected a finite number")
+    return float(value)
 
 
-def _list(option: str, name: str, text: str) -> list[float]:
-    return [_number(option, name, cell) for cell in text.split(",")]
-
-
-def _range(name: str, text: str) -> tuple[float, float]:
-    low, colon, high = text.partition(":")
-    pair = _number("--initial", name, low), _number("--initial", name, high if colon else low)
-    if pair[0] > pair[1]:
-        raise InputError(f"--initial {name}={text}: expected LOW:HIGH")
-    return pair
+def _known(what: str, given: Mapping[str, Any] | Sequence[str], known: Sequence[str]) -> None:
+    """Refuse a name that is not known."""
+    for name in given:
+        if name not in known:
+            raise unknown(what, name, list(known) or ["none"])

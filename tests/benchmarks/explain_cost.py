@@ -15,8 +15,8 @@ import numpy as np
 
 from bench.gap import explain as explaining
 from bench.gap.model.world import World
-from bench.recordings.simulate import Wish, write
 from sims import effects
+from tests.wishes import Wish, write
 
 USUAL = Wish(
     "slider", effects=["friction.coulomb=0.3"], noise=["0.005"], observe=["x"], engine="mujoco"

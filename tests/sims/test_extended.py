@@ -5,11 +5,12 @@ import pytest
 
 from bench.checks import SIMULATOR_CHECKS
 from bench.cli import main
-from bench.recordings.simulate import Wish, make
+from bench.recordings.simulate import make
 from bench.registry import load_plugins, simulators
 from sims.base import InputError, Scenario
 from sims.extended import SPREAD, Extended, Number, load, opened, read, write
 from sims.pendulum.simulator import Pendulum
+from tests.wishes import Wish
 
 MODEL = Extended(
     "pendulum_extended", "pendulum", "batch", "A swing, measured",

@@ -10,10 +10,11 @@ from bench.gap.model.base_fit import fit_base
 from bench.gap.model.fit import Fit
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
-from bench.recordings.simulate import Wish, make
+from bench.recordings.simulate import make
 from bench.registry import simulators
 from sims.base import Scenario
 from sims.recording.recording import Recording, Run
+from tests.wishes import Wish
 
 
 def recording(system="pendulum", **wish):

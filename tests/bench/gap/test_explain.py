@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.gap.explain import explain
-from bench.recordings.simulate import Wish, make, write
+from bench.recordings.simulate import make
 from bench.registry import load_plugins, simulators
 from sims.base import InputError, Scenario
 from sims.extended import load
@@ -15,6 +15,7 @@ from sims.pendulum.simulator import Pendulum
 from tests.bench.gap import schema
 from tests.bench.gap.tables import swing, table
 from tests.conftest import PLUGINS
+from tests.wishes import Wish, write
 
 EXAMPLES = PLUGINS.parents[1] / "examples"
 TIMES = np.arange(90) / 60

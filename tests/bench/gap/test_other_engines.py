@@ -4,7 +4,7 @@ system's batch engine did not make."""
 import pytest
 
 from bench.gap.explain import explain
-from bench.recordings.simulate import Wish, write
+from tests.wishes import Wish, write
 
 CASES = {
     "pendulum": ("drag.linear=6e-4", "mujoco", ("q",)),

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from bench.gap.score_model import scored
-from bench.recordings.simulate import Wish
-from bench.recordings.simulate import write as simulate
+from tests.wishes import write as simulate
 from sims.base import InputError
 from sims.extended import Extended, Number, write
+from tests.wishes import Wish
 
 MODEL = Extended(
     "swing", "pendulum", "batch", "", {"inertia": Number(4e-3, "kg*m^2", None, None)},

@@ -6,10 +6,10 @@ from bench.cli import main
 from bench.figures.recording import _thinned
 from bench.recordings.inspection import load, summary
 from bench.recordings.noise import estimated, gaps
-from bench.recordings.simulate import Wish, write
 from sims.base import InputError
 from sims.recording.recording import read_recording
 from sims.servo.simulator import Servo
+from tests.wishes import Wish, write
 
 RNG = np.random.default_rng(3)
 

@@ -5,11 +5,12 @@ import pytest
 
 from bench.cli import main
 from bench.problem.signals import HELP, signal
-from bench.recordings.simulate import Wish, make, write
+from bench.recordings.simulate import make
 from bench.registry import load_plugins, simulators
 from sims.base import InputError
 from sims.recording.recording import read_recording, read_toml
 from tests.conftest import PLUGINS
+from tests.wishes import Wish, write
 
 RNG = np.random.default_rng(0)
 TIMES = np.arange(400) / 100
@@ -137,7 +138,7 @@ def test_a_simulator_without_engines_is_a_system_too(tmp_path, spring):
     ("changes", "message"),
     [
         ({"system": "bal"}, "unknown simulator 'bal'; there are: "),
-        ({"theta": ["restitution=2"]}, "--theta restitution=2: expected 0 to 1 1"),
+        ({"theta": ["restitution=2"]}, "parameter restitution = 2: expected 0 to 1 1"),
         ({"theta": ["restituton=0.5"]}, "unknown parameter 'restituton'; there are: restitution"),
         ({"theta": ["0.5,0.6"]}, r"expected 1 values \(restitution\), found 2"),
         ({"theta": ["restitution=high"]}, "--theta restitution=high: expected a number"),
@@ -154,7 +155,7 @@ def test_a_simulator_without_engines_is_a_system_too(tmp_path, spring):
         ({"constants": ["mass=-1"]}, "'mass' of simulator ball must be > 0, found -1"),
         ({"noise": ["accel_z=1"]}, "unknown recorded channel 'accel_z'; there are: x, y, z"),
         ({"noise": ["1", "2"]}, "--noise 1 2: expected one number for all channels"),
-        ({"noise": ["-1"]}, "--noise x=-1: expected at least 0"),
+        ({"noise": ["-1"]}, "noise of x = -1: expected at least 0"),
         ({"inputs": ["u=1"]}, "unknown input 'u'; there are: none"),
         ({"initial": ["q=1"]}, "unknown initial state 'q'; there are: vx"),
         ({"initial": ["z=3:1"]}, "--initial z=3:1: expected LOW:HIGH"),
@@ -162,7 +163,7 @@ def test_a_simulator_without_engines_is_a_system_too(tmp_path, spring):
         ({"seconds": 0.001}, "expected at least 2 samples"),
         ({"seconds": math.inf}, "expected at least 2 samples"),
         ({"rate": math.nan}, "expected at least 2 samples"),
-        ({"held_out": 4}, "--held-out 4: expected fewer than the 4 runs"),
+        ({"held_out": 4}, "held_out = 4: expected fewer than the 4 runs"),
         ({"engine": "ode"}, "unknown engine 'ode'; there are: batch, mujoco, pybullet"),
     ],
 )

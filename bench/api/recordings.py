@@ -1,0 +1,81 @@
+"""`simgap.simulate` and `simgap.read_recording`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from bench.recordings.inspection import load
+from bench.recordings.simulate import Coefficients, SimulatedRecording, Wish, make
+from sims.recording.recording import Recording
+
+
+def simulate(
+    system: str,
+    *,
+    parameters: Mapping[str, float] | Sequence[float] | None = None,
+    effects: Mapping[str, Coefficients] | None = None,
+    constants: Mapping[str, float] | None = None,
+    noise: float | Mapping[str, float] = 0.0,
+    inputs: Mapping[str, float | str] | None = None,
+    initial: Mapping[str, float | tuple[float, float]] | None = None,
+    observe: Sequence[str] = (),
+    runs: int = 4,
+    seconds: float = 4.0,
+    rate: float = 100.0,
+    engine: str | None = None,
+    seed: int = 0,
+    held_out: int | None = None,
+) -> SimulatedRecording:
+    """Simulate a recording whose truth is known; nothing is written before `write` is called.
+
+    Args:
+        system: registered name of a simulator, e.g. ``pendulum``.
+        parameters: other than their nominal values, by name; or all of them in order.
+        effects: that act, with a coefficient, several in order, or some by name.
+        constants: other than the system's defaults.
+        noise: sensor noise, 1 sigma, of every channel or by channel.
+        inputs: by name, a constant or the text of a signal, as ``sine:2:0.5``.
+        initial: initial states by name, a value or (low, high) from which each run draws.
+        observe: channels to record; the system's usual ones where empty.
+        runs: number of runs.
+        seconds: length of a run.
+        rate: samples a second.
+        engine: pybullet, mujoco or batch.
+        seed: of all that is drawn.
+        held_out: how many of the last runs are marked as held out; a third where None.
+
+    Raises:
+        InputError: something that cannot be, in one line.
+    """
+    return make(
+        Wish(
+            system,
+            parameters={} if parameters is None else parameters,
+            effects=effects or {},
+            constants=constants or {},
+            noise=noise,
+            inputs=inputs or {},
+            initial=initial or {},
+            observe=tuple(observe),
+            runs=runs,
+            seconds=seconds,
+            rate=rate,
+            engine=engine,
+            seed=seed,
+            held_out=held_out,
+        )
+    )
+
+
+def read_recording(path: str | Path, system: str | None = None) -> Recording:
+    """Read and check ``NAME.csv`` with ``NAME.toml`` beside it.
+
+    Args:
+        path: the table.
+        system: take it for this system, whatever the description says.
+
+    Raises:
+        InputError: anything malformed, in one line.
+    """
+    return load(Path(path), system)[0]

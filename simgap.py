@@ -1,0 +1,168 @@
+"""simgap compares methods that tune a simulator's parameters, and explains what tuning cannot fix.
+
+The one name for users and for authors of plugins, in a script, a notebook and a test::
+
+    import simgap
+
+    run = simgap.compare("ball-drop", tuners=["cma_es", "least_squares"], targets=5)
+    found = simgap.explain("swing.csv")
+    simgap.simulate("pendulum", effects={"drag.linear": 2e-4}, noise=0.002).write("swing.csv")
+
+    from simgap import Tuner, Force, Friction, Parameter, Channel, OwnSimulator, InputError
+
+Nothing is imported before it is asked for; `dir(simgap)` lists what there is.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from importlib.machinery import PathFinder
+from os.path import abspath, dirname, realpath
+
+TYPE_CHECKING = False  # as typing.TYPE_CHECKING, whose module takes half of the time there is
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Any
+
+    from bench import __version__
+    from bench.api.compare import Compared, compare
+    from bench.api.explain import explain, score
+    from bench.api.recordings import read_recording, simulate
+    from bench.checks import parametrize
+    from bench.gap.explanation import Explanation
+    from bench.problem.experiment import Experiment
+    from bench.registry import load_plugins, simulators, tuners
+    from methods.base import (
+        Ask,
+        BudgetExceededError,
+        Evaluation,
+        Practice,
+        Scene,
+        Steps,
+        Task,
+        Tuner,
+        from_callback,
+    )
+    from sims.base import (
+        Array,
+        Channel,
+        Constant,
+        InputError,
+        Parameter,
+        Scenario,
+        Simulator,
+    )
+    from sims.effects import registry as effects
+    from sims.extended import Extended
+    from sims.own import BulletWorld, OwnSimulator
+    from sims.recording.recording import Recording, Run
+    from sims.system import (
+        Coefficient,
+        Contact,
+        Effect,
+        Force,
+        Friction,
+        Input,
+        Moment,
+        Sensor,
+        Signal,
+        System,
+    )
+
+_WHERE = {
+    "bench": ("__version__",),
+    "bench.api.compare": ("Compared", "compare"),
+    "bench.api.explain": ("explain", "score"),
+    "bench.api.recordings": ("read_recording", "simulate"),
+    "bench.checks": ("parametrize",),
+    "bench.gap.explanation": ("Explanation",),
+    "bench.problem.experiment": ("Experiment",),
+    "bench.registry": ("load_plugins", "simulators", "tuners"),
+    "methods.base": (
+        "Ask",
+        "BudgetExceededError",
+        "Evaluation",
+        "Practice",
+        "Scene",
+        "Steps",
+        "Task",
+        "Tuner",
+        "from_callback",
+    ),
+    "sims.base": (
+        "Array",
+        "Channel",
+        "Constant",
+        "InputError",
+        "Parameter",
+        "Scenario",
+        "Simulator",
+    ),
+    "sims.effects": ("effects",),
+    "sims.extended": ("Extended",),
+    "sims.own": ("BulletWorld", "OwnSimulator"),
+    "sims.recording.recording": ("Recording", "Run"),
+    "sims.system": (
+        "Coefficient",
+        "Contact",
+        "Effect",
+        "Force",
+        "Friction",
+        "Input",
+        "Moment",
+        "Sensor",
+        "Signal",
+        "System",
+    ),
+}
+"""Where each public name lives; the block above says the same to type checkers, a test compares."""
+_MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
+__all__ = [*sorted(_MODULE_OF), "main"]  # noqa: PLE0604 - every entry is a text
+
+
+def _refuse_namesakes() -> None:
+    """Say in one line whose folder hides one of simgap's own packages, before something odd happens.
+
+    Raises:
+        ImportError: a package that is called as one of simgap's would be imported in its place.
+    """
+    home = dirname(realpath(abspath(__file__)))
+    for name in ("bench", "methods", "sims"):
+        if name in sys.modules:
+            places = getattr(sys.modules[name], "__path__", [])
+        else:
+            spec = PathFinder.find_spec(name)
+            places = (spec.submodule_search_locations if spec else None) or []
+        for place in places:
+            if dirname(realpath(place)) != home:
+                raise ImportError(
+                    f"simgap cannot be imported here: the package '{name}' in {realpath(place)} hides "
+                    f"simgap's own; rename that folder, or run from another one"
+                )
+
+
+_refuse_namesakes()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    from bench.cli import main as run
+
+    return run(arguments)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'simgap' has no attribute {name!r}")
+    value = getattr(import_module(_MODULE_OF[name]), name)
+    globals()[name] = value  # the next time it is found without asking
+    return value
+
+
+def __dir__() -> list[str]:
+    return list(__all__)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
