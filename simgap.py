@@ -25,12 +25,13 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import Any
 
-    from bench import __version__
     from bench.api.compare import Compared, compare
+    from bench.gap.explanation import Explanation
+
+    from bench import __version__
     from bench.api.explain import explain, score
     from bench.api.recordings import read_recording, simulate
     from bench.checks import parametrize
-    from bench.gap.explanation import Explanation
     from bench.problem.experiment import Experiment
     from bench.registry import load_plugins, simulators, tuners
     from methods.base import (
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
         Tuner,
         from_callback,
     )
+    from sims import effects
     from sims.base import (
         Array,
         Channel,
@@ -53,7 +55,6 @@ if TYPE_CHECKING:
         Scenario,
         Simulator,
     )
-    from sims.effects import registry as effects
     from sims.extended import Extended
     from sims.own import BulletWorld, OwnSimulator
     from sims.recording.recording import Recording, Run
@@ -99,7 +100,6 @@ _WHERE = {
         "Scenario",
         "Simulator",
     ),
-    "sims.effects": ("effects",),
     "sims.extended": ("Extended",),
     "sims.own": ("BulletWorld", "OwnSimulator"),
     "sims.recording.recording": ("Recording", "Run"),
@@ -117,8 +117,57 @@ _WHERE = {
     ),
 }
 """Where each public name lives; the block above says the same to type checkers, a test compares."""
-_MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
-__all__ = [*sorted(_MODULE_OF), "main"]  # noqa: PLE0604 - every entry is a text
+_ROOMS = {"effects": "sims.effects"}
+"""Names that are modules."""
+_MODULE_OF = {name: module for module, names in _WHERE.items() for name in names} | _ROOMS
+__all__ = [
+    "Array",
+    "Ask",
+    "BudgetExceededError",
+    "BulletWorld",
+    "Channel",
+    "Coefficient",
+    "Compared",
+    "Constant",
+    "Contact",
+    "Effect",
+    "Evaluation",
+    "Experiment",
+    "Explanation",
+    "Extended",
+    "Force",
+    "Friction",
+    "Input",
+    "InputError",
+    "Moment",
+    "OwnSimulator",
+    "Parameter",
+    "Practice",
+    "Recording",
+    "Run",
+    "Scenario",
+    "Scene",
+    "Sensor",
+    "Signal",
+    "Simulator",
+    "Steps",
+    "System",
+    "Task",
+    "Tuner",
+    "__version__",
+    "compare",
+    "effects",
+    "explain",
+    "from_callback",
+    "load_plugins",
+    "main",
+    "parametrize",
+    "read_recording",
+    "score",
+    "simulate",
+    "simulators",
+    "tuners",
+]
 
 
 def _refuse_namesakes() -> None:
@@ -155,7 +204,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'simgap' has no attribute {name!r}")
-    value = getattr(import_module(_MODULE_OF[name]), name)
+    module = import_module(_MODULE_OF[name])
+    value = module if name in _ROOMS else getattr(module, name)
     globals()[name] = value  # the next time it is found without asking
     return value
 

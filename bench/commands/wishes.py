@@ -70,8 +70,8 @@ def noise(texts: Sequence[str]) -> dict[str, float]:
         raise InputError(
             f"--noise {' '.join(plain)}: expected one number for all channels, or NAME=VALUE"
         )
-    rest = {EVERY: number("--noise", "every channel", text) for text in plain}
-    return {**rest, **numbers("--noise", [text for text in texts if "=" in text])}
+    named = numbers("--noise", [text for text in texts if "=" in text])
+    return {EVERY: number("--noise", "every channel", plain[0]), **named} if plain else named
 
 
 def initial(texts: Sequence[str]) -> dict[str, float | tuple[float, float]]:

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from bench.problem.signals import signal
-from bench.recordings.simulate import Wish, make
+from bench.recordings.simulate import make
 from bench.registry import simulators
 from sims.base import InputError
 from sims.simulated import Simulated
 from sims.slider.system import SliderSystem
 from sims.system import UsualRecording
 from tests.sims.cases import SIMULATORS
+from tests.wishes import Wish
 
 SYSTEMS = {name: kind.system for name, kind in SIMULATORS.items()}
 

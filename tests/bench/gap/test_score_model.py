@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from bench.gap.score_model import scored
-from tests.wishes import write as simulate
 from sims.base import InputError
 from sims.extended import Extended, Number, write
 from tests.wishes import Wish
+from tests.wishes import write as simulate
 
 MODEL = Extended(
     "swing", "pendulum", "batch", "", {"inertia": Number(4e-3, "kg*m^2", None, None)},
@@ -91,7 +91,7 @@ def test_missing_samples_do_not_count(files):
 def test_what_cannot_be_scored_is_one_line(files, tmp_path):
     model, recording = files
     simulate(Wish("slider", runs=1, seconds=0.5), tmp_path / "other.csv")
-    simulate(replace(WISH, observe=["q"], noise=["0.003"]), tmp_path / "angle.csv")
+    simulate(replace(WISH, observe=["q"], noise=0.003), tmp_path / "angle.csv")
     for other, message in [
         ("other.csv", "other.csv|other.toml"),
         ("angle.csv", "unknown channel of .*angle.csv 'qd'; there are: q"),

@@ -1,0 +1,59 @@
+"""`simgap.explain` and `simgap.score`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.gap import explain as explaining
+from bench.gap.score_model import scored
+from bench.recordings.simulate import SimulatedRecording
+from sims.recording.recording import Recording
+
+
+def explain(
+    recording: str | Path | Recording | SimulatedRecording,
+    *,
+    system: str | None = None,
+    engine: str = "batch",
+    free: Sequence[str] = (),
+    tuner: str | None = None,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda _: None,
+) -> explaining.Explanation:
+    """Show what the simulation of a recording gets wrong, name the cause, extend the simulator.
+
+    Args:
+        recording: the path of ``NAME.csv``, or a recording that was read or simulated.
+        system: take it for this system, whatever the description says.
+        engine: pybullet, mujoco or batch; a simulator that steps itself has its own.
+        free: constants to estimate with the parameters.
+        tuner: a registered tuner that finds where the fit of the base parameters begins.
+        seed: of the surrogates and the bootstrap.
+        say: told what is being done.
+
+    Raises:
+        InputError: the recording cannot be read, is too short, or is of nothing that takes effects.
+    """
+    if isinstance(recording, SimulatedRecording):
+        recording = recording.recording
+    return explaining.explain(recording, system, engine, seed, free, tuner, say)
+
+
+def score(model: str | Path, recording: str | Path, *, held_out: bool = False) -> dict[str, Any]:
+    """The error of an extended simulator on another recording; initial states are estimated there,
+    nothing else.
+
+    Args:
+        model: extended.toml.
+        recording: the path of ``NAME.csv``.
+        held_out: count only runs that are marked so.
+
+    Returns:
+        rmse by channel in its unit, normalised_rmse in units of the noise, runs, samples, units.
+
+    Raises:
+        InputError: a file cannot be read, or the recording is of another system.
+    """
+    return scored(Path(model), Path(recording), held_out)

@@ -1,0 +1,83 @@
+"""The face: what `import simgap` offers, how quickly, and whose folder hides it."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import simgap
+
+ROOT = Path(simgap.__file__).parent
+
+
+def python(code, cwd, **environment):
+    """Run code in a fresh interpreter that finds simgap where this one does."""
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT), **environment},
+        check=False,
+    )
+
+
+def test_every_name_is_there_and_means_what_type_checkers_are_told():
+    tree = ast.parse((ROOT / "simgap.py").read_text())
+    (block,) = (
+        n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"
+    )
+    told = {}
+    for statement in block.body:
+        for alias in statement.names:
+            where = (
+                f"{statement.module}.{alias.name}"
+                if statement.module == "sims"
+                else statement.module
+            )
+            told[alias.name] = where
+    for standard in ("Sequence", "Any"):
+        del told[standard]
+    assert told == simgap._MODULE_OF
+    assert sorted([*told, "main"]) == simgap.__all__ == dir(simgap)
+    for name in simgap.__all__:
+        assert getattr(simgap, name) is not None, name
+    with pytest.raises(AttributeError, match="module 'simgap' has no attribute 'tune'"):
+        _ = simgap.tune
+
+
+def test_the_import_takes_less_than_five_milliseconds_and_brings_nothing_heavy(tmp_path):
+    code = (
+        "import sys, time; t = time.perf_counter(); import simgap; t = time.perf_counter() - t\n"
+        "print(1e3 * t, *(m for m in ('numpy', 'bench', 'torch', 'matplotlib') if m in sys.modules))"
+    )
+    answers = [python(code, tmp_path).stdout.split() for _ in range(5)]
+    assert all(len(answer) == 1 for answer in answers), answers
+    assert min(float(milliseconds) for (milliseconds,) in answers) < 5
+
+
+@pytest.mark.parametrize("name", ["bench", "methods", "sims"])
+def test_a_folder_that_hides_a_package_is_named_in_one_line(name, tmp_path):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "__init__.py").write_text("")
+    said = python("import simgap", tmp_path)
+    assert said.returncode == 1
+    last = said.stderr.strip().splitlines()[-1]
+    assert last.startswith(f"ImportError: simgap cannot be imported here: the package '{name}' in")
+    assert str(tmp_path.resolve() / name) in last
+    # Imported before simgap, it hides the other way round.
+    path = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import {name}; import simgap"
+    assert str(tmp_path.resolve() / name) in python(path, "/").stderr
+
+
+def test_a_folder_of_that_name_without_a_package_in_it_does_no_harm(tmp_path):
+    (tmp_path / "methods").mkdir()
+    assert python("import simgap; simgap.Tuner", tmp_path).returncode == 0
+
+
+def test_main_is_the_command_line(capsys):
+    with pytest.raises(SystemExit):
+        simgap.main(["--version"])
+    assert capsys.readouterr().out == f"simgap {simgap.__version__}\n"
