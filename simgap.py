@@ -25,15 +25,14 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import Any
 
-    from bench.api.compare import Compared, compare
-    from bench.gap.explanation import Explanation
-
     from bench import __version__
+    from bench.api.compare import Compared, compare
     from bench.api.explain import explain, score
     from bench.api.recordings import read_recording, simulate
     from bench.checks import parametrize
+    from bench.gap.explanation import Explanation
     from bench.problem.experiment import Experiment
-    from bench.registry import load_plugins, simulators, tuners
+    from bench.registry import effects, load_plugins, simulators, tuners
     from methods.base import (
         Ask,
         BudgetExceededError,
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
         Tuner,
         from_callback,
     )
-    from sims import effects
     from sims.base import (
         Array,
         Channel,
@@ -79,7 +77,7 @@ _WHERE = {
     "bench.checks": ("parametrize",),
     "bench.gap.explanation": ("Explanation",),
     "bench.problem.experiment": ("Experiment",),
-    "bench.registry": ("load_plugins", "simulators", "tuners"),
+    "bench.registry": ("effects", "load_plugins", "simulators", "tuners"),
     "methods.base": (
         "Ask",
         "BudgetExceededError",
@@ -117,9 +115,7 @@ _WHERE = {
     ),
 }
 """Where each public name lives; the block above says the same to type checkers, a test compares."""
-_ROOMS = {"effects": "sims.effects"}
-"""Names that are modules."""
-_MODULE_OF = {name: module for module, names in _WHERE.items() for name in names} | _ROOMS
+_MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
 __all__ = [
     "Array",
     "Ask",
@@ -204,8 +200,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'simgap' has no attribute {name!r}")
-    module = import_module(_MODULE_OF[name])
-    value = module if name in _ROOMS else getattr(module, name)
+    value = getattr(import_module(_MODULE_OF[name]), name)
     globals()[name] = value  # the next time it is found without asking
     return value
 

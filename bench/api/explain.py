@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.gap import explain as explaining
+from bench.gap.explanation import Explanation
 from bench.gap.score_model import scored
 from bench.recordings.simulate import SimulatedRecording
 from sims.recording.recording import Recording
@@ -21,7 +22,7 @@ def explain(
     tuner: str | None = None,
     seed: int = 0,
     say: Callable[[str], None] = lambda _: None,
-) -> explaining.Explanation:
+) -> Explanation:
     """Show what the simulation of a recording gets wrong, name the cause, extend the simulator.
 
     Args:

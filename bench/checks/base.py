@@ -6,7 +6,7 @@ import random
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,16 @@ class CheckError(AssertionError):
     """A subject does not conform; the message says what was expected, what was found, and where to
     look.
     """
+
+
+class NotApplicable(NamedTuple):
+    """What a check returns that found nothing to check; it has neither passed nor failed.
+
+    Attributes:
+        reason: why it does not apply to the subject.
+    """
+
+    reason: str
 
 
 def require(condition: bool, expected: str, found: object, look: str) -> None:
@@ -38,7 +48,9 @@ def global_random_state_untouched(look: str) -> Iterator[None]:
     They are put into a state of their own first, so that seeding with a usual number shows, and
     back afterwards.
     """
-    python, legacy = random.getstate(), np.random.get_state()  # noqa: NPY002 - it is what must not change
+    python = random.getstate()
+    legacy = np.random.get_state()  # noqa: NPY002 - it is what must not change
+    # A method that seeds with 0 or 42 would leave these unchanged only by coming upon two primes.
     random.seed(82_589_933)
     np.random.seed(30_402_457)  # noqa: NPY002
     before = _random_states()

@@ -7,22 +7,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from bench.checks import EFFECT_CHECKS, SIMULATOR_CHECKS, TUNER_CHECKS, CheckError
+from bench.checks.base import CheckError
 from bench.checks.processes import LIMIT
+from bench.checks.suites import SUITES
 from bench.checks.tuners import check_same_run_in_other_processes
-from bench.registry import simulators, tuners
+from bench.registry import REGISTRIES
 from bench.runs.pools import LocalPool
-from sims import effects
 from sims.base import InputError, unknown
 
-_SUITES: dict[str, tuple[Callable[[Any], None], ...]] = {
-    "tuner": TUNER_CHECKS,
-    "simulator": SIMULATOR_CHECKS,
-    "effect": EFFECT_CHECKS,
-}
 _HERE = (check_same_run_in_other_processes,)
 """Checks that start worker processes themselves."""
 _KNOWN = "known: "
+"""Begins the line of a check that fails on purpose."""
+_IDLE = "not applicable: "
+"""Begins the line of a check that found nothing to check."""
+_MARKS = {_KNOWN: "known ", _IDLE: "-     "}
 
 
 def kind_of(name: str) -> str:
@@ -31,34 +30,28 @@ def kind_of(name: str) -> str:
     Raises:
         InputError: it is none.
     """
-    kinds = {"tuner": tuners.names(), "simulator": simulators.names(), "effect": effects.names()}
-    for kind, names in kinds.items():
-        if name in names:
-            return kind
-    raise unknown(
-        "tuner, simulator or effect", name, [n for names in kinds.values() for n in names]
-    )
+    for registry in REGISTRIES:
+        if name in registry.names():
+            return registry.kind
+    names = [name for registry in REGISTRIES for name in registry.names()]
+    raise unknown("tuner, simulator or effect", name, names)
 
 
 def _subject(kind: str, name: str) -> Any:
-    if kind == "effect":
-        return effects.get(name)
-    return tuners.get(name) if kind == "tuner" else simulators.get(name)
+    return {registry.kind: registry for registry in REGISTRIES}[kind].get(name)
 
 
 def attempt(kind: str, name: str, place: int) -> str:
     """Make one check in this process; returns what is wrong, or nothing."""
-    check, subject = _SUITES[kind][place], _subject(kind, name)
+    check, subject = SUITES[kind][place], _subject(kind, name)
     known = getattr(subject, "known_failures", {}).get(check.__name__)
     try:
-        check(subject)
+        outcome = check(subject)
     except CheckError as error:
         return f"{_KNOWN}{known}" if known else str(error)
-    return (
-        f"expected to fail ({known}); found that it passes; see {name}.known_failures"
-        if known
-        else ""
-    )
+    if known:
+        return f"expected to fail ({known}); found that it passes; see {name}.known_failures"
+    return f"{_IDLE}{outcome.reason}" if outcome else ""
 
 
 def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> bool:
@@ -74,33 +67,45 @@ def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> bool:
     """
     kind = kind_of(name)
     subject = _subject(kind, name)
-    checks = _SUITES[kind]
+    checks = SUITES[kind]
     ends = _isolated(kind, name, plugins)
     for place, check in enumerate(checks):
         if check in _HERE and not any(isinstance(end, Exception) for end in ends.values()):
-            ends[place] = attempt(
-                kind, name, place
-            )  # it runs the subject here too, which is known to be safe now
-    failed = 0
-    for place, check in enumerate(checks):
-        line = _line(ends.get(place, "not made: the subject does not survive the others"))
-        bad = bool(line) and not line.startswith(_KNOWN)
-        failed += bad
+            # It runs the subject here too, which is known to be safe now.
+            ends[place] = attempt(kind, name, place)
+    lines = [
+        _line(ends.get(place, "not made: the subject does not survive the others"))
+        for place in range(len(checks))
+    ]
+    for check, line in zip(checks, lines, strict=True):
         title = check.__name__.removeprefix("check_").replace("_", " ")
-        mark = "FAILED" if bad else "known " if line else "ok    "
-        say(f"{mark}  {title}" + (f"\n        {line.removeprefix(_KNOWN)}" if line else ""))
+        below = f"\n        {line.removeprefix(_KNOWN)}" if line else ""
+        say(f"{_mark(line)}  {title}{below}")
+    failed = [line for line in lines if _mark(line) == "FAILED"]
+    idle = sum(line.startswith(_IDLE) for line in lines)
+    rest = f", {idle} not applicable" if idle else ""
     summary = (
-        f"{failed} of {len(checks)} checks failed" if failed else f"all {len(checks)} checks passed"
+        f"{len(failed)} of {len(checks) - idle} checks failed{rest}"
+        if failed
+        else f"all {len(checks) - idle} checks passed{rest}"
     )
     say(f"{kind} {name} ({subject.__module__}.{subject.__qualname__}): {summary}")
     return not failed
+
+
+def _mark(line: str) -> str:
+    """The word before a check's title."""
+    for begin, mark in _MARKS.items():
+        if line.startswith(begin):
+            return mark
+    return "FAILED" if line else "ok    "
 
 
 def _isolated(kind: str, name: str, plugins: Sequence[str]) -> dict[int, Any]:
     """How each check ends in a worker process; after two that had to be killed, or died, no more
     are made.
     """
-    places = [place for place, check in enumerate(_SUITES[kind]) if check not in _HERE]
+    places = [place for place, check in enumerate(SUITES[kind]) if check not in _HERE]
     ends: dict[int, Any] = {}
     with LocalPool(1) as pool:
         pool.load(plugins)

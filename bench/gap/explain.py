@@ -30,6 +30,7 @@ from sims import extended as extend
 from sims.base import Array, InputError
 from sims.extended import Extended, Number
 from sims.own import OwnSimulator
+from sims.recording.recording import Recording
 from sims.simulated import Simulated
 
 LEAST = 2.0
@@ -42,7 +43,7 @@ Say = Callable[[str], None]
 
 
 def explain(
-    path: str | Path,
+    recording: str | Path | Recording,
     system: str | None = None,
     engine: str = "batch",
     seed: int = 0,
@@ -53,7 +54,7 @@ def explain(
     """Explain a recording.
 
     Args:
-        path: the table.
+        recording: the path of the table, or a recording that is in memory.
         system: take it for this system, whatever the description says.
         engine: pybullet, mujoco or batch; a simulator that steps itself has its own.
         seed: of the surrogates and the bootstrap.
@@ -64,13 +65,13 @@ def explain(
     Raises:
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects.
     """
-    return _Explainer(Path(path), system, engine, seed, tuple(free), tuner, say).run()
+    return _Explainer(recording, system, engine, seed, tuple(free), tuner, say).run()
 
 
 class _Explainer:
     def __init__(
         self,
-        path: Path,
+        source: str | Path | Recording,
         system: str | None,
         engine: str,
         seed: int,
@@ -78,17 +79,13 @@ class _Explainer:
         tuner: str | None,
         say: Say,
     ) -> None:
-        self.started, self.path, self.seed, self.tuner, self.say = (
-            time.perf_counter(),
-            path,
-            seed,
-            tuner,
-            say,
-        )
-        self.recording, kind = load(path, system)
+        self.started, self.seed, self.tuner, self.say = time.perf_counter(), seed, tuner, say
+        self.recording, kind = load(source, system)
+        self.path = self.recording.path
         if not issubclass(kind, Simulated):
             raise InputError(
-                f"{path}: simulator {self.recording.system} takes no effects, so nothing can be missing from it"
+                f"{self.path}: simulator {self.recording.system} takes no effects, "
+                "so nothing can be missing from it"
             )
         extend.refuse_extended(kind)
         self.kind: type[Simulated] = kind

@@ -10,7 +10,7 @@ import numpy as np
 from bench.recordings.noise import Noise, estimated, gaps
 from bench.registry import simulators
 from sims.base import Array, Channel, InputError, Simulator
-from sims.recording.recording import Recording, Run, read_recording, system_of
+from sims.recording.recording import Recording, Run, divided, read_recording, system_of
 
 _MOST_RUNS = 40
 _CAVEAT = (
@@ -19,17 +19,26 @@ _CAVEAT = (
 )
 
 
-def load(path: Path, system: str | None = None) -> tuple[Recording, type[Simulator]]:
+def load(
+    source: str | Path | Recording, system: str | None = None
+) -> tuple[Recording, type[Simulator]]:
     """A recording, and the simulator of the system it is of (or of `system`).
+
+    Args:
+        source: the table's path, or a recording that is in memory already.
+        system: take it for this system, whatever it says of itself.
 
     Raises:
         InputError: it cannot be read, or there is no such system.
     """
-    name = system or system_of(path)
+    path = source.path if isinstance(source, Recording) else Path(source)
+    name = system or (source.system if isinstance(source, Recording) else system_of(path))
     try:
         kind = simulators.get(name)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    if isinstance(source, Recording):
+        return divided(source), kind
     return read_recording(path, kind), kind
 
 

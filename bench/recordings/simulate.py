@@ -157,7 +157,8 @@ class _Maker:
         runs = tuple(self._run(int(name), scenario) for name, scenario in scenarios.items())
         stated = {name: sigma for name, sigma in self.noise.items() if sigma}
         constants, system = self.simulator.constant_values, self.wish.system
-        recording = Recording(Path(), system, f"{system}, simulated", constants, stated, runs)
+        path = Path(f"{system}-simulated.csv")  # a name for messages; nothing lies there
+        recording = Recording(path, system, f"{system}, simulated", constants, stated, runs)
         truth = {
             "system": system,
             "engine": self.engine or "its own",
@@ -270,15 +271,12 @@ def _theta(given: Mapping[str, float] | Sequence[float], kind: type[Simulator]) 
 def _coefficients(name: str, given: Coefficients, kind: type[Simulator]) -> list[float]:
     """An effect's coefficients in order; those that are not named are zero."""
     if isinstance(given, Mapping):
-        names = [c.name for c in library.get(name).on(kind.system)] if _has_system(kind) else []
+        of_system = library.get(name).on(kind.system) if issubclass(kind, Simulated) else ()
+        names = [c.name for c in of_system]
         _known(f"coefficient of effect {name}", given, names)
         return [_number(f"effect {name}:", c, given.get(c, 0.0)) for c in names]
     values = [given] if isinstance(given, int | float) else list(given)
     return [_number("effect", name, value) for value in values]
-
-
-def _has_system(kind: type[Simulator]) -> bool:
-    return issubclass(kind, Simulated)
 
 
 def _noise(given: float | Mapping[str, float], channels: Sequence[str]) -> dict[str, float]:

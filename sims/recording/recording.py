@@ -109,6 +109,16 @@ def read_recording(path: str | Path, declared: Declared, whole: bool = False) ->
     )
 
 
+def divided(recording: Recording) -> Recording:
+    """The recording with something held out, as `read_recording` gives it: marked runs, else every
+    third one, else the last third of a single one.
+
+    Raises:
+        InputError: all runs are held out, or a single one is too short to be divided.
+    """
+    return replace(recording, runs=_split(recording.path, recording.runs))
+
+
 _UNMARKED = RunMarks({}, {}, None)
 
 

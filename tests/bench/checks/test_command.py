@@ -35,9 +35,17 @@ def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
     plugin.write_text(SOUND)
     code, said = checked(capsys, "shrinking", "--plugin", str(plugin))
     assert code == 0, said
-    assert said.count("ok    ") == 15
+    assert said.count("ok    ") == 13
+    assert (
+        "-       stochastic is declared\n        not applicable: it says that it uses chance"
+        in said
+    )
+    assert (
+        "-       what was learned can be stored\n        not applicable: it does not learn" in said
+    )
     assert said.endswith(
-        "tuner shrinking (simgap_plugin_shrinking.Shrinking): all 15 checks passed\n"
+        "tuner shrinking (simgap_plugin_shrinking.Shrinking): all 13 checks passed, "
+        "2 not applicable\n"
     )
 
 
@@ -86,6 +94,7 @@ def test_unknown_name_is_one_line(capsys):
     assert main(["check", "cma_ess"]) == 2
     error = capsys.readouterr().err
     assert error.startswith(
-        "simgap: unknown tuner, simulator or effect 'cma_ess'; there are: arm, backlash, ball, ball-filmed, bayes"
+        "simgap: unknown tuner, simulator or effect 'cma_ess'; "
+        "there are: arm, backlash, ball, ball-filmed, bayes"
     )
     assert error.count("\n") == 1
