@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.store.folder import Configuration, configuration, create, free_folder, write_results
-from bench.store.journal import FOLDER, Journal, finished, read_plan, replace_text, write_plan
+from bench.store.journal import FOLDER, Journal, finished, read_plan, write_plan
 from sims.base import InputError
+from sims.files import write
 
 if TYPE_CHECKING:
     from bench.problem.experiment import Experiment
@@ -32,7 +33,7 @@ def begin(
     from bench.runs.identity import fingerprint
     from bench.runs.runner import prepare
 
-    folder = free_folder(experiment, out)
+    folder = free_folder(experiment, Path(out) if out else None)
     results = prepare(experiment)
     create(folder, Configuration(experiment, list(plugins), fingerprint(experiment, plugins)), jobs)
     _attach(folder, results)
@@ -164,7 +165,7 @@ def _write_spectra(folder: Path, results: Results) -> None:
         table = spectra_table(
             results.problem.experiment, results.spectra, results.problem.cube.parameters
         )
-        replace_text(folder / "identifiability.csv", table.to_csv(index=False))
+        write(folder / "identifiability.csv", table.to_csv(index=False))
 
 
 def status(folder: Path, every: bool, say: Say) -> bool:

@@ -6,7 +6,7 @@ conditional density estimation, NeurIPS 2016, arXiv 1605.06376; D. Greenberg, M.
 Macke, Automatic posterior transformation for likelihood-free inference, ICML 2019, arXiv
 1905.07488; the flow: G. Papamakarios, T. Pavlakou, I. Murray, Masked autoregressive flow for
 density estimation, NeurIPS 2017, arXiv 1705.07057. Built and trained by the `sbi` package (JOSS
-5(52), 2020, doi:10.21105/joss.02505), which is an optional extra: pip install simgap[npe].
+5(52), 2020, doi:10.21105/joss.02505), which is an optional extra: pip install -e ".[npe]".
 """
 
 from __future__ import annotations

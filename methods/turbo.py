@@ -4,7 +4,7 @@ Sources: D. Eriksson, M. Pearce, J. Gardner, R. Turner, M. Poloczek, Scalable gl
 via local Bayesian optimization, NeurIPS 2019, arXiv 1910.01739 (section 2; constants from its
 supplement); M. Balandat et al., BoTorch: a framework for efficient Monte-Carlo Bayesian
 optimization, NeurIPS 2020, arXiv 1910.06403. Gaussian process and sampling are the `botorch`
-package's, which is an optional extra: pip install simgap[turbo].
+package's, which is an optional extra: pip install -e ".[turbo]".
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from sims import effects as library
+from sims import files
 from sims.base import InputError, Parameter, Simulator, unknown
 from sims.recording.recording import read_toml
 from sims.simulated import Simulated, effect_parameters
@@ -71,7 +72,7 @@ class Extended:
 
 def write(extended: Extended, path: Path) -> None:
     """Write the file."""
-    path.write_text(_written(extended), encoding="utf-8")
+    files.write(path, _written(extended))
 
 
 def _written(extended: Extended) -> str:

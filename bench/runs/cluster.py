@@ -25,6 +25,7 @@ from bench.runs.sources import rooms, versions
 from bench.runs.training import Training, folder, train
 from bench.runs.worker import Order
 from sims.base import InputError
+from sims.files import first_line, write
 
 _PATIENCE = 20.0
 """Seconds without a scheduler after which it counts as lost."""
@@ -50,7 +51,7 @@ class ClusterPool:
             from distributed import Client
         except ImportError:
             raise InputError(
-                "--cluster: needs the package distributed (pip install 'simgap[cluster]')"
+                '--cluster: needs the package distributed (pip install -e ".[cluster]")'
             ) from None
         for name in [
             *logging.root.manager.loggerDict,
@@ -63,7 +64,7 @@ class ClusterPool:
             self._client = Client(address, timeout=10.0, set_as_default=False)
         except (OSError, ValueError, TypeError, ImportError) as error:
             raise InputError(
-                f"--cluster {address}: no Dask scheduler answers there ({_line(error)})"
+                f"--cluster {address}: no Dask scheduler answers there ({first_line(error)})"
             ) from None
         self._files: Files = ()
         self._weights: dict[str, Any] = {}
@@ -80,7 +81,7 @@ class ClusterPool:
             others = [w for w, there in self._client.run(_identity).items() if there != here]
         except Exception as error:
             raise InputError(
-                f"--cluster {self.address}: its workers lack simgap ({_line(error)})"
+                f"--cluster {self.address}: its workers lack simgap ({first_line(error)})"
             ) from None
         if others:
             raise InputError(
@@ -205,17 +206,11 @@ class ClusterPool:
         return value
 
 
-def _line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
-
-
 def _keep(path: Path, content: bytes) -> None:
     """Write a file that is not there yet, whole or not at all."""
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as partial:
-            partial.write(content)
-        Path(partial.name).replace(path)
+        write(path, content)
 
 
 def _itself(content: tuple[str, bytes]) -> tuple[str, bytes]:

@@ -37,6 +37,7 @@ from bench.runs.sources import (
 )
 from methods.base import Tuner, Watch
 from sims.base import Array, InputError
+from sims.files import replacing
 
 _COUNTS = "__simulations_and_seconds__"
 _KEY = "__key__"
@@ -171,17 +172,10 @@ def train(
 
 
 def _write(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
-    """Write a whole file or none."""
+    """Write a whole file or none: several processes may train the same."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(
-        f"{path.stem}.{os.getpid()}.partial"
-    )  # so that a reader never meets half a file
-    try:
-        with partial.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with replacing(path) as partial, partial.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def trained(entry: Entry, path: Path) -> Tuner:

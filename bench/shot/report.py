@@ -14,8 +14,9 @@ from bench.shot.pictures import draw, examples
 from bench.shot.settings import Settings
 from bench.shot.study import read
 from bench.shot.table import FAILED, table, text
-from bench.store.journal import FOLDER, replace_text
+from bench.store.journal import FOLDER
 from bench.store.status import STATUS_COLUMNS
+from sims.files import write
 
 
 def finish(
@@ -42,11 +43,9 @@ def finish(
     ):
         rows[name] = pd.to_numeric(rows[name])
     lines = table(rows)
-    replace_text(folder / "table.csv", lines.to_csv(index=False, float_format="%.6g"))
-    replace_text(folder / "shots.csv", rows.to_csv(index=False, float_format="%.6g"))
-    replace_text(
-        folder / "status.csv", _statuses(rows, skipped).to_csv(index=False, float_format="%.6g")
-    )
+    write(folder / "table.csv", lines.to_csv(index=False, float_format="%.6g"))
+    write(folder / "shots.csv", rows.to_csv(index=False, float_format="%.6g"))
+    write(folder / "status.csv", _statuses(rows, skipped).to_csv(index=False, float_format="%.6g"))
     figures = draw(folder, experiment, settings, dealt, kept, rows, lines)
     figures += [
         animate(folder, settings, example, kept) for example in examples(dealt, kept, rows)[:1]

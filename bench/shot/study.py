@@ -19,9 +19,9 @@ from bench.shot.deal import RECORDINGS, Deal, deals, in_view, record
 from bench.shot.settings import Settings, settings_of
 from bench.shot.throw import thrown
 from bench.store.folder import Configuration, configuration, create, free_folder
-from bench.store.journal import replace_text
 from sims.base import InputError
 from sims.camera import packages
+from sims.files import write
 from sims.shot import world
 
 Say = Callable[[str], None]
@@ -42,7 +42,7 @@ def begin(experiment: Experiment, plugins: Sequence[str], out: str | None, jobs:
         raise InputError(
             f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'
         )
-    folder = free_folder(experiment, out)
+    folder = free_folder(experiment, Path(out) if out else None)
     create(folder, Configuration(experiment, list(plugins), fingerprint(experiment, plugins)), jobs)
     return folder
 
@@ -156,7 +156,7 @@ def _keep(
         "models": models,
         "rows": [{**row, "seen": seen} for row in thrown(dealt, settings, models)],
     }
-    replace_text(_path(folder, dealt), json.dumps(_plain(kept), indent=1, allow_nan=False) + "\n")
+    write(_path(folder, dealt), json.dumps(_plain(kept), indent=1, allow_nan=False) + "\n")
 
 
 def _trained(experiment: Experiment, settings: Settings, bar: Progress) -> dict[str, Path]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import shutil
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -18,33 +17,28 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench import __version__
 from bench.problem.experiment import Experiment, parse
-from bench.store.journal import FOLDER, Journal, replace_text
+from bench.store.journal import FOLDER, Journal
 from bench.store.status import STATUS_COLUMNS
 from sims.base import InputError
+from sims.files import first_line, fresh_folder, refuse_full, replacing, stamped, write
 from sims.recording.recording import read_toml
 
 if TYPE_CHECKING:
     import pandas as pd
 
+RESULTS = Path("results")
+"""Below which new runs go that name no folder."""
 
-def free_folder(experiment: Experiment, out: str | None, results: Path = Path("results")) -> Path:
-    """Where a new run may be written: `out`, or a folder below results/ named for the experiment
+
+def free_folder(experiment: Experiment, out: Path | None, results: Path = RESULTS) -> Path:
+    """Where a new run may be written: `out`, or a folder below `results` named for the experiment
     and the time.
 
     Raises:
         InputError: `out` exists and has something in it.
     """
-    stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
-    folder = Path(out) if out else results / f"{experiment.name}-{stamp}"
-    number = 1
-    while not out and folder.exists():
-        number += 1
-        folder = results / f"{experiment.name}-{stamp}-{number}"
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(
-            f"--out {folder}: exists and is not empty; results are never overwritten: "
-            f"name another folder, or finish what is in it with --resume {folder}"
-        )
+    folder = out or stamped(results, experiment.name)
+    refuse_full(folder)
     return folder
 
 
@@ -78,19 +72,13 @@ def create(folder: Path, configuration: Configuration, jobs: int) -> None:
         "fingerprint": configuration.fingerprint,
         "packages": dict(sorted({d.metadata["Name"]: d.version for d in distributions()}.items())),
     }
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
-        partial.mkdir(parents=True)
-        text = tomli_w.dumps(_plain(experiment.document()))
-        (partial / "experiment.toml").write_text(text, encoding="utf-8")
-        (partial / "environment.json").write_text(
-            json.dumps(environment, indent=1) + "\n", encoding="utf-8"
-        )
-        (partial / FOLDER).mkdir()
-        partial.replace(folder)
+        with fresh_folder(folder) as partial:
+            write(partial / "experiment.toml", tomli_w.dumps(_plain(experiment.document())))
+            write(partial / "environment.json", json.dumps(environment, indent=1) + "\n")
+            (partial / FOLDER).mkdir()
     except OSError as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise InputError(f"--out {folder}: cannot be made ({error.strerror})") from None
+        raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
 
 
 def _plain(value: Any) -> Any:
@@ -137,17 +125,13 @@ def _environment(folder: Path) -> dict[str, Any]:
         environment = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
-            f"{folder}: not a complete comparison: {path.name}: {_line(error)}"
+            f"{folder}: not a complete comparison: {path.name}: {first_line(error)}"
         ) from None
     if not isinstance(environment, dict) or not isinstance(environment.get("experiment"), str):
         raise InputError(
             f"{folder}: not a complete comparison: {path.name} does not name the experiment"
         )
     return environment
-
-
-def _line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def write_results(
@@ -169,23 +153,23 @@ def write_results(
     import pyarrow as pa
     from pyarrow import parquet
 
-    partial = folder / ".runs.parquet.partial"
-    writer = None
-    for rows in journal.tables():
-        writer = writer or parquet.ParquetWriter(partial, rows.schema, compression="zstd")
-        writer.write_table(rows)
-    if writer is None:
-        parquet.write_table(pa.table({}), partial)
-    else:
-        writer.close()
-    partial.replace(folder / "runs.parquet")
+    with replacing(folder / "runs.parquet") as partial:
+        writer = None
+        for rows in journal.tables():
+            # The first rows say what the columns are.
+            writer = writer or parquet.ParquetWriter(partial, rows.schema, compression="zstd")
+            writer.write_table(rows)
+        if writer is None:
+            parquet.write_table(pa.table({}), partial)
+        else:
+            writer.close()
     training = pd.DataFrame(sorted(trainings), columns=["tuner", "seed", "simulations", "seconds"])
-    replace_text(folder / "training.csv", training.to_csv(index=False))
+    write(folder / "training.csv", training.to_csv(index=False))
     rows_of_statuses = [
         asdict(journal.statuses[place]) for place in sorted(journal.statuses)
     ] + list(skipped)
     statuses = pd.DataFrame(rows_of_statuses, columns=STATUS_COLUMNS)
-    replace_text(folder / "status.csv", statuses.to_csv(index=False))
+    write(folder / "status.csv", statuses.to_csv(index=False))
 
 
 class Stored(NamedTuple):
@@ -235,7 +219,7 @@ def read(folder: Path, columns: Sequence[str] | None = None) -> Stored:
     except (OSError, ValueError, KeyError, ArrowException) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{folder}: not a complete comparison: {_line(error)}") from None
+        raise InputError(f"{folder}: not a complete comparison: {first_line(error)}") from None
     return Stored(experiment, runs, statuses, costs)
 
 

@@ -12,7 +12,6 @@ machine may cost the runs since the last part.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import struct
 import zlib
@@ -24,6 +23,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from bench.store.status import Status
 from sims.base import InputError
+from sims.files import first_line, replacing, write
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -50,6 +50,9 @@ class Journal:
         self.folder = folder / FOLDER
         self.folder.mkdir(exist_ok=True)
         self._lock = _locked(self.folder / "lock")
+        # Half a part, of a process that was killed while it wrote; its journal is still there.
+        for half in self.folder.glob("*.partial"):
+            half.unlink()
         self._part_runs = part_runs
         self.statuses: dict[int, Status] = {}
         self._index: dict[Path, list[int]] = {}
@@ -107,10 +110,9 @@ class Journal:
         tables = [_placed(place, rows) for place, _, rows in self._records]
         whole = pa.concat_tables(tables).replace_schema_metadata({"statuses": statuses})
         path = self._path("parquet")
-        partial = path.with_suffix(".partial")
-        parquet.write_table(whole, partial, compression="zstd")
-        _to_disk(partial)
-        partial.replace(path)
+        with replacing(path) as partial:
+            parquet.write_table(whole, partial, compression="zstd")
+        # Only now: until the part is there, the journal is all there is of these runs.
         self._file.close()
         self._path("journal").unlink()
         self._index[path] = [place for place, _, _ in self._records]
@@ -204,12 +206,8 @@ def part_statuses(path: Path) -> dict[int, Status]:
         return {int(place): Status(**status) for place, status in held}
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
         raise InputError(
-            f"{path}: expected a part of a comparison, found damage: {_first_line(error)}"
+            f"{path}: expected a part of a comparison, found damage: {first_line(error)}"
         ) from None
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def finished(folder: Path) -> dict[int, Status]:
@@ -227,7 +225,7 @@ def finished(folder: Path) -> dict[int, Status]:
 
 def write_plan(folder: Path, ids: Sequence[str]) -> None:
     """Write the id of every run, in the order of the plan."""
-    replace_text(folder / FOLDER / "plan.txt", "".join(f"{name}\n" for name in ids))
+    write(folder / FOLDER / "plan.txt", "".join(f"{name}\n" for name in ids))
 
 
 def read_plan(folder: Path) -> list[str] | None:
@@ -243,19 +241,6 @@ def read_plan(folder: Path) -> list[str] | None:
         raise InputError(
             f"{path}: expected the ids of the runs as UTF-8 text, found other bytes"
         ) from None
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a whole file or nothing."""
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text, encoding="utf-8")
-    _to_disk(partial)
-    partial.replace(path)
-
-
-def _to_disk(path: Path) -> None:
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
 
 
 def _locked(path: Path) -> IO[str]:

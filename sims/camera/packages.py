@@ -23,7 +23,7 @@ def require(instead: str = "") -> None:
         InputError: a package is missing.
     """
     if not all(map(importlib.util.find_spec, NEEDED)):
-        raise InputError(f'films need PyAV and OpenCV: pip install "simgap[vision]"{instead}')
+        raise InputError(f'films need PyAV and OpenCV: pip install -e ".[vision]"{instead}')
 
 
 @cache

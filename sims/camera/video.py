@@ -6,7 +6,6 @@ come unevenly.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from sims.base import Array, InputError
 from sims.camera.packages import imported
 from sims.camera.render import Image
+from sims.files import replacing
 from sims.recording.write import publish, refuse_existing
 
 _TICKS = 90_000
@@ -49,16 +49,15 @@ def write_video(
     if path.suffix != ".mp4":
         raise InputError(f"{path}: expected a name that ends in .mp4")
     refuse_existing([path])
-    draft = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
     try:
-        _encode(draft, frames, times, crf)
-        refuse_existing([path])
-        publish(beside or {})
-        draft.rename(path)
+        # FFmpeg tells the format by the name.
+        with replacing(path, keep_ending=True) as partial:
+            _encode(partial, frames, times, crf)
+            # Encoding takes long enough for somebody to have made the file meanwhile.
+            refuse_existing([path])
+            publish(beside or {})
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None:

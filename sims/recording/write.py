@@ -4,22 +4,20 @@ what is there.
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sims.base import Array, InputError, unknown
+from sims.files import Content, write_new
 from sims.recording.description import description_of
 from sims.recording.recording import Declared, Recording, Run
 
 _EXACT = 17
-Content = str | bytes
-"""Of a file; text is written as UTF-8."""
+"""Significant digits that keep every bit of a number."""
 
 
 def write_recording(
@@ -55,33 +53,19 @@ def write_recording(
     publish({**texts, **(beside or {})})
 
 
-def publish(files: Mapping[Path, Content]) -> None:
+def publish(contents: Mapping[Path, Content]) -> None:
     """Write all files or none; readers never see half of one.
 
     Raises:
         InputError: one exists already, or cannot be written.
     """
-    refuse_existing(files)
-    made: list[Path] = []
-    with contextlib.ExitStack() as undo:
-        drafts = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in files}
-        try:
-            for path, draft in drafts.items():
-                undo.callback(draft.unlink, missing_ok=True)
-                content = files[path]
-                with draft.open("xb") as file:
-                    file.write(content.encode() if isinstance(content, str) else content)
-            for path, draft in drafts.items():
-                _place(draft, path)
-                made.append(path)
-        except BaseException as error:
-            for done in made:
-                done.unlink()
-            if isinstance(error, FileExistsError):
-                raise _exists(path) from None
-            if isinstance(error, OSError):
-                raise InputError(f"{path}: cannot be written ({error.strerror})") from None
-            raise
+    refuse_existing(contents)
+    try:
+        write_new(contents)
+    except FileExistsError as error:
+        raise _exists(error.filename) from None
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be written ({error.strerror})") from None
 
 
 def refuse_existing(paths: Iterable[Path]) -> None:
@@ -95,19 +79,10 @@ def refuse_existing(paths: Iterable[Path]) -> None:
             raise _exists(path)
 
 
-def _exists(path: Path) -> InputError:
+def _exists(path: Path | str) -> InputError:
     return InputError(
         f"{path}: exists already; recordings are never overwritten, name another file"
     )
-
-
-def _place(draft: Path, path: Path) -> None:
-    try:
-        os.link(draft, path)  # unlike a rename, fails if someone made the file meanwhile
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without hard links
-        draft.rename(path)
 
 
 def _table(runs: Sequence[Run], digits: int) -> str:
