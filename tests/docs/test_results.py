@@ -1,0 +1,190 @@
+"""The page on results describes every file, column and figure that is written, and no other."""
+
+import json
+import re
+
+import pandas as pd
+import pytest
+import tomli_w
+
+from bench.analysis.amortisation import EVEN_COLUMNS
+from bench.analysis.paired import PAIR_COLUMNS
+from bench.analysis.table import FAILURES, METRICS
+from bench.cli import main
+from bench.compare import begin, make
+from bench.problem.experiment import load
+from bench.problem.problem import Problem
+from bench.report import finish
+from bench.shot.deal import deals
+from bench.shot.settings import settings_of
+from bench.shot.table import COLUMNS as SHOT_COLUMNS
+from bench.shot.throw import thrown
+from bench.shot.tune import Model
+from sims.camera.camera import Camera
+from sims.camera.files import Filmed, described
+from sims.recording.description import read_toml
+from tests.conftest import PLUGINS
+from tests.docs.pages import ROOT, quoted, section, tables, text_of
+from tests.experiments import SPRING, spring_experiment
+
+PAGE = text_of("results.md")
+SPRING_PLUGIN = str(PLUGINS / "spring.py")
+PARAMETERS, CHANNELS, TUNERS = ("rate", "decay"), ("x",), ("random", "least_squares", "small")
+TABLES = (
+    "status",
+    "training",
+    "identifiability",
+    "table",
+    "ert",
+    "pairs",
+    "break_even",
+    "who_wins",
+)
+SMALL = {"tuner": "regressor", "options": {"epochs": 2, "points": 20}}
+
+
+def told(heading, below=PAGE):
+    """The names in the first column of the first table below a heading."""
+    return [name for row in tables(section(below, heading))[0][1:] for name in quoted(row[0])]
+
+
+def written_out(names, **placeholders):
+    """Names with PARAMETER, CHANNEL and TUNER replaced by each that there is."""
+    whole = []
+    for name in names:
+        (mark,) = re.findall("PARAMETER|CHANNEL|TUNER", name) or [None]
+        whole += [name.replace(mark, one) for one in placeholders[mark]] if mark else [name]
+    return whole
+
+
+def columns(path):
+    """The header of a CSV file."""
+    return list(pd.read_csv(path, nrows=0).columns)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, spring):
+    """A comparison of three tuners, one of which learns, on two parameters."""
+    experiment = spring_experiment(
+        targets=2,
+        seeds=1,
+        budget=4,
+        training_budget=40,
+        noise={"x": 0.01},
+        held_out={"scenarios": 1},
+        tuners={"random": {}, "least_squares": {}, "small": SMALL},
+    )
+    out = str(tmp_path_factory.mktemp("results") / "spring")
+    path, results = begin(experiment, [SPRING_PLUGIN], out, 1)
+    make(path, results, [SPRING_PLUGIN], 1, lambda *_: lambda: None, None)
+    finish(path, Problem(experiment), lambda _: None)
+    return path
+
+
+def test_the_folder_holds_the_files_of_the_page(folder):
+    files = {f"{f.name}/" if f.is_dir() else f.name for f in folder.iterdir()}
+    assert files == set(told("## compare"))
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_every_column_of_a_table_is_on_the_page_in_this_order(folder, name):
+    names = written_out(told(f"### `{name}.csv`"), PARAMETER=PARAMETERS)
+    assert columns(folder / f"{name}.csv") == names
+
+
+def test_every_column_of_the_runs_is_on_the_page(folder):
+    runs = pd.read_parquet(folder / "runs.parquet")
+    names = written_out(told("### `runs.parquet`"), PARAMETER=PARAMETERS, CHANNEL=CHANNELS)
+    assert set(names) - set(runs.columns) == {"param_abs_error"}  # of one parameter alone
+    assert set(runs.columns) <= set(names)
+    assert len(names) == len(set(names))
+
+
+def test_every_metric_and_status_is_on_the_page(folder):
+    rows = tables(section(PAGE, "### `table.csv`"))[0]
+    (metrics,) = [row[2] for row in rows if row[0] == "`metric`"]
+    assert set(quoted(metrics)) - {"runs.parquet"} == set(METRICS)
+    statuses = tables(section(PAGE, "### `status.csv`"))[1][1:]
+    failed = {quoted(row[0])[0] for row in statuses if row[2] != "no"}
+    assert failed == set(FAILURES)
+
+
+def test_the_environment_is_described(folder):
+    environment = json.loads((folder / "environment.json").read_text(encoding="utf-8"))
+    assert list(environment) == told("### `environment.json`")
+
+
+def test_every_figure_is_described(folder):
+    figures = {path.stem for path in (folder / "figures").glob("*.png")}
+    names = set(told("### Figures of a comparison"))
+    assert figures <= names
+    # of targets from another simulator, beyond the training range, and with sloppy directions
+    assert names - figures <= {"misfit-vs-simulations", "error-vs-distance"}
+    code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "bench").rglob("*.py"))
+    assert [name for name in names if f'"{name}"' not in code] == []
+
+
+def test_several_comparisons(folder, tmp_path, capsys):
+    assert main(["plot", str(folder), str(folder), "--out", str(tmp_path / "all")]) == 0
+    written = {path.name for path in (tmp_path / "all").glob("*.csv")}
+    assert written | {"nemenyi.csv"} == set(told("## plot of several comparisons"))
+    names = written_out(told("### `ranks.csv`"), TUNER=TUNERS)
+    assert set(columns(tmp_path / "all" / "ranks.csv")) == set(names)
+    assert set(PAIR_COLUMNS) == set(columns(tmp_path / "all" / "pairs.csv"))
+    assert set(EVEN_COLUMNS) == set(told("### `break_even.csv`"))
+
+
+def test_the_tables_of_the_bounce_shot():
+    assert told("### `table.csv` of shots") == SHOT_COLUMNS
+    experiment = load("bounce-shot")
+    settings = settings_of(experiment)
+    nothing = vars(Model("nominal", 0.5, {}, 0, 0.0, "no plan"))
+    (row,) = thrown(deals(experiment, settings)[0], settings, [nothing])
+    assert [*row, "seen"] == told("### `shots.csv`")
+
+
+def test_the_losses_of_a_training(tmp_path, monkeypatch, spring, capsys):
+    monkeypatch.chdir(tmp_path)
+    document = {**SPRING, "training_budget": 40, "targets": 1, "tuners": {"small": SMALL}}
+    (tmp_path / "ahead.toml").write_text(tomli_w.dumps(document), encoding="utf-8")
+    of = ["small", "spring", "--experiment", "ahead.toml", "--plugin", SPRING_PLUGIN]
+    assert main(["train", *of, "--seeds", "1", "--out", "out"]) == 0
+    assert columns(tmp_path / "out" / "loss.csv") == told("### `loss.csv`")
+    assert [f.stem for f in (tmp_path / "out" / "figures").glob("*.png")] == ["loss"]
+
+
+@pytest.fixture(scope="module")
+def explained(tmp_path_factory):
+    """A simulated swing with a hidden drag, and what `explain` and `score` say of it."""
+    folder = tmp_path_factory.mktemp("explained")
+    swing, out = folder / "swing.csv", folder / "out"
+    hidden = ["--effect", "drag.linear=2e-4", "--noise", "q=0.002", "--rate", "50"]
+    assert main(["simulate", "pendulum", *hidden, "--runs", "3", "--out", str(swing)]) == 0
+    assert main(["explain", str(swing), "--out", str(out)]) == 0
+    return folder
+
+
+def test_the_truth_of_a_simulated_recording(explained):
+    assert list(read_toml(explained / "swing.truth.toml")) == told("### `NAME.truth.toml`")
+
+
+def test_the_folder_of_an_explanation(explained):
+    files = {f.name for f in (explained / "out").iterdir() if f.suffix not in (".png", ".pdf")}
+    figures = {f.stem for f in (explained / "out").glob("*.png")}
+    assert files | figures == set(told("## explain"))
+    assert figures == set(told("### Figures of an explanation"))
+    extended = read_toml(explained / "out" / "extended.toml")
+    assert set(extended) == set(told("### `extended.toml`"))
+
+
+def test_the_score(explained, capsys):
+    model, recording = explained / "out" / "extended.toml", explained / "swing.csv"
+    assert main(["score", str(model), str(recording), "--json"]) == 0
+    assert list(json.loads(capsys.readouterr().out)) == told("## score")
+
+
+def test_the_camera_of_a_film(tmp_path):
+    path = tmp_path / "film.camera.toml"
+    path.write_text(described(Filmed(Camera(0.0, 5.0, 2.0), 0.1)), encoding="utf-8")
+    keys = {f"{table}.{key}" for table, entries in read_toml(path).items() for key in entries}
+    assert keys == set(told("### `NAME.camera.toml`"))
