@@ -22,7 +22,7 @@ def blocks(text, language=None):
 def section(text, heading):
     """What stands below a heading, up to the next of its rank."""
     marks = heading.split(" ")[0]
-    start = text.index(f"\n{heading}\n") + len(heading) + 2
+    start = f"\n{text}".index(f"\n{heading}\n") + len(heading) + 1
     end = re.search(rf"^#{{1,{len(marks)}}} ", text[start:], re.M)
     return text[start : start + end.start()] if end else text[start:]
 

@@ -42,6 +42,18 @@ def test_links_lead_somewhere(page):
     assert not broken
 
 
+PLACE = re.compile(r"`((?:bench|docs|examples|methods|results|sims|tests)/[\w./*-]*)`")
+"""A file or folder of the project as pages name it."""
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_files_that_a_page_names_are_there(page):
+    named = PLACE.findall(page.read_text(encoding="utf-8"))
+    made = {"results/train/", "results/inspect/"}  # by commands
+    fixed = [n for n in named if n not in made and not re.search("[A-Z]{4}", n)]
+    assert [name for name in fixed if not [*ROOT.glob(name)]] == []
+
+
 def test_every_page_below_docs_is_in_the_index():
     index = (DOCS / "index.md").read_text(encoding="utf-8")
     listed = {(DOCS / link.partition("#")[0]).resolve() for link in LINK.findall(index)}

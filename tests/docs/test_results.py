@@ -188,3 +188,14 @@ def test_the_camera_of_a_film(tmp_path):
     path.write_text(described(Filmed(Camera(0.0, 5.0, 2.0), 0.1)), encoding="utf-8")
     keys = {f"{table}.{key}" for table, entries in read_toml(path).items() for key in entries}
     assert keys == set(told("### `NAME.camera.toml`"))
+
+
+def test_the_verdict(explained):
+    page = text_of("reference/verdict.md")
+    answer = json.loads((explained / "out" / "verdict.json").read_text(encoding="utf-8"))
+    assert list(answer) == told("# verdict.json", page)
+    (inertia,) = answer["parameters"].values()
+    assert list(inertia) == told("## An estimate", page)
+    assert list(answer["causes"][0]) == told("## A cause", page)
+    assert list(answer["heldout"]) == told("## The gain on held-out runs", page)
+    assert list(answer["candidates"][0]) == told("## A candidate", page)
