@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from bench.gap.causes.name import Finding, name
+from bench.gap.causes.rules import CHANCE
 from bench.gap.causes.search import Search
-from bench.gap.causes.structure import CHANCE, Hat, Remains
+from bench.gap.causes.structure import Hat
 from bench.gap.explanation import Explanation
-from bench.gap.measure import HeldOut
+from bench.gap.measure import HeldOutRuns
 from bench.gap.model.base_fit import Base, fit_base
 from bench.gap.model.floor import Floor, noise_floor
 from bench.gap.model.noise import Noise
@@ -37,8 +38,6 @@ LEAST = 2.0
 """Samples for each unknown without which nothing can be said."""
 HUGE = 1e9
 """Values so many times a channel's typical size are none."""
-STILL = 6.0
-"""A channel whose range is below so many sigmas shows no motion."""
 Say = Callable[[str], None]
 
 
@@ -128,8 +127,8 @@ class _Explainer:
         search = Search(self.fitting, self.noise, base.untouched, rng, self.floor.stated)
         search.enter(base.fit)
         self.say("looking for what is missing")
-        held_out = HeldOut(self.measuring, self.noise) if self.measuring else None
-        finding = self._still(search, base) or name(search, held_out)
+        held_out = HeldOutRuns(self.measuring, self.noise) if self.measuring else None
+        finding = name(search, held_out)
         self.say("measuring the gain")
         verdict = self.answer.verdict(search, finding, rng, self.started)
         story = self._story(search, base, finding, verdict)
@@ -146,22 +145,6 @@ class _Explainer:
         from bench.gap.model.tuner_start import tuned
 
         return tuned(self.tuner, self.fitting, self.noise, self.seed)
-
-    def _still(self, search: Search, base: Base) -> Finding | None:
-        """The verdict on a recording in which nothing moves, and nothing should."""
-        world, model = self.fitting, search.models[frozenset()]
-        ranges = np.nanmax(world.observed, axis=(0, 1)) - np.nanmin(world.observed, axis=(0, 1))
-        small = model.likelihood.sigma < 3.0 * self.floor.sigma
-        still = (
-            (ranges < STILL * self.floor.sigma).all()
-            and small.all()
-            and len(base.untouched) == world.base.size
-        )
-        if still or not ranges.any():
-            vague = tuple(world.parameters[i].name for i in world.base)
-            nothing = Remains(1.0, "", model.likelihood.sigma / self.floor.sigma, ())
-            return Finding("unidentifiable", model, model, (), nothing, vague)
-        return None
 
     def _story(
         self, search: Search, base: Base, finding: Finding, verdict: dict[str, Any]

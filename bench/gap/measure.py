@@ -1,5 +1,16 @@
 """Measures what an extension gains: on held-out runs against the noise floor, and how well its
 numbers are known.
+
+The share of the gap closed, of RMS errors b before, a after and the floor n, is
+
+    closed = (b - max(a, n)) / (b - n)                                                         (1)
+
+The covariance of the fitted parameters is the inverse of the curvature of the sum of squares after
+the initial states of every run r are eliminated (W. H. Greene, Econometric Analysis, chapter 9;
+generalised least squares). With the whitened Jacobian J_r = [A_r B_r], of parameters and of initial
+states, and what was known of these beforehand, sigma_0,
+
+    covariance = (sum_r A_r' A_r - A_r' B_r (B_r' B_r + diag sigma_0^-2)^-1 B_r' A_r)^-1       (2)
 """
 
 from __future__ import annotations
@@ -10,21 +21,30 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.gap.causes.search import Search
 from bench.gap.model.fit import RESPONSE, Fit, Fitter, Start, prior_of
-from bench.gap.model.models import Model, freedom
+from bench.gap.model.models import Model, Models, freedom
 from bench.gap.model.noise import Noise, likelihood, whitened
 from bench.gap.model.world import Mask, World
 from sims.base import Array
 
 Z95 = 1.959964
+"""Sigmas on either side that hold 95 % of a normal distribution."""
 RESAMPLES = 2000
+"""Bootstrap samples."""
+STRETCHES = 10
+"""Parts of a single run over which it is resampled."""
 STAGES = ((0.2, 6), (0.45, 6), (0.7, 6), (1.0, 10))
 """Shares of a run over which its initial state is fitted one after another, and steps of each."""
 TWICE = 2.0
 """Models this much farther from held-out runs than the nearest one, as a sum of squares, are fitted
 there once more.
 """
+UNBOUNDED = 4.0
+"""An interval wider than so many times the bounds, or the value, says that the data do not bound
+the parameter.
+"""
+WORST = -9.0
+"""Shares of the gap closed are cut here: how many times worse a failed model is has no meaning."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +57,7 @@ class Measured:
     merit: float
 
 
-class HeldOut:
+class HeldOutRuns:
     """Runs on which nothing is fitted but their initial states.
 
     Args:
@@ -58,10 +78,11 @@ class HeldOut:
         """
         fits = self._fitted([Start((), theta, self.world.guess) for theta in thetas], STAGES)
         nearest = min(fits, key=lambda fit: fit.cost)
+        # Asked this way round, since a fit that failed has a cost that is no number.
         apart = [i for i, fit in enumerate(fits) if not fit.cost < TWICE * nearest.cost]
-        again = self._fitted(
-            [replace(fits[i].start(), states=nearest.states) for i in apart], STAGES[1:]
-        )
+        starts = [replace(fits[i].start(), states=nearest.states) for i in apart]
+        # These states are good over the first share of the runs already.
+        again = self._fitted(starts, STAGES[1:])
         for i, fit in zip(apart, again, strict=True):
             fits[i] = min(fits[i], fit, key=lambda fit: fit.cost)
         return [self._measured(fit) for fit in fits]
@@ -69,10 +90,11 @@ class HeldOut:
     def _fitted(self, starts: Sequence[Start], stages: Sequence[tuple[float, int]]) -> list[Fit]:
         """Initial states fitted over longer and longer parts of the runs."""
         fits: list[Fit] = []
-        for share, iterations in stages if starts else ():
-            fits = Fitter(self.world, self.noise, share=share, parameters=False).fit(
-                starts, iterations
-            )
+        if not starts:
+            return fits
+        for share, iterations in stages:
+            fitter = Fitter(self.world, self.noise, share=share, parameters=False)
+            fits = fitter.fit(starts, iterations)
             starts = [fit.start() for fit in fits]
         return fits
 
@@ -80,11 +102,11 @@ class HeldOut:
         if not np.isfinite(fit.cost):
             return Measured(np.full_like(self.world.observed, np.nan), -np.inf)
         residual = np.where(self.seen, self.world.observed - fit.simulated, 0.0)
+        # Only initial states were fitted here, so they alone cost merit.
         free = freedom(self.world, fit, self.noise)
-        value = likelihood(residual, self.seen, free).value - free * float(
-            np.log(max(int(self.seen.sum()), 2))
-        )
-        return Measured(fit.simulated, value)
+        price = float(np.log(max(int(self.seen.sum()), 2)))
+        merit = likelihood(residual, self.seen, free).value - free * price
+        return Measured(fit.simulated, merit)
 
 
 def central(world: World, fit: Fit, noise: Noise) -> Fit:
@@ -94,78 +116,85 @@ def central(world: World, fit: Fit, noise: Noise) -> Fit:
     different that are not.
     """
     q, runs, size = fit.free.size, *fit.states.shape
-    bounds = np.array([world.parameters[i].bounds for i in fit.free]).reshape(-1, 2)
-    bounds = np.stack(
-        [
-            np.minimum(bounds[:, 0], fit.theta[fit.free]),
-            np.maximum(bounds[:, 1], fit.theta[fit.free]),
-        ],
-        1,
-    )
-    moved = np.sqrt(np.mean(np.square(fit.jacobian / noise.sigma[:, None]), axis=(0, 1, 2)))
-    largest = np.concatenate([1e-2 * (bounds[:, 1] - bounds[:, 0]), np.full(size, 1e-2)])
-    steps = np.clip(RESPONSE / np.maximum(moved, 1e-300), 1e-5 * largest, largest)
-    theta, states = np.tile(fit.theta, (2, q + size, 1)), np.tile(fit.states, (2, q + size, 1, 1))
+    bounds = _bounds_around(world, fit)
+    steps = _steps(fit, noise, bounds)
+    # Two sides, and on each side one row for each number that is moved.
+    theta = np.tile(fit.theta, (2, q + size, 1))
+    states = np.tile(fit.states, (2, q + size, 1, 1))
     for side, sign in enumerate((-1.0, 1.0)):
         for j, place in enumerate(fit.free):
+            # At a bound the step is one-sided; what it comes to is divided by below.
             theta[side, j, place] = np.clip(theta[side, j, place] + sign * steps[j], *bounds[j])
         for j in range(size):
             states[side, q + j, :, j] += sign * steps[q + j]
     rows = np.repeat(theta.reshape(-1, theta.shape[2]), runs, axis=0)
     lanes = np.tile(np.arange(runs), 2 * (q + size))
-    seen = world.simulate(rows, lanes, states.reshape(-1, size)).reshape(
-        2, q + size, *fit.simulated.shape
-    )
-    apart = np.concatenate(
-        [np.diagonal(theta[1][:q][:, fit.free] - theta[0][:q][:, fit.free]), 2.0 * steps[q:]]
-    )
-    jacobian = np.moveaxis(seen[1] - seen[0], 0, -1) / apart
+    simulated = world.simulate(rows, lanes, states.reshape(-1, size))
+    simulated = simulated.reshape(2, q + size, *fit.simulated.shape)
+    moved = np.diagonal(theta[1][:q][:, fit.free] - theta[0][:q][:, fit.free])
+    widths = np.concatenate([moved, 2.0 * steps[q:]])
+    jacobian = np.moveaxis(simulated[1] - simulated[0], 0, -1) / widths
+    # A simulation that failed on one side tells nothing of the slope.
     return replace(fit, jacobian=np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0))
 
 
-def covariance(search: Search, model: Model) -> Array:
-    """(q, q) of the fitted parameters, from the curvature, with the noise's own correlation.
-
-    Generalised least squares (W. H. Greene, Econometric Analysis, chapter 9): initial states are
-    eliminated run by run.
+def _bounds_around(world: World, fit: Fit) -> Array:
+    """(q, 2) bounds of the fitted parameters, widened to hold the fit: coefficients may lie beyond
+    their plausible range.
     """
-    world, fit, q = (
-        search.world,
-        central(search.world, model.fit, search.noise),
-        model.fit.free.size,
-    )
+    values = fit.theta[fit.free]
+    bounds = np.array([world.parameters[i].bounds for i in fit.free]).reshape(-1, 2)
+    return np.stack([np.minimum(bounds[:, 0], values), np.maximum(bounds[:, 1], values)], 1)
+
+
+def _steps(fit: Fit, noise: Noise, bounds: Array) -> Array:
+    """(q + s,) steps that move the runs by as much as the fit's own differences do."""
+    size = fit.states.shape[1]
+    moved = np.sqrt(np.mean(np.square(fit.jacobian / noise.sigma[:, None]), axis=(0, 1, 2)))
+    largest = np.concatenate([1e-2 * (bounds[:, 1] - bounds[:, 0]), np.full(size, 1e-2)])
+    steps: Array = np.clip(RESPONSE / np.maximum(moved, 1e-300), 1e-5 * largest, largest)
+    return steps
+
+
+def covariance(models: Models, model: Model) -> Array:
+    """(q, q) of the fitted parameters, from the curvature, with the noise's own correlation."""
+    world, q = models.world, model.fit.free.size
+    fit = central(world, model.fit, models.noise)
     noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), model.likelihood.phi)
-    jacobian = whitened(np.where(search.seen[..., None], fit.jacobian, 0.0), search.seen, noise)
+    jacobian = whitened(np.where(models.seen[..., None], fit.jacobian, 0.0), models.seen, noise)
     j = jacobian.reshape(len(jacobian), -1, jacobian.shape[3])
     normal = np.matmul(j.transpose(0, 2, 1), j)
     inner = normal[:, q:, q:] + np.diag(1.0 / prior_of(world) ** 2)
+    # An initial state that is known is not fitted, so it takes nothing away.
     cross = np.where(world.known[:, None, :], 0.0, normal[:, :q, q:])
-    schur = normal[:, :q, :q].sum(axis=0) - np.matmul(
-        cross, np.linalg.solve(inner, cross.transpose(0, 2, 1))
-    ).sum(0)
-    scale = np.sqrt(np.maximum(np.diagonal(normal[:, :q, :q].sum(axis=0)), 1e-300))
-    inverse = np.linalg.pinv(schur / np.outer(scale, scale), rcond=1e-13, hermitian=True)
-    values, vectors = np.linalg.eigh(schur / np.outer(scale, scale))
+    own = normal[:, :q, :q].sum(axis=0)
+    absorbed = np.matmul(cross, np.linalg.solve(inner, cross.transpose(0, 2, 1))).sum(0)
+    schur = own - absorbed  # what eq. (2) inverts
+    # Parameters of any unit on one scale, so that the cut-off below means the same for each.
+    scale = np.sqrt(np.maximum(np.diagonal(own), 1e-300))
+    scaled = schur / np.outer(scale, scale)
+    inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
+    values, vectors = np.linalg.eigh(scaled)
     lost = values < 1e-12
-    if lost.any():  # a direction that the data do not fix at all has no pseudo-inverse that says so
+    # A direction that the data do not fix at all has no pseudo-inverse that says so.
+    if lost.any():
         inverse = inverse + (vectors[:, lost] * 1e12) @ vectors[:, lost].T
     result: Array = inverse / np.outer(scale, scale)
     return result
 
 
-def intervals(search: Search, model: Model) -> dict[int, tuple[float, float, float]]:
+def intervals(models: Models, model: Model) -> dict[int, tuple[float, float, float]]:
     """Value, low and high (95 %) of each fitted parameter by its place; NaN where the data do not
     bound it.
     """
-    spread = np.sqrt(np.maximum(np.diagonal(covariance(search, model)), 0.0))
+    spread = np.sqrt(np.maximum(np.diagonal(covariance(models, model)), 0.0))
     result = {}
     for place, sd in zip(model.fit.free.tolist(), spread.tolist(), strict=True):
         value = float(model.fit.theta[place])
-        low, high = search.world.parameters[place].bounds
-        known = np.isfinite(sd) and 2.0 * Z95 * sd < 4.0 * max(high - low, abs(value))
-        result[place] = (
-            (value, value - Z95 * sd, value + Z95 * sd) if known else (value, np.nan, np.nan)
-        )
+        low, high = models.world.parameters[place].bounds
+        known = np.isfinite(sd) and 2.0 * Z95 * sd < UNBOUNDED * max(high - low, abs(value))
+        reach = Z95 * sd if known else np.nan
+        result[place] = (value, value - reach, value + reach)
     return result
 
 
@@ -191,8 +220,7 @@ def gain(
     floor: float,
     rng: np.random.Generator,
 ) -> Gain:
-    """Share of the gap closed, (before - after) / (before - floor) in RMSE, with a bootstrap
-    interval over runs.
+    """Share of the gap closed (1), with a bootstrap interval over runs.
 
     With a single run the resampling is over stretches of it (circular blocks; D. N. Politis, J. P.
     Romano 1992).
@@ -205,33 +233,37 @@ def gain(
         floor: RMS of the noise over them.
         rng: of the resampling.
     """
-    pieces = _pieces(world, before, after, channels)
-    whole = pieces.sum(axis=0)
-    rows = rng.integers(len(pieces), size=(RESAMPLES, len(pieces)))
-    shares = _closed(pieces[rows].sum(axis=1), floor)
-    low, high = (
-        (float(v) for v in np.quantile(shares, [0.025, 0.975]))
-        if len(pieces) > 1
-        else (np.nan, np.nan)
-    )
+    sums = _sums(world, before, after, channels)
+    whole = sums.sum(axis=0)
     base, extended = float(np.sqrt(whole[0] / whole[2])), float(np.sqrt(whole[1] / whole[2]))
+    rows = rng.integers(len(sums), size=(RESAMPLES, len(sums)))
+    shares = _closed(sums[rows].sum(axis=1), floor)
+    low, high = np.nan, np.nan
+    # Of one stretch every resample is the same, and would look certain.
+    if len(sums) > 1:
+        low, high = (float(v) for v in np.quantile(shares, [0.025, 0.975]))
     return Gain(base, extended, floor, float(_closed(whole[None], floor)[0]), low, high)
 
 
-def _pieces(world: World, before: Array, after: Array, channels: Sequence[int]) -> Array:
-    """(n, 3): sums of squares before and after, and samples, of each run, or of ten stretches of a
+def _sums(world: World, before: Array, after: Array, channels: Sequence[int]) -> Array:
+    """(n, 3): sums of squares before and after, and samples, of each run, or of the stretches of a
     single one.
     """
     parts: list[tuple[int, slice]] = [(r, slice(None)) for r in range(len(world.tracks))]
     if len(parts) == 1:
-        edges = np.linspace(0, world.lengths[0], 11).astype(int)
+        edges = np.linspace(0, world.lengths[0], STRETCHES + 1).astype(int)
         parts = [(0, slice(int(a), int(b))) for a, b in pairwise(edges) if b > a]
     rows = []
     for run, part in parts:
-        seen = np.isfinite(world.observed[run, part][:, channels])
-        if seen.any():
-            errors = [(world.observed - s)[run, part][:, channels][seen] for s in (before, after)]
-            rows.append([*(float(e @ e) for e in errors), float(seen.sum())])
+        observed = world.observed[run, part][:, channels]
+        seen = np.isfinite(observed)
+        if not seen.any():
+            continue
+        squares = []
+        for simulated in (before, after):
+            error = (observed - simulated[run, part][:, channels])[seen]
+            squares.append(float(error @ error))
+        rows.append([*squares, float(seen.sum())])
     return np.array(rows)
 
 
@@ -240,5 +272,6 @@ def _closed(sums: Array, floor: float) -> Array:
     base, extended = np.sqrt(sums[:, 0] / sums[:, 2]), np.sqrt(sums[:, 1] / sums[:, 2])
     gap = base - floor
     with np.errstate(all="ignore"):
-        share: Array = np.where(gap > 1e-3 * floor, (base - np.maximum(extended, floor)) / gap, 0.0)
-    return np.clip(share, -9.0, 1.0)
+        share = (base - np.maximum(extended, floor)) / gap  # (1)
+    # A gap of less than rounding would make any share of it, and a resample may have none.
+    return np.clip(np.where(gap > 1e-3 * floor, share, 0.0), WORST, 1.0)

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap.causes.search import Search
-from bench.gap.model.models import Model
+from bench.gap.model.models import Model, Models
 from bench.gap.model.world import World
 from sims.base import Array, Scenario
 
@@ -25,14 +24,14 @@ run.
 """
 
 
-def next_experiment(search: Search, model: Model, rival: Model) -> dict[str, Any]:
+def next_experiment(models: Models, model: Model, rival: Model) -> dict[str, Any]:
     """What to record next: a sentence, the change, and how far apart the two models then are in
     units of the noise.
     """
-    world = search.world
+    world = models.world
     best: tuple[float, str, dict[str, Any]] = (0.0, "", {})
     for says, change, scenario, states in _changes(world):
-        apart = _apart(world, scenario, states, model, rival, search.noise.sigma)
+        apart = _apart(world, scenario, states, model, rival, models.noise.sigma)
         if np.isfinite(apart) and apart > best[0]:
             best = apart, says, change
     added = [

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap.measure import HeldOut
+from bench.gap.measure import HeldOutRuns
 from bench.gap.model.floor import noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
@@ -56,7 +56,9 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
         there = [c.name for c in world.effects[name].on(world.simulator.system)]
         theta[world.slots[name]] = [numbers[c].value if c in numbers else 0.0 for c in there]
     floor = noise_floor(world, data)
-    measured = HeldOut(world, Noise(floor.sigma, np.zeros(len(floor.sigma)))).measure([theta])[0]
+    measured = HeldOutRuns(world, Noise(floor.sigma, np.zeros(len(floor.sigma)))).measure([theta])[
+        0
+    ]
     world.close()
     seen = np.isfinite(world.observed)
     squares = np.where(seen, np.square(world.observed - measured.simulated), 0.0)

@@ -5,34 +5,59 @@ or not it does, a force of any shape must not help: hats over time, position and
 axis and against the motion, stand for causes that nobody has thought of (a nonparametric
 lack-of-fit test; J. D. Hart, Nonparametric Smoothing and Lack-of-Fit Tests, 1997,
 doi:10.1007/978-1-4757-2722-7), calibrated by surrogates as the library is.
+
+A hat of width w around a centre m of a variable z (time, position or speed) is a force
+
+    f(z) = c max(1 - |z - m| / w, 0) d                                                         (1)
+
+with d its direction. Neighbours overlap by half, so the sum of a family over one variable is any
+force that is linear between `BINS` knots. How well sigma is known that is estimated from n samples of
+noise with a correlation phi between neighbours is (M. S. Bartlett's formula of 1946 at lag 0)
+
+    sd(sigma) / sigma = sqrt((1 + phi^2) / (1 - phi^2) / (2 n))                                (2)
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from bench.gap.causes.candidates import Directions, Probe, simulate_with
+from bench.gap.causes.rules import CHANCE, has_structure, is_loud, level_of
 from bench.gap.causes.score_test import score
-from bench.gap.causes.search import Search
-from bench.gap.model.models import Model
+from bench.gap.model.models import Model, Models
 from bench.gap.model.noise import surrogates
 from bench.gap.model.world import World
 from sims.base import Array
 from sims.system import Coefficient, Force, Moment
 
 BINS = 7
-AGAINST, ALONG = 0, 2
-TIME, SPEED, POSITION = 0, 1, 2
-CHANCE, UNSURE = 1e-3, 1e-4
-"""Chance at which structure would be seen where there is none; the second where the recording
-states no noise, and a noise that remembers may be all there is."""
-EXCESS, SIGMAS = 0.05, 4.0
-"""What is left may exceed the stated noise by this share and so many standard errors: no sensor is
-known better.
-"""
+"""Hats over the range of a variable."""
+SURROGATES = 150
+"""Residuals that mean nothing, drawn to calibrate the hats."""
+SLOW = 0.05
+"""Share of a speed that is seldom exceeded over which dry friction turns its sign."""
+SIZE = 1e-4
+"""Strength of a hat that is simulated, as a share of a typical force: its response is linear there."""
+TYPICAL = {"point": 2.0, "linear": 5.0, "rotary": 0.5}
+"""A typical force of each kind of system: m/s^2, N, N m."""
+
+AGAINST = 0
+"""Direction of a hat: against the motion, in proportion to speed."""
+DRY = 1
+"""Against the motion, whatever the speed."""
+ALONG = 2
+"""Along the first axis; the others follow."""
+
+TIME = 0
+"""Variable of a hat: time."""
+SPEED = 1
+"""Speed."""
+POSITION = 2
+"""The first coordinate; the others follow."""
 
 
 class Hat(Force):
@@ -50,28 +75,19 @@ class Hat(Force):
 
     def force(self, c: Array, moment: Moment) -> Array:
         """Strength times a triangle around the centre."""
-        variables = np.concatenate(
-            [np.broadcast_to(moment.t, moment.speed.shape), moment.speed, moment.x], axis=1
-        )
-        value = np.take_along_axis(variables, c[1].astype(np.intp), axis=1)
-        height = np.maximum(1.0 - np.abs(value - c[2]) / np.maximum(c[3], 1e-12), 0.0)
-        against = -moment.v / (
-            moment.speed + np.maximum(c[5], 1e-9)
-        )  # smooth, so that no step has to be shortened
-        directions = [
-            -moment.v,
-            against,
-            *(np.eye(moment.x.shape[1])[d] for d in range(moment.x.shape[1])),
-        ]
-        chosen = sum(np.where(c[4] == i, way, 0.0) for i, way in enumerate(directions))
-        result: Array = c[0] * height * chosen
+        strength, variable, centre, width, direction, slow = c
+        time = np.broadcast_to(moment.t, moment.speed.shape)
+        variables = np.concatenate([time, moment.speed, moment.x], axis=1)
+        value = np.take_along_axis(variables, variable.astype(np.intp), axis=1)
+        height = np.maximum(1.0 - np.abs(value - centre) / np.maximum(width, 1e-12), 0.0)  # (1)
+        # Smooth in the speed, so that no step has to be shortened where the motion turns.
+        dry = -moment.v / (moment.speed + np.maximum(slow, 1e-9))
+        axes = moment.x.shape[1]
+        ways = [-moment.v, dry, *(np.eye(axes)[axis] for axis in range(axes))]
+        # The lanes of one call differ in direction, and every lane has exactly one.
+        chosen = sum(np.where(direction == i, way, 0.0) for i, way in enumerate(ways))
+        result: Array = strength * height * chosen
         return result
-
-
-SLOWEST = 7.0
-"""Estimated noise that is exceeded by more than this would have to remember for 30 samples: that is
-no sensor's.
-"""
 
 
 @dataclass(frozen=True)
@@ -96,108 +112,136 @@ class Remains:
     @property
     def structure(self) -> bool:
         """Whether there is structure left."""
-        return self.p_value < self.chance or bool(self.loud)
+        return has_structure(self.p_value, self.chance, self.loud)
 
 
-def remains(search: Search, model: Model) -> Remains:
+def remains(models: Models, model: Model) -> Remains:
     """Test what a fitted model leaves.
 
     Args:
-        search: whose model it is.
+        models: among which the model is.
         model: the model.
     """
-    world, stated = search.world, search.stated
+    world, stated = models.world, models.stated
     left = np.where(np.isfinite(model.likelihood.sigma), model.likelihood.sigma, 0.0)
-    excess = left / search.noise.sigma
+    excess = left / models.noise.sigma
     loud = tuple(
         name
         for c, name in enumerate(world.channels)
-        if excess[c] > (1.0 + EXCESS + SIGMAS * _error(search, model, c) if stated[c] else SLOWEST)
+        if is_loud(excess[c], _error(models, model, c), stated[c])
     )
     if Hat.name not in world.slots:
         return Remains(1.0, "", excess, loud)
-    found = hats(world, model)
-    if not found.probes:
+    directions = hats(world, model)
+    if not directions.probes:
         return Remains(1.0, "", excess, loud)
-    residual = search.residual(model.fit)
-    like = surrogates(residual, search.seen, 150, search.rng)
-    scores = score(model.fit, residual, found, search.seen, search.weights(model), like)
+    residual = models.residual(model.fit)
+    surrogate = surrogates(residual, models.seen, SURROGATES, models.rng)
+    weights = models.weights(model)
+    scores = score(model.fit, residual, directions, models.seen, weights, surrogate)
     promise = scores.score - scores.chance
     where = scores.effects[int(np.argmax(promise))]
-    return Remains(scores.p_value, where, excess, loud, CHANCE if stated.all() else UNSURE)
+    return Remains(scores.p_value, where, excess, loud, level_of(bool(stated.all())))
 
 
-def _error(search: Search, model: Model, channel: int) -> float:
+def _error(models: Models, model: Model, channel: int) -> float:
     """Standard error of a channel's sigma, as a share of it: fewer samples count where noise
     remembers.
     """
+    # At a correlation of one the formula knows nothing, and every channel would be quiet.
     phi = min(abs(float(model.likelihood.phi[channel])), 0.99)
-    count = max(int(search.seen[:, :, channel].sum()), 2)
-    return float(np.sqrt((1.0 + phi * phi) / (1.0 - phi * phi) / (2.0 * count)))
+    count = max(int(models.seen[:, :, channel].sum()), 2)
+    return float(np.sqrt((1.0 + phi * phi) / (1.0 - phi * phi) / (2.0 * count)))  # (2)
 
 
 def hats(world: World, model: Model) -> Directions:
     """What hats over every recorded variable would change about a model."""
     labels, added = [], []
-    slow = 0.05 * _fastest(world)
-    size = 1e-4 * {"point": 2.0, "linear": 5.0, "rotary": 0.5}[world.simulator.system.kind]
-    for label, variable, direction, low, high in _families(world):
-        width = (high - low) / (BINS - 1)
-        for centre in np.linspace(low, high, BINS):
-            labels.append(label)
-            added.append((Hat.name, np.array([size, variable, centre, width, direction, slow])))
+    slow = SLOW * _fastest(world)
+    size = SIZE * TYPICAL[world.simulator.system.kind]
+    for family in _families(world):
+        # At this spacing each hat reaches to the centres of its neighbours.
+        width = (family.high - family.low) / (BINS - 1)
+        for centre in np.linspace(family.low, family.high, BINS):
+            labels.append(family.label)
+            c = np.array([size, family.variable, centre, width, family.direction, slow])
+            added.append((Hat.name, c))
     if not added:
         return Directions((), np.zeros((*world.observed.shape, 0)))
     changed = simulate_with(world, model.fit, added) - model.fit.simulated
     values = np.nan_to_num(np.moveaxis(changed, 0, -1)) / size
-    kept = np.flatnonzero(np.abs(values).max(axis=(0, 1, 2)) > 0)
-    probes = tuple(Probe(labels[i], 0, 0, added[i][1], True) for i in kept)
-    return Directions(probes, values[..., kept])
+    # A hat where no run ever is changes nothing, and would be a column of zeros.
+    acting = np.flatnonzero(np.abs(values).max(axis=(0, 1, 2)) > 0)
+    # One label for a family: its hats are one hypothesis, and act together.
+    probes = tuple(Probe(labels[i], 0, 0, added[i][1], True) for i in acting)
+    return Directions(probes, values[..., acting])
 
 
-def _families(world: World) -> Iterator[tuple[str, int, int, float, float]]:
-    """Label, variable, direction and range of each family of hats."""
-    system, times = world.simulator.system, [t.scenario.times for t in world.tracks]
-    axes, free = len(system.coordinates), system.bounces
-    longest = max(float(t[-1] - t[0]) for t in times)
-    for axis, name in enumerate(system.coordinates):
+class _Family(NamedTuple):
+    """Hats over the range of one variable, with one direction."""
+
+    label: str
+    variable: int
+    direction: int
+    low: float
+    high: float
+
+
+def _families(world: World) -> Iterator[_Family]:
+    """Every family of hats that the recording can show."""
+    yield from _over_time(world)
+    yield from _over_positions(world)
+    yield from _over_speed(world)
+
+
+def _over_time(world: World) -> Iterator[_Family]:
+    longest = max(float(t.scenario.times[-1] - t.scenario.times[0]) for t in world.tracks)
+    for axis, name in enumerate(world.simulator.system.coordinates):
         if name in world.channels:
-            yield f"time, along {name}", TIME, ALONG + axis, 0.0, longest
-    yield "time, against the motion", TIME, AGAINST, 0.0, longest
+            yield _Family(f"time, along {name}", TIME, ALONG + axis, 0.0, longest)
+    yield _Family("time, against the motion", TIME, AGAINST, 0.0, longest)
+
+
+def _over_positions(world: World) -> Iterator[_Family]:
+    system = world.simulator.system
+    # What bounces flies free: there is nothing that it slides on, and its height comes last.
+    free, last = system.bounces, len(system.coordinates) - 1
     for axis, name in enumerate(system.coordinates):
         if name not in world.channels:
             continue
         values = world.observed[:, :, world.channels.index(name)]
         low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
-        if high > low:
-            if not (free and axis == axes - 1):
-                yield (
-                    f"position {name}, along {system.coordinates[-1]}",
-                    POSITION + axis,
-                    ALONG + axes - 1,
-                    low,
-                    high,
-                )
-            yield f"position {name}, against the motion", POSITION + axis, AGAINST, low, high
-            if not free:
-                yield f"position {name}, dry", POSITION + axis, AGAINST + 1, low, high
+        if not high > low:
+            continue
+        position = POSITION + axis
+        if not (free and axis == last):
+            along = f"position {name}, along {system.coordinates[last]}"
+            yield _Family(along, position, ALONG + last, low, high)
+        yield _Family(f"position {name}, against the motion", position, AGAINST, low, high)
+        if not free:
+            yield _Family(f"position {name}, dry", position, DRY, low, high)
+
+
+def _over_speed(world: World) -> Iterator[_Family]:
     speed = _fastest(world)
     if speed > 0:
-        yield "speed, against the motion", SPEED, AGAINST, 0.0, speed
-    if speed > 0 and not free:
-        yield "speed, dry", SPEED, AGAINST + 1, 0.0, speed
+        yield _Family("speed, against the motion", SPEED, AGAINST, 0.0, speed)
+    if speed > 0 and not world.simulator.system.bounces:
+        yield _Family("speed, dry", SPEED, DRY, 0.0, speed)
 
 
 def _fastest(world: World) -> float:
     """A speed that is seldom exceeded, from the recorded coordinates."""
-    system, squares = world.simulator.system, []
-    for name in system.coordinates:
-        if name in world.channels:
-            c = world.channels.index(name)
-            rates = [
-                np.diff(t.observed[::3, c]) / np.diff(t.scenario.times[::3])
-                for t in world.tracks
-                if len(t.observed) > 3
-            ]
-            squares.append(np.square(np.concatenate([np.zeros(1), *rates])))
+    squares = []
+    for name in world.simulator.system.coordinates:
+        if name not in world.channels:
+            continue
+        c = world.channels.index(name)
+        rates = [np.zeros(1)]
+        for track in world.tracks:
+            if len(track.observed) > 3:
+                # Every third sample: differences of neighbours are mostly noise.
+                step = np.diff(track.scenario.times[::3])
+                rates.append(np.diff(track.observed[::3, c]) / step)
+        squares.append(np.square(np.concatenate(rates)))
     return float(np.sqrt(np.nanquantile(sum(squares), 0.98))) if squares else 0.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.gap.causes.search import Search
-from bench.gap.measure import HeldOut, central, covariance, gain, intervals
+from bench.gap.measure import HeldOutRuns, central, covariance, gain, intervals
 from bench.gap.model.fit import Fitter, Start
 from bench.gap.model.noise import Noise
 from sims.pendulum.simulator import Pendulum
@@ -151,7 +151,7 @@ def test_held_out_runs_estimate_initial_states_and_nothing_else():
         theta=["4e-3"], runs=3, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"], held_out=0
     )
     there = world(made, candidates=["drag.linear"])
-    held_out = HeldOut(there, white(there, [0.003, 0.02]))
+    held_out = HeldOutRuns(there, white(there, [0.003, 0.02]))
     right, wrong, failed = held_out.measure(
         [np.array(theta) for theta in ([4e-3, 0.0], [3e-3, 0.0], [np.nan, 0.0])]
     )

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from bench.gap.causes.structure import CHANCE, SLOWEST, Hat, hats, remains
+from bench.gap.causes.rules import CHANCE, SLOWEST
+from bench.gap.causes.structure import Hat, hats, remains
 from sims.pendulum.simulator import Pendulum
 from sims.slider.simulator import Slider
 from sims.system import Coefficient, Force

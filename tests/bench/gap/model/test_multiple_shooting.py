@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.gap.causes import name, search
+from bench.gap.causes import moves, search
+from bench.gap.causes.settle import settle
 from bench.gap.model.fit import Fitter, Start
 from bench.gap.model.multiple_shooting import PIECES, pieces, whole
 from sims.ball.simulator import Ball
@@ -84,7 +85,8 @@ def test_a_fit_of_pieces_begins_that_of_whole_runs_with_their_first_pieces():
 
 
 def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkeypatch):
-    monkeypatch.setattr(search, "NOMINATED", 1)
+    for module in (search, moves):
+        monkeypatch.setattr(module, "NOMINATED", 1)
     dragged = Pendulum(effects=["drag.quadratic"])
     data = recorded(
         dragged,
@@ -101,7 +103,7 @@ def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkey
         "spring.linear",
     ]
     looking, _ = searched(data, [0.002, 0.01], candidates=library)
-    found = name.settled(looking, looking.run())
+    found = settle(looking, looking.run())
     tried = {n for names in looking.models for n in names}
     assert {"drag.linear", "friction.coulomb", "friction.load"} <= tried
     assert found.names == ("drag.quadratic",)

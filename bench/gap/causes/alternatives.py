@@ -1,0 +1,131 @@
+"""Collects what would explain the same as well, effect by effect.
+
+A model with effects N stands beside every model of the same size that shares all of N but one. The
+effect by which they differ is an alternative if that model is not behind by odds of 33 to 1, fitted
+and held-out runs together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.gap.causes.rules import behind_in_excess, is_alike, ratio_of
+from bench.gap.causes.score_test import tail
+from bench.gap.causes.search import Search
+from bench.gap.causes.trial import Trial
+from bench.gap.model.models import Model
+from sims.simulated import effect_parameters
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One effect that was found, and what speaks for it.
+
+    Attributes:
+        effect: its name.
+        alternatives: effects that would explain the same as well, the most plausible first.
+        p_value: chance of a gain like its own if it were not there.
+        gain: twice the log likelihood lost without it.
+        preferred: which of the set should stand for it: the likeliest, held-out runs included, of
+            those whose coefficients are plausible.
+    """
+
+    effect: str
+    alternatives: tuple[str, ...]
+    p_value: float
+    gain: float
+    preferred: str = ""
+
+
+@dataclass(frozen=True)
+class Alternatives:
+    """Collects them for the effects of a model.
+
+    Attributes:
+        search: with every model that was fitted.
+        trial: the models on held-out runs; None where there are none.
+        structure: whether the model leaves structure that no effect accounts for.
+    """
+
+    search: Search
+    trial: Trial | None
+    structure: bool
+
+    def evidence(self, model: Model) -> tuple[Evidence, ...]:
+        """The model's effects, strongest first."""
+        effects = [self._evidence(model, name) for name in model.names]
+        return tuple(sorted(effects, key=lambda evidence: -evidence.gain))
+
+    def _evidence(self, model: Model, effect: str) -> Evidence:
+        rest = self.search.without(model, effect)
+        gain = model.likelihood.value - rest.likelihood.value
+        p_value = self._p_value(rest, effect, gain)
+        rivals = self._rivals(model, rest, effect)
+        # What explains the data with a coefficient that nobody would expect comes last in its set.
+        rivals.sort(key=lambda rival: (not self._is_plausible(rival[1]), rival))
+        ordered = [name for _, name in rivals]
+        alternatives = tuple(name for name in ordered if name != effect)
+        # Alike is not as likely where structure is left, so there the effect found stands.
+        preferred = effect if self.structure else ordered[0]
+        return Evidence(
+            effect, alternatives, float(np.clip(p_value, 0.0, 1.0)), float(gain), preferred
+        )
+
+    def _p_value(self, rest: Model, effect: str, gain: float) -> float:
+        """Chance of such a gain, or of the best score of the library, about the model without it."""
+        search, key = self.search, frozenset(rest.names)
+        known = search.scanned.get(key)
+        scores = search.scan(rest) if known is None else known.scores
+        chance = dict(zip(scores.effects, scores.chance.tolist(), strict=True)).get(effect, 0.0)
+        by_refit = tail(scores.by_chance, np.array([gain - chance]))
+        return min(search.tests.get(key, 1.0), by_refit)
+
+    def _rivals(self, model: Model, rest: Model, effect: str) -> list[tuple[float, str]]:
+        """How far behind, and the name, of each effect that does as well in place of this one."""
+        shared = set(rest.names)
+        rivals = [(0.0, effect)]
+        for other in list(self.search.models.values()):
+            names = set(other.names)
+            if len(names) != len(model.names) or not shared < names:
+                continue
+            (added,) = names - shared
+            if added == effect:
+                continue
+            behind = self._behind(model, other)
+            if is_alike(behind):
+                rivals.append((behind, added))
+        return rivals
+
+    def _behind(self, model: Model, other: Model) -> float:
+        """How far another model is behind, in twice the log likelihood; negative if it is ahead.
+
+        Where structure is left that neither has, likelihoods compare nothing but how each mimics
+        it; then what counts is how much of the gap is left.
+        """
+        trial = self.trial
+        both = trial is not None and other.names in trial.measured and model.names in trial.measured
+        if self.structure:
+            ratios = [ratio_of(self.search.excess(other), self.search.excess(model))]
+            if both and trial is not None:
+                ratios.append(ratio_of(trial.excess(other.names), trial.excess(model.names)))
+            return behind_in_excess(ratios)
+        behind = model.merit - other.merit
+        if both and trial is not None:
+            behind += trial.measured[model.names].merit - trial.measured[other.names].merit
+        return behind
+
+    def _is_plausible(self, effect: str) -> bool:
+        """Whether the coefficients with which an effect explains the gap are what one would expect."""
+        world = self.search.world
+        having = [m for m in self.search.models.values() if effect in m.names]
+        if not having:
+            return False
+        best = max(having, key=lambda m: m.merit)
+        system = world.simulator.system
+        parameters = effect_parameters(world.effects[effect], system, world.channels)
+        values = best.fit.theta[world.slots[effect]]
+        return all(
+            p.bounds[0] <= value <= p.bounds[1] for p, value in zip(parameters, values, strict=True)
+        )

@@ -1,0 +1,160 @@
+"""What the models of a recording seem to lack: each scored against the whole library, once.
+
+A model is scored by a linear test (`bench.gap.causes.score_test`); whether it lacks something is then
+asked of that score and of the size of what it leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.gap.causes.candidates import Directions, directions
+from bench.gap.causes.nominate import nominated
+from bench.gap.causes.score_test import Scores, score, tail
+from bench.gap.model.models import Model, Models
+from bench.gap.model.noise import forgets, surrogates
+from sims.base import Array
+
+SURROGATES = 120
+"""Residuals that mean nothing, drawn to calibrate the scores about one model."""
+CERTAIN = 1e-6
+"""A chance below which surrogates of another colour are not asked."""
+LOUD = 1.3
+"""What is left that exceeds the noise floor by this factor is looked into by simulation, whatever
+the scores say.
+"""
+FORGOT = 0.01
+"""But not over an estimated floor, where the chance that all of it is first-order noise is above
+this.
+"""
+
+
+class Scanned(NamedTuple):
+    """What each effect would change about a model, and the scores of that."""
+
+    directions: Directions
+    scores: Scores
+
+
+@dataclass
+class Scored(Models):
+    """Models, and what has been scored about them.
+
+    Attributes:
+        scanned: of each model that was scored, by its effects.
+        tests: the p value of the best score about each, by its effects.
+    """
+
+    scanned: dict[frozenset[str], Scanned] = field(default_factory=dict)
+    tests: dict[frozenset[str], float] = field(default_factory=dict)
+
+    @property
+    def base(self) -> Model:
+        """The model without any effect."""
+        return self.models[frozenset()]
+
+    def replaced(self, key: frozenset[str]) -> None:
+        """What was scored about the model before holds no longer."""
+        self.scanned.pop(key, None)
+
+    def scan(self, model: Model, against: Array | None = None) -> Scores:
+        """Score every effect that the model lacks.
+
+        Args:
+            model: about which.
+            against: (R, T, C) a residual for surrogates; the model's own if None.
+        """
+        key = frozenset(model.names)
+        known = self.scanned.get(key)
+        if known is not None and against is None:
+            return known.scores
+        # Directions cost a simulation of each candidate; other surrogates need no new ones.
+        candidates = self._lacking(model) if known is None else known.directions
+        residual = self.residual(model.fit)
+        meaningless = residual if against is None else against
+        surrogate = surrogates(meaningless, self.seen, SURROGATES, self.rng)
+        scores = score(model.fit, residual, candidates, self.seen, self.weights(model), surrogate)
+        self.scanned[key] = Scanned(candidates, scores)
+        self.tests[key] = scores.p_value
+        # Kept from the first scan, so that merits stay comparable when a better base fit turns up.
+        if not key and not self.chances:
+            self.chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
+        return scores
+
+    def _lacking(self, model: Model) -> Directions:
+        """Directions of the effects that a model lacks."""
+        held = set(model.names)
+        # Of an effect and one that it contains nothing would fix how they share what they explain.
+        for name in model.names:
+            held.update(self.world.effects[name].contains)
+        lacking = [name for name in self.world.library if name not in held]
+        return directions(self.world, model.fit, lacking)
+
+    def extend(self, beam: Iterable[Model], most: int, patient: bool = False) -> None:
+        """Refit the most promising extensions of some models; those that are known already only
+        with patience.
+        """
+        starts = []
+        for model in beam:
+            key = frozenset(model.names)
+            if key not in self.scanned:
+                self.scan(model)
+            candidates, scores = self.scanned[key]
+            # The model may have been fitted better since it was put into the beam.
+            newest = self.models[key]
+            for start in nominated(
+                self.world, self.noise, newest, candidates, scores, most, patient
+            ):
+                if patient or frozenset(start.effects) not in self.models:
+                    starts.append(start)
+        if starts:
+            self.refit(starts, patient=patient)
+
+    def missing(self, model: Model, larger: Model) -> float:
+        """Probability that a model which lacks nothing would seem to gain as much by becoming the
+        larger one.
+
+        The surrogates have the colour of what the larger model leaves, which is closer to the noise
+        alone.
+        """
+        gain = larger.likelihood.value - model.likelihood.value
+        model = self.models[frozenset(model.names)]
+        first = self._gained(self.scan(model), larger, gain)
+        if first < CERTAIN:
+            return first
+        scores = self.scan(model, self.residual(larger.fit))
+        return min(scores.p_value, self._gained(scores, larger, gain))
+
+    def _gained(self, scores: Scores, larger: Model, gain: float) -> float:
+        """Chance of a gain in twice the log likelihood, less what chance gives the larger model's
+        effects.
+        """
+        chance = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
+        lucky = max((chance.get(name, 0.0) for name in larger.names), default=0.0)
+        return tail(scores.by_chance, np.array([gain - lucky]))
+
+    def plain(self, model: Model, doubt: float) -> bool:
+        """Whether nothing suggests that the model lacks something: neither a score nor the size of
+        what it leaves.
+        """
+        return self.scan(model).p_value > doubt and self.quiet(model)
+
+    def quiet(self, model: Model) -> bool:
+        """Whether what a model leaves may be noise: as small as the floor, or larger where the
+        floor is an estimate.
+
+        The floor is estimated as if noise forgot itself; what is left may exceed it if it is of
+        first order.
+        """
+        left = np.nan_to_num(model.likelihood.sigma, nan=np.inf)
+        loud = left >= LOUD * self.noise.sigma
+        if not loud.any():
+            return True
+        # Stated noise is known, so more than it is no noise, whatever its colour.
+        if (loud & self.stated).any():
+            return False
+        return forgets(self.residual(model.fit), self.seen, model.likelihood) > FORGOT

@@ -1,0 +1,82 @@
+"""Fits what the search ended with, and its rivals, to the end, before anything is named.
+
+The search asks few candidates about each model and stops fits that fall behind; a cause that it
+names must stand against all of them, each at its own best.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.gap.causes.candidates import neighbours
+from bench.gap.causes.search import Search
+from bench.gap.causes.structure import remains
+from bench.gap.model.models import Model
+from bench.gap.model.noise import Noise
+
+NEAR = 30.0
+"""Rivals this near in twice the log likelihood are fitted once more before they are judged."""
+NEARLY = 1.5
+"""So are those that leave less than so many times the model's excess over the noise."""
+
+
+def settle(search: Search, model: Model) -> Model:
+    """The best model after it and its rivals of the same size, all that are promising, were fitted
+    to the end.
+
+    By generalised least squares where what is left is noise; by ordinary ones where structure is
+    left, which is none and would pull the fit away from the data.
+    """
+    size = len(model.names)
+    model = _among_all(search, model)
+    around = list(neighbours(search.world, model.fit))
+    # What repeats has minima by the dozen.
+    if around:
+        search.from_pieces(size)
+    near = rivals(search, model)
+    parts = _smaller(search, model)
+    noise = _noise_of(search, model)
+    judged = [model]
+    # Where structure is left merits only compare how each model mimics it, so none takes its place.
+    if noise is not None:
+        judged = [m for m in near if abs(model.merit - m.merit) < NEAR] or [model]
+    search.refit([*(m.fit.start() for m in (*near, *parts)), *around], noise)
+    refitted = [search.models[frozenset(m.names)] for m in judged]
+    return max(refitted, key=lambda m: m.merit)
+
+
+def _among_all(search: Search, model: Model) -> Model:
+    """The best of a model and those that have any other effect of the library in place of one."""
+    size, known = len(model.names), set(search.models)
+    smaller = [search.without(model, name) for name in model.names]
+    search.extend(smaller, len(search.world.library))
+    asked = [m for key, m in search.models.items() if key not in known and len(key) == size]
+    return max([model, *asked], key=lambda m: m.merit)
+
+
+def rivals(search: Search, model: Model) -> list[Model]:
+    """Models of as many effects that explain nearly as much, the model itself among them."""
+    same = [m for m in search.models.values() if len(m.names) == len(model.names)]
+    return [m for m in same if _is_near(search, m, model)]
+
+
+def _is_near(search: Search, other: Model, model: Model) -> bool:
+    """By merit, or by what is left over the noise, since merit is misled where structure is left."""
+    if abs(model.merit - other.merit) < NEAR:
+        return True
+    return search.excess(other) < NEARLY * search.excess(model)
+
+
+def _smaller(search: Search, model: Model) -> list[Model]:
+    """The models without one of the effects: the gain of each is measured against them."""
+    size, names = len(model.names) - 1, set(model.names)
+    return [m for m in search.models.values() if len(m.names) == size and set(m.names) < names]
+
+
+def _noise_of(search: Search, model: Model) -> Noise | None:
+    """The noise that a model leaves, to weigh samples with; None where it leaves structure."""
+    if remains(search, model).structure:
+        return None
+    sigma = np.maximum(model.likelihood.sigma, 1e-300)
+    # As in the score test, correlations are never negative.
+    return Noise(sigma, np.maximum(model.likelihood.phi, 0.0))

@@ -1,0 +1,85 @@
+"""What held-out runs say about the models of a search: they have a veto and a voice.
+
+An effect that makes them worse goes. A gap that only they show is something that the model has not
+learnt. And between models that explain the fitted runs alike, their likelihood counts too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bench.gap.causes.rules import helps, is_missed
+from bench.gap.causes.search import Search
+from bench.gap.causes.structure import Remains
+from bench.gap.measure import HeldOutRuns, Measured
+from bench.gap.model.models import Model, Names
+from sims.base import Array
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Models on held-out runs.
+
+    Attributes:
+        runs: the held-out runs.
+        measured: the models that were tried there, by their effects.
+    """
+
+    runs: HeldOutRuns
+    measured: dict[Names, Measured] = field(default_factory=dict)
+
+    def measure(self, models: Iterable[Model]) -> None:
+        """Try models, all at once: each is compared with the nearest of them."""
+        chosen = {model.names: model for model in models}
+        results = self.runs.measure([model.fit.theta for model in chosen.values()])
+        self.measured.update(zip(chosen, results, strict=True))
+
+    def excess(self, names: Names, sigma: Array | None = None) -> float:
+        """RMS of what a model leaves of the held-out runs in units of the noise, less one.
+
+        Args:
+            names: its effects; it has been measured.
+            sigma: (C,) the noise; that of the runs if None.
+        """
+        runs = self.runs
+        noise = runs.noise.sigma if sigma is None else sigma
+        left = (runs.world.observed - self.measured[names].simulated) / noise
+        return float(np.sqrt(np.square(left[runs.seen]).mean())) - 1.0
+
+    def without_idle(self, search: Search, model: Model) -> Model:
+        """The model without effects that make held-out runs worse, or hardly better while much is
+        left of the gap.
+        """
+        while model.names and model.names in self.measured:
+            idle = [m for m in self._smaller(search, model) if not self._helps(m, model)]
+            if not idle:
+                return model
+            model = max(idle, key=lambda m: self.measured[m.names].merit)
+        return model
+
+    def _smaller(self, search: Search, model: Model) -> list[Model]:
+        """Models that were tried and lack one of the model's effects."""
+        size, names = len(model.names) - 1, set(model.names)
+        return [
+            m
+            for m in search.models.values()
+            if len(m.names) == size and set(m.names) < names and m.names in self.measured
+        ]
+
+    def _helps(self, without: Model, having: Model) -> bool:
+        """Whether the effect by which two models differ makes held-out runs better."""
+        names = without.names, having.names
+        merits = self.measured[names[0]].merit, self.measured[names[1]].merit
+        return helps(merits, (self.excess(names[0]), self.excess(names[1])))
+
+    def misses(self, model: Model, left: Remains) -> bool:
+        """Whether held-out runs show a gap that the model does not close: something acts there that
+        it has not learnt.
+        """
+        own = np.nan_to_num(model.likelihood.sigma)
+        # What is left of fitted runs is the noise where it has no structure; else only the floor is.
+        noise = np.maximum(self.runs.noise.sigma, np.where(left.structure, 0.0, own))
+        return is_missed(self.excess((), noise), self.excess(model.names, noise))
