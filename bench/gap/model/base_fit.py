@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,14 +15,32 @@ from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
 from sims.base import Array, Parameter
 
-STARTS, KEPT = 15, 3
-HORIZONS = ((0.2, 6), (0.45, 6), (1.0, 20))
-"""Shares of each run that are fitted one after another, and steps of each: the end of a run depends
-on its beginning in ways that only a nearly fitted model follows."""
+STARTS = 15
+"""Starts over the bounds, beside the nominal one."""
+KEPT = 3
+"""So many of them are fitted: those nearest to the data."""
+LAST_STEPS = 10
+"""Steps of the fit that follows when parameters have been found untouched."""
 TOUCHED = 1.0
 """A parameter that changes the observations by less than this many sigmas in all, moved across its
 bounds, is not touched by the data."""
 LOGARITHMIC = 5.0
+"""Bounds whose ratio is larger are searched by their logarithm."""
+LOST = 1e3
+"""Residual, in the channel's unit, that a sample counts which a start could not simulate."""
+
+
+class Horizon(NamedTuple):
+    """A first share of each run that is fitted, and how many steps of it."""
+
+    share: float
+    iterations: int
+
+
+HORIZONS = (Horizon(0.2, 6), Horizon(0.45, 6), Horizon(1.0, 20))
+"""Fitted one after another: the end of a run depends on its beginning in ways that only a nearly
+fitted model follows.
+"""
 
 
 @dataclass(frozen=True)
@@ -44,53 +63,63 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
             bounds.
     """
     starts = [Start((), theta, world.guess) for theta in _starts(world, given)]
+    # to simulate a start costs far less than to fit it, so the field is thinned first
     if len(starts) > KEPT:
-        costs = _costs(world, noise, starts)
-        starts = [starts[i] for i in np.argsort(costs, kind="stable")[:KEPT]]
+        order = np.argsort(_costs(world, noise, starts), kind="stable")
+        starts = [starts[i] for i in order[:KEPT]]
     fits: list[Fit] = []
-    for share, iterations in HORIZONS:
-        fitter = Fitter(world, noise, share=share)
-        fits = fitter.fit(starts, iterations)
+    for horizon in HORIZONS:
+        fits = Fitter(world, noise, share=horizon.share).fit(starts, horizon.iterations)
         starts = [fit.start() for fit in fits]
     best = min(fits, key=lambda fit: fit.cost)
+
+    # what the data do not touch stands wherever the search left it: nominal says more
     untouched = frozenset(int(i) for i in world.base if not _touched(world, best, int(i), noise))
     if untouched:
+        places = list(untouched)
         theta = best.theta.copy()
-        theta[list(untouched)] = world.nominal()[list(untouched)]
-        best = Fitter(world, noise, untouched).fit([replace(best.start(), theta=theta)], 10)[0]
+        theta[places] = world.nominal()[places]
+        start = replace(best.start(), theta=theta)
+        best = Fitter(world, noise, untouched).fit([start], LAST_STEPS)[0]
     return Base(best, untouched)
 
 
 def _starts(world: World, given: Array | None) -> list[Array]:
+    """Parameter vectors (P,) to begin with: the given one, or the nominal one and a grid."""
     nominal = world.nominal()
     if given is not None:
         nominal[world.base] = given
         return [nominal]
     parameters = [world.parameters[i] for i in world.base]
-    result = [nominal]
-    for row in evenly(STARTS, len(parameters)) if parameters else ():
+    starts = [nominal]
+    for shares in evenly(STARTS, len(parameters)) if parameters else ():
         theta = nominal.copy()
-        theta[world.base] = [_between(p, share) for p, share in zip(parameters, row, strict=True)]
-        result.append(theta)
-    return result
+        for place, parameter, share in zip(world.base, parameters, shares, strict=True):
+            theta[place] = _between(parameter, share)
+        starts.append(theta)
+    return starts
 
 
 def evenly(count: int, dim: int) -> Array:
     """Points (count, dim) spread evenly over the unit cube: an additive recurrence with the
-    generalised golden ratio.
+    generalised golden ratio g (M. Roberts, The unreasonable effectiveness of quasirandom sequences,
+    2018).
 
-    M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018.
+        g^(d + 1) = g + 1                                                                        (1)
+        x_nk = (1/2 + n g^-k) mod 1,   n = 1 ... count, k = 1 ... d                              (2)
     """
     ratio = 2.0
+    # (1) as a fixed point, each pass more than halving the error: 60 are beyond rounding
     for _ in range(60):
         ratio = (1.0 + ratio) ** (1.0 / (dim + 1))
-    points: Array = (
-        0.5 + np.arange(1, count + 1)[:, None] * ratio ** -np.arange(1.0, dim + 1)
-    ) % 1.0
+    steps = ratio ** -np.arange(1.0, dim + 1)
+    numbers = np.arange(1, count + 1)[:, None]
+    points: Array = (0.5 + numbers * steps) % 1.0  # (2)
     return points
 
 
 def _between(parameter: Parameter, share: float) -> float:
+    """The value at a share of a parameter's bounds."""
     low, high = parameter.bounds
     if low > 0 and high / low > LOGARITHMIC:
         return float(low * (high / low) ** share)
@@ -99,22 +128,26 @@ def _between(parameter: Parameter, share: float) -> float:
 
 def _costs(world: World, noise: Noise, starts: Sequence[Start]) -> Array:
     """Sums of squares of each start over the first samples of the runs."""
-    runs = len(world.tracks)
+    count, runs = len(starts), len(world.tracks)
+    share = HORIZONS[0].share
     theta = np.repeat([s.theta for s in starts], runs, axis=0)
     states = np.concatenate([s.states for s in starts])
-    share = HORIZONS[0][0]
-    seen = world.simulate(theta, np.tile(np.arange(runs), len(starts)), states, share)
-    seen = seen.reshape(len(starts), runs, *seen.shape[1:])
-    counted = world.counted(share)
-    residual = np.where(counted, np.nan_to_num(world.observed - seen, nan=1e3), 0.0) / noise.sigma
-    costs: Array = np.square(residual).sum(axis=(1, 2, 3))
+    lanes = np.tile(np.arange(runs), count)
+    simulated = world.simulate(theta, lanes, states, share)
+    simulated = simulated.reshape(count, runs, *simulated.shape[1:])
+
+    left = np.nan_to_num(world.observed - simulated, nan=LOST)
+    residuals = np.where(world.counted(share), left, 0.0) / noise.sigma
+    costs: Array = np.square(residuals).sum(axis=(1, 2, 3))
     return costs
 
 
 def _touched(world: World, fit: Fit, place: int, noise: Noise) -> bool:
-    where = np.flatnonzero(fit.free == place)
-    if not where.size:
+    """Whether the data tell anything of a parameter."""
+    columns = np.flatnonzero(fit.free == place)
+    if not columns.size:
         return False
     low, high = world.parameters[place].bounds
-    change = fit.jacobian[..., where[0]] * (high - low) / noise.sigma
-    return float(np.sqrt(np.square(change[np.isfinite(world.observed)]).sum())) > TOUCHED
+    change = fit.jacobian[..., columns[0]] * (high - low) / noise.sigma
+    seen = np.isfinite(world.observed)
+    return float(np.sqrt(np.square(change[seen]).sum())) > TOUCHED

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from bench.gap.model.world import World
+from sims.base import Parameter
 from sims.simulated import effect_parameters
-from sims.system import Friction
+from sims.system import Effect, Friction
 
-BEYOND, DRY = 20.0, 4.0
-"""The second for dry friction: what is stronger only sticks."""
+BEYOND = 20.0
+"""A coefficient may be so many times as large as its plausible range has it."""
+DRY = 4.0
+"""The same for dry friction: what is stronger only sticks, and sticking divides the engine's steps.
+"""
 CYCLES = 1.0
 """What comes and goes must do so about once in the longest run, else any slow change would be
 called periodic.
@@ -21,13 +25,22 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
     twenty times larger. What is zero or positive by its meaning stays so, and what shapes an effect
     stays in its range.
     """
-    bounds = []
-    for parameter in effect_parameters(world.effects[name], world.simulator.system, world.channels):
-        low, high = parameter.bounds
-        if parameter.unit == "Hz":
-            low = min(max(low, CYCLES / world.longest), high / 2.0)
-        beyond = DRY if isinstance(world.effects[name], Friction) else BEYOND
-        bounds.append(
-            (low, high) if low > 0 else (0.0 if low == 0 else beyond * low, beyond * high)
-        )
-    return bounds
+    effect = world.effects[name]
+    coefficients = effect_parameters(effect, world.simulator.system, world.channels)
+    return [_bounds(coefficient, effect, world.longest) for coefficient in coefficients]
+
+
+def _bounds(coefficient: Parameter, effect: Effect, longest: float) -> tuple[float, float]:
+    """Of one coefficient, in runs of so many seconds at most."""
+    low, high = coefficient.bounds
+    if coefficient.unit == "Hz":
+        # no higher than half of the range, so that there is one left
+        low = min(max(low, CYCLES / longest), high / 2.0)
+    # a shape: how often, how fast, how sharp
+    if low > 0:
+        return low, high
+    beyond = DRY if isinstance(effect, Friction) else BEYOND
+    # a size whose sign is part of what the effect is
+    if low == 0:
+        return 0.0, beyond * high
+    return beyond * low, beyond * high

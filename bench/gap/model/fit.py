@@ -1,20 +1,29 @@
 """Least squares on trajectories: parameters that all runs share, initial states that each run has
 for itself.
 
-Levenberg-Marquardt for many models at once, so that one call of the engine serves all of them.
-Initial states are eliminated run by run (damping by Nielsen's rule, IMM-REP-1999-05; the Schur
-complement of the arrow-shaped normal equations; B. Triggs et al., Bundle adjustment, 2000,
-doi:10.1007/3-540-44480-7_21, section 6), so the cost grows linearly with the number of runs. Noise
-that remembers is whitened first (`colour`), which makes the fit one of generalised least squares.
+Levenberg-Marquardt for many models at once, so that one call of the engine serves all of them. One
+step of one model is in `arrow`. Noise that remembers is whitened first (`noise`), which makes the
+fit one of generalised least squares.
+
+A step that promised a decrease p of the cost F and brought it from F to F' has the gain ratio
+
+    ρ = (F - F') / p                                                                             (1)
+
+and the damping λ follows it by Nielsen's rule (H. B. Nielsen, Damping parameter in Marquardt's
+method, IMM-REP-1999-05), here quicker in both directions: his least factor is 1/3, his growth ν λ.
+
+    λ ← λ max(0.1, 1 - (2ρ - 1)³),   ν ← 2        where F' < F, and the step is taken            (2)
+    λ ← 2ν λ,                        ν ← 2ν       where it is not                                (3)
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bench.gap.model.arrow import arrow_step
 from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.noise import Noise, whitened
 from bench.gap.model.world import Indices, Mask, World
@@ -24,16 +33,46 @@ RESPONSE = 0.1
 """Finite differences move a parameter until the observation changes by this share of its noise,
 RMS.
 """
-UNMEASURED, MEASURED = 3.0, 100.0
-"""1 sigma of what is known beforehand of an initial state, SI units: without, and with samples that
-show it.
+FIRST_STEP = 1e-4
+"""The first one, before the response is known, as a share of a parameter's bounds."""
+FIRST_STATE_STEP = 1e-5
+"""The first one of an initial state, SI units."""
+LARGEST_STEP = 1e-2
+"""The largest one, as a share of a parameter's bounds; of an initial state, SI units."""
+SMALLEST_STEP = 1e-5
+"""The smallest one, as a share of the largest: below it rounding is in the quotient."""
+
+UNMEASURED = 3.0
+"""1 sigma of what is known beforehand of an initial state that no sample shows, SI units."""
+MEASURED = 100.0
+"""The same where samples show it, SI units: so wide that they decide alone."""
+
+RACED = 4
+"""Steps after which a model can be so far behind that it is given up."""
+BEATEN = 100.0
+"""A model is given up whose sum of squares, less what may be hoped for, is so much above the best
+one's.
 """
-BEATEN, RACED, HOPE = 100.0, 4, 10.0
-"""After so many steps a model is given up whose sum of squares, less several times what the next
-step promises, is so much above the best one's."""
-ENOUGH, SHARE = 0.02, 1e-4
+HOPE = 10.0
+"""What may be hoped for, in multiples of what the next step promises."""
+
+ENOUGH = 0.02
 """A fit has converged when a step lowers the sum of squares, in units of the noise, by less than
-this and less than this share of it."""
+this and the share below of it.
+"""
+SHARE = 1e-4
+"""The share."""
+
+FIRST_DAMPING = 1e-3
+"""Where the λ of (2) begins."""
+LEAST_DAMPING = 1e-10
+"""The lowest one: from zero, no factor would bring it back."""
+LARGEST_DAMPING = 1e8
+"""Above it no step downhill is to be found, however short."""
+GROWTH = 2.0
+"""Where the ν of (3) begins, and by what it grows."""
+LEAST_FACTOR = 0.1
+"""The least factor of (2)."""
 
 
 @dataclass(frozen=True)
@@ -72,36 +111,74 @@ class Fit:
         return Start(self.effects, self.theta, self.states)
 
 
-@dataclass
-class _Problem:
-    """One model on its way."""
+@dataclass(frozen=True)
+class _Point:
+    """Where a model stands, and what it gives there; attributes as those of `Fit`."""
 
     start: Start
+    simulated: Array
+    jacobian: Array
+    cost: float
+
+
+@dataclass
+class _Problem:
+    """One model on its way.
+
+    Attributes:
+        point: the best one so far.
+        free: (q,) which of theta are fitted.
+        low, high: (q,) where they may be.
+        widths: (q,) the ranges of their bounds.
+        steps: (q + s,) of the finite differences.
+        damping: λ.
+        growth: ν.
+        promised: decrease of the cost that the last step promised.
+        done: whether it has converged, or is given up.
+    """
+
+    point: _Point
     free: Indices
     low: Array
     high: Array
     widths: Array
     steps: Array
-    theta: Array
-    states: Array
-    simulated: Array = field(default_factory=lambda: np.empty(0))
-    jacobian: Array = field(default_factory=lambda: np.empty(0))
-    cost: float = np.inf
-    damping: float = 1e-3
-    growth: float = 2.0
+    damping: float = FIRST_DAMPING
+    growth: float = GROWTH
     promised: float = np.inf
     done: bool = False
 
     def fit(self) -> Fit:
+        at = self.point
         return Fit(
-            self.start.effects,
-            self.theta,
-            self.states,
+            at.start.effects,
+            at.start.theta,
+            at.start.states,
             self.free,
-            self.simulated,
-            self.jacobian,
-            self.cost,
+            at.simulated,
+            at.jacobian,
+            at.cost,
         )
+
+    def inward(self, theta: Array) -> Array:
+        """(q + s,) the steps from parameters (P,), with their signs: inward at an upper bound."""
+        steps = self.steps.copy()
+        own = steps[: self.free.size]
+        own[theta[self.free] + own > self.high] *= -1.0
+        return steps
+
+    def taken(self, gained: float, cost: float) -> None:
+        """After a step that brought the cost down to this."""
+        ratio = gained / max(self.promised, 1e-300)  # (1)
+        factor = max(LEAST_FACTOR, 1.0 - (2.0 * ratio - 1.0) ** 3)
+        self.damping = max(self.damping * factor, LEAST_DAMPING)  # (2)
+        self.growth = GROWTH
+        self.done = gained < ENOUGH + SHARE * cost
+
+    def refused(self) -> None:
+        """After a step that did not, (3)."""
+        self.damping = self.damping * GROWTH * self.growth
+        self.growth = GROWTH * self.growth
 
 
 @dataclass(frozen=True)
@@ -129,236 +206,208 @@ class Fitter:
         race: bool = False,
         reached: float = np.inf,
     ) -> list[Fit]:
-        """Fit each model from its start; in a race, those far behind the best, or the cost reached,
-        stay unfinished.
+        """Fit each model from its start.
+
+        Args:
+            starts: where to begin; one or more.
+            iterations: steps of each, at most.
+            race: leave those unfinished that are far behind the best, or behind the cost reached.
+            reached: what other models have come down to.
         """
         problems = [self._problem(start) for start in starts]
         seen = self.world.counted(self.share)
-        for problem, (simulated, jacobian) in zip(
-            problems, self._derivatives(problems), strict=True
-        ):
-            self._take(problem, problem.theta, problem.states, simulated, jacobian, seen)
-        for taken in range(iterations):
-            best = min(reached, *(p.cost for p in problems))
-            for p in problems if race and taken >= RACED else ():
-                p.done |= p.cost - HOPE * p.promised > best + BEATEN
-            active = [p for p in problems if not p.done]
-            trials = [(p, *self._step(p, seen)) for p in active]
-            trials = [(p, t, s) for p, t, s in trials if not p.done]
+        begun = self._points([(p, p.point.start) for p in problems], seen)
+        for problem, point in zip(problems, begun, strict=True):
+            self._take(problem, point)
+        for iteration in range(iterations):
+            # in its first steps even the right model may be far behind
+            if race and iteration >= RACED:
+                _give_up(problems, reached)
+            trials = list(self._trials(problems, seen))
             if not trials:
                 break
-            moved = [replace_at(p, theta, states) for p, theta, states in trials]
-            for (p, theta, states), (simulated, jacobian) in zip(
-                trials, self._derivatives(moved), strict=True
-            ):
-                self._judge(p, theta, states, simulated, jacobian, seen)
+            for (problem, _), point in zip(trials, self._points(trials, seen), strict=True):
+                self._judge(problem, point)
         return [p.fit() for p in problems]
 
     def _problem(self, start: Start) -> _Problem:
+        """What of a model is fitted, and how far it may go."""
         world = self.world
-        free = [int(i) for i in world.base if int(i) not in self.frozen] if self.parameters else []
-        bounds = [world.parameters[i].bounds for i in free]
+        free: list[int] = []
+        bounds: list[tuple[float, float]] = []
         if self.parameters:
+            free += [int(i) for i in world.base if int(i) not in self.frozen]
+            bounds += [world.parameters[i].bounds for i in free]
             for name in start.effects:
                 free += range(*world.slots[name].indices(len(world.parameters)))
                 bounds += coefficient_bounds(world, name)
         low, high = np.array(bounds, dtype=np.float64).reshape(-1, 2).T
-        ranges = [world.parameters[i].bounds for i in free]
-        widths = np.array([b - a for a, b in ranges], dtype=np.float64)
+
+        # plausible ranges scale the differences; a fit may leave them by far
+        plausible = [world.parameters[i].bounds for i in free]
+        widths = np.array([b - a for a, b in plausible], dtype=np.float64)
+        state_steps = np.full(len(world.states), FIRST_STATE_STEP)
+
         theta = start.theta.copy()
         theta[free] = np.clip(theta[free], low, high)
-        steps = np.concatenate([1e-4 * widths, np.full(len(world.states), 1e-5)])
+        begun = Start(start.effects, theta, start.states.copy())
         return _Problem(
-            start,
-            np.array(free, dtype=np.intp),
-            low,
-            high,
-            widths,
-            steps,
-            theta,
-            start.states.copy(),
+            point=_Point(begun, np.empty(0), np.empty(0), np.inf),
+            free=np.array(free, dtype=np.intp),
+            low=low,
+            high=high,
+            widths=widths,
+            steps=np.concatenate([FIRST_STEP * widths, state_steps]),
         )
 
-    def _derivatives(self, problems: Sequence[_Problem]) -> list[tuple[Array, Array]]:
-        """Simulated runs (R, T, C) of each problem and their derivatives (R, T, C, q + s), in one
-        call.
+    def _points(self, trials: Sequence[tuple[_Problem, Start]], seen: Mask) -> list[_Point]:
+        """What each problem gives at a trial's place, its derivatives and its cost.
+
+        One call of the engine has every run of every model, with every unknown moved: it goes
+        through time once for all of them.
         """
-        runs, states = self.world.guess.shape
-        blocks = []
-        for p in problems:
-            count = 1 + p.free.size + states
-            theta = np.tile(p.theta, (count, 1))
-            begin = np.tile(p.states, (count, 1, 1))
-            steps = self._steps(p)
-            for j, place in enumerate(p.free):
-                theta[1 + j, place] += steps[j]
-            for j in range(states):
-                begin[1 + p.free.size + j, :, j] += steps[p.free.size + j]
-            blocks.append((theta, begin, steps))
-        thetas = np.concatenate([np.repeat(theta, runs, axis=0) for theta, _, _ in blocks])
-        begins = np.concatenate([begin.reshape(-1, states) for _, begin, _ in blocks])
+        runs, size = self.world.guess.shape
+        steps = [problem.inward(start.theta) for problem, start in trials]
+        moved = [
+            _moved(start, problem.free, step)
+            for (problem, start), step in zip(trials, steps, strict=True)
+        ]
+        thetas = np.concatenate([np.repeat(theta, runs, axis=0) for theta, _ in moved])
+        states = np.concatenate([begin.reshape(-1, size) for _, begin in moved])
         lanes = np.tile(np.arange(runs), len(thetas) // runs)
-        seen = self.world.simulate(thetas, lanes, begins, self.share)
-        result, place = [], 0
-        for theta, _, steps in blocks:
-            part = seen[place : place + len(theta) * runs].reshape(
-                len(theta), runs, *seen.shape[1:]
-            )
-            place += len(theta) * runs
+        simulated = self.world.simulate(thetas, lanes, states, self.share)
+
+        points, first = [], 0
+        for (_, start), (theta, _), step in zip(trials, moved, steps, strict=True):
+            last = first + len(theta) * runs
+            part = simulated[first:last].reshape(len(theta), runs, *simulated.shape[1:])
+            first = last
+            # a lane that was given up is NaN, and tells nothing of how its unknown acts
             with np.errstate(all="ignore"):
-                jacobian = np.moveaxis(part[1:] - part[0], 0, -1) / steps
-            result.append((part[0], np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)))
-        return result
+                quotients = np.moveaxis(part[1:] - part[0], 0, -1) / step
+            jacobian = np.nan_to_num(quotients, nan=0.0, posinf=0.0, neginf=0.0)
+            points.append(_Point(start, part[0], jacobian, self._cost(part[0], start.states, seen)))
+        return points
 
-    def _steps(self, p: _Problem) -> Array:
-        """Signed steps of the finite differences: inward at an upper bound."""
-        steps = p.steps.copy()
-        beyond = p.theta[p.free] + steps[: p.free.size] > p.high
-        steps[: p.free.size][beyond] *= -1.0
-        return steps
-
-    def _take(
-        self,
-        p: _Problem,
-        theta: Array,
-        states: Array,
-        simulated: Array,
-        jacobian: Array,
-        seen: Mask,
-    ) -> None:
-        p.theta, p.states, p.simulated, p.jacobian = theta, states, simulated, jacobian
-        p.cost = self._cost(simulated, states, seen)
-        sizes = np.sqrt(np.mean(np.square(jacobian / self.noise.sigma[:, None]), axis=(0, 1, 2)))
-        largest = np.concatenate([1e-2 * p.widths, np.full(states.shape[1], 1e-2)])
+    def _take(self, problem: _Problem, point: _Point) -> None:
+        """Go on from a point, with differences that suit what it responds to."""
+        problem.point = point
+        scaled = point.jacobian / self.noise.sigma[:, None]
+        responses = np.sqrt(np.mean(np.square(scaled), axis=(0, 1, 2)))
+        states = np.full(point.start.states.shape[1], LARGEST_STEP)
+        largest = np.concatenate([LARGEST_STEP * problem.widths, states])
+        # an unknown without any response is moved as far as may be
         with np.errstate(divide="ignore"):
-            p.steps = np.clip(
-                RESPONSE / np.where(sizes > 0, sizes, 1e-300), 1e-5 * largest, largest
-            )
+            steps = RESPONSE / np.where(responses > 0, responses, 1e-300)
+        problem.steps = np.clip(steps, SMALLEST_STEP * largest, largest)
+
+    def _residual(self, simulated: Array, seen: Mask) -> Array:
+        """(R, T, C) observed less simulated, zero where nothing counts."""
+        residual: Array = np.where(seen, self.world.observed - simulated, 0.0)
+        return residual
+
+    def _drift(self, states: Array) -> Array:
+        """(R, s) how far initial states are from their guesses, in sigmas."""
+        drift: Array = (states - self.world.guess) / prior_of(self.world)
+        return drift
 
     def _cost(self, simulated: Array, states: Array, seen: Mask) -> float:
-        residual = np.where(seen, self.world.observed - simulated, 0.0)
+        """The cost of eq. (1) of `arrow`; infinite where the simulator gave up."""
+        residual = self._residual(simulated, seen)
         if not np.isfinite(residual).all():
             return np.inf
         w = whitened(residual, seen, self.noise)
-        drift = (states - self.world.guess) / prior_of(self.world)
+        drift = self._drift(states)
         return float((w * w).sum() + (drift * drift).sum())
 
-    def _step(self, p: _Problem, seen: Mask) -> tuple[Array, Array]:
-        """The next parameters and initial states to try; marks the problem done if they promise
+    def _trials(self, problems: Sequence[_Problem], seen: Mask) -> Iterator[tuple[_Problem, Start]]:
+        """Where each problem that is not done goes next; one whose step promises nothing is."""
+        for problem in problems:
+            if problem.done:
+                continue
+            trial = self._trial(problem, seen)
+            if trial is not None:
+                yield problem, trial
+
+    def _trial(self, problem: _Problem, seen: Mask) -> Start | None:
+        """The next parameters and initial states to try; None, and done, if they promise
         nothing.
         """
-        q = p.free.size
-        if not np.isfinite(p.cost):
-            p.done = True
-            return p.theta, p.states
-        residual = whitened(
-            np.where(seen, self.world.observed - p.simulated, 0.0), seen, self.noise
+        at = problem.point
+        # there is no downhill from where nothing could be simulated
+        if not np.isfinite(at.cost):
+            problem.done = True
+            return None
+
+        residual = whitened(self._residual(at.simulated, seen), seen, self.noise)
+        jacobian = whitened(np.where(seen[..., None], at.jacobian, 0.0), seen, self.noise)
+        step = arrow_step(
+            residual,
+            jacobian,
+            problem.free.size,
+            self._drift(at.start.states),
+            prior_of(self.world),
+            self.world.known,
+            problem.damping,
+            _stuck(problem, residual, jacobian),
         )
-        jacobian = whitened(np.where(seen[..., None], p.jacobian, 0.0), seen, self.noise)
-        prior = prior_of(self.world)
-        drift, stuck = (p.states - self.world.guess) / prior, _stuck(p, residual, jacobian)
-        solved = arrow_step(residual, jacobian, q, drift, prior, self.world.known, p.damping, stuck)
-        theta = p.theta.copy()
-        theta[p.free] = np.clip(theta[p.free] + solved.shared, p.low, p.high)
-        p.promised = solved.promised
-        if solved.promised < ENOUGH + SHARE * p.cost or p.damping > 1e8:
-            p.done = True
-        return theta, p.states + solved.own
+        problem.promised = step.promised
+        if step.promised < ENOUGH + SHARE * at.cost or problem.damping > LARGEST_DAMPING:
+            problem.done = True
+            return None
 
-    def _judge(
-        self,
-        p: _Problem,
-        theta: Array,
-        states: Array,
-        simulated: Array,
-        jacobian: Array,
-        seen: Mask,
-    ) -> None:
-        cost = self._cost(simulated, states, seen)
-        if cost < p.cost:
-            gained = p.cost - cost
-            ratio = gained / max(p.promised, 1e-300)
-            self._take(p, theta, states, simulated, jacobian, seen)
-            p.damping, p.growth = (
-                max(p.damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3), 1e-10),
-                2.0,
-            )
-            p.done = gained < ENOUGH + SHARE * cost
+        theta = at.start.theta.copy()
+        moved = theta[problem.free] + step.shared
+        theta[problem.free] = np.clip(moved, problem.low, problem.high)
+        return replace(at.start, theta=theta, states=at.start.states + step.own)
+
+    def _judge(self, problem: _Problem, point: _Point) -> None:
+        """Take a trial's point if it is better, and learn from it how much to damp."""
+        gained = problem.point.cost - point.cost
+        if point.cost < problem.point.cost:
+            self._take(problem, point)
+            problem.taken(gained, point.cost)
         else:
-            p.damping, p.growth = p.damping * 2.0 * p.growth, 2.0 * p.growth
+            problem.refused()
 
 
-def replace_at(p: _Problem, theta: Array, states: Array) -> _Problem:
-    """The same problem elsewhere."""
-    return replace(p, theta=theta, states=states)
+def _give_up(problems: Sequence[_Problem], reached: float) -> None:
+    """Leave models unfinished that several steps like the last would not bring near the best."""
+    best = min(reached, *(p.point.cost for p in problems))
+    for p in problems:
+        p.done |= p.point.cost - HOPE * p.promised > best + BEATEN
+
+
+def _moved(start: Start, free: Indices, steps: Array) -> tuple[Array, Array]:
+    """Parameters (1 + q + s, P) and initial states (1 + q + s, R, s): as they are, then each
+    unknown moved by its step, an initial state in all runs at once.
+    """
+    q, size = free.size, start.states.shape[1]
+    theta = np.tile(start.theta, (1 + q + size, 1))
+    states = np.tile(start.states, (1 + q + size, 1, 1))
+    for j, place in enumerate(free):
+        theta[1 + j, place] += steps[j]
+    # no run's initial state touches another run: one lane has the derivatives of all
+    for j in range(size):
+        states[1 + q + j, :, j] += steps[q + j]
+    return theta, states
 
 
 def prior_of(world: World) -> Array:
     """(s,) what is known of initial states beforehand, 1 sigma."""
     system, shown = world.simulator.system, set(world.channels)
+    # a coordinate's samples show its rate, too
     pairs = dict(zip(system.rates, system.coordinates, strict=False))
     measured = [name in shown or pairs.get(name) in shown for name in world.states]
     return np.where(measured, MEASURED, UNMEASURED)
 
 
-@dataclass(frozen=True)
-class _Solved:
-    shared: Array
-    own: Array
-    promised: float
-
-
-def arrow_step(
-    residual: Array,
-    jacobian: Array,
-    q: int,
-    drift: Array,
-    prior: Array,
-    known: Mask,
-    damping: float,
-    stuck: Mask,
-) -> _Solved:
-    """One damped Gauss-Newton step: shared parameters (q,), initial states (R, s), promised
-    decrease of the cost.
-    """
-    runs, size = len(residual), jacobian.shape[3]
-    j = jacobian.reshape(runs, -1, size)
-    r = residual.reshape(runs, -1)
-    normal = np.matmul(j.transpose(0, 2, 1), j)
-    right = np.matmul(j.transpose(0, 2, 1), r[:, :, None])[:, :, 0]
-    own = slice(q, size)
-    inner = normal[:, own, own] + np.diag(1.0 / prior**2)
-    diagonal = np.einsum("rii->ri", inner).copy()
-    inner = inner + damping * diagonal[:, :, None] * np.eye(size - q)
-    pull = right[:, own] - drift / prior
-    cross = normal[:, :q, own].copy()
-    fixed = np.broadcast_to(known[:, :], diagonal.shape)
-    inner = np.where(fixed[:, :, None] | fixed[:, None, :], np.eye(size - q), inner)
-    pull = np.where(fixed, 0.0, pull)
-    cross[np.broadcast_to(fixed[:, None, :], cross.shape)] = 0.0
-    inverse_cross = np.linalg.solve(inner, cross.transpose(0, 2, 1))
-    inverse_pull = np.linalg.solve(inner, pull[:, :, None])[:, :, 0]
-    shared_normal = normal[:, :q, :q].sum(axis=0)
-    scale = np.maximum(np.diagonal(shared_normal), 1e-12)
-    damped = shared_normal + np.diag(damping * scale + 1e-9 * scale + 1e-12)
-    schur = damped - np.matmul(cross, inverse_cross).sum(axis=0)
-    gradient = right[:, :q].sum(axis=0) - np.einsum("rqs,rs->q", cross, inverse_pull)
-    step = np.zeros(q)
-    moves = ~stuck
-    if moves.any():
-        step[moves] = np.linalg.lstsq(schur[np.ix_(moves, moves)], gradient[moves], rcond=None)[0]
-    own_step = inverse_pull - np.einsum("rsq,q->rs", inverse_cross, step)
-    whole = np.concatenate([np.tile(step, (runs, 1)), own_step], axis=1)
-    left = r - np.matmul(j, whole[:, :, None])[:, :, 0]
-    promised = float((r * r).sum() - (left * left).sum())
-    promised += float((drift**2).sum() - ((drift + own_step / prior) ** 2).sum())
-    return _Solved(step, own_step, promised)
-
-
-def _stuck(p: _Problem, residual: Array, jacobian: Array) -> Mask:
+def _stuck(problem: _Problem, residual: Array, jacobian: Array) -> Mask:
     """(q,) parameters at a bound that the data push against."""
-    q = p.free.size
-    pushed = np.einsum("rtc,rtcq->q", residual, jacobian[..., :q])
-    here = p.theta[p.free]
-    stuck: Mask = ((here <= p.low) & (pushed < 0)) | ((here >= p.high) & (pushed > 0))
+    start, free = problem.point.start, problem.free
+    pushed = np.einsum("rtc,rtcq->q", residual, jacobian[..., : free.size])
+    here = start.theta[free]
+    below = (here <= problem.low) & (pushed < 0)
+    above = (here >= problem.high) & (pushed > 0)
+    stuck: Mask = below | above
     return stuck

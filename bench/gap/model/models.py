@@ -1,4 +1,14 @@
-"""The models of a recording: each a set of effects with its fit, its likelihood and its merit."""
+"""The models of a recording: each a set of effects with its fit, its likelihood and its merit.
+
+Of a model with log likelihood L that has k numbers fixed by n samples, the merit is
+
+    M = 2 log L - k log n - Σ_e max(c_e - k_e log n, 0)                                          (1)
+
+Without the last term this is the criterion of G. Schwarz (Ann. Stat. 6(2), 461, 1978,
+doi:10.1214/aos/1176344136), turned over so that more is better. The last one is for effects e whose
+shapes are tried by the dozen: c_e is what the best of them gains by chance, and k_e log n what its
+coefficients have paid of that already.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +27,10 @@ Names = tuple[str, ...]
 
 SIFTED = (12, 8)
 """Of models that are fitted with patience so many go on from each horizon to the next."""
+STEPS = 24
+"""Steps of each fit, at most."""
+FEWEST = 2
+"""Samples that there are taken to be at least: the logarithm of one prices nothing."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +40,8 @@ class Model:
     Attributes:
         fit: the fit.
         likelihood: of its residual.
-        merit: twice the log likelihood less the log of the number of samples for each parameter and
-            initial state that the data fix (G. Schwarz, Ann. Stat. 6(2), 461, 1978,
-            doi:10.1214/aos/1176344136); for an effect with many shapes, less what the best of them
-            gains by chance.
+        merit: (1); the numbers that it counts are parameters, coefficients, and the initial states
+            that the data fix.
     """
 
     fit: Fit
@@ -77,11 +89,16 @@ class Models:
     def enter(self, fit: Fit) -> Model:
         """Take a fit into account; the better of two fits of the same effects is kept."""
         free = fit.free.size + freedom(self.world, fit, self.noise)
-        found = likelihood(self.residual(fit), self.seen, free) if np.isfinite(fit.cost) else _LOST
-        merit = found.value - free * self._price - sum(self._chance(name) for name in fit.effects)
-        model, key = Model(fit, found, merit), frozenset(fit.effects)
+        # one that could not be simulated is entered, too: it need not be tried again
+        found = _LOST
+        if np.isfinite(fit.cost):
+            found = likelihood(self.residual(fit), self.seen, free)
+        chance = sum(self._chance(name) for name in fit.effects)
+        merit = found.value - free * self._price - chance  # (1)
+
+        key = frozenset(fit.effects)
         if key not in self.models or merit > self.models[key].merit:
-            self.models[key] = model
+            self.models[key] = Model(fit, found, merit)
             self.replaced(key)
         return self.models[key]
 
@@ -90,15 +107,14 @@ class Models:
 
     @property
     def _price(self) -> float:
-        """What each number that the data fix costs a model: the log of the number of samples."""
-        return float(np.log(max(int(self.seen.sum()), 2)))
+        """What each number that the data fix costs a model, the log n of (1)."""
+        return float(np.log(max(int(self.seen.sum()), FEWEST)))
 
     def _chance(self, name: str) -> float:
-        """What an effect costs beside that: its shapes are tried by the dozen, and the best of them
-        gains by chance.
-        """
+        """What an effect costs beside that, its part of the last term of (1)."""
         slot = self.world.slots[name]
-        return float(max(self.chances.get(name, 0.0) - (slot.stop - slot.start) * self._price, 0.0))
+        paid = (slot.stop - slot.start) * self._price
+        return float(max(self.chances.get(name, 0.0) - paid, 0.0))
 
     def refit(
         self,
@@ -117,26 +133,37 @@ class Models:
             race: give up what falls far behind.
         """
         noise = noise or self.noise
-        for (share, iterations), kept in zip(HORIZONS[:-1], SIFTED, strict=True) if patient else ():
-            fits = Fitter(self.world, noise, self.frozen, share).fit(starts, iterations)
-            starts = [fit.start() for fit in sorted(fits, key=lambda fit: fit.cost)[:kept]]
-        best = self._reached(starts) if race and noise is self.noise else np.inf
-        for fit in Fitter(self.world, noise, self.frozen).fit(starts, 24, race=race, reached=best):
+        if patient:
+            starts = self._sifted(starts, noise)
+        # sums of squares by other weights are not to be compared
+        racing = race and noise is self.noise
+        reached = self._reached(starts) if racing else np.inf
+        fitter = Fitter(self.world, noise, self.frozen)
+        for fit in fitter.fit(starts, STEPS, race=race, reached=reached):
             self.enter(fit)
+
+    def _sifted(self, starts: Sequence[Start], noise: Noise) -> list[Start]:
+        """Where the best stand after all horizons but the last, which is the whole of the runs."""
+        begun = list(starts)
+        for horizon, count in zip(HORIZONS[:-1], SIFTED, strict=True):
+            fitter = Fitter(self.world, noise, self.frozen, horizon.share)
+            fits = fitter.fit(begun, horizon.iterations)
+            fits.sort(key=lambda fit: fit.cost)
+            begun = [fit.start() for fit in fits[:count]]
+        return begun
 
     def _reached(self, starts: Sequence[Start]) -> float:
         """The least sum of squares of the models known that have no more effects than the largest
         of these.
         """
         most = max(len(start.effects) for start in starts)
-        return min(
-            (m.fit.cost for m in self.models.values() if 0 < len(m.names) <= most), default=np.inf
-        )
+        rivals = [m for m in self.models.values() if 0 < len(m.names) <= most]
+        return min((m.fit.cost for m in rivals), default=np.inf)
 
     def best(self, size: int) -> Model | None:
         """The best model with so many effects."""
-        there = [m for m in self.models.values() if len(m.names) == size]
-        return max(there, key=lambda m: m.merit) if there else None
+        models = [m for m in self.models.values() if len(m.names) == size]
+        return max(models, key=lambda m: m.merit) if models else None
 
     def excess(self, model: Model) -> float:
         """RMS of what a model leaves in units of the noise floor, less the one that noise itself
@@ -147,24 +174,33 @@ class Models:
 
     def weights(self, model: Model) -> Noise:
         """Channels weigh by what the model leaves of them where that is more than their noise."""
-        left = np.where(np.isfinite(model.likelihood.sigma), model.likelihood.sigma, 0.0)
+        sigma = model.likelihood.sigma
+        left = np.where(np.isfinite(sigma), sigma, 0.0)
         return Noise(np.maximum(self.noise.sigma, left), self.noise.phi)
 
 
 def freedom(world: World, fit: Fit, noise: Noise) -> float:
     """How many initial states the data fix, all runs together: one that a model does not use gives
     it no freedom.
+
+    The effective degrees of freedom of ridge regression (T. Hastie, R. Tibshirani, J. Friedman, The
+    Elements of Statistical Learning, 2nd ed., section 3.4.1). With B_i the derivatives of run i by
+    its initial state in units of the noise, π its prior, and λ_ij the eigenvalues of π B_iᵀ B_i π,
+
+        f = Σ_ij λ_ij / (1 + λ_ij)                                                               (2)
     """
     seen = np.isfinite(world.observed)
-    states = (
-        np.where(seen[..., None], fit.jacobian[..., fit.free.size :], 0.0) / noise.sigma[:, None]
-    )
-    columns = states.reshape(
-        len(states), seen.shape[1] * seen.shape[2], states.shape[3]
-    ) * prior_of(world)
+    states = fit.jacobian[..., fit.free.size :]
+    scaled = np.where(seen[..., None], states, 0.0) / noise.sigma[:, None]
+    runs, length, channels, size = scaled.shape
+    columns = scaled.reshape(runs, length * channels, size) * prior_of(world)
+    # a state that is known has no freedom
     columns = np.where(world.known[:, None, :], 0.0, columns)
-    powers = np.linalg.eigvalsh(np.matmul(columns.transpose(0, 2, 1), columns))
-    return float((powers / (1.0 + np.maximum(powers, 0.0))).clip(0.0, 1.0).sum())
+    eigenvalues = np.linalg.eigvalsh(np.matmul(columns.transpose(0, 2, 1), columns))
+    # rounding may put one a little below zero
+    fixed = eigenvalues / (1.0 + np.maximum(eigenvalues, 0.0))  # (2)
+    return float(fixed.clip(0.0, 1.0).sum())
 
 
 _LOST = Likelihood(-np.inf, np.zeros(0), np.zeros(0))
+"""Of a model that could not be simulated."""

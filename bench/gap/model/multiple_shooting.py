@@ -3,8 +3,14 @@ the right minimum.
 
 Over a long run a small change of a period, a limit or a delay moves the trajectory far from the
 data, so the sum of squares has many minima. Over pieces it has few, since every piece begins where
-the data are (multiple shooting; H. G. Bock 1983, doi:10.1007/978-1-4684-7324-7_7). What the pieces
-find is where fits of the whole runs begin; it decides nothing.
+the data are (multiple shooting; H. G. Bock 1983, doi:10.1007/978-1-4684-7324-7_7). With y the
+observation and h the simulated one at time t, from the state z_k that piece k has at τ_k, what is
+fitted is
+
+    min over θ, z_1 ... z_K of  Σ_k Σ_{τ_k ≤ t < τ_{k+1}} |y(t) - h(t; z_k, θ)|² / σ²            (1)
+
+Bock demands besides that piece k ends where piece k + 1 begins. Here nothing does: what the pieces
+find is where fits of the whole runs begin, which join them; it decides nothing.
 """
 
 from __future__ import annotations
@@ -18,8 +24,12 @@ from bench.gap.model.fit import Fit, Start
 from bench.gap.model.world import Mask, World
 from sims.recording.recording import Run
 
-PIECES, LEAST = 4, 20
-"""Of each run so many pieces, if each has so many samples; else fewer."""
+PIECES = 4
+"""Of each run so many pieces, if each has enough samples; else fewer."""
+LEAST = 20
+"""Samples of a piece on average, at least."""
+HOLES = 2
+"""A single piece may have this many times fewer, as samples may be missing."""
 
 
 def pieces(world: World) -> World | None:
@@ -36,35 +46,39 @@ def pieces(world: World) -> World | None:
         return None
     freed = [p.name for p in world.freed]
     cut = World(world.kind, world.recording, runs, world.engine, world.extra, freed, world.library)
-    cut.longest, cut.travel = (
-        world.longest,
-        world.travel,
-    )  # what is periodic goes on from piece to piece
+    # what is periodic goes on from piece to piece
+    cut.longest = world.longest
+    cut.travel = world.travel
     return cut
 
 
 def _cut(run: Run) -> list[Run]:
+    """The pieces of a run, the run itself where it is too short."""
     seen: Mask = np.any(np.isfinite(np.stack(list(run.channels.values()))), axis=0)
     count = int(np.clip(seen.sum() // LEAST, 1, PIECES))
     edges = np.linspace(0, run.times.size, count + 1).astype(int)
     parts = [slice(a, b) for a, b in pairwise(edges)]
-    if any(seen[part].sum() < LEAST // 2 for part in parts):
+    # pieces are equally long, but samples may be missing in one of them
+    if any(seen[part].sum() < LEAST // HOLES for part in parts):
         return [run]
-    return [
-        replace(
-            run,
-            name=f"{run.name}.{i}",
-            times=run.times[part],
-            channels={name: values[part] for name, values in run.channels.items()},
-            inputs={name: values[part] for name, values in run.inputs.items()},
-            initial=run.initial if i == 0 else {},
-            extra={},
-        )
-        for i, part in enumerate(parts)
-    ]
+    return [_piece(run, number, part) for number, part in enumerate(parts)]
+
+
+def _piece(run: Run, number: int, part: slice) -> Run:
+    """A piece of a run; what is known of the beginning is known of the first one alone."""
+    return replace(
+        run,
+        name=f"{run.name}.{number}",
+        times=run.times[part],
+        channels={name: values[part] for name, values in run.channels.items()},
+        inputs={name: values[part] for name, values in run.inputs.items()},
+        initial=run.initial if number == 0 else {},
+        extra={},
+    )
 
 
 def whole(world: World, found: Fit) -> Start:
     """Where a fit of the whole runs begins, from a fit of their pieces."""
-    first = np.cumsum([0, *(len(_cut(run)) for run in world.runs)])[:-1]
+    counts = [len(_cut(run)) for run in world.runs]
+    first = np.cumsum([0, *counts])[:-1]
     return Start(found.effects, found.theta, found.states[first])

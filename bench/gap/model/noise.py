@@ -1,10 +1,24 @@
 """Sensor noise that remembers: first-order autoregression, how it is taken out, how surrogates of
 it are made.
 
-Noise e of a channel has variance sigma^2 and correlation phi between neighbouring samples: e_t =
-phi e_(t-1) + u_t. Whitening (Prais & Winsten 1954; W. H. Greene, Econometric Analysis, chapter 20)
-turns it into independent numbers of variance one, so that ordinary least squares becomes
-generalised least squares. Across a missing sample it starts anew.
+Noise e of a channel has variance σ² and correlation φ between neighbouring samples (G. E. P. Box,
+G. M. Jenkins, Time Series Analysis, chapter 3), u being independent of one sample to the next:
+
+    e_t = φ e_{t-1} + u_t,   var u = (1 - φ²) σ²                                                 (1)
+
+Whitening (S. J. Prais, C. B. Winsten 1954; W. H. Greene, Econometric Analysis, chapter 20) turns it
+into independent numbers of variance one, so that ordinary least squares becomes generalised least
+squares. A sample that follows none, at the beginning of a run or behind a missing one, starts anew:
+
+    w_t = (e_t - φ e_{t-1}) / (σ √(1 - φ²)),   w_t = e_t / σ where no sample is before           (2)
+
+Of n samples, m of which follow one, twice the log likelihood is, but for a constant,
+
+    2 log L = - n log σ² - m log(1 - φ²) - Σ w_t²                                                (3)
+
+and where σ² is the mean square v of what (2) leaves with σ = 1, it is highest:
+
+    2 log L = - n log v - m log(1 - φ²) - n                                                      (4)
 """
 
 from __future__ import annotations
@@ -20,10 +34,29 @@ Mask = NDArray[np.bool_]
 
 GRID = (0.0, 0.3, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98)
 """Correlations among which a likelihood is maximised."""
-
-
+AROUND = (-0.1, -0.05, -0.02, 0.0, 0.01, 0.02, 0.05, 0.1)
+"""Correlations that are tried about the one that a residual itself shows."""
+LEAST_PHI = -0.5
+"""The lowest correlation that is tried: of errors that turn their sign from sample to sample."""
+LARGEST_PHI = 0.995
+"""The highest one: at 1 noise wanders without limit, and (2) divides by zero."""
+LEAST_SHARE = 0.1
+"""Share of the samples that a fit leaves at least, however many numbers it has fitted."""
 LAGS = 20
 """Correlations that the portmanteau test adds up."""
+
+BURN_IN = 200
+"""Samples that a surrogate is driven by before it counts, to forget that it began with nothing."""
+RIDGE = 1e-9
+"""Share of the variance added to the Yule-Walker matrix, which a pure tone makes singular."""
+STATIONARY = 0.999
+"""Largest root of an autoregression that is taken, in magnitude: from 1 on it does not die away."""
+GAINED = 1e-9
+"""An order must lower Akaike's criterion by more than this, else rounding would choose it."""
+FEWEST = 10
+"""Innovations from which surrogates are drawn at least; of fewer the samples themselves are."""
+TINY = 1e-300
+"""Stands for a variance of zero, whose logarithm and reciprocal there are not."""
 
 
 @dataclass(frozen=True)
@@ -35,44 +68,64 @@ class Noise:
 
     def coloured(self, phi: Array | float) -> Noise:
         """The same with other correlations."""
-        return Noise(
-            self.sigma, np.broadcast_to(np.asarray(phi, dtype=np.float64), self.sigma.shape).copy()
-        )
+        correlations = np.asarray(phi, dtype=np.float64)
+        return Noise(self.sigma, np.broadcast_to(correlations, self.sigma.shape).copy())
+
+
+def _unit(phi: float) -> Noise:
+    """Noise of one channel with a correlation and a variance of one."""
+    return Noise(np.ones(1), np.array([phi]))
+
+
+def _follows(seen: Mask) -> Mask:
+    """(R, T - 1, C) whether a sample, the first left out, has one right before it."""
+    follows: Mask = seen[:, 1:] & seen[:, :-1]
+    return follows
 
 
 def whitened(values: Array, seen: Mask, noise: Noise) -> Array:
-    """Values (R, T, C, ...) as independent numbers of variance one; zero where nothing was seen,
-    (R, T, C).
+    """Values as independent numbers of variance one, by (2).
+
+    Args:
+        values: (R, T, C, ...) noise, or derivatives of what bears it: (2) is linear.
+        seen: (R, T, C) which samples there are; the others come out as zero.
+        noise: of each channel.
     """
     extra = (1,) * (values.ndim - 3)
-    phi, sigma = (part.reshape(-1, *extra) for part in (noise.phi, noise.sigma))
-    fresh = np.sqrt(1.0 - phi * phi)
-    result: Array = values * (np.ones_like(phi) / sigma)
+    phi = noise.phi.reshape(-1, *extra)
+    sigma = noise.sigma.reshape(-1, *extra)
+    # a Jacobian is large, and multiplying is quicker than dividing
+    result: Array = values * (1.0 / sigma)
+
+    # (2), a second pass over all samples that white noise does not need
     if phi.any():
-        follows = (seen[:, 1:] & seen[:, :-1]).reshape(
-            seen.shape[0], seen.shape[1] - 1, seen.shape[2], *extra
-        )
-        before = result[:, :-1]
-        result[:, 1:] = np.where(
-            follows, (result[:, 1:] - phi * np.where(follows, before, 0.0)) / fresh, result[:, 1:]
-        )
-    mask = seen.reshape(*seen.shape, *extra)
+        pairs = _follows(seen)
+        follows = pairs.reshape(*pairs.shape, *extra)
+        # values where nothing was seen may be anything, even NaN: they must not reach the next
+        before = np.where(follows, result[:, :-1], 0.0)
+        innovations = (result[:, 1:] - phi * before) / np.sqrt(1.0 - phi * phi)
+        result[:, 1:] = np.where(follows, innovations, result[:, 1:])
+
     if not seen.all():
-        result = np.where(mask, result, 0.0)
+        result = np.where(seen.reshape(*seen.shape, *extra), result, 0.0)
     return result
 
 
 def log_determinant(seen: Mask, phi: Array | float) -> float:
-    """Half the log determinant of whitening at unit variance: -0.5 log(1 - phi^2) for each sample
-    that follows one.
-    """
-    follows = (seen[:, 1:] & seen[:, :-1]).sum(axis=(0, 1))
+    """Half the log determinant of whitening at unit variance, -m/2 log(1 - φ²) of (3)."""
+    follows = _follows(seen).sum(axis=(0, 1))
     return float(-0.5 * (follows * np.log1p(-np.square(phi))).sum())
 
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Twice the log likelihood of a residual, maximal over each channel's phi and sigma, and where."""
+    """Twice the log likelihood of a residual, maximal over each channel's phi and sigma, and where.
+
+    Attributes:
+        value: (4) summed over the channels, without its last term, which is the same for all.
+        sigma: (C,) 1 sigma of each channel's noise; NaN of a channel without samples.
+        phi: (C,) its correlation.
+    """
 
     value: float
     sigma: Array
@@ -88,61 +141,91 @@ def likelihood(residual: Array, seen: Mask, lost: float = 0.0) -> Likelihood:
         lost: degrees of freedom that the fit has used, taken off the samples where sigma is
             estimated.
     """
-    total, sigmas, phis = 0.0, [], []
-    share = lost / max(int(seen.sum()), 1)
+    total = 0.0
+    sigmas, phis = [], []
+    # every channel bears its part of what the fit has used
+    share = max(1.0 - lost / max(int(seen.sum()), 1), LEAST_SHARE)
     for c in range(residual.shape[2]):
-        here = seen[:, :, c : c + 1]
-        count = int(here.sum())
-        if count == 0:
+        channel = slice(c, c + 1)
+        here = seen[:, :, channel]
+        if not here.any():
             sigmas.append(np.nan)
             phis.append(0.0)
             continue
-        best = (-np.inf, 0.0, 0.0)
-        for phi in _fine(residual[:, :, c : c + 1], here):
-            w = whitened(residual[:, :, c : c + 1], here, Noise(np.ones(1), np.array([phi])))
-            variance = max(float((w * w).sum()) / count, 1e-300)
-            value = -count * np.log(variance) + 2.0 * log_determinant(here, phi)
-            best = max(best, (value, phi, variance / max(1.0 - share, 0.1)))
-        total += best[0]
-        sigmas.append(best[2] ** 0.5)
-        phis.append(best[1])
+        value, phi, variance = _likeliest(residual[:, :, channel], here, share)
+        total += value
+        sigmas.append(variance**0.5)
+        phis.append(phi)
     return Likelihood(total, np.array(sigmas), np.array(phis))
 
 
-def _fine(residual: Array, seen: Mask) -> Array:
+def _likeliest(residual: Array, seen: Mask, share: float) -> tuple[float, float, float]:
+    """Of one channel (R, T, 1): the highest value of (4), with its correlation and variance.
+
+    The variance is over the share of the samples that the fit has left; the value counts them all,
+    as Schwarz's criterion has its own price for what is fitted.
+    """
+    count = int(seen.sum())
+    best = (-np.inf, 0.0, 0.0)
+    for phi in _near(residual, seen):
+        w = whitened(residual, seen, _unit(phi))
+        variance = max(float((w * w).sum()) / count, TINY)
+        value = -count * np.log(variance) + 2.0 * log_determinant(seen, phi)  # (4)
+        best = max(best, (value, phi, variance / share))
+    return best
+
+
+def _near(residual: Array, seen: Mask) -> Array:
     """Correlations worth a try: around the sample's own."""
-    follows = seen[:, 1:] & seen[:, :-1]
-    first, second = residual[:, :-1][follows], residual[:, 1:][follows]
-    power = float(first @ first)
-    rough = float(first @ second) / power if power > 0 else 0.0
-    around = np.clip(
-        rough + np.array([-0.1, -0.05, -0.02, 0.0, 0.01, 0.02, 0.05, 0.1]), -0.5, 0.995
-    )
-    found: Array = np.unique(np.append(around, 0.0))
-    return found
+    follows = _follows(seen)
+    former, latter = residual[:, :-1][follows], residual[:, 1:][follows]
+    power = float(former @ former)
+    own = float(former @ latter) / power if power > 0 else 0.0
+    around = np.clip(own + np.array(AROUND), LEAST_PHI, LARGEST_PHI)
+    # white noise is always a hypothesis
+    correlations: Array = np.unique(np.append(around, 0.0))
+    return correlations
 
 
 def forgets(residual: Array, seen: Mask, found: Likelihood) -> float:
-    """Probability that a residual (R, T, C) is nothing but first-order noise with the correlation
-    found.
+    """Probability that a residual is nothing but first-order noise with the correlation found.
 
-    The portmanteau test of what whitening leaves (G. M. Ljung, G. E. P. Box, Biometrika 65(2), 297,
-    1978, doi:10.1093/biomet/65.2.297); of several channels the least probable counts, times their
-    number.
+    The portmanteau test of what whitening leaves: where its correlations r_k at h lags are those of
+    independent numbers, Q is a chi squared of h - 1 degrees of freedom, φ having taken one
+    (G. M. Ljung, G. E. P. Box, Biometrika 65(2), 297, 1978, doi:10.1093/biomet/65.2.297).
+
+        Q = n (n + 2) Σ r_k² / (n - k)                                                           (5)
+
+    Of several channels the least probable counts, times their number (Bonferroni).
+
+    Args:
+        residual: (R, T, C) what a model leaves.
+        seen: (R, T, C) which samples there are.
+        found: its likelihood.
     """
     from scipy.special import chdtrc
 
     least = 1.0
     for c, phi in enumerate(found.phi.tolist()):
-        here = seen[:, :, c : c + 1]
-        w = whitened(residual[:, :, c : c + 1], here, Noise(np.ones(1), np.array([phi])))[:, :, 0]
-        power, count, total = max(float((w * w).sum()), 1e-300), max(int(here.sum()), 2), 0.0
-        for lag in range(1, min(LAGS, w.shape[1] - 1) + 1):
-            total += (float((w[:, lag:] * w[:, :-lag]).sum()) / power) ** 2 / max(
-                count - lag * len(w), 1
-            )
-        least = min(least, float(chdtrc(LAGS - 1, count * (count + 2.0) * total)))
+        channel = slice(c, c + 1)
+        here = seen[:, :, channel]
+        w = whitened(residual[:, :, channel], here, _unit(phi))[:, :, 0]
+        count = max(int(here.sum()), 2)
+        statistic = count * (count + 2.0) * _correlated(w, count)
+        least = min(least, float(chdtrc(LAGS - 1, statistic)))
     return min(1.0, least * len(found.phi))
+
+
+def _correlated(w: Array, count: int) -> float:
+    """The sum in (5) of whitened values (R, T) with so many samples."""
+    runs, length = w.shape
+    power = max(float((w * w).sum()), TINY)
+    total = 0.0
+    for lag in range(1, min(LAGS, length - 1) + 1):
+        correlation = float((w[:, lag:] * w[:, :-lag]).sum()) / power
+        # each run has a beginning of its own: so many pairs are lost in every one
+        total += correlation**2 / max(count - lag * runs, 1)
+    return total
 
 
 def surrogates(
@@ -152,67 +235,101 @@ def surrogates(
 
     Each channel is fitted by an autoregression whose order Akaike's criterion picks, and driven
     again by its own resampled innovations (P. Buhlmann, Bernoulli 3(2), 123, 1997,
-    doi:10.2307/3318584).
+    doi:10.2307/3318584):
+
+        e_t = Σ_k a_k e_{t-k} + u_t                                                              (6)
+
+    Args:
+        residual: (R, T, C) what a model leaves, zero where nothing was seen.
+        seen: (R, T, C) which samples there are; the surrogates are zero elsewhere.
+        count: how many.
+        rng: draws the innovations.
+        largest: order that an autoregression has at most.
     """
     runs, length, channels = residual.shape
     result = np.zeros((count, runs, length, channels))
-    burn = 200
     for c in range(channels):
         here = seen[:, :, c]
         weights, innovations = _autoregression(residual[:, :, c], here, largest)
-        made = _driven(weights, rng.choice(innovations, size=(length + burn, count, runs)))[burn:]
-        result[:, :, :, c] = np.where(here, np.moveaxis(made, 0, 2), 0.0)
+        drawn = rng.choice(innovations, size=(length + BURN_IN, count, runs))
+        driven = _driven(weights, drawn)[BURN_IN:]
+        result[:, :, :, c] = np.where(here, np.moveaxis(driven, 0, 2), 0.0)
     return result
 
 
-def _driven(weights: Array, drive: Array) -> Array:
-    """An autoregression (T, ...) of the innovations (T, ...)."""
-    for t in range(1, len(drive)):
+def _driven(weights: Array, innovations: Array) -> Array:
+    """The autoregression (6) of innovations (T, ...), in their place."""
+    for t in range(1, len(innovations)):
         for k, weight in enumerate(weights[:t], start=1):
-            drive[t] += weight * drive[t - k]
-    return drive
+            innovations[t] += weight * innovations[t - k]
+    return innovations
 
 
 def _autoregression(values: Array, seen: Mask, largest: int) -> tuple[Array, Array]:
-    """Weights (p,) of an autoregression of values (R, T) and its centred innovations."""
+    """Weights (p,) of an autoregression of values (R, T), and its centred innovations."""
     filled = np.where(seen, values, 0.0)
-    count = int(seen.sum())
-    largest, covariances = min(largest, seen.shape[1] - 1), []
-    for lag in range(largest + 1):
-        both = seen[:, lag:] & seen[:, : seen.shape[1] - lag]
-        pairs = max(int(both.sum()), 1)
-        covariances.append(
-            float((filled[:, lag:] * filled[:, : seen.shape[1] - lag]).sum()) / pairs
-        )
-    best, weights = np.inf, np.zeros(0)
-    for order in range(largest + 1):
-        solved, variance = _yule_walker(np.array(covariances), order)
-        score = count * np.log(max(variance, 1e-300)) + 2.0 * order
-        if score < best - 1e-9:
-            best, weights = score, solved
-    order = weights.size
-    whole = np.all([seen[:, k : seen.shape[1] - order + k] for k in range(order + 1)], axis=0)
-    innovations = filled[:, order:] - sum(
-        (weights[k] * filled[:, order - 1 - k : seen.shape[1] - 1 - k] for k in range(order)),
-        np.zeros(1),
-    )
-    kept = innovations[whole]
-    if kept.size < 10:
+    covariances = _autocovariances(filled, seen, min(largest, seen.shape[1] - 1))
+    weights = _most_plausible(covariances, int(seen.sum()))
+    innovations = _innovations(filled, seen, weights)
+    if innovations.size < FEWEST:
         return np.zeros(0), filled[seen] if seen.any() else np.zeros(1)
-    return weights, kept - kept.mean()
+    # a mean of theirs would add up to an offset of the surrogates
+    return weights, innovations - innovations.mean()
+
+
+def _autocovariances(filled: Array, seen: Mask, largest: int) -> Array:
+    """(largest + 1,) covariances of values (R, T) with those so many samples later, lag 0 first."""
+    length = seen.shape[1]
+    covariances = []
+    for lag in range(largest + 1):
+        former, latter = slice(0, length - lag), slice(lag, length)
+        pairs = max(int((seen[:, latter] & seen[:, former]).sum()), 1)
+        covariances.append(float((filled[:, latter] * filled[:, former]).sum()) / pairs)
+    return np.array(covariances)
+
+
+def _most_plausible(covariances: Array, count: int) -> Array:
+    """Weights (p,) of the order p that H. Akaike's criterion (1974) picks, n log var u + 2 p."""
+    best, weights = np.inf, np.zeros(0)
+    for order in range(len(covariances)):
+        solved, variance = _yule_walker(covariances, order)
+        criterion = count * np.log(max(variance, TINY)) + 2.0 * order
+        if criterion < best - GAINED:
+            best, weights = criterion, solved
+    return weights
+
+
+def _innovations(filled: Array, seen: Mask, weights: Array) -> Array:
+    """(n,) the u of (6), where all samples are there that it needs."""
+    order, length = weights.size, seen.shape[1]
+    predicted = np.zeros(1)
+    complete = seen[:, order:]
+    for k, weight in enumerate(weights, start=1):
+        earlier = slice(order - k, length - k)
+        predicted = predicted + weight * filled[:, earlier]
+        complete = complete & seen[:, earlier]
+    innovations: Array = (filled[:, order:] - predicted)[complete]
+    return innovations
 
 
 def _yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
-    if order == 0 or covariances[0] <= 0:
-        return np.zeros(0), float(covariances[0])
+    """Weights (p,) of an autoregression from covariances γ, and the variance of its innovations.
+
+    The equations of Yule and Walker (Box & Jenkins, chapter 3):
+
+        Σ_l γ_|k-l| a_l = γ_k,   var u = γ_0 - Σ_k a_k γ_k                                       (7)
+
+    The variance is infinite where (6) would not die away, so that nothing prefers it.
+    """
+    power = covariances[0]
+    if order == 0 or power <= 0:
+        return np.zeros(0), float(power)
     lags = np.abs(np.arange(order)[:, None] - np.arange(order))
-    solved = np.linalg.solve(
-        covariances[lags] + 1e-9 * covariances[0] * np.eye(order), covariances[1 : order + 1]
-    )
-    reflected = float(covariances[0] - solved @ covariances[1 : order + 1])
-    if (
-        reflected <= 0
-        or np.abs(np.roots(np.concatenate([[1.0], -solved]))).max(initial=0.0) > 0.999
-    ):
+    later = covariances[1 : order + 1]
+    weights = np.linalg.solve(covariances[lags] + RIDGE * power * np.eye(order), later)  # (7)
+    variance = float(power - weights @ later)
+    # what (6) makes of one innovation is a sum of powers of these
+    roots = np.roots(np.concatenate([[1.0], -weights]))
+    if variance <= 0 or np.abs(roots).max(initial=0.0) > STATIONARY:
         return np.zeros(0), np.inf
-    return solved, reflected
+    return weights, variance

@@ -5,12 +5,13 @@ lanes in one call.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.gap.model.tracks import Track, first_of, tracked
 from sims import effects as library
 from sims.base import Array, InputError, Parameter, Scenario, unknown
 from sims.recording.recording import Recording, Run
@@ -27,36 +28,19 @@ TIME_STEP = 0.01
 """Longest step of the batch engine, seconds; it shortens its steps itself where motion or forces
 ask for it.
 """
-TURN, PATIENCE = 0.14, 4.0
-"""Radians of an oscillation in a step of the batch engine: its phase is then off by 3e-6 of itself.
-A lane is given up that needs so many times the planned steps."""
 FINE_STEP = 0.0025
 """The same where a sensor filters: a filter takes what it reads for linear over each step, which an
 impact is not.
 """
+TURN = 0.14
+"""Radians of an oscillation in a step of the batch engine: its phase is then off by 3e-6 of itself.
+"""
+PATIENCE = 4.0
+"""A lane is given up that needs so many times the planned steps: all lanes of a call wait for the
+slowest one.
+"""
 FREED = 5.0
 """A constant that is set free is searched from a fifth of its value to five times it."""
-
-
-@dataclass(frozen=True)
-class Track:
-    """One recorded run.
-
-    Attributes:
-        name: the run's name.
-        scenario: what the simulator is given; its initial states are guesses where they are not
-            stated.
-        observed: (T, C) SI units, NaN where missing.
-        guess: (s,) initial states, stated or guessed from the first samples.
-        known: (s,) which of them are not to be estimated: stated, or of a coordinate that is not
-            recorded.
-    """
-
-    name: str
-    scenario: Scenario
-    observed: Array
-    guess: Array
-    known: Mask
 
 
 class World:
@@ -64,8 +48,27 @@ class World:
     coefficients say so.
 
     A vector theta (P,) holds the system's own parameters, constants set free, then all
-    coefficients. `longest` is the duration of the longest run in seconds, `travel` the largest
-    range of the primary coordinate in one run.
+    coefficients. A model is thus a sparse vector, and models, runs and finite differences share one
+    call of the engine as lanes of it.
+
+    Attributes:
+        kind, recording, runs, engine, extra: as given.
+        library: names of the effects at hand, without the extra ones.
+        simulator: has them all; its channels are those recorded.
+        own: number of the system's own parameters.
+        freed: constants that are treated as parameters.
+        parameters: (P,) what stands in theta.
+        base: (b,) places of the own parameters and the freed constants.
+        slots: places of each effect's coefficients.
+        states: names of the initial states.
+        tracks: the runs.
+        lengths: (R,) their numbers of samples.
+        observed: (R, T, C) SI units; NaN where missing, or behind the end of a run.
+        known: (R, s) initial states that are not to be estimated.
+        guess: (R, s) initial states, stated or guessed.
+        longest: duration of the longest run, seconds.
+        travel: the largest range of the primary coordinate in one run.
+        simulations: lanes simulated so far.
 
     Args:
         kind: the simulator's class.
@@ -74,6 +77,7 @@ class World:
         engine: the engine's name.
         extra: effects beside the registered library.
         free: constants to treat as parameters.
+        candidates: names of the library's effects to have at hand; None for all that fit.
 
     Raises:
         InputError: the simulator is no system that takes effects, a constant does not exist, or no
@@ -93,47 +97,58 @@ class World:
         self.kind, self.recording, self.engine = kind, recording, engine
         self.runs, self.extra = tuple(runs), tuple(extra)
         usable = library.library(kind.system)
-        names = list(usable) if candidates is None else list(candidates)
-        self.library = names
-        chosen: list[str | type[Effect]] = [*names, *(e for e in extra if e.fits(kind.system))]
-        observe = [c.name for c in kind.channels if c.name in runs[0].channels]
-        steps: tuple[dict[str, Any], ...] = ({}, {})
-        if engine == "batch":
-            pace = {"turn": TURN, "patience": PATIENCE}
-            steps = {"time_step": TIME_STEP, **pace}, {"time_step": FINE_STEP, **pace}
-        self.simulator, self._fine = (
-            kind(recording.constants, observe, engine=engine, effects=chosen, **settings)
-            for settings in steps
+        self.library = list(usable) if candidates is None else list(candidates)
+        self.simulator, self._fine = self._simulators()
+
+        # theta in its three parts: own parameters, freed constants, coefficients
+        system = self.simulator.system
+        self.own = len(system.parameters)
+        self.freed = [_freed(name, self.simulator, recording) for name in free]
+        coefficients = self.simulator.parameters[self.own :]
+        self.parameters: tuple[Parameter, ...] = (*system.parameters, *self.freed, *coefficients)
+        self.base: Indices = np.arange(self.own + len(self.freed))
+        self.slots = _slots(self.simulator, self.base.size)
+        self._shifting, self._filtering = self._delaying()
+
+        self.states = [*system.coordinates, *system.rates] or list(kind.states)
+        self.tracks: tuple[Track, ...] = tuple(
+            tracked(run, recording, self.simulator, self.states) for run in runs
         )
-        own = list(self.simulator.system.parameters)
-        self.own = len(own)
-        self.freed = [self._freed(name) for name in free]
-        self.parameters: tuple[Parameter, ...] = (
-            *own,
-            *self.freed,
-            *self.simulator.parameters[len(own) :],
-        )
-        self.base: Indices = np.arange(len(own) + len(self.freed))
-        self.slots = self._slots()
-        self.states = [*self.simulator.system.coordinates, *self.simulator.system.rates] or list(
-            kind.states
-        )
-        self.tracks = tuple(self._track(run) for run in runs)
         self.lengths: Indices = np.array([len(t.observed) for t in self.tracks])
-        self.observed = np.full((len(runs), self.lengths.max(), len(observe)), np.nan)
-        for row, track in zip(self.observed, self.tracks, strict=True):
-            row[: len(track.observed)] = track.observed
+        self.observed = self._padded()
         self.known: Mask = np.array([t.known for t in self.tracks])
         self.guess: Array = np.array([t.guess for t in self.tracks])
         self.longest, self.travel = self._longest(), self._travel()
         self.simulations = 0
         self._parts: dict[float, list[Scenario]] = {}
-        self._shifting, self._filtering = self._delaying()
 
-    @property
-    def channels(self) -> list[str]:
-        """Names of the recorded channels, in the order of observations."""
-        return [c.name for c in self.simulator.channels]
+    def _simulators(self) -> tuple[Simulated, Simulated]:
+        """The simulator with all effects, and the same with the steps that a filter needs."""
+        kind = self.kind
+        effects: list[str | type[Effect]] = list(self.library)
+        effects += [effect for effect in self.extra if effect.fits(kind.system)]
+        recorded = self.runs[0].channels
+        observe = [c.name for c in kind.channels if c.name in recorded]
+        usual: dict[str, Any] = {}
+        fine: dict[str, Any] = {}
+        # the other engines have steps of their own
+        if self.engine == "batch":
+            usual = {"time_step": TIME_STEP, "turn": TURN, "patience": PATIENCE}
+            fine = {**usual, "time_step": FINE_STEP}
+
+        def made(settings: dict[str, Any]) -> Simulated:
+            constants = self.recording.constants
+            return kind(constants, observe, engine=self.engine, effects=effects, **settings)
+
+        return made(usual), made(fine)
+
+    def _padded(self) -> Array:
+        """(R, T, C) the observations of all runs, NaN behind the end of a shorter one."""
+        shape = len(self.tracks), self.lengths.max(), len(self.channels)
+        observed = np.full(shape, np.nan)
+        for row, track in zip(observed, self.tracks, strict=True):
+            row[: len(track.observed)] = track.observed
+        return observed
 
     def _longest(self) -> float:
         """Seconds that the longest run takes."""
@@ -148,7 +163,27 @@ class World:
         if name not in self.channels:
             return 0.0
         values = self.observed[:, :, self.channels.index(name)]
-        return float(np.nan_to_num(np.nanmax(values, axis=1) - np.nanmin(values, axis=1)).max())
+        ranges = np.nanmax(values, axis=1) - np.nanmin(values, axis=1)
+        return float(np.nan_to_num(ranges).max())
+
+    def _delaying(self) -> tuple[Indices, Indices]:
+        """Where coefficients stand that move instants, and that need every step: such lanes are
+        simulated apart.
+        """
+        shifting: list[int] = []
+        filtering: list[int] = []
+        for effect in self.simulator.effects:
+            places = range(*self.slots[effect.name].indices(len(self.parameters)))
+            if _moves_instants(effect):
+                shifting.extend(places)
+            if isinstance(effect, Sensor) and effect.filters:
+                filtering.extend(places)
+        return np.array(shifting, dtype=np.intp), np.array(filtering, dtype=np.intp)
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the recorded channels, in the order of observations."""
+        return [c.name for c in self.simulator.channels]
 
     @property
     def effects(self) -> dict[str, Effect]:
@@ -161,173 +196,103 @@ class World:
         values[self.base.size :] = 0.0
         return values
 
-    def simulate(self, theta: Array, runs: Indices, states: Array, share: float = 1.0) -> Array:
-        """Observations (L, T, C) of lanes with parameters (L, P), in runs (L,), from initial states
-        (L, s).
-
-        Only the first share of each run is simulated; what is behind it, or behind the end of a
-        shorter run, is NaN.
-        """
-        self.simulations += len(theta)
-        result = np.full((len(theta), self.observed.shape[1], self.observed.shape[2]), np.nan)
-        active = theta != 0
-        kinds = active[:, self._shifting].any(axis=1) + 2 * active[:, self._filtering].any(axis=1)
-        for kind in np.unique(kinds):
-            lanes = np.flatnonzero(kinds == kind)
-            size = max(1, LANE_SAMPLES // result.shape[1])
-            for begin in range(0, lanes.size, size):
-                part = lanes[begin : begin + size]
-                simulator = self._fine if kind >= 2 else self.simulator
-                seen = self._simulated(simulator, theta[part], runs[part], states[part], share)
-                result[part, : seen.shape[1]] = seen
-        return result
-
     def counted(self, share: float) -> Mask:
         """(R, T, C) the samples that are there in the first share of each run."""
         first = np.arange(self.observed.shape[1]) < np.ceil(share * self.lengths)[:, None]
         counted: Mask = np.isfinite(self.observed) & first[:, :, None]
         return counted
 
-    def _scenarios(self, share: float) -> list[Scenario]:
-        """The first share of every run, made once."""
+    def simulate(self, theta: Array, runs: Indices, states: Array, share: float = 1.0) -> Array:
+        """Observations (L, T, C) of lanes.
+
+        Args:
+            theta: (L, P) parameters.
+            runs: (L,) which runs they are in.
+            states: (L, s) initial states.
+            share: only this first share of each run is simulated; what is behind it, or behind the
+                end of a shorter run, is NaN.
+        """
+        self.simulations += len(theta)
+        length = self.observed.shape[1]
+        result = np.full((len(theta), length, self.observed.shape[2]), np.nan)
+
+        # the slowest lane of a call sets its steps: those that need many do not go with the others
+        active = theta != 0
+        shifting = active[:, self._shifting].any(axis=1)
+        filtering = active[:, self._filtering].any(axis=1)
+        kinds = shifting + 2 * filtering
+        size = max(1, LANE_SAMPLES // length)
+        for kind in np.unique(kinds):
+            simulator = self._fine if kind >= 2 else self.simulator
+            lanes = np.flatnonzero(kinds == kind)
+            for begin in range(0, lanes.size, size):
+                part = lanes[begin : begin + size]
+                scenarios = self._scenarios(theta[part], runs[part], share)
+                simulated = self._simulated(simulator, theta[part], scenarios, states[part])
+                result[part, : simulated.shape[1]] = simulated
+        return result
+
+    def _scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:
+        """The first share of each lane's run, with the constants that its parameters (L, P) set."""
         if share not in self._parts:
             self._parts[share] = [
                 first_of(t.scenario, int(np.ceil(share * len(t.observed)))) for t in self.tracks
             ]
-        return self._parts[share]
+        scenarios = [self._parts[share][run] for run in runs]
+        if not self.freed:
+            return scenarios
+        names = [p.name for p in self.freed]
+        values = theta[:, self.own : self.base.size].tolist()
+        return [
+            replace(
+                scenario, constants={**scenario.constants, **dict(zip(names, row, strict=True))}
+            )
+            for scenario, row in zip(scenarios, values, strict=True)
+        ]
 
     def _simulated(
-        self, simulator: Simulated, theta: Array, runs: Indices, states: Array, share: float
+        self, simulator: Simulated, theta: Array, scenarios: Sequence[Scenario], states: Array
     ) -> Array:
-        whole = self._scenarios(share)
-        scenarios = [whole[run] for run in runs]
-        if self.freed:
-            names = [p.name for p in self.freed]
-            values = theta[:, self.own : self.own + len(names)].tolist()
-            scenarios = [
-                replace(s, constants={**s.constants, **dict(zip(names, row, strict=True))})
-                for s, row in zip(scenarios, values, strict=True)
-            ]
+        """Observations of lanes that one simulator can take together."""
+        # to the simulator a freed constant is none of its parameters
         lanes = np.delete(theta, np.arange(self.own, self.base.size), axis=1)
-        return simulator.simulate_lanes(
-            lanes, scenarios, dict(zip(self.states, states.T, strict=True))
-        )
+        initial = dict(zip(self.states, states.T, strict=True))
+        return simulator.simulate_lanes(lanes, scenarios, initial)
 
     def close(self) -> None:
         """Give back what the engine holds."""
         self.simulator.close()
         self._fine.close()
 
-    def _freed(self, name: str) -> Parameter:
-        constants = {c.name: c for c in self.kind.constants}
-        if name not in constants:
-            raise unknown(f"constant of system {self.kind.name}", name, list(constants) or ["none"])
-        value = self.simulator.constant_values[name]
-        if value == 0 or any(name in run.constants for run in self.recording.runs):
-            raise InputError(
-                f"--free {name}: expected a constant that is not zero and the same in every run"
-            )
-        low, high = sorted((value / FREED, value * FREED))
-        return Parameter(name, constants[name].unit, value, (low, high), says=constants[name].says)
 
-    def _slots(self) -> dict[str, slice]:
-        slots, place = {}, self.base.size
-        for effect in self.simulator.effects:
-            count = len(effect.on(self.simulator.system))
-            slots[effect.name] = slice(place, place + count)
-            place += count
-        return slots
-
-    def _delaying(self) -> tuple[Indices, Indices]:
-        """Where coefficients stand that move instants, and that need every step: such lanes are
-        simulated apart.
-        """
-        found: tuple[list[int], list[int]] = ([], [])
-        for effect in self.simulator.effects:
-            places = range(*self.slots[effect.name].indices(len(self.parameters)))
-            if (isinstance(effect, Input) and type(effect).times is not Input.times) or (
-                isinstance(effect, Sensor) and type(effect).times is not Sensor.times
-            ):
-                found[0].extend(places)
-            if isinstance(effect, Sensor) and effect.filters:
-                found[1].extend(places)
-        return np.array(found[0], dtype=np.intp), np.array(found[1], dtype=np.intp)
-
-    def _track(self, run: Run) -> Track:
-        observed = np.stack([run.channels[name] for name in self.channels], axis=1)
-        guess, known = self._start(run)
-        constants = {**self.recording.constants, **run.constants}
-        scenario = Scenario(run.times, {}, run.inputs, constants)
-        return Track(run.name, scenario, observed, guess, known)
-
-    def _start(self, run: Run) -> tuple[Array, Mask]:
-        """Initial states (s,), and which of them are stated: from the first samples where they are
-        not.
-        """
-        system, defaults = self.simulator.system, self.kind.states
-        values = dict(defaults)
-        for coordinate, rate in zip(
-            system.coordinates, system.rates, strict=False
-        ):  # behind them: an own one's other states
-            if coordinate in run.channels:
-                values[coordinate], values[rate] = beginning(run.times, run.channels[coordinate])
-        for rate in system.rates:
-            if rate in run.channels:
-                values[rate] = beginning(run.times, run.channels[rate])[0]
-        self._lift(values, run)
-        values.update(run.initial)
-        known = [name in run.initial or name in self._hidden() for name in self.states]
-        return np.array([values[name] for name in self.states]), np.array(known)
-
-    def _hidden(self) -> set[str]:
-        """States of coordinates that nothing recorded has to do with: taken to be at their
-        defaults.
-        """
-        system, shown = self.simulator.system, self.channels
-        hidden = set()
-        for axis, (coordinate, rate) in enumerate(
-            zip(system.coordinates, system.rates, strict=False)
-        ):
-            about = (coordinate, rate, f"accel_{coordinate}")
-            if axis != system.primary and not any(name in shown for name in about):
-                hidden |= {coordinate, rate}
-        return hidden
-
-    def _lift(self, values: dict[str, float], run: Run) -> None:
-        """Where the height above the ground is not recorded, no impact can be told: begin too high
-        for one.
-        """
-        system = self.simulator.system
-        if not system.bounces or system.coordinates[-1] in run.channels:
-            return
-        gravity = float(
-            run.constants.get("gravity", self.simulator.constant_values.get("gravity", 9.81))
+def _freed(name: str, simulator: Simulated, recording: Recording) -> Parameter:
+    """A constant as a parameter."""
+    constants = {c.name: c for c in simulator.constants}
+    if name not in constants:
+        raise unknown(f"constant of system {simulator.name}", name, list(constants) or ["none"])
+    value = simulator.constant_values[name]
+    # its range is a multiple of its value, and a run's own value would overrule what is fitted
+    if value == 0 or any(name in run.constants for run in recording.runs):
+        raise InputError(
+            f"--free {name}: expected a constant that is not zero and the same in every run"
         )
-        seconds = float(run.times[-1] - run.times[0])
-        values[system.coordinates[-1]] = 10.0 + 100.0 * seconds + gravity * seconds**2
+    low, high = sorted((value / FREED, value * FREED))
+    return Parameter(name, constants[name].unit, value, (low, high), says=constants[name].says)
 
 
-def first_of(scenario: Scenario, samples: int) -> Scenario:
-    """The first samples of a scenario."""
-    if samples >= scenario.times.size:
-        return scenario
-    inputs = {name: signal[:samples] for name, signal in scenario.inputs.items()}
-    return replace(scenario, times=scenario.times[:samples], inputs=inputs)
+def _slots(simulator: Simulated, first: int) -> dict[str, slice]:
+    """Where each effect's coefficients stand, from the first place on."""
+    slots = {}
+    for effect in simulator.effects:
+        last = first + len(effect.on(simulator.system))
+        slots[effect.name] = slice(first, last)
+        first = last
+    return slots
 
 
-def beginning(times: Array, values: Array) -> tuple[float, float]:
-    """Value and slope at the first instant, from a parabola through the first samples that are
-    there.
-    """
-    seen = np.isfinite(values)
-    t, y = times[seen][:_FIRST] - times[0], values[seen][:_FIRST]
-    if t.size == 0:
-        return 0.0, 0.0
-    if t.size < 3:
-        return float(y[0]), 0.0
-    scale = float(t[-1]) or 1.0
-    slope, value = np.polynomial.polynomial.polyfit(t / scale, y, 1 if t.size < 5 else 2)[1::-1]
-    return float(value), float(slope / scale)
-
-
-_FIRST = 8
+def _moves_instants(effect: Effect) -> bool:
+    """Whether an effect reads signals at other instants than the scenario's."""
+    for family in (Input, Sensor):
+        if isinstance(effect, family) and type(effect).times is not family.times:
+            return True
+    return False

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from bench.gap.model.bounds import BEYOND, DRY, coefficient_bounds
-from bench.gap.model.world import FREED, beginning, first_of
+from bench.gap.model.tracks import beginning, first_of
+from bench.gap.model.world import FREED
 from sims.ball.simulator import Ball
 from sims.base import InputError, Scenario
 from sims.pendulum.simulator import Pendulum

@@ -1,0 +1,161 @@
+"""One damped Gauss-Newton step for parameters that all runs share and initial states that each run
+has for itself.
+
+Run i leaves a residual r_i, which the shared parameters x change by A_i and the run's own initial
+state z_i by B_i; of z_i a guess g is known beforehand to within π, 1 sigma. The cost is
+
+    F = Σ_i |r_i|² + Σ_i |d_i|²,   d_i = (z_i - g_i) / π                                         (1)
+
+A Gauss-Newton step takes r for linear. As no run's initial state touches another run, its normal
+equations have the shape of an arrow (B. Triggs et al., Bundle adjustment, 2000,
+doi:10.1007/3-540-44480-7_21, section 6), here with U = Σ A_iᵀ A_i, W_i = A_iᵀ B_i and
+V_i = B_iᵀ B_i + π⁻²:
+
+    U δx + Σ_i W_i δz_i = a,          a = Σ A_iᵀ r_i                                             (2)
+    W_iᵀ δx + V_i δz_i = b_i,         b_i = B_iᵀ r_i - d_i / π                                   (3)
+
+Levenberg and Marquardt damp it: U and V_i get λ times their own diagonals on top (J. Nocedal, S. J.
+Wright, Numerical Optimization, 2nd ed., section 10.3). Initial states are eliminated run by run,
+which leaves the Schur complement for the shared parameters, and then follow from them:
+
+    (U - Σ W_i V_i⁻¹ W_iᵀ) δx = a - Σ W_i V_i⁻¹ b_i                                              (4)
+    δz_i = V_i⁻¹ b_i - V_i⁻¹ W_iᵀ δx                                                             (5)
+
+so the work grows linearly with the number of runs. If r were linear, (1) would fall by
+
+    Σ |r_i|² - |r_i - A_i δx - B_i δz_i|² + Σ |d_i|² - |d_i + δz_i / π|²                         (6)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.gap.model.world import Mask
+from sims.base import Array
+
+LEAST_POWER = 1e-12
+"""Stands for a diagonal element of U that is zero, so that it is damped at all."""
+RIDGE = 1e-9
+"""Share of its diagonal that U gets besides the damping: undamped, parameters that act alike make
+it singular."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step to try: of the shared parameters (q,), of the initial states (R, s), and the decrease
+    of the cost that it promises.
+    """
+
+    shared: Array
+    own: Array
+    promised: float
+
+
+@dataclass(frozen=True)
+class _Arrow:
+    """The normal equations (2) and (3) of R runs, q shared parameters and s initial states.
+
+    Attributes:
+        shared: (q, q) U.
+        cross: (R, q, s) every W_i.
+        inner: (R, s, s) every V_i.
+        gradient: (q,) a.
+        pull: (R, s) every b_i.
+    """
+
+    shared: Array
+    cross: Array
+    inner: Array
+    gradient: Array
+    pull: Array
+
+    def solved(self, stuck: Mask) -> tuple[Array, Array]:
+        """The steps (q,) and (R, s), by (4) and (5); stuck parameters (q,) do not move."""
+        inverse_cross = np.linalg.solve(self.inner, self.cross.transpose(0, 2, 1))
+        inverse_pull = np.linalg.solve(self.inner, self.pull[:, :, None])[:, :, 0]
+
+        # (4): the two sides, then least squares, which finds a short step where directions vanish
+        schur = self.shared - np.matmul(self.cross, inverse_cross).sum(axis=0)
+        right = self.gradient - np.einsum("rqs,rs->q", self.cross, inverse_pull)
+        shared = np.zeros(len(right))
+        moves = ~stuck
+        if moves.any():
+            free = np.ix_(moves, moves)
+            shared[moves] = np.linalg.lstsq(schur[free], right[moves], rcond=None)[0]
+
+        own = inverse_pull - np.einsum("rsq,q->rs", inverse_cross, shared)  # (5)
+        return shared, own
+
+
+def arrow_step(
+    residual: Array,
+    jacobian: Array,
+    q: int,
+    drift: Array,
+    prior: Array,
+    known: Mask,
+    damping: float,
+    stuck: Mask,
+) -> Step:
+    """One damped Gauss-Newton step.
+
+    Args:
+        residual: (R, T, C) whitened, observed less simulated.
+        jacobian: (R, T, C, q + s) of what is simulated, whitened; initial states last.
+        q: number of shared parameters.
+        drift: (R, s) the d of (1): how far initial states are from their guesses, in sigmas.
+        prior: (s,) the π of (1).
+        known: (R, s) initial states that do not move.
+        damping: the λ of Levenberg and Marquardt.
+        stuck: (q,) parameters that do not move.
+    """
+    runs, size = len(residual), jacobian.shape[3]
+    j = jacobian.reshape(runs, -1, size)
+    r = residual.reshape(runs, -1)
+    arrow = _damped(_normal(j, r, q, drift, prior), damping, known)
+    shared, own = arrow.solved(stuck)
+    return Step(shared, own, _promised(j, r, drift, prior, shared, own))
+
+
+def _normal(j: Array, r: Array, q: int, drift: Array, prior: Array) -> _Arrow:
+    """Equations (2) and (3) of residuals (R, n) and their derivatives (R, n, q + s)."""
+    own = slice(q, j.shape[2])
+    # one product of all columns holds every A'A, A'B and B'B
+    transposed = j.transpose(0, 2, 1)
+    normal = np.matmul(transposed, j)
+    right = np.matmul(transposed, r[:, :, None])[:, :, 0]
+    return _Arrow(
+        shared=normal[:, :q, :q].sum(axis=0),
+        cross=normal[:, :q, own].copy(),
+        inner=normal[:, own, own] + np.diag(1.0 / prior**2),
+        gradient=right[:, :q].sum(axis=0),
+        pull=right[:, own] - drift / prior,
+    )
+
+
+def _damped(arrow: _Arrow, damping: float, known: Mask) -> _Arrow:
+    """The equations damped, and with initial states that do not move where they are known."""
+    identity = np.eye(arrow.inner.shape[1])
+    diagonal = np.einsum("rii->ri", arrow.inner)
+    inner = arrow.inner + damping * diagonal[:, :, None] * identity
+    # a known state's equation reads: its step is zero
+    inner = np.where(known[:, :, None] | known[:, None, :], identity, inner)
+    pull = np.where(known, 0.0, arrow.pull)
+    # and W must not lead from it to the parameters
+    cross = np.where(known[:, None, :], 0.0, arrow.cross)
+
+    scale = np.maximum(np.diagonal(arrow.shared), LEAST_POWER)
+    shared = arrow.shared + np.diag(damping * scale + RIDGE * scale + LEAST_POWER)
+    return _Arrow(shared, cross, inner, arrow.gradient, pull)
+
+
+def _promised(j: Array, r: Array, drift: Array, prior: Array, shared: Array, own: Array) -> float:
+    """What a step would gain if the residual were linear, (6)."""
+    whole = np.concatenate([np.tile(shared, (len(r), 1)), own], axis=1)
+    left = r - np.matmul(j, whole[:, :, None])[:, :, 0]
+    after = drift + own / prior
+    promised = float((r * r).sum() - (left * left).sum())
+    promised += float((drift**2).sum() - (after**2).sum())
+    return promised
