@@ -24,7 +24,7 @@ class Standalone:
     Attributes:
         parameters: what it tunes.
         start: (b,) where it starts, physical units.
-        observed: (T, C) what was observed, runs one behind the other; NaN where a sample is missing.
+        observed: (T, C) SI units, runs one behind the other; NaN where a sample is missing.
         scale: (C,) what a residual is divided by.
         lengths: samples of each run; they add up to T.
         evaluate: physical parameters (n, b) -> observations (n, T, C) and losses (n,).
