@@ -1,0 +1,110 @@
+"""Trains a learned tuner ahead, into the cache that comparisons use, and keeps the losses."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from bench.figures.training import draw
+from bench.problem.experiment import Entry, Experiment, load, names
+from bench.problem.problem import Problem
+from bench.registry import simulators, tuners
+from methods.base import Practice
+from sims import files
+from sims.base import InputError
+
+HEAD = ("seed", "stage", "epoch", "training_loss", "held_out_loss")
+"""Columns of loss.csv."""
+_HELD_OUT = 160
+"""Simulations that the held-out loss is measured with, apart from the training budget."""
+
+
+def choose(
+    tuner: str, simulator: str, experiment: str | None = None, budget: int | None = None
+) -> tuple[Experiment, Entry]:
+    """The experiment and the entry to train.
+
+    Args:
+        tuner: registered name, or the experiment's label.
+        simulator: registered name.
+        experiment: name or TOML file; the only one of the project with this simulator where None.
+        budget: simulations to learn from; the experiment's where None.
+
+    Raises:
+        InputError: they do not go together, or the tuner does not learn.
+    """
+    simulators.get(simulator)
+    chosen = load(experiment or _only(simulator)).chosen(training_budget=budget)
+    if chosen.simulator != simulator:
+        raise InputError(
+            f"experiment {chosen.name}: its simulator is {chosen.simulator}, not {simulator}"
+        )
+    entries = {entry.label: entry for entry in chosen.tuners}
+    entry = entries.get(tuner, Entry(tuner, tuner))
+    if not tuners.get(entry.tuner).learned:
+        raise InputError(f"tuner {entry.label} does not learn: there is nothing to train")
+    return chosen, entry
+
+
+def _only(simulator: str) -> str:
+    """The only experiment that comes with the project and has this simulator."""
+    fitting = [name for name in names() if load(name).simulator == simulator]
+    if len(fitting) == 1:
+        return fitting[0]
+    there = "none of the project's fits; give a TOML file"
+    if fitting:
+        there = f"there are: {', '.join(fitting)}"
+    raise InputError(f"expected --experiment with simulator {simulator}; {there}")
+
+
+@dataclass
+class Losses:
+    """Looks on while a tuner trains, and keeps the losses; see `methods.base.Watch`.
+
+    Attributes:
+        experiment: in which it trains.
+        start: begins to show the progress of a stage: title, steps; gives what advances it.
+        rows: as `HEAD`.
+    """
+
+    experiment: Experiment
+    start: Callable[[str, int], Callable[[], None]]
+    rows: list[tuple[int, str, int, float, float]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.begin("", 0)
+
+    def begin(self, title: str, seed: int) -> None:
+        """What is trained from now on."""
+        self._title, self._seed, self._stage = title, seed, ""
+
+    @property
+    def ground(self) -> Practice:
+        """Simulations that only measure."""
+        return Problem(self.experiment).practice(_HELD_OUT)
+
+    def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
+        """Note one pass over the data."""
+        if stage != self._stage:
+            self._stage = stage
+            self._step = self.start(f"{self._title}, {stage}", epochs)
+        self.rows.append((self._seed, stage, epoch, loss, held_out))
+        self._step()
+
+    def write(self, folder: Path, title: str) -> list[Path]:
+        """Write the losses as a table and a figure; returns what was written.
+
+        Raises:
+            InputError: the folder cannot be made.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
+        text = io.StringIO(newline="")
+        csv.writer(text).writerows([HEAD, *self.rows])
+        files.write(folder / "loss.csv", text.getvalue())
+        return [folder / "loss.csv", draw(folder, title, self.rows)]
