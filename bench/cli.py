@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from bench import __version__
 from bench.commands.check import add_check
@@ -36,10 +37,17 @@ COMMANDS = (
 """Name, what adds its options, and its line of help, in the order of `simgap --help`."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose faults are one line, as every other of the user's is."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"simgap: {message}; see {self.prog} --help\n")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     options = parser().parse_args(arguments)
-    from sims.base import InputError
+    from sims.base import InputError  # after the parser, which has ended the quick `--help`
 
     try:
         code: int = options.command(options)
@@ -57,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """The parser of the command line, all commands in it."""
-    whole = argparse.ArgumentParser(
+    whole = _Parser(
         prog="simgap",
         description="Compare methods that tune simulator parameters; find what tuning cannot fix.",
     )

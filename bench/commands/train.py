@@ -25,7 +25,10 @@ def add_train(parser: argparse.ArgumentParser) -> None:
         "--budget", type=positive, metavar="N", help="simulations to learn from (default: its own)"
     )
     parser.add_argument(
-        "--seeds", type=positive, metavar="N", help="trainings, each from its own seed (default: all)"
+        "--seeds",
+        type=positive,
+        metavar="N",
+        help="trainings, each from its own seed (default: all)",
     )
     parser.add_argument(
         "--again", action="store_true", help="train although there are weights, and replace them"
@@ -45,9 +48,7 @@ def _train(options: argparse.Namespace) -> int:
     from bench.runs.training import train
 
     load_plugins(options.plugin)
-    experiment, entry = choose(
-        options.tuner, options.simulator, options.experiment, options.budget
-    )
+    experiment, entry = choose(options.tuner, options.simulator, options.experiment, options.budget)
     with Bars("epoch") as bars:
         losses = Losses(experiment, bars.start)
         for seed in range(options.seeds or seeds_of(experiment, entry)):
