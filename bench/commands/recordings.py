@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 
 from bench.commands.options import add_plugin, names, positive
-from bench.commands.wishes import wish
 
 
 def add_simulate(simulate: argparse.ArgumentParser) -> None:
@@ -76,6 +75,7 @@ def add_inspect(inspect: argparse.ArgumentParser) -> None:
 
 def _simulate(options: argparse.Namespace) -> int:
     from bench.api.recordings import simulate
+    from bench.commands.wishes import wish
     from bench.recordings.simulate import ready
     from bench.registry import load_plugins
 

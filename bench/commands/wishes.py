@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from bench.recordings.simulate import EVERY
 from sims.base import InputError
-
-EVERY = "*"
-"""As in `bench.recordings.simulate`, which is heavy to import."""
 
 
 def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
