@@ -4,8 +4,7 @@ simulator, whole.
 
 import mujoco
 
-from sims.base import Channel, Constant, Parameter
-from sims.own import OwnSimulator
+from simgap import Channel, Constant, OwnSimulator, Parameter
 
 MODEL = """<mujoco><option integrator="Euler" gravity="0 0 0"/><worldbody><body>
   <joint name="z" type="slide" axis="0 0 1" stiffness="{stiffness}" damping="{damping}"/>
