@@ -15,17 +15,30 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sims import effects as library
 from sims import files
 from sims.base import InputError, Parameter, Simulator, unknown
-from sims.recording.recording import read_toml
 from sims.simulated import Simulated, effect_parameters
+from sims.user_toml import fault, finite, known, names, read_toml, table, text
 
 FORMAT = 1
+"""Of the file; a reader refuses any other."""
+
 SPREAD = 0.2
 """The training range of a fitted number reaches at least this share of it to either side."""
+
+_KEYS = (
+    "format",
+    "name",
+    "system",
+    "engine",
+    "title",
+    "observe",
+    "constants",
+    "parameters",
+    "effects",
+)
+"""What may stand in the file."""
 
 
 @dataclass(frozen=True)
@@ -104,91 +117,76 @@ def read(path: Path) -> Extended:
     """
     document = read_toml(path)
     if document.get("format") != FORMAT:
-        raise InputError(
-            f"{path}: expected an extended simulator with format = {FORMAT}, found {document.get('format')!r}"
-        )
-    for key in document:
-        if key not in (
-            "format",
-            "name",
-            "system",
-            "engine",
-            "title",
-            "observe",
-            "constants",
-            "parameters",
-            "effects",
-        ):
-            raise unknown(
-                f"key of {path}",
-                key,
-                ["name", "system", "engine", "title", "observe", "constants", "..."],
-            )
-    name, system = (_text(path, document, key) for key in ("name", "system"))
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]*", name):
-        raise InputError(
-            f"{path}: name: expected letters, digits, '_', '.' and '-', found {name!r}"
-        )
-    observe = document.get("observe", [])
-    if not isinstance(observe, list) or not observe or not all(isinstance(c, str) for c in observe):
-        raise InputError(f"{path}: observe: expected a list of channel names, found {observe!r}")
-    constants = {
-        key: _real(path, f"constants.{key}", v)
-        for key, v in _table(path, document, "constants").items()
-    }
-    parameters = {
-        key: _number(path, f"parameters.{key}", v)
-        for key, v in _table(path, document, "parameters").items()
-    }
-    effects = {
-        key: {
-            c: _number(path, f"effects.{key}.{c}", v)
-            for c, v in _table(path, {key: value}, key).items()
-        }
-        for key, value in _table(path, document, "effects").items()
-    }
-    engine = _text(path, document, "engine") if "engine" in document else None
+        wanted = f"an extended simulator with format = {FORMAT}"
+        raise fault(path, "", wanted, document.get("format"))
+    known(f"key of {path}", document, _KEYS)
+    name = _name(path, document.get("name"))
+    engine = _text(path, "engine", document["engine"]) if "engine" in document else None
     return Extended(
-        name,
-        system,
-        engine,
-        str(document.get("title", "")),
-        parameters,
-        effects,
-        constants,
-        observe,
+        name=name,
+        system=_text(path, "system", document.get("system")),
+        engine=engine,
+        title=str(document.get("title", "")),
+        parameters=_numbers(path, "parameters", document.get("parameters", {})),
+        effects=_effects(path, document.get("effects", {})),
+        constants=_constants(path, document.get("constants", {})),
+        observe=_observe(path, document.get("observe", [])),
     )
 
 
-def _table(path: Path, document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    value = document.get(key, {})
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: {key}: expected a table, found {value!r}")
-    return value
+def _name(path: Path, value: Any) -> str:
+    """The name under which it registers; a class, a folder and a file are called after it."""
+    name = _text(path, "name", value)
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]*", name):
+        raise fault(path, "name", "letters, digits, '_', '.' and '-'", name)
+    return name
 
 
-def _text(path: Path, document: Mapping[str, Any], key: str) -> str:
-    value = document.get(key)
-    if not isinstance(value, str) or not value:
-        raise InputError(f"{path}: {key}: expected a text, found {value!r}")
-    return value
+def _observe(path: Path, value: Any) -> list[str]:
+    wanted = "a list of channel names"
+    observe = names(path, "observe", value, wanted)
+    if not observe:
+        raise fault(path, "observe", wanted, value)
+    return list(observe)
 
 
-def _real(path: Path, where: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise InputError(f"{path}: {where}: expected a finite number, found {value!r}")
-    return float(value)
+def _constants(path: Path, value: Any) -> dict[str, float]:
+    given = table(path, "constants", value)
+    return {name: _real(path, f"constants.{name}", number) for name, number in given.items()}
 
 
-def _number(path: Path, where: str, value: object) -> Number:
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: {where}: expected a table with value and unit, found {value!r}")
-    low, high = (
-        _real(path, f"{where}.{k}", value[k]) if k in value else None for k in ("low", "high")
+def _effects(path: Path, value: Any) -> dict[str, dict[str, Number]]:
+    coefficients = {}
+    for name, numbers in table(path, "effects", value).items():
+        table(path, name, numbers)
+        coefficients[name] = _numbers(path, f"effects.{name}", numbers)
+    return coefficients
+
+
+def _numbers(path: Path, where: str, value: Any) -> dict[str, Number]:
+    given = table(path, where, value)
+    return {name: _number(path, f"{where}.{name}", number) for name, number in given.items()}
+
+
+def _number(path: Path, where: str, value: Any) -> Number:
+    given = table(path, where, value, "a table with value and unit")
+    fitted = _real(path, f"{where}.value", given.get("value"))
+    bounds = (
+        _real(path, f"{where}.{end}", given[end]) if end in given else None
+        for end in ("low", "high")
     )
-    return Number(
-        _real(path, f"{where}.value", value.get("value")), _text(path, value, "unit"), low, high
-    )
+    return Number(fitted, _text(path, "unit", given.get("unit")), *bounds)
+
+
+def _text(path: Path, where: str, value: Any) -> str:
+    result = text(path, where, value, "a text")
+    if not result:
+        raise fault(path, where, "a text", value)
+    return result
+
+
+def _real(path: Path, where: str, value: Any) -> float:
+    return finite(path, where, value, "a finite number")
 
 
 def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:

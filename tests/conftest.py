@@ -6,6 +6,12 @@ import pytest
 
 PLUGINS = Path(__file__).parent / "plugins"
 
+_BESIDE = Path(__file__).parents[2] / "shared" / "data"
+"""Where the real recordings lie on machines that have them."""
+
+if _BESIDE.is_dir():  # for child processes too; who has set it knows better
+    os.environ.setdefault("SIMGAP_DATA", str(_BESIDE))
+
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background; children inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -28,7 +34,7 @@ def own_cache(tmp_path_factory, monkeypatch):
 @pytest.fixture(scope="session")
 def recordings():
     """The folder of real recordings; tests that need it skip visibly where it is missing."""
-    folder = Path(os.environ.get("SIMGAP_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    folder = Path(os.environ.get("SIMGAP_DATA", _BESIDE))
     if not folder.is_dir():
         pytest.skip(f"no recordings: {folder} is missing (set SIMGAP_DATA)")
     return folder

@@ -20,11 +20,15 @@ def lines(what: str) -> list[str]:
         ],
         "systems": _systems,
         "effects": _effects,
-        "experiments": lambda: [
-            f"{name:22} {experiment.load(name).says}" for name in experiment.names()
-        ],
+        "experiments": _experiments,
     }
     return kinds[what]()
+
+
+def _experiments() -> list[str]:
+    """Every experiment that comes with the project: its sentence, then its tags."""
+    loaded = [experiment.load(name) for name in experiment.names()]
+    return [f"{each.name:22} {each.says} [{', '.join(each.tags)}]" for each in loaded]
 
 
 def _systems() -> list[str]:

@@ -11,26 +11,40 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
-from bench.problem.reading import checked, pair, table_of
+from bench.problem import sweep
+from bench.problem.entries import Entry, entries_of
+from bench.problem.recorded import beside
 from sims.base import InputError, unknown
-from sims.recording.recording import read_toml
+from sims.user_toml import Pair, entries, hints_of, known, read_toml
+
+__all__ = [
+    "Entry",
+    "Experiment",
+    "HeldOut",
+    "Sampling",
+    "Source",
+    "expand",
+    "load",
+    "names",
+    "parse",
+]
 
 RANGES = ("in", "wide", "real")
+"""Where targets come from: the training range, the bounds, a recording."""
+
+Drawn = float | Pair
+"""A number, or the range from which each scenario draws one uniformly."""
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One tuner of a comparison: its registered name, options, and seeds or budget where they
-    differ.
-    """
+class Change(TypedDict, total=False):
+    """What an experiment may change of a parameter; see `sims.base.Parameter`."""
 
-    label: str
-    tuner: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-    seeds: int | None = None
-    budget: int | None = None
+    nominal: float
+    bounds: Pair
+    training: Pair
+    log: bool
 
 
 @dataclass(frozen=True)
@@ -48,7 +62,7 @@ class HeldOut:
     """
 
     scenarios: int = 3
-    initial: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
+    initial: Mapping[str, Drawn] = field(default_factory=dict)
     inputs: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -69,6 +83,7 @@ class Experiment:
         name: file name without its ending.
         title: heading of figures.
         says: a sentence on what it is.
+        tags: words by which a list is searched, e.g. ``quick``; they change nothing.
         simulator: registered name.
         observe: channels the tuner sees; all where empty.
         error_channel: the channel in which `obs_error` and `heldout_error` are reported; the first
@@ -101,12 +116,15 @@ class Experiment:
         recording: the measured data, for range real.
         shot: where the experiment is a bounce shot, its scene (`bench.shot.settings`); targets are
             then shots a ball.
+        sweep: values by key, for each of which the file stands for an experiment of its own
+            (`expand`); a key within a table is joined by dots, as ``noise.x``.
         tuners: the entries.
     """
 
     name: str
     title: str = ""
     says: str = ""
+    tags: tuple[str, ...] = ()
     simulator: str = ""
     observe: tuple[str, ...] = ()
     error_channel: str = ""
@@ -121,45 +139,42 @@ class Experiment:
     noise: Mapping[str, float] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     world: Mapping[str, Any] = field(default_factory=dict)
-    constants: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
-    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    initial: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
+    constants: Mapping[str, Drawn] = field(default_factory=dict)
+    parameters: Mapping[str, Change] = field(default_factory=dict)
+    initial: Mapping[str, Drawn] = field(default_factory=dict)
     inputs: Mapping[str, str] = field(default_factory=dict)
     sampling: Sampling = field(default_factory=Sampling)
     held_out: HeldOut | None = None
     identifiability: bool = True
     recording: Source | None = None
     shot: Mapping[str, Any] = field(default_factory=dict)
+    sweep: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
     tuners: tuple[Entry, ...] = ()
 
     def __post_init__(self) -> None:
+        who = f"experiment {self.name}"
         for what in ("targets", "seeds", "budget"):
-            if getattr(self, what) < 1:
-                raise InputError(
-                    f"experiment {self.name}: {what} must be at least 1, found {getattr(self, what)}"
-                )
+            count = getattr(self, what)
+            if count < 1:
+                raise InputError(f"{who}: {what} must be at least 1, found {count}")
         if self.memory < 0 or not self.timeout > 0:
-            raise InputError(f"experiment {self.name}: expected timeout > 0 and memory >= 0")
-        for name in self.ranges:
-            if name not in RANGES:
-                raise unknown("range", name, RANGES)
-        if ("real" in self.ranges) != (self.recording is not None) or (
-            self.recording and len(self.ranges) != 1
-        ):
-            raise InputError(
-                f"experiment {self.name}: range 'real' and a [recording] go together, and alone"
-            )
+            raise InputError(f"{who}: expected timeout > 0 and memory >= 0")
+        known("range", self.ranges, RANGES)
+        # A recording has no range to draw from, and ranges have no recording.
+        real = "real" in self.ranges
+        if real != (self.recording is not None) or (real and len(self.ranges) != 1):
+            raise InputError(f"{who}: range 'real' and a [recording] go together, and alone")
         if self.held_out and (self.recording or self.held_out.scenarios < 1):
-            raise InputError(
-                f"experiment {self.name}: [held_out] needs simulated targets and scenarios of at least 1"
-            )
+            wanted = "simulated targets and scenarios of at least 1"
+            raise InputError(f"{who}: [held_out] needs {wanted}")
 
     def document(self) -> dict[str, Any]:
         """The whole configuration as TOML tables; `parse` of it gives an equal experiment."""
-        document = {
-            k: v for k, v in asdict(self).items() if k not in ("name", "tuners") and v is not None
-        }
-        document["tuners"] = {e.label: _without_none(e) for e in self.tuners}
+        document = {key: value for key, value in asdict(self).items() if value is not None}
+        del document["name"]
+        if not self.sweep:
+            del document["sweep"]  # what is run never has one
+        document["tuners"] = {entry.label: entry.table() for entry in self.tuners}
         return document
 
     @property
@@ -188,10 +203,6 @@ class Experiment:
         return replace(
             self, tuners=tuple(entries.get(label, Entry(label, label)) for label in labels)
         )
-
-
-def _without_none(entry: Entry) -> dict[str, Any]:
-    return {k: v for k, v in asdict(entry).items() if v is not None and k != "label"}
 
 
 def names() -> list[str]:
@@ -223,113 +234,50 @@ def load(name_or_path: str) -> Experiment:
 def parse(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
     """Check the tables of an experiment file.
 
+    Args:
+        name: of the experiment.
+        document: the file's tables.
+        path: the file, for messages; its recording may lie beside it.
+
     Raises:
         InputError: an unknown key or a value of another type, naming file and key.
     """
-    values = dict(document)
-    entries = checked(path, "tuners", values.pop("tuners", {}), dict)
-    fields = {k: _field(path, k, v) for k, v in values.items()}
+    hints = {key: hint for key, hint in hints_of(Experiment).items() if key != "name"}
+    known(f"entry of {path}", document, hints)
+    tuners = entries_of(path, document.get("tuners", {}))
+    given = {key: value for key, value in document.items() if key != "tuners"}
+    fields = entries(path, "", given, hints)
     if not fields.get("simulator"):
         raise InputError(f'{path}: expected simulator = "NAME", found none')
-    tuners = tuple(_entry(path, label, table) for label, table in entries.items())
+    if "recording" in fields:
+        fields["recording"] = Source(beside(fields["recording"].path, path))
     try:
-        return Experiment(name=name, tuners=tuners, **fields)
+        experiment = Experiment(name=name, tuners=tuners, **fields)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    _expanded(experiment, path)  # a fault in what is swept over is a fault of this file
+    return experiment
 
 
-_TYPES: dict[str, type | tuple[type, ...]] = {
-    "title": str,
-    "says": str,
-    "simulator": str,
-    "observe": list,
-    "error_channel": str,
-    "ranges": list,
-    "targets": int,
-    "seeds": int,
-    "budget": int,
-    "same_targets_as": str,
-    "training_budget": int,
-    "timeout": (int, float),
-    "memory": int,
-    "noise": dict,
-    "settings": dict,
-    "world": dict,
-    "constants": dict,
-    "parameters": dict,
-    "initial": dict,
-    "inputs": dict,
-    "sampling": dict,
-    "held_out": dict,
-    "identifiability": bool,
-    "recording": dict,
-    "shot": dict,
-}
+def expand(experiment: Experiment) -> list[Experiment]:
+    """The experiments that a file stands for: one for each combination of the values it sweeps
+    over, named ``NAME[budget=10]``; itself where it sweeps over nothing.
+
+    All meet the same targets: the seeds of targets depend on the file's name alone.
+    """
+    return _expanded(experiment, Path(f"{experiment.name}.toml"))
 
 
-def _field(path: Path, key: str, value: Any) -> Any:
-    if key not in _TYPES:
-        raise unknown(f"entry of {path}", key, [*_TYPES, "tuners"])
-    checked(path, key, value, _TYPES[key])
-    if key in ("observe", "ranges"):
-        return tuple(checked(path, key, v, str) for v in value)
-    if key == "noise":
-        return {k: float(checked(path, f"{key}.{k}", v, (int, float))) for k, v in value.items()}
-    if key == "parameters":
-        return {k: dict(_parameter(path, k, v)) for k, v in value.items()}
-    if key in ("initial", "constants"):
-        return _initial(path, key, value)
-    if key == "inputs":
-        return _inputs(path, key, value)
-    if key == "held_out":
-        return _held_out(path, value)
-    if key == "sampling":
-        return Sampling(**table_of(path, key, value, {"rate": (int, float), "samples": int}))
-    if key == "recording":
-        return Source(**table_of(path, key, value, {"path": str}))
-    return value
-
-
-def _parameter(path: Path, name: str, table: Any) -> dict[str, Any]:
-    changes = table_of(
-        path,
-        f"parameters.{name}",
-        table,
-        {"nominal": (int, float), "bounds": list, "training": list, "log": bool},
-    )
-    for key in ("bounds", "training"):
-        if key in changes:
-            changes[key] = pair(path, f"parameters.{name}.{key}", changes[key])
-    return changes
-
-
-def _initial(path: Path, where: str, value: Any) -> dict[str, float | tuple[float, float]]:
-    return {
-        k: pair(path, f"{where}.{k}", v)
-        if isinstance(v, list)
-        else float(checked(path, f"{where}.{k}", v, (int, float)))
-        for k, v in value.items()
-    }
-
-
-def _inputs(path: Path, where: str, value: Any) -> dict[str, str]:
-    return {k: str(checked(path, f"{where}.{k}", v, str)) for k, v in value.items()}
-
-
-def _held_out(path: Path, value: Any) -> HeldOut:
-    given = table_of(path, "held_out", value, {"scenarios": int, "initial": dict, "inputs": dict})
-    initial = _initial(path, "held_out.initial", given.pop("initial", {}))
-    return HeldOut(
-        initial=initial, inputs=_inputs(path, "held_out.inputs", given.pop("inputs", {})), **given
-    )
-
-
-def _entry(path: Path, label: str, table: Any) -> Entry:
-    where = f"tuners.{label}"
-    fields = table_of(
-        path, where, table, {"tuner": str, "options": dict, "seeds": int, "budget": int}
-    )
-    for key in ("seeds", "budget"):
-        if fields.get(key, 1) < 1:
-            raise InputError(f"{path}: {where}.{key}: expected at least 1, found {fields[key]}")
-    return Entry(label, fields.pop("tuner", label), **fields)
+def _expanded(experiment: Experiment, path: Path) -> list[Experiment]:
+    if not experiment.sweep:
+        return [experiment]
+    document = experiment.document()
+    del document["sweep"]
+    document["same_targets_as"] = experiment.same_targets_as or experiment.name
+    expanded = []
+    for label, changed in sweep.documents(path, document, experiment.sweep):
+        if experiment.title:
+            values = label.replace("=", " = ").replace(",", ", ")
+            changed["title"] = f"{experiment.title} ({values})"
+        expanded.append(parse(f"{experiment.name}[{label}]", changed, path))
+    return expanded

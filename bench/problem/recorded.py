@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sims.base import Array, InputError, Scenario, Simulator, unknown
+from sims.base import Array, InputError, Scenario, Simulator
 from sims.recording.recording import Recording, Run, read_recording
+from sims.user_toml import known
 
 
 class Side(NamedTuple):
@@ -39,11 +40,8 @@ def measured(path: str, simulator: Simulator) -> Measured:
         InputError: it cannot be found or read, or lacks a channel of the simulator.
     """
     recording = read_recording(find_recording(path), type(simulator))
-    for channel in simulator.channels:
-        if channel.name not in recording.runs[0].channels:
-            raise unknown(
-                f"channel of {recording.path}", channel.name, list(recording.runs[0].channels)
-            )
+    wanted = [channel.name for channel in simulator.channels]
+    known(f"channel of {recording.path}", wanted, recording.runs[0].channels)
     return Measured(
         _side(recording, recording.training(), simulator),
         _side(recording, recording.held_out(), simulator),
@@ -52,10 +50,10 @@ def measured(path: str, simulator: Simulator) -> Measured:
 
 
 def _side(recording: Recording, runs: tuple[Run, ...], simulator: Simulator) -> Side:
-    observed = [
-        np.stack([run.channels[c.name] for c in simulator.channels], axis=1) for run in runs
-    ]
-    nothing = np.empty((0, len(simulator.channels)))
+    names = [channel.name for channel in simulator.channels]
+    observed = [np.stack([run.channels[name] for name in names], axis=1) for run in runs]
+    # Where nothing is held out there is nothing to join, and yet channels.
+    nothing = np.empty((0, len(names)))
     scenarios = tuple(scenario_of(run, simulator, recording.constants) for run in runs)
     return Side(scenarios, np.concatenate([nothing, *observed]))
 
@@ -64,28 +62,44 @@ def scenario_of(run: Run, simulator: Simulator, constants: Mapping[str, float]) 
     """The scenario of a recorded run: it starts in the measured state where the run does not state
     its own.
     """
+    first = {name: float(values[0]) for name, values in run.channels.items()}
+    # A channel that is no state, such as an acceleration, says nothing of where the run starts.
     start = {
-        n: float(v[0])
-        for n, v in run.channels.items()
-        if n in simulator.states and np.isfinite(v[0])
+        name: value
+        for name, value in first.items()
+        if name in simulator.states and np.isfinite(value)
     }
     return Scenario(run.times, {**start, **run.initial}, run.inputs, {**constants, **run.constants})
 
 
+def beside(path: str, experiment: Path) -> str:
+    """The path of an experiment's recording, made absolute where it lies beside the experiment's
+    file: elsewhere, as in a worker or a folder of results, nobody knows where that was.
+    """
+    file = experiment.parent / path
+    # The folder of recordings comes first wherever the path is looked up.
+    return path if _in_folder(path) or not file.is_file() else str(file.resolve())
+
+
 def find_recording(path: str) -> Path:
-    """The file `path` below $SIMGAP_DATA, below ../shared/data, or as it stands.
+    """The file `path` below $SIMGAP_DATA, or as it stands.
 
     Raises:
-        InputError: it is in none of these places.
+        InputError: it is in neither place.
     """
-    project = Path(__file__).resolve().parents[2]
-    folders = [Path("../shared/data"), project.parent / "shared" / "data"]
-    if os.environ.get("SIMGAP_DATA"):
-        folders = [Path(os.environ["SIMGAP_DATA"])]
-    for candidate in [*(folder / path for folder in folders), Path(path)]:
-        if candidate.is_file():
-            return candidate
-    places = ", ".join(map(str, folders))
-    raise InputError(
-        f"recording {path}: not found in {places}; set SIMGAP_DATA to the folder of recordings"
-    )
+    in_folder = _in_folder(path)
+    if in_folder is not None:
+        return in_folder
+    if Path(path).is_file():
+        return Path(path)
+    folder = os.environ.get("SIMGAP_DATA")
+    places = f"in {folder} (SIMGAP_DATA)" if folder else "here (SIMGAP_DATA is not set)"
+    remedy = "set SIMGAP_DATA to the folder of recordings"
+    raise InputError(f"recording {path}: no such file {places} or beside the experiment; {remedy}")
+
+
+def _in_folder(path: str) -> Path | None:
+    """The file below the folder of recordings, if it is there."""
+    folder = os.environ.get("SIMGAP_DATA")
+    file = Path(folder, path) if folder else None
+    return file if file is not None and file.is_file() else None

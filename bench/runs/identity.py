@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.problem.experiment import Entry, Experiment
-from bench.problem.problem import SealedTarget
+from bench.problem.targets import SealedTarget
 from bench.registry import SkippedError, simulators, tuners
 from bench.runs.sources import (
     digest,

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from bench.problem.identifiability import Spectrum
-from bench.problem.problem import Problem, Target
+from bench.problem.problem import Problem
+from bench.problem.targets import Target
 from bench.runs.drive import Trace
 from bench.runs.worker import Order, Outcome
 from bench.store.status import Status

@@ -12,7 +12,8 @@ from typing import Any, Protocol
 
 from bench.problem.experiment import Entry, Experiment
 from bench.problem.identifiability import Spectrum
-from bench.problem.problem import Problem, Target
+from bench.problem.problem import Problem
+from bench.problem.targets import Target
 from bench.registry import SkippedError, tuners
 from bench.runs.guard import limits
 from bench.runs.identity import Identities

@@ -12,8 +12,9 @@ from pathlib import Path
 from time import perf_counter
 
 from bench.problem.experiment import Entry, Experiment
-from bench.problem.problem import Problem, SealedTarget
+from bench.problem.problem import Problem
 from bench.problem.seeds import rng_for
+from bench.problem.targets import SealedTarget
 from bench.runs.drive import Trace, drive
 from bench.runs.evaluate import Evaluator
 from bench.runs.guard import memory_limit

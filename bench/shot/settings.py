@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from bench.problem.experiment import Experiment
 from bench.registry import tuners
-from sims.base import InputError, unknown
+from sims.base import InputError
 from sims.shot.balls import BALLS, ball_named
-
-Range = tuple[float, float]
+from sims.user_toml import Pair, ends, fault, hints_of, known, names, number
 
 
 @dataclass(frozen=True)
@@ -37,11 +36,11 @@ class Settings:
     """
 
     balls: tuple[str, ...] = tuple(BALLS)
-    angle: Range = (0.30, 0.40)
-    hoop_x: Range = (0.7, 1.1)
-    hoop_drop: Range = (0.0, 0.2)
+    angle: Pair = (0.30, 0.40)
+    hoop_x: Pair = (0.7, 1.1)
+    hoop_drop: Pair = (0.0, 0.2)
     hoop_radius: float = 0.15
-    heights: Range = (0.3, 2.5)
+    heights: Pair = (0.3, 2.5)
     release: float = 0.01
     planned_friction: float = 0.2
     planned_inertia: float = 0.4
@@ -56,53 +55,35 @@ def settings_of(experiment: Experiment) -> Settings:
     Raises:
         InputError: an unknown entry, or a value of another kind.
     """
-    names = [f.name for f in fields(Settings)]
-    values: dict[str, Any] = {}
-    for key, value in experiment.shot.items():
-        if key not in names:
-            raise unknown(f"entry of [shot] in experiment {experiment.name}", key, names)
-        values[key] = _value(f"experiment {experiment.name}: shot.{key}", key, value)
-    made = Settings(**values)
-    if made.rows and not made.filmed:
-        raise InputError(
-            f"experiment {experiment.name}: shot.rows: only a film has pixel rows; set shot.filmed too"
-        )
-    known = sorted({*(e.label for e in experiment.tuners), *tuners.names()})
-    for name in made.rows:
-        if name not in known:
-            raise unknown(f"tuner in shot.rows of experiment {experiment.name}", name, known)
-    return made
+    source, hints = f"experiment {experiment.name}", hints_of(Settings)
+    known(f"entry of [shot] in {source}", experiment.shot, hints)
+    values = {
+        key: _value(source, f"shot.{key}", value, hints[key])
+        for key, value in experiment.shot.items()
+    }
+    settings = Settings(**values)
+    if not settings.balls:
+        raise InputError(f"{source}: shot.balls: expected at least one ball")
+    for ball in settings.balls:
+        ball_named(ball)
+    if settings.rows and not settings.filmed:
+        raise InputError(f"{source}: shot.rows: only a film has pixel rows; set shot.filmed too")
+    there = {*(entry.label for entry in experiment.tuners), *tuners.names()}
+    known(f"tuner in shot.rows of {source}", settings.rows, there)
+    return settings
 
 
-def _value(where: str, key: str, value: Any) -> Any:
-    if key == "rows":
-        return _names(where, value)
-    if key == "balls":
-        balls = tuple(ball_named(name).name for name in _names(where, value))
-        if not balls:
-            raise InputError(f"{where}: expected at least one ball")
-        return balls
-    if isinstance(getattr(Settings, key), tuple):
-        if (
-            not isinstance(value, list | tuple)
-            or len(value) != 2
-            or not all(_number(v) for v in value)
-        ):
-            raise InputError(f"{where}: expected [low, high], found {value!r}")
-        low, high = (float(v) for v in value)
-        if not 0 <= low <= high:
-            raise InputError(f"{where}: expected 0 <= low <= high, found {value!r}")
+def _value(source: str, where: str, value: Any, declared: Any) -> Any:
+    """A value as the field of its name is declared; every number here is a size or a place ahead."""
+    if declared == tuple[str, ...]:
+        return names(source, where, value)
+    if declared == Pair:
+        low, high = ends(source, where, value)
+        if not 0 <= low <= high:  # both ends alike leave nothing to chance
+            raise fault(source, where, "0 <= low <= high", value)
         return low, high
-    if not _number(value) or value < 0:
-        raise InputError(f"{where}: expected a number of at least 0, found {value!r}")
-    return float(value)
-
-
-def _names(where: str, value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
-        raise InputError(f"{where}: expected a list of names, found {value!r}")
-    return tuple(value)
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    wanted = "a number of at least 0"
+    size = number(source, where, value, wanted)
+    if size < 0:
+        raise fault(source, where, wanted, value)
+    return size

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from bench.problem.experiment import Entry, Experiment
-from bench.problem.problem import SealedTarget
 from bench.problem.recorded import Side, scenario_of
+from bench.problem.targets import SealedTarget
 from bench.runs.worker import Order, perform, problem_of
 from bench.shot.rows import before_a_camera, rows_of
 from bench.shot.settings import Settings

@@ -21,7 +21,7 @@ from bench.store.journal import FOLDER, Journal
 from bench.store.status import STATUS_COLUMNS
 from sims.base import InputError
 from sims.files import first_line, fresh_folder, refuse_full, replacing, stamped, write
-from sims.recording.recording import read_toml
+from sims.user_toml import read_toml
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -4,13 +4,20 @@ vertical it falls along.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sims.base import InputError, unknown
+from sims.base import InputError
 from sims.camera.camera import Camera
-from sims.recording.recording import read_toml
+from sims.user_toml import fault, finite, known, numbers, read_toml, table
+
+_CAMERA = {"azimuth": 1, "distance": 1, "height": 1, "field_of_view": 1, "target": 3, "size": 2}
+"""Entries of [camera], with how many numbers each has."""
+
+_BALL = {"radius": 1, "x": 1, "y": 1}
+"""Entries of [ball]."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +52,11 @@ def read_filmed(path: Path) -> Filmed:
         InputError: anything malformed, in one line.
     """
     meta = read_toml(path)
-    camera = _numbers(
-        path,
-        "camera",
-        meta,
-        ("azimuth", "distance", "height", "field_of_view"),
-        {"target": 3, "size": 2},
-    )
-    ball = _numbers(path, "ball", meta, ("radius", "x", "y"), {})
+    camera = _values(path, "camera", meta, _CAMERA)
+    ball = _values(path, "ball", meta, _BALL)
     if ball["radius"] <= 0:
-        raise InputError(f"{path}: ball.radius: expected more than 0 m, found {ball['radius']:g}")
+        raise fault(path, "ball.radius", "more than 0 m", ball["radius"])
+    # Pixels are counted; TOML gives every number as it was written.
     camera["size"] = tuple(int(n) for n in camera["size"])
     try:
         return Filmed(Camera(**camera), **ball)
@@ -62,25 +64,18 @@ def read_filmed(path: Path) -> Filmed:
         raise InputError(f"{path}: {error}") from None
 
 
-def _numbers(
-    path: Path, section: str, meta: dict[str, Any], single: tuple[str, ...], rows: dict[str, int]
-) -> Any:
-    table = meta.get(section)
-    if not isinstance(table, dict):
-        raise InputError(f"{path}: expected a table [{section}]")
-    for name in table:
-        if name not in (*single, *rows):
-            raise unknown(f"entry in [{section}] of {path}", name, [*single, *rows])
+def _values(
+    path: Path, section: str, meta: Mapping[str, Any], counts: Mapping[str, int]
+) -> dict[str, Any]:
+    """The entries of a section, every one of them: a number, or as many as are counted."""
+    given = table(path, section, meta.get(section))
+    known(f"entry in [{section}] of {path}", given, counts)
     values: dict[str, Any] = {}
-    for name in (*single, *rows):
-        found: Any = table.get(name)
-        length = rows.get(name, 0)
-        cells = found if length and isinstance(found, list) else [found]
-        if len(cells) != max(1, length) or not all(
-            isinstance(c, int | float) and not isinstance(c, bool) for c in cells
-        ):
-            raise InputError(
-                f"{path}: {section}.{name}: expected {length or 'a'} number{'s' * bool(length)}"
-            )
-        values[name] = tuple(map(float, cells)) if length else float(cells[0])
+    for name, count in counts.items():
+        where, value = f"{section}.{name}", given.get(name)
+        if count == 1:
+            values[name] = finite(path, where, value)
+        else:
+            row = numbers(path, where, value, count)
+            values[name] = tuple(finite(path, where, entry) for entry in row)
     return values

@@ -4,22 +4,15 @@ known of each run.
 
 from __future__ import annotations
 
-import math
-import sys
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from sims.base import InputError, Simulator, unknown
-from sims.recording.table import shown
+from sims.base import InputError, Simulator
 from sims.recording.units import Scale, scale
 from sims.system import System
-
-if sys.version_info >= (3, 11):
-    import tomllib as tomllib  # others have it from here
-else:
-    import tomli as tomllib
+from sims.user_toml import checked, fault, finite, known, read_toml, table, text
 
 Declared: TypeAlias = type[Simulator] | type[System]
 """What a recording is checked against: channels, inputs, constants and states of a system."""
@@ -59,30 +52,6 @@ class Description:
     extra: Mapping[str, str]
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file.
-
-    Raises:
-        InputError: the file is missing, unreadable or not TOML.
-    """
-    if not path.is_file():
-        raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: expected UTF-8 text ({error.reason} at byte {error.start})"
-        ) from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    try:
-        return tomllib.loads(text)
-    except ValueError as error:  # bad TOML, or a date or number that cannot be
-        raise InputError(f"{path}: not valid TOML: {error}") from None
-    except RecursionError:
-        raise InputError(f"{path}: not valid TOML: nested too deeply") from None
-
-
 def system_of(path: str | Path) -> str:
     """The name of the system that a recording's description states.
 
@@ -115,33 +84,25 @@ def read_description(path: Path, declared: Declared) -> Description:
     """
     meta = read_toml(path)
     _known(path, "", meta, ("system", "title", "channels", "inputs", "constants", "runs", "extra"))
-    title = meta.get("title", path.stem)
-    if not isinstance(title, str):
-        raise InputError(f"{path}: title: expected text, found {shown(title)}")
+    title = text(path, "title", meta.get("title", path.stem))
     channels = _columns(path, "channel", meta, {c.name: c.unit for c in declared.channels})
     inputs = _columns(path, "input", meta, {c.name: c.unit for c in declared.inputs})
     if not channels:
         raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
-    noise = {
-        n: abs(s.gain) * _noise(path, n, e["noise"])
-        for n, (s, e) in channels.items()
-        if "noise" in e
-    }
-    constants = _numbers(
-        path, "constants", _section(path, meta, "constants"), [c.name for c in declared.constants]
-    )
+    constants = _constants(path, "constants", meta.get("constants", {}), declared)
     _positive(path, "constants", constants, declared)
-    runs = {
-        name: _run(path, name, own, declared) for name, own in _section(path, meta, "runs").items()
-    }
-    of_channels, of_inputs = (
-        {n: s for n, (s, _) in columns.items()} for columns in (channels, inputs)
-    )
-    extra = _extra(
-        path, meta, ["run", "t", *(c.name for c in (*declared.channels, *declared.inputs))]
-    )
+    marks = table(path, "runs", meta.get("runs", {}))
+    runs = {name: _run(path, name, own, declared) for name, own in marks.items()}
+    taken = ["run", "t", *(c.name for c in (*declared.channels, *declared.inputs))]
     return Description(
-        _system(path, meta), title, of_channels, of_inputs, noise, constants, runs, extra
+        system=_system(path, meta),
+        title=title,
+        channels={name: column for name, (column, _) in channels.items()},
+        inputs={name: column for name, (column, _) in inputs.items()},
+        noise=_noises(path, channels),
+        constants=constants,
+        runs=runs,
+        extra=_extra(path, meta, taken),
     )
 
 
@@ -151,133 +112,108 @@ def check_names(path: Path, marked: Iterable[str], there: Iterable[str]) -> None
     Raises:
         InputError: it marks another.
     """
-    _known(path, "runs", marked, list(there))
+    _known(path, "runs", marked, there)
 
 
-def _system(path: Path, meta: dict[str, Any]) -> str:
+def _known(path: Path, where: str, given: Iterable[str], allowed: Iterable[str]) -> None:
+    known(f"entry {f'in [{where}] ' if where else ''}of {path}", given, allowed)
+
+
+def _system(path: Path, meta: Mapping[str, Any]) -> str:
     system = meta.get("system")
     if not isinstance(system, str):
-        raise InputError(f'{path}: expected system = "NAME", found {shown(system)}')
+        raise fault(path, "", 'system = "NAME"', system)
     return system
 
 
 def _columns(
-    path: Path, kind: str, meta: dict[str, Any], units: Mapping[str, str]
+    path: Path, kind: str, meta: Mapping[str, Any], units: Mapping[str, str]
 ) -> dict[str, tuple[Scale, dict[str, Any]]]:
     """Each column's scale and table; `units` are the system's."""
-    result = {}
-    for name, entry in _section(path, meta, f"{kind}s").items():
-        if name not in units:
-            raise unknown(f"{kind} in {path}", name, list(units) or ["none"])
-        if not isinstance(entry, dict):
-            raise InputError(
-                f'{path}: {kind} {name}: expected a table with unit = "{units[name]}", found {shown(entry)}'
-            )
-        _known(
-            path, f"{kind}s.{name}", entry, ("unit", "noise") if kind == "channel" else ("unit",)
-        )
-        unit = entry.get("unit")
-        if not isinstance(unit, str):
-            raise InputError(
-                f'{path}: {kind} {name}: expected unit = "{units[name]}" or one that converts to it, '
-                f"found {shown(unit)}"
-            )
+    columns = {}
+    given = table(path, f"{kind}s", meta.get(f"{kind}s", {}))
+    known(f"{kind} in {path}", given, units)
+    for name, entry in given.items():
+        where, usual = f"{kind} {name}", f'unit = "{units[name]}"'
+        own = table(path, where, entry, f"a table with {usual}")
+        # The noise of a signal that is put in is nothing that a simulation could use.
+        allowed = ("unit", "noise") if kind == "channel" else ("unit",)
+        _known(path, f"{kind}s.{name}", own, allowed)
+        unit = text(path, where, own.get("unit"), f"{usual} or one that converts to it")
         try:
-            result[name] = scale(unit, units[name]), entry
+            columns[name] = scale(unit, units[name]), own
         except InputError as error:
-            raise InputError(f"{path}: {kind} {name}: {error}") from None
-    return result
+            raise InputError(f"{path}: {where}: {error}") from None
+    return columns
 
 
-def _extra(path: Path, meta: dict[str, Any], taken: Collection[str]) -> dict[str, str]:
-    """Units of the columns that are no channel or input; `taken` are names that they cannot have."""
-    result = {}
-    for name, entry in _section(path, meta, "extra").items():
-        if name in taken:
-            raise InputError(
-                f"{path}: extra.{name}: is a column of its own right; declare it as channel or input"
-            )
-        unit = entry.get("unit") if isinstance(entry, dict) else None
-        if not isinstance(unit, str):
-            raise InputError(
-                f'{path}: extra {name}: expected a table with unit = "TEXT", found {shown(entry)}'
-            )
-        _known(path, f"extra.{name}", entry, ("unit",))
-        result[name] = unit
-    return result
+def _noises(
+    path: Path, channels: Mapping[str, tuple[Scale, Mapping[str, Any]]]
+) -> dict[str, float]:
+    """Each channel's noise where stated, SI units."""
+    noises = {}
+    for name, (column, entry) in channels.items():
+        if "noise" in entry:
+            # A spread knows no offset, and no sign.
+            noises[name] = abs(column.gain) * _noise(path, name, entry["noise"])
+    return noises
 
 
 def _noise(path: Path, name: str, value: Any) -> float:
-    noise = _number(path, f"channels.{name}.noise", value)
+    where = f"channels.{name}.noise"
+    noise = finite(path, where, value)
     if noise <= 0:
-        raise InputError(
-            f"{path}: channels.{name}.noise: expected more than 0 (leave it out if unknown), found {value}"
-        )
+        raise fault(path, where, "more than 0 (leave it out if unknown)", value)
     return noise
 
 
-def _run(path: Path, name: str, own: Any, declared: Declared) -> RunMarks:
+def _extra(path: Path, meta: Mapping[str, Any], taken: Collection[str]) -> dict[str, str]:
+    """Units of the columns that are no channel or input; `taken` are names that they cannot have."""
+    units = {}
+    for name, entry in table(path, "extra", meta.get("extra", {})).items():
+        if name in taken:
+            remedy = "declare it as channel or input"
+            raise InputError(f"{path}: extra.{name}: is a column of its own right; {remedy}")
+        unit = entry.get("unit") if isinstance(entry, dict) else None
+        if not isinstance(unit, str):
+            raise fault(path, f"extra {name}", 'a table with unit = "TEXT"', entry)
+        _known(path, f"extra.{name}", entry, ("unit",))
+        units[name] = unit
+    return units
+
+
+def _run(path: Path, name: str, value: Any, declared: Declared) -> RunMarks:
     where = f"runs.{name}"
-    if not isinstance(own, dict):
-        raise InputError(f"{path}: {where}: expected a table, found {shown(own)}")
+    own = table(path, where, value)
     allowed = [c.name for c in declared.constants]
     _known(path, where, own, ("constants", "initial", "held_out", *allowed))
     held_out = own.get("held_out")
-    if not isinstance(held_out, bool | None):
-        raise InputError(
-            f"{path}: {where}.held_out: expected true or false, found {shown(held_out)}"
-        )
-    constants = _numbers(path, f"{where}.constants", own.get("constants", {}), allowed)
-    direct = _numbers(path, where, {k: v for k, v in own.items() if k in allowed}, allowed)
+    if held_out is not None:
+        checked(path, f"{where}.held_out", held_out, bool, "true or false")
+    # A run's constants may stand in a table of their own or among its other entries.
+    constants = _constants(path, f"{where}.constants", own.get("constants", {}), declared)
+    direct = {key: number for key, number in own.items() if key in allowed}
     for twice in constants.keys() & direct.keys():
         raise InputError(f"{path}: {where}: constant {twice} stands twice")
-    constants |= direct
+    constants |= _constants(path, where, direct, declared)
     _positive(path, where, constants, declared)
-    initial = _numbers(path, f"{where}.initial", own.get("initial", {}), list(declared.states))
+    initial = _numbers(path, f"{where}.initial", own.get("initial", {}), declared.states)
     return RunMarks(constants, initial, held_out)
 
 
-def _section(path: Path, meta: dict[str, Any], name: str) -> dict[str, Any]:
-    section = meta.get(name, {})
-    if not isinstance(section, dict):
-        raise InputError(f"{path}: expected a table [{name}], found {shown(section)}")
-    return section
+def _constants(path: Path, where: str, value: Any, declared: Declared) -> dict[str, float]:
+    return _numbers(path, where, value, [c.name for c in declared.constants])
 
 
-def _known(path: Path, where: str, found: Iterable[str], allowed: Collection[str]) -> None:
-    for name in found:
-        if name not in allowed:
-            raise unknown(
-                f"entry {f'in [{where}] ' if where else ''}of {path}",
-                name,
-                list(allowed) or ["none"],
-            )
-
-
-def _number(path: Path, where: str, value: Any) -> float:
-    try:
-        number = (
-            math.nan
-            if isinstance(value, bool) or not isinstance(value, int | float)
-            else float(value)
-        )
-    except OverflowError:  # TOML's whole numbers have no end
-        number = math.inf
-    if not math.isfinite(number):
-        raise InputError(f"{path}: {where}: expected a number, found {shown(value)}")
-    return number
-
-
-def _numbers(path: Path, where: str, values: Any, allowed: Collection[str]) -> dict[str, float]:
-    if not isinstance(values, dict):
-        raise InputError(f"{path}: {where}: expected a table of numbers, found {shown(values)}")
-    _known(path, where, values, allowed)
-    return {name: _number(path, f"{where}.{name}", value) for name, value in values.items()}
+def _numbers(path: Path, where: str, value: Any, allowed: Collection[str]) -> dict[str, float]:
+    given = table(path, where, value)
+    _known(path, where, given, allowed)
+    return {name: finite(path, f"{where}.{name}", number) for name, number in given.items()}
 
 
 def _positive(path: Path, where: str, constants: Mapping[str, float], declared: Declared) -> None:
     for c in declared.constants:
-        if c.positive and constants.get(c.name, 1.0) <= 0:
-            raise InputError(
-                f"{path}: {where}.{c.name}: expected more than 0 {c.unit}, found {constants[c.name]:g}"
-            )
+        value = constants.get(c.name, 1.0)
+        if c.positive and value <= 0:
+            wanted = f"more than 0 {c.unit}"
+            raise InputError(f"{path}: {where}.{c.name}: expected {wanted}, found {value:g}")

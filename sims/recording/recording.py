@@ -22,14 +22,12 @@ from sims.recording.description import (
     check_names,
     description_of,
     read_description,
-    read_toml,
     system_of,
-    tomllib,
 )
 from sims.recording.table import TableRun, read_table
 from sims.recording.units import SAME, Scale
 
-__all__ = ["Declared", "Recording", "Run", "read_recording", "read_toml", "system_of", "tomllib"]
+__all__ = ["Declared", "Recording", "Run", "read_recording", "system_of"]
 
 
 @dataclass(frozen=True)

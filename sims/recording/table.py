@@ -17,10 +17,10 @@ import numpy as np
 
 from sims.base import Array, InputError, frozen
 from sims.recording.fast import WORTHWHILE, read_fast
+from sims.user_toml import shown
 
 _CHUNK = 1 << 13
 _NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
-_LONGEST = 40
 
 
 class TableRun(NamedTuple):
@@ -31,12 +31,6 @@ class TableRun(NamedTuple):
     name: str
     times: Array
     columns: dict[str, Array]
-
-
-def shown(cell: object) -> str:
-    """A value from a user's file as a message quotes it: short."""
-    text = repr(cell)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
 def read_table(

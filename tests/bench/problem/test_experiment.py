@@ -3,10 +3,14 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from bench.problem.experiment import load, names, parse
+from bench.problem.experiment import Entry, expand, load, names, parse
+from bench.problem.problem import Problem
+from bench.problem.recorded import find_recording
+from bench.runs.identity import Identities
+from bench.runs.training import key
 from bench.store.folder import _plain
 from sims.base import InputError
-from sims.recording.recording import tomllib
+from sims.user_toml import tomllib
 from tests.experiments import SPRING, spring_experiment
 
 
@@ -90,3 +94,154 @@ def test_chosen_tuners_keep_their_entries_and_new_ones_get_one():
         ("cma_es", "cma_es", None),
         ("mine", "random", 2),
     ]
+
+
+def test_tuners_may_be_a_list_of_names_and_of_tables_that_name_one():
+    listed = spring_experiment(
+        tuners=["random", {"tuner": "cma_es", "seeds": 1}, {"label": "mine", "tuner": "cma_es"}]
+    )
+    tables = {"random": {}, "cma_es": {"seeds": 1}, "mine": {"tuner": "cma_es"}}
+    assert listed == spring_experiment(tuners=tables)
+
+
+@pytest.mark.parametrize(
+    ("tuners", "message"),
+    [
+        ("random", "tuners: expected a list of names or a table for each tuner, found 'random'"),
+        (["random", 3], r"tuners\[1\]: expected a name or a table, found 3"),
+        ([{"seeds": 1}], r"tuners\[0\]: expected a table with tuner = \"NAME\", found"),
+        (["random", "random"], "tuners: random stands twice; give one of them a label"),
+        ([{"tuner": "random", "budget": 0}], r"tuners\[0\].budget: expected at least 1, found 0"),
+        ([{"tuner": "random", "option": {}}], "'option'; there are: budget, options, seeds, tuner"),
+    ],
+)
+def test_faults_in_a_list_of_tuners_are_one_line(tuners, message):
+    with pytest.raises(InputError, match=message) as caught:
+        spring_experiment(path="mine.toml", tuners=tuners)
+    assert "mine.toml" in str(caught.value)
+
+
+@pytest.mark.parametrize("change", [{"noise": {"x": 10**400}}, {"timeout": 10**400}])
+def test_a_number_without_end_is_refused(change):
+    with pytest.raises(InputError, match=r"mine.toml: .*: expected a number, found 1000"):
+        spring_experiment(path="mine.toml", **change)
+
+
+def test_a_sweep_is_an_experiment_for_each_combination():
+    swept = spring_experiment(
+        title="A spring",
+        tags=["quick"],
+        parameters={"rate": {"training": [2.0, 3.0]}},
+        sweep={"budget": [3, 9], "noise.x": [0.001, 0.01], "parameters.rate.log": [True]},
+    )
+    expanded = expand(swept)
+    assert [e.name for e in expanded] == [
+        "spring-test[budget=3,noise.x=0.001,parameters.rate.log=true]",
+        "spring-test[budget=3,noise.x=0.01,parameters.rate.log=true]",
+        "spring-test[budget=9,noise.x=0.001,parameters.rate.log=true]",
+        "spring-test[budget=9,noise.x=0.01,parameters.rate.log=true]",
+    ]
+    last = expanded[-1]
+    assert (last.budget, last.noise, last.sweep) == (9, {"x": 0.01}, {})
+    assert last.parameters == {"rate": {"training": (2.0, 3.0), "log": True}}
+    assert last.tuners == swept.tuners
+    assert last.tags == ("quick",)
+    assert last.title.startswith("A spring (budget = 9, noise.x = 0.01, ")
+    assert [expand(e) for e in expanded] == [[e] for e in expanded]
+
+
+def test_experiments_of_a_sweep_meet_the_same_targets(spring):
+    small, large = (
+        Problem(e).target("in", 1)
+        for e in expand(spring_experiment(sweep={"noise.x": [1e-9, 1e-3]}))
+    )
+    alone = Problem(spring_experiment()).target("in", 1)
+    assert small.truth.tolist() == large.truth.tolist() == alone.truth.tolist()
+    assert small.sealed.start.tolist() == large.sealed.start.tolist()
+    apart = large.sealed.fitting.observed - small.sealed.fitting.observed
+    assert 1e-4 < apart.std() < 1e-2
+
+
+def test_a_sweep_names_entries_whose_names_have_dots():
+    swept = spring_experiment(
+        parameters={"drag.linear": {"nominal": 0.5}},
+        sweep={"parameters.drag.linear.nominal": [0.1], "observe": [["x"], ["x", "v"]]},
+    )
+    first, second = expand(swept)
+    assert first.parameters == {"drag.linear": {"nominal": 0.1}}
+    assert second.observe == ("x", "v")
+    assert second.name == "spring-test[parameters.drag.linear.nominal=0.1,observe=x_v]"
+
+
+@pytest.mark.parametrize(
+    ("sweep", "message"),
+    [
+        ({"budgte": [1]}, r"unknown entry of mine.toml 'budgte'; there are: .*budget"),
+        ({"budget": 3}, "mine.toml: sweep.budget: expected a list, found 3"),
+        ({"budget": []}, "mine.toml: sweep.budget: expected at least one value"),
+        ({"budget": [3, "x"]}, "mine.toml: budget: expected a whole number, found 'x'"),
+        ({"budget": [3, 3]}, "mine.toml: sweep.budget: 3 stands twice"),
+        ({"budget": [0]}, "mine.toml: .*budget must be at least 1"),
+        ({"budget.x": [1]}, "mine.toml: sweep.budget.x: budget is no table"),
+        ({"sampling.rat": [1]}, r"unknown entry of \[sampling\] in mine.toml 'rat'"),
+        ({"sampling": [{"rate": 1}]}, "sweep.sampling: expected texts, numbers, bools or lists"),
+    ],
+)
+def test_faults_in_a_sweep_are_one_line_that_names_the_file(sweep, message):
+    with pytest.raises(InputError, match=message):
+        spring_experiment(path="mine.toml", sweep=sweep)
+
+
+def test_what_is_not_expanded_is_not_run(spring):
+    with pytest.raises(InputError, match=r"spring-test: sweeps over budget; run those that"):
+        Problem(spring_experiment(sweep={"budget": [3]}))
+
+
+def test_what_only_describes_enters_no_name_of_a_run_or_of_weights(spring):
+    described = {"title": "Another", "says": "Words.", "tags": ["quick"]}
+    plain, told = spring_experiment(), spring_experiment(**described)
+    entry, target = plain.tuners[0], Problem(plain).target("in", 0).sealed
+    ids = [Identities(e).run(entry, target, 0, 12) for e in (plain, told)]
+    assert ids[0] == ids[1]
+    regressor = Entry("regressor", "regressor")
+    assert key(plain, regressor, 0) == key(told, regressor, 0)
+
+
+def test_every_shipped_experiment_has_tags():
+    assert {tag for name in names() for tag in load(name).tags} == {
+        "other-engine", "published", "quick", "real", "several-parameters", "video",
+    }  # fmt: skip
+    assert all(load(name).tags for name in names())
+
+
+RECORDED = SPRING | {"ranges": ["real"], "recording": {"path": "logs/swing.csv"}}
+
+
+def test_a_recording_is_looked_for_in_its_folder_and_beside_the_experiment(tmp_path, monkeypatch):
+    monkeypatch.delenv("SIMGAP_DATA", raising=False)
+    beside, data = tmp_path / "mine" / "logs", tmp_path / "data" / "logs"
+    for folder in (beside, data):
+        folder.mkdir(parents=True)
+        (folder / "swing.csv").touch()
+    file = tmp_path / "mine" / "mine.toml"
+    document = {k: v for k, v in RECORDED.items() if k != "initial"}
+    found = parse("mine", document, file).recording.path
+    assert found == str(beside / "swing.csv")
+    again = parse("mine", {**document, "recording": {"path": found}}, tmp_path / "x" / "e.toml")
+    assert again.recording.path == found, "as from a folder of results"
+    monkeypatch.setenv("SIMGAP_DATA", str(tmp_path / "data"))
+    assert parse("mine", document, file).recording.path == "logs/swing.csv"
+    assert find_recording("logs/swing.csv") == data / "swing.csv"
+    monkeypatch.chdir(tmp_path / "mine")
+    monkeypatch.setenv("SIMGAP_DATA", str(tmp_path / "nowhere"))
+    assert find_recording("logs/swing.csv").samefile(beside / "swing.csv"), "as it stands"
+
+
+def test_a_recording_that_is_missing_says_what_to_set(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("SIMGAP_DATA", raising=False)
+    with pytest.raises(InputError, match=r"SIMGAP_DATA is not set.*; set SIMGAP_DATA to the folde"):
+        find_recording("pendulum_free_swing/recording.csv")
+    monkeypatch.setenv("SIMGAP_DATA", "/elsewhere")
+    with pytest.raises(InputError, match=r"no such file in /elsewhere \(SIMGAP_DATA\) or beside"):
+        find_recording("pendulum_free_swing/recording.csv")

@@ -13,7 +13,7 @@ from bench.problem.problem import Problem
 from bench.report import finish
 from bench.store.folder import read
 from sims.base import InputError, Parameter
-from sims.recording.recording import tomllib
+from sims.user_toml import tomllib
 from tests.conftest import PLUGINS
 from tests.experiments import spring_experiment
 

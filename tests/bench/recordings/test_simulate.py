@@ -8,7 +8,8 @@ from bench.problem.signals import HELP, signal
 from bench.recordings.simulate import make
 from bench.registry import load_plugins, simulators
 from sims.base import InputError
-from sims.recording.recording import read_recording, read_toml
+from sims.recording.recording import read_recording
+from sims.user_toml import read_toml
 from tests.conftest import PLUGINS
 from tests.wishes import Wish, write
 

@@ -1,0 +1,74 @@
+"""The tuners that an experiment names: as a list, or as a table for each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sims.base import InputError
+from sims.user_toml import entries, fault, hints_of
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One tuner of a comparison: its registered name, options, and seeds or budget where they
+    differ.
+    """
+
+    label: str
+    tuner: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    seeds: int | None = None
+    budget: int | None = None
+
+    def table(self) -> dict[str, Any]:
+        """The entry as the table ``[tuners.LABEL]``."""
+        given = {key: value for key, value in asdict(self).items() if value is not None}
+        del given["label"]
+        return given
+
+
+def entries_of(path: Path, value: Any) -> tuple[Entry, ...]:
+    """The entries of an experiment file, in its order.
+
+    Args:
+        path: the file.
+        value: what stands under ``tuners``: a table of tables by label, or a list of registered
+            names and of tables that name their tuner.
+
+    Raises:
+        InputError: a fault in it, in one line.
+    """
+    if isinstance(value, dict):
+        return tuple(_entry(path, f"tuners.{label}", label, own) for label, own in value.items())
+    if not isinstance(value, list):
+        raise fault(path, "tuners", "a list of names or a table for each tuner", value)
+    listed = tuple(_listed(path, f"tuners[{place}]", item) for place, item in enumerate(value))
+    labels = [entry.label for entry in listed]
+    for label in labels:
+        if labels.count(label) > 1:  # tables and figures tell tuners apart by it
+            raise InputError(f"{path}: tuners: {label} stands twice; give one of them a label")
+    return listed
+
+
+def _listed(path: Path, where: str, item: Any) -> Entry:
+    if isinstance(item, str):
+        return Entry(item, item)
+    if not isinstance(item, dict):
+        raise fault(path, where, "a name or a table", item)
+    own = dict(item)
+    label = own.pop("label", own.get("tuner"))
+    if not isinstance(label, str):
+        raise fault(path, where, 'a table with tuner = "NAME"', item)
+    return _entry(path, where, label, own)
+
+
+def _entry(path: Path, where: str, label: str, value: Any) -> Entry:
+    hints = {key: hint for key, hint in hints_of(Entry).items() if key != "label"}
+    own = entries(path, where, value, hints)
+    for key in ("seeds", "budget"):
+        if own.get(key, 1) < 1:
+            raise fault(path, f"{where}.{key}", "at least 1", own[key])
+    return Entry(label, own.pop("tuner", label), **own)

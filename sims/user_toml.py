@@ -1,0 +1,232 @@
+"""Checks of a user's TOML file: each fault is one line that names file, entry, expected and found.
+
+Every check takes the source that its message begins with (the file's path, or what a person calls
+the thing), where in it the value stands (``noise.x``), and the value; it returns the value as the
+program uses it.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import is_dataclass
+from functools import cache
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints, is_typeddict
+
+from sims.base import InputError, unknown
+
+if sys.version_info >= (3, 11):
+    import tomllib as tomllib  # others have it from here
+else:
+    import tomli as tomllib
+
+Source = Path | str
+Pair = tuple[float, float]
+"""The lower and the upper end of a range."""
+
+_LONGEST = 40
+"""Characters of a user's value that a message quotes."""
+
+_WORDS: Mapping[type, str] = {
+    str: "text",
+    int: "a whole number",
+    float: "a number",
+    dict: "a table",
+    list: "a list",
+    bool: "a bool",
+}
+"""What a message calls a value of each type."""
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file.
+
+    Raises:
+        InputError: the file is missing, unreadable or not TOML.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        what = f"{error.reason} at byte {error.start}"
+        raise InputError(f"{path}: expected UTF-8 text ({what})") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:  # bad TOML, or a date or number that cannot be
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise InputError(f"{path}: not valid TOML: nested too deeply") from None
+
+
+def shown(value: object) -> str:
+    """A value from a user's file as a message quotes it: short."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
+
+def fault(source: Source, where: str, wanted: str, value: object) -> InputError:
+    """The error for a value that is not what is wanted; `where` may be empty."""
+    place = f"{where}: " if where else ""
+    return InputError(f"{source}: {place}expected {wanted}, found {shown(value)}")
+
+
+def known(kind: str, given: Iterable[str], allowed: Iterable[str]) -> None:
+    """Refuse names that are not among the allowed ones.
+
+    Args:
+        kind: what a message calls one of them, and where, e.g. ``entry of [held_out] in mine.toml``.
+        given: what the user wrote.
+        allowed: what there is.
+    """
+    names = list(allowed)
+    for name in given:
+        if name not in names:
+            raise unknown(kind, name, names or ["none"])
+
+
+def checked(source: Source, where: str, value: Any, wanted: type, words: str = "") -> Any:
+    """`value`, if it is of this type; any number will do where a float is wanted.
+
+    Raises:
+        InputError: it is not; `words` stand for what was expected, in place of the usual ones.
+    """
+    kinds: tuple[type, ...] = {float: (int, float), list: (list, tuple)}.get(wanted, (wanted,))
+    # Python counts true and false among the whole numbers.
+    if not isinstance(value, kinds) or (isinstance(value, bool) and wanted is not bool):
+        raise fault(source, where, words or _WORDS[wanted], value)
+    return value
+
+
+def table(source: Source, where: str, value: Any, words: str = "") -> dict[str, Any]:
+    """`value` as a table."""
+    return dict(checked(source, where, value, dict, words))
+
+
+def text(source: Source, where: str, value: Any, words: str = "") -> str:
+    """`value` as text."""
+    return str(checked(source, where, value, str, words))
+
+
+def names(
+    source: Source, where: str, value: Any, words: str = "a list of names"
+) -> tuple[str, ...]:
+    """`value` as a list of texts."""
+    if not isinstance(value, list | tuple) or not all(isinstance(name, str) for name in value):
+        raise fault(source, where, words, value)
+    return tuple(value)
+
+
+def number(source: Source, where: str, value: Any, words: str = "") -> float:
+    """`value` as a number, which may be infinite or none (TOML writes inf and nan)."""
+    try:
+        return float(checked(source, where, value, float, words))
+    except OverflowError:  # TOML's whole numbers have no end
+        raise fault(source, where, words or _WORDS[float], value) from None
+
+
+def finite(source: Source, where: str, value: Any, words: str = "") -> float:
+    """`value` as a number that is finite."""
+    result = number(source, where, value, words)
+    if not math.isfinite(result):
+        raise fault(source, where, words or _WORDS[float], value)
+    return result
+
+
+def numbers(
+    source: Source, where: str, value: Any, count: int, words: str = ""
+) -> tuple[float, ...]:
+    """`value` as a list of so many numbers."""
+    if not isinstance(value, list | tuple) or len(value) != count:
+        raise fault(source, where, words or f"{count} numbers", value)
+    return tuple(number(source, where, entry) for entry in value)
+
+
+def ends(source: Source, where: str, value: Any) -> Pair:
+    """`value` as two numbers, in whatever order."""
+    low, high = numbers(source, where, value, 2, "[low, high]")
+    return low, high
+
+
+def pair(source: Source, where: str, value: Any) -> Pair:
+    """`value` as two numbers that increase."""
+    low, high = ends(source, where, value)
+    if not low < high:
+        raise fault(source, where, "low < high", value)
+    return low, high
+
+
+def as_declared(source: Source, where: str, value: Any, declared: Any) -> Any:
+    """`value` as a type annotation asks for it, whatever is in it checked likewise.
+
+    Args:
+        source: what messages begin with.
+        where: in it the value stands.
+        value: from the file.
+        declared: text, numbers, bools, pairs of numbers, tuples of one type, mappings from names, a
+            dataclass or TypedDict of all these; `None` in a union is what a file leaves out.
+
+    Raises:
+        InputError: it is not.
+    """
+    origin, inner = get_origin(declared), get_args(declared)
+    if declared is Any:
+        return value
+    if origin in (Union, UnionType):
+        return as_declared(source, where, value, _chosen(value, inner))
+    if declared == Pair:
+        return pair(source, where, value)
+    if origin is tuple:
+        items = checked(source, where, value, list)
+        return tuple(as_declared(source, where, item, inner[0]) for item in items)
+    if origin is not None:  # a mapping
+        items = table(source, where, value).items()
+        return {key: as_declared(source, f"{where}.{key}", v, inner[1]) for key, v in items}
+    if isinstance(declared, type) and is_dataclass(declared):
+        return declared(**entries(source, where, value, hints_of(declared)))
+    if is_typeddict(declared):
+        return entries(source, where, value, hints_of(declared))
+    if declared is float:
+        return number(source, where, value)
+    return checked(source, where, value, declared)
+
+
+def entries(
+    source: Source, where: str, value: Any, hints: Mapping[str, Any], kind: str = ""
+) -> dict[str, Any]:
+    """`value` as a table whose entries are the names of `hints`, each as its hint asks for it.
+
+    Args:
+        source: what messages begin with.
+        where: in it the table stands; empty for the whole of it.
+        value: from the file.
+        hints: type annotations by name.
+        kind: what a message calls an entry of the table, and where.
+    """
+    given = table(source, where, value)
+    known(kind or f"entry of [{where}] in {source}", given, hints)
+    result = {}
+    for key, item in given.items():
+        place = f"{where}.{key}" if where else key
+        read = as_declared(source, place, item, hints[key])
+        # A whole number stays one: names of runs and of trained weights hash what is written.
+        result[key] = item if hints[key] is float else read
+    return result
+
+
+@cache
+def hints_of(kind: type) -> dict[str, Any]:
+    """The fields of a dataclass or TypedDict with their types."""
+    return get_type_hints(kind)
+
+
+def _chosen(value: Any, among: Sequence[Any]) -> Any:
+    """Which type of a union the value is checked against: a list against a pair, else the first."""
+    kinds = [kind for kind in among if kind is not NoneType]
+    lists = [kind for kind in kinds if get_origin(kind) is tuple]
+    return lists[0] if lists and isinstance(value, list | tuple) else kinds[0]
