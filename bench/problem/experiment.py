@@ -69,7 +69,7 @@ class HeldOut:
 @dataclass(frozen=True)
 class Source:
     """The recording that an experiment on real data tunes to; `path` is relative to the folder of
-    recordings.
+    recordings ($SIMGAP_DATA), to the experiment's file, or to the working directory.
     """
 
     path: str = ""
@@ -116,9 +116,10 @@ class Experiment:
         recording: the measured data, for range real.
         shot: where the experiment is a bounce shot, its scene (`bench.shot.settings`); targets are
             then shots a ball.
-        sweep: values by key, for each of which the file stands for an experiment of its own
-            (`expand`); a key within a table is joined by dots, as ``noise.x``.
-        tuners: the entries.
+        sweep: lists of values by key; the file stands for an experiment ``NAME[budget=10]`` for
+            each combination of them. A key within a table is joined by dots, as ``noise.x``.
+        tuners: a list of registered names, and of tables with ``tuner`` and, where two entries have
+            the same, a ``label``; or a table for each by its label.
     """
 
     name: str

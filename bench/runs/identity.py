@@ -29,6 +29,7 @@ from sims.base import InputError
 NOT_OF_A_RUN = {
     "title": "words",
     "says": "words",
+    "tags": "words",
     "ranges": "which targets there are; each run's id has its own",
     "targets": "how many there are",
     "same_targets_as": "which targets there are; their scenarios and observations are hashed",
@@ -39,6 +40,7 @@ NOT_OF_A_RUN = {
     "identifiability": "is found beside the runs, which know nothing of it",
     "recording": "where it lies; what it holds is hashed",
     "shot": "what is done with a tuned model afterwards",
+    "sweep": "what is run sweeps over nothing; it has values of its own",
     "tuners": "who else runs; each run's id has its own tuner with its options",
 }
 """Keys of an experiment that change no run by themselves, each with the reason; all others do."""

@@ -82,6 +82,7 @@ def folder() -> Path:
 NOT_OF_A_TRAINING = {
     "title": "words",
     "says": "words",
+    "tags": "words",
     "error_channel": "what is reported of runs",
     "ranges": "targets are met after the training",
     "targets": "targets are met after the training",
@@ -95,6 +96,7 @@ NOT_OF_A_TRAINING = {
     "identifiability": "is found beside the runs",
     "recording": "where it lies; what it holds is hashed",
     "shot": "what is done with a tuned model afterwards",
+    "sweep": "what is run sweeps over nothing; it has values of its own",
     "tuners": "who else trains; the key has its own tuner with its options",
 }
 """Keys of an experiment that change no trained weights, each with the reason; all others do."""

@@ -9,7 +9,7 @@ import dataclasses
 import inspect
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints, is_typeddict
 
 from bench.cli import parser
 from bench.problem.experiment import Experiment
@@ -152,6 +152,8 @@ def parts_of(hint):
 
 def words(hint):
     """A type as one would say it of TOML."""
+    if is_typeddict(hint):
+        return f"table of {', '.join(f'`{name}`' for name in hint.__annotations__)}"
     origin, inner = get_origin(hint), [a for a in get_args(hint) if a not in (type(None), ...)]
     if dataclasses.is_dataclass(hint):
         return "table, see below"

@@ -22,7 +22,7 @@ from bench.shot.throw import thrown
 from bench.shot.tune import Model
 from sims.camera.camera import Camera
 from sims.camera.files import Filmed, described
-from sims.recording.description import read_toml
+from sims.user_toml import read_toml
 from tests.conftest import PLUGINS
 from tests.docs.pages import ROOT, quoted, section, tables, text_of
 from tests.experiments import SPRING, spring_experiment

@@ -71,7 +71,7 @@ def test_nobody_writes_into_a_usual_recording():
     assert replace(own, observe=("x",)).initial == own.initial
 
 
-def test_a_recording_of_a_system_is_made_from_its_declaration(monkeypatch):
+def test_a_recording_of_a_system_is_made_from_its_declaration(fresh_registries):
     """Also of one that no list in the product knows."""
 
     class TestedSystem(SliderSystem):
@@ -81,7 +81,7 @@ def test_a_recording_of_a_system_is_made_from_its_declaration(monkeypatch):
     class Tested(Simulated):
         system = TestedSystem
 
-    monkeypatch.setitem(simulators._from_files, Tested.name, Tested)
+    simulators.register(Tested)
     made = make(Wish("slider-tested", runs=2, seconds=0.1))
     assert [c.name for c in made.simulator.channels] == ["v"]
     for run in made.recording.runs:
