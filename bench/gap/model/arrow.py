@@ -73,17 +73,24 @@ class _Arrow:
 
     def solved(self, stuck: Mask) -> tuple[Array, Array]:
         """The steps (q,) and (R, s), by (4) and (5); stuck parameters (q,) do not move."""
-        inverse_cross = np.linalg.solve(self.inner, self.cross.transpose(0, 2, 1))
-        inverse_pull = np.linalg.solve(self.inner, self.pull[:, :, None])[:, :, 0]
+        # V⁻¹ Wᵀ and V⁻¹ b of every run
+        transposed = self.cross.transpose(0, 2, 1)
+        inverse_cross = np.linalg.solve(self.inner, transposed)
+        columns = self.pull[:, :, None]
+        inverse_pull = np.linalg.solve(self.inner, columns)[:, :, 0]
 
-        # (4): the two sides, then least squares, which finds a short step where directions vanish
-        schur = self.shared - np.matmul(self.cross, inverse_cross).sum(axis=0)
+        # (4), its two sides
+        products = np.matmul(self.cross, inverse_cross)
+        schur = self.shared - products.sum(axis=0)
         right = self.gradient - np.einsum("rqs,rs->q", self.cross, inverse_pull)
+
+        # least squares takes the shortest step where parameters act alike
         shared = np.zeros(len(right))
         moves = ~stuck
         if moves.any():
-            free = np.ix_(moves, moves)
-            shared[moves] = np.linalg.lstsq(schur[free], right[moves], rcond=None)[0]
+            free = schur[np.ix_(moves, moves)]
+            solution = np.linalg.lstsq(free, right[moves], rcond=None)
+            shared[moves] = solution[0]
 
         own = inverse_pull - np.einsum("rsq,q->rs", inverse_cross, shared)  # (5)
         return shared, own
@@ -119,19 +126,26 @@ def arrow_step(
     return Step(shared, own, _promised(j, r, drift, prior, shared, own))
 
 
-def _normal(j: Array, r: Array, q: int, drift: Array, prior: Array) -> _Arrow:
+def _normal(
+    j: Array,
+    r: Array,
+    q: int,
+    drift: Array,
+    prior: Array,
+) -> _Arrow:
     """Equations (2) and (3) of residuals (R, n) and their derivatives (R, n, q + s)."""
     own = slice(q, j.shape[2])
-    # one product of all columns holds every A'A, A'B and B'B
+    # one product holds every AᵀA, AᵀB and BᵀB, another every Aᵀr and Bᵀr
     transposed = j.transpose(0, 2, 1)
     normal = np.matmul(transposed, j)
-    right = np.matmul(transposed, r[:, :, None])[:, :, 0]
+    residuals = r[:, :, None]
+    right = np.matmul(transposed, residuals)[:, :, 0]
     return _Arrow(
-        shared=normal[:, :q, :q].sum(axis=0),
-        cross=normal[:, :q, own].copy(),
-        inner=normal[:, own, own] + np.diag(1.0 / prior**2),
-        gradient=right[:, :q].sum(axis=0),
-        pull=right[:, own] - drift / prior,
+        shared=normal[:, :q, :q].sum(axis=0),  # U
+        cross=normal[:, :q, own].copy(),  # W
+        inner=normal[:, own, own] + np.diag(1.0 / prior**2),  # V
+        gradient=right[:, :q].sum(axis=0),  # a
+        pull=right[:, own] - drift / prior,  # b
     )
 
 
@@ -141,7 +155,8 @@ def _damped(arrow: _Arrow, damping: float, known: Mask) -> _Arrow:
     diagonal = np.einsum("rii->ri", arrow.inner)
     inner = arrow.inner + damping * diagonal[:, :, None] * identity
     # a known state's equation reads: its step is zero
-    inner = np.where(known[:, :, None] | known[:, None, :], identity, inner)
+    touched = known[:, :, None] | known[:, None, :]
+    inner = np.where(touched, identity, inner)
     pull = np.where(known, 0.0, arrow.pull)
     # and W must not lead from it to the parameters
     cross = np.where(known[:, None, :], 0.0, arrow.cross)
@@ -151,10 +166,19 @@ def _damped(arrow: _Arrow, damping: float, known: Mask) -> _Arrow:
     return _Arrow(shared, cross, inner, arrow.gradient, pull)
 
 
-def _promised(j: Array, r: Array, drift: Array, prior: Array, shared: Array, own: Array) -> float:
+def _promised(
+    j: Array,
+    r: Array,
+    drift: Array,
+    prior: Array,
+    shared: Array,
+    own: Array,
+) -> float:
     """What a step would gain if the residual were linear, (6)."""
-    whole = np.concatenate([np.tile(shared, (len(r), 1)), own], axis=1)
-    left = r - np.matmul(j, whole[:, :, None])[:, :, 0]
+    repeated = np.tile(shared, (len(r), 1))
+    steps = np.concatenate([repeated, own], axis=1)
+    changes = np.matmul(j, steps[:, :, None])[:, :, 0]
+    left = r - changes
     after = drift + own / prior
     promised = float((r * r).sum() - (left * left).sum())
     promised += float((drift**2).sum() - (after**2).sum())

@@ -67,6 +67,7 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
     if len(starts) > KEPT:
         order = np.argsort(_costs(world, noise, starts), kind="stable")
         starts = [starts[i] for i in order[:KEPT]]
+
     fits: list[Fit] = []
     for horizon in HORIZONS:
         fits = Fitter(world, noise, share=horizon.share).fit(starts, horizon.iterations)
@@ -74,11 +75,12 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
     best = min(fits, key=lambda fit: fit.cost)
 
     # what the data do not touch stands wherever the search left it: nominal says more
-    untouched = frozenset(int(i) for i in world.base if not _touched(world, best, int(i), noise))
+    places = world.base.tolist()
+    untouched = frozenset(i for i in places if not _touched(world, best, i, noise))
     if untouched:
-        places = list(untouched)
+        kept = list(untouched)
         theta = best.theta.copy()
-        theta[places] = world.nominal()[places]
+        theta[kept] = world.nominal()[kept]
         start = replace(best.start(), theta=theta)
         best = Fitter(world, noise, untouched).fit([start], LAST_STEPS)[0]
     return Base(best, untouched)
@@ -92,7 +94,10 @@ def _starts(world: World, given: Array | None) -> list[Array]:
         return [nominal]
     parameters = [world.parameters[i] for i in world.base]
     starts = [nominal]
-    for shares in evenly(STARTS, len(parameters)) if parameters else ():
+    # a simulator may have nothing to tune: its base fit is that of initial states
+    if not parameters:
+        return starts
+    for shares in evenly(STARTS, len(parameters)):
         theta = nominal.copy()
         for place, parameter, share in zip(world.base, parameters, shares, strict=True):
             theta[place] = _between(parameter, share)
@@ -130,12 +135,14 @@ def _costs(world: World, noise: Noise, starts: Sequence[Start]) -> Array:
     """Sums of squares of each start over the first samples of the runs."""
     count, runs = len(starts), len(world.tracks)
     share = HORIZONS[0].share
-    theta = np.repeat([s.theta for s in starts], runs, axis=0)
+    thetas = [s.theta for s in starts]
+    theta = np.repeat(thetas, runs, axis=0)
     states = np.concatenate([s.states for s in starts])
     lanes = np.tile(np.arange(runs), count)
     simulated = world.simulate(theta, lanes, states, share)
     simulated = simulated.reshape(count, runs, *simulated.shape[1:])
 
+    # a start that was given up has no samples: it must not seem to fit them
     left = np.nan_to_num(world.observed - simulated, nan=LOST)
     residuals = np.where(world.counted(share), left, 0.0) / noise.sigma
     costs: Array = np.square(residuals).sum(axis=(1, 2, 3))
@@ -144,10 +151,12 @@ def _costs(world: World, noise: Noise, starts: Sequence[Start]) -> Array:
 
 def _touched(world: World, fit: Fit, place: int, noise: Noise) -> bool:
     """Whether the data tell anything of a parameter."""
+    # one that was frozen has no column
     columns = np.flatnonzero(fit.free == place)
     if not columns.size:
         return False
     low, high = world.parameters[place].bounds
     change = fit.jacobian[..., columns[0]] * (high - low) / noise.sigma
-    seen = np.isfinite(world.observed)
-    return float(np.sqrt(np.square(change[seen]).sum())) > TOUCHED
+    # only where a sample could show it
+    shown = change[np.isfinite(world.observed)]
+    return float(np.sqrt(np.square(shown).sum())) > TOUCHED

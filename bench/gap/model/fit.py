@@ -173,12 +173,16 @@ class _Problem:
         factor = max(LEAST_FACTOR, 1.0 - (2.0 * ratio - 1.0) ** 3)
         self.damping = max(self.damping * factor, LEAST_DAMPING)  # (2)
         self.growth = GROWTH
-        self.done = gained < ENOUGH + SHARE * cost
+        self.done = gained < ENOUGH + SHARE * cost  # converged
 
     def refused(self) -> None:
         """After a step that did not, (3)."""
         self.damping = self.damping * GROWTH * self.growth
         self.growth = GROWTH * self.growth
+
+
+_Trial = tuple[_Problem, Start]
+"""A model, and where it may go next."""
 
 
 @dataclass(frozen=True)
@@ -215,6 +219,7 @@ class Fitter:
             reached: what other models have come down to.
         """
         problems = [self._problem(start) for start in starts]
+        # the samples that count, (R, T, C)
         seen = self.world.counted(self.share)
         begun = self._points([(p, p.point.start) for p in problems], seen)
         for problem, point in zip(problems, begun, strict=True):
@@ -226,7 +231,8 @@ class Fitter:
             trials = list(self._trials(problems, seen))
             if not trials:
                 break
-            for (problem, _), point in zip(trials, self._points(trials, seen), strict=True):
+            points = self._points(trials, seen)
+            for (problem, _), point in zip(trials, points, strict=True):
                 self._judge(problem, point)
         return [p.fit() for p in problems]
 
@@ -236,18 +242,21 @@ class Fitter:
         free: list[int] = []
         bounds: list[tuple[float, float]] = []
         if self.parameters:
-            free += [int(i) for i in world.base if int(i) not in self.frozen]
+            free += [i for i in world.base.tolist() if i not in self.frozen]
             bounds += [world.parameters[i].bounds for i in free]
             for name in start.effects:
-                free += range(*world.slots[name].indices(len(world.parameters)))
+                free += world.places(name)
                 bounds += coefficient_bounds(world, name)
-        low, high = np.array(bounds, dtype=np.float64).reshape(-1, 2).T
+        # two columns also where nothing is free
+        table = np.array(bounds, dtype=np.float64).reshape(-1, 2)
+        low, high = table.T
 
         # plausible ranges scale the differences; a fit may leave them by far
         plausible = [world.parameters[i].bounds for i in free]
         widths = np.array([b - a for a, b in plausible], dtype=np.float64)
         state_steps = np.full(len(world.states), FIRST_STATE_STEP)
 
+        # a start may be the size that a score asks for, or come from wider bounds
         theta = start.theta.copy()
         theta[free] = np.clip(theta[free], low, high)
         begun = Start(start.effects, theta, start.states.copy())
@@ -260,7 +269,7 @@ class Fitter:
             steps=np.concatenate([FIRST_STEP * widths, state_steps]),
         )
 
-    def _points(self, trials: Sequence[tuple[_Problem, Start]], seen: Mask) -> list[_Point]:
+    def _points(self, trials: Sequence[_Trial], seen: Mask) -> list[_Point]:
         """What each problem gives at a trial's place, its derivatives and its cost.
 
         One call of the engine has every run of every model, with every unknown moved: it goes
@@ -272,28 +281,33 @@ class Fitter:
             _moved(start, problem.free, step)
             for (problem, start), step in zip(trials, steps, strict=True)
         ]
+        # lanes model by model, in each unknown by unknown, in each run by run
         thetas = np.concatenate([np.repeat(theta, runs, axis=0) for theta, _ in moved])
         states = np.concatenate([begin.reshape(-1, size) for _, begin in moved])
         lanes = np.tile(np.arange(runs), len(thetas) // runs)
         simulated = self.world.simulate(thetas, lanes, states, self.share)
+        simulated = simulated.reshape(-1, runs, *simulated.shape[1:])
 
-        points, first = [], 0
-        for (_, start), (theta, _), step in zip(trials, moved, steps, strict=True):
-            last = first + len(theta) * runs
-            part = simulated[first:last].reshape(len(theta), runs, *simulated.shape[1:])
+        points = []
+        first = 0
+        for (_, start), step in zip(trials, steps, strict=True):
+            # as it is, and with each unknown moved
+            last = first + 1 + step.size
+            part = simulated[first:last]
             first = last
             # a lane that was given up is NaN, and tells nothing of how its unknown acts
             with np.errstate(all="ignore"):
                 quotients = np.moveaxis(part[1:] - part[0], 0, -1) / step
             jacobian = np.nan_to_num(quotients, nan=0.0, posinf=0.0, neginf=0.0)
-            points.append(_Point(start, part[0], jacobian, self._cost(part[0], start.states, seen)))
+            cost = self._cost(part[0], start.states, seen)
+            points.append(_Point(start, part[0], jacobian, cost))
         return points
 
     def _take(self, problem: _Problem, point: _Point) -> None:
         """Go on from a point, with differences that suit what it responds to."""
         problem.point = point
-        scaled = point.jacobian / self.noise.sigma[:, None]
-        responses = np.sqrt(np.mean(np.square(scaled), axis=(0, 1, 2)))
+        squares = np.square(point.jacobian / self.noise.sigma[:, None])
+        responses = np.sqrt(np.mean(squares, axis=(0, 1, 2)))
         states = np.full(point.start.states.shape[1], LARGEST_STEP)
         largest = np.concatenate([LARGEST_STEP * problem.widths, states])
         # an unknown without any response is moved as far as may be
@@ -314,13 +328,14 @@ class Fitter:
     def _cost(self, simulated: Array, states: Array, seen: Mask) -> float:
         """The cost of eq. (1) of `arrow`; infinite where the simulator gave up."""
         residual = self._residual(simulated, seen)
+        # a lane that was given up is NaN, which compares with nothing
         if not np.isfinite(residual).all():
             return np.inf
         w = whitened(residual, seen, self.noise)
         drift = self._drift(states)
         return float((w * w).sum() + (drift * drift).sum())
 
-    def _trials(self, problems: Sequence[_Problem], seen: Mask) -> Iterator[tuple[_Problem, Start]]:
+    def _trials(self, problems: Sequence[_Problem], seen: Mask) -> Iterator[_Trial]:
         """Where each problem that is not done goes next; one whose step promises nothing is."""
         for problem in problems:
             if problem.done:
@@ -339,8 +354,10 @@ class Fitter:
             problem.done = True
             return None
 
-        residual = whitened(self._residual(at.simulated, seen), seen, self.noise)
-        jacobian = whitened(np.where(seen[..., None], at.jacobian, 0.0), seen, self.noise)
+        left = self._residual(at.simulated, seen)
+        derivatives = np.where(seen[..., None], at.jacobian, 0.0)
+        residual = whitened(left, seen, self.noise)
+        jacobian = whitened(derivatives, seen, self.noise)
         step = arrow_step(
             residual,
             jacobian,
@@ -349,13 +366,15 @@ class Fitter:
             prior_of(self.world),
             self.world.known,
             problem.damping,
-            _stuck(problem, residual, jacobian),
+            _stuck(problem, residual, jacobian),  # clipped afterwards, they would spoil the rest
         )
         problem.promised = step.promised
+        # converged, or no step is short enough
         if step.promised < ENOUGH + SHARE * at.cost or problem.damping > LARGEST_DAMPING:
             problem.done = True
             return None
 
+        # a copy: where the trial is refused, the old point stands
         theta = at.start.theta.copy()
         moved = theta[problem.free] + step.shared
         theta[problem.free] = np.clip(moved, problem.low, problem.high)
@@ -396,7 +415,7 @@ def _moved(start: Start, free: Indices, steps: Array) -> tuple[Array, Array]:
 def prior_of(world: World) -> Array:
     """(s,) what is known of initial states beforehand, 1 sigma."""
     system, shown = world.simulator.system, set(world.channels)
-    # a coordinate's samples show its rate, too
+    # a coordinate's samples show its rate, too; behind the rates an own system may have more
     pairs = dict(zip(system.rates, system.coordinates, strict=False))
     measured = [name in shown or pairs.get(name) in shown for name in world.states]
     return np.where(measured, MEASURED, UNMEASURED)
@@ -405,6 +424,7 @@ def prior_of(world: World) -> Array:
 def _stuck(problem: _Problem, residual: Array, jacobian: Array) -> Mask:
     """(q,) parameters at a bound that the data push against."""
     start, free = problem.point.start, problem.free
+    # the gradient of the cost, downhill
     pushed = np.einsum("rtc,rtcq->q", residual, jacobian[..., : free.size])
     here = start.theta[free]
     below = (here <= problem.low) & (pushed < 0)

@@ -47,19 +47,26 @@ def noise_floor(world: World, recording: Recording) -> Floor:
     for channel in world.simulator.channels:
         signals = [(run.times, run.channels[channel.name]) for run in recording.runs]
         values = np.concatenate([y[np.isfinite(y)] for _, y in signals])
+        # even where it is stated: a step tells that the channel is quantised
         estimate = estimated(signals)
         known = recording.noise.get(channel.name, 0.0) > 0
         sigma = recording.noise[channel.name] if known else estimate.sigma
 
         # no simulation is as exact as an error of nothing asks for
         least = max(PRECISION * _range(values), LEAST)
+        # too few samples, or none
         if not np.isfinite(sigma):
             sigma = TYPICAL * channel.scale
         sigmas.append(max(sigma, least))
         stated.append(known)
         steps.append(estimate.step)
         doubts.append(0.0 if known else MEDIAN / max(values.size, FEW) ** 0.5)
-    return Floor(np.array(sigmas), np.array(stated), np.array(steps), np.array(doubts))
+    return Floor(
+        sigma=np.array(sigmas),
+        stated=np.array(stated),
+        step=np.array(steps),
+        uncertainty=np.array(doubts),
+    )
 
 
 def _range(values: Array) -> float:

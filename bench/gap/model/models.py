@@ -83,7 +83,8 @@ class Models:
 
     def residual(self, fit: Fit) -> Array:
         """(R, T, C) observed less simulated, zero where nothing was seen."""
-        residual: Array = np.where(self.seen, self.world.observed - fit.simulated, 0.0)
+        left = self.world.observed - fit.simulated
+        residual: Array = np.where(self.seen, left, 0.0)
         return residual
 
     def enter(self, fit: Fit) -> Model:
@@ -96,6 +97,7 @@ class Models:
         chance = sum(self._chance(name) for name in fit.effects)
         merit = found.value - free * self._price - chance  # (1)
 
+        # the order in which effects were added makes no difference
         key = frozenset(fit.effects)
         if key not in self.models or merit > self.models[key].merit:
             self.models[key] = Model(fit, found, merit)
@@ -108,11 +110,13 @@ class Models:
     @property
     def _price(self) -> float:
         """What each number that the data fix costs a model, the log n of (1)."""
-        return float(np.log(max(int(self.seen.sum()), FEWEST)))
+        count = int(self.seen.sum())
+        return float(np.log(max(count, FEWEST)))
 
     def _chance(self, name: str) -> float:
         """What an effect costs beside that, its part of the last term of (1)."""
         slot = self.world.slots[name]
+        # few shapes gain less by chance than their coefficients pay
         paid = (slot.stop - slot.start) * self._price
         return float(max(self.chances.get(name, 0.0) - paid, 0.0))
 
@@ -145,6 +149,7 @@ class Models:
     def _sifted(self, starts: Sequence[Start], noise: Noise) -> list[Start]:
         """Where the best stand after all horizons but the last, which is the whole of the runs."""
         begun = list(starts)
+        # patience takes every candidate along: only so many may cost a fit of the whole
         for horizon, count in zip(HORIZONS[:-1], SIFTED, strict=True):
             fitter = Fitter(self.world, noise, self.frozen, horizon.share)
             fits = fitter.fit(begun, horizon.iterations)
@@ -157,24 +162,28 @@ class Models:
         of these.
         """
         most = max(len(start.effects) for start in starts)
-        rivals = [m for m in self.models.values() if 0 < len(m.names) <= most]
-        return min((m.fit.cost for m in rivals), default=np.inf)
+        known = self.models.values()
+        costs = [m.fit.cost for m in known if 0 < len(m.names) <= most]
+        return min(costs, default=np.inf)
 
     def best(self, size: int) -> Model | None:
         """The best model with so many effects."""
-        models = [m for m in self.models.values() if len(m.names) == size]
+        known = self.models.values()
+        models = [m for m in known if len(m.names) == size]
         return max(models, key=lambda m: m.merit) if models else None
 
     def excess(self, model: Model) -> float:
         """RMS of what a model leaves in units of the noise floor, less the one that noise itself
         leaves.
         """
-        left = self.residual(model.fit) / self.noise.sigma
-        return float(np.sqrt(np.square(left[self.seen]).mean())) - 1.0
+        scaled = self.residual(model.fit) / self.noise.sigma
+        squares = np.square(scaled[self.seen])
+        return float(np.sqrt(squares.mean())) - 1.0
 
     def weights(self, model: Model) -> Noise:
         """Channels weigh by what the model leaves of them where that is more than their noise."""
         sigma = model.likelihood.sigma
+        # a channel without samples has no sigma, and its weight does not matter
         left = np.where(np.isfinite(sigma), sigma, 0.0)
         return Noise(np.maximum(self.noise.sigma, left), self.noise.phi)
 
@@ -191,12 +200,15 @@ def freedom(world: World, fit: Fit, noise: Noise) -> float:
     """
     seen = np.isfinite(world.observed)
     states = fit.jacobian[..., fit.free.size :]
-    scaled = np.where(seen[..., None], states, 0.0) / noise.sigma[:, None]
+    counted = np.where(seen[..., None], states, 0.0)
+    scaled = counted / noise.sigma[:, None]
+    # written out, as -1 is ambiguous where there are no states
     runs, length, channels, size = scaled.shape
     columns = scaled.reshape(runs, length * channels, size) * prior_of(world)
     # a state that is known has no freedom
     columns = np.where(world.known[:, None, :], 0.0, columns)
-    eigenvalues = np.linalg.eigvalsh(np.matmul(columns.transpose(0, 2, 1), columns))
+    normal = np.matmul(columns.transpose(0, 2, 1), columns)
+    eigenvalues = np.linalg.eigvalsh(normal)
     # rounding may put one a little below zero
     fixed = eigenvalues / (1.0 + np.maximum(eigenvalues, 0.0))  # (2)
     return float(fixed.clip(0.0, 1.0).sum())

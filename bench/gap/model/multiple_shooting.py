@@ -45,7 +45,15 @@ def pieces(world: World) -> World | None:
     if len(runs) == len(world.runs):
         return None
     freed = [p.name for p in world.freed]
-    cut = World(world.kind, world.recording, runs, world.engine, world.extra, freed, world.library)
+    cut = World(
+        world.kind,
+        world.recording,
+        runs,
+        engine=world.engine,
+        extra=world.extra,
+        free=freed,
+        candidates=world.library,
+    )
     # what is periodic goes on from piece to piece
     cut.longest = world.longest
     cut.travel = world.travel
@@ -54,7 +62,9 @@ def pieces(world: World) -> World | None:
 
 def _cut(run: Run) -> list[Run]:
     """The pieces of a run, the run itself where it is too short."""
-    seen: Mask = np.any(np.isfinite(np.stack(list(run.channels.values()))), axis=0)
+    # a sample counts where any of the channels has it
+    values = np.stack(list(run.channels.values()))
+    seen: Mask = np.any(np.isfinite(values), axis=0)
     count = int(np.clip(seen.sum() // LEAST, 1, PIECES))
     edges = np.linspace(0, run.times.size, count + 1).astype(int)
     parts = [slice(a, b) for a, b in pairwise(edges)]
@@ -80,5 +90,6 @@ def _piece(run: Run, number: int, part: slice) -> Run:
 def whole(world: World, found: Fit) -> Start:
     """Where a fit of the whole runs begins, from a fit of their pieces."""
     counts = [len(_cut(run)) for run in world.runs]
+    # each run goes on from where its first piece began
     first = np.cumsum([0, *counts])[:-1]
     return Start(found.effects, found.theta, found.states[first])

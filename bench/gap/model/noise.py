@@ -69,7 +69,8 @@ class Noise:
     def coloured(self, phi: Array | float) -> Noise:
         """The same with other correlations."""
         correlations = np.asarray(phi, dtype=np.float64)
-        return Noise(self.sigma, np.broadcast_to(correlations, self.sigma.shape).copy())
+        spread = np.broadcast_to(correlations, self.sigma.shape)
+        return Noise(self.sigma, spread.copy())
 
 
 def _unit(phi: float) -> Noise:
@@ -92,6 +93,7 @@ def whitened(values: Array, seen: Mask, noise: Noise) -> Array:
         noise: of each channel.
     """
     extra = (1,) * (values.ndim - 3)
+    # a derivative has axes behind that of the channels
     phi = noise.phi.reshape(-1, *extra)
     sigma = noise.sigma.reshape(-1, *extra)
     # a Jacobian is large, and multiplying is quicker than dividing
@@ -103,8 +105,9 @@ def whitened(values: Array, seen: Mask, noise: Noise) -> Array:
         follows = pairs.reshape(*pairs.shape, *extra)
         # values where nothing was seen may be anything, even NaN: they must not reach the next
         before = np.where(follows, result[:, :-1], 0.0)
-        innovations = (result[:, 1:] - phi * before) / np.sqrt(1.0 - phi * phi)
-        result[:, 1:] = np.where(follows, innovations, result[:, 1:])
+        latter = result[:, 1:]
+        innovations = (latter - phi * before) / np.sqrt(1.0 - phi * phi)
+        result[:, 1:] = np.where(follows, innovations, latter)
 
     if not seen.all():
         result = np.where(seen.reshape(*seen.shape, *extra), result, 0.0)
@@ -114,7 +117,8 @@ def whitened(values: Array, seen: Mask, noise: Noise) -> Array:
 def log_determinant(seen: Mask, phi: Array | float) -> float:
     """Half the log determinant of whitening at unit variance, -m/2 log(1 - φ²) of (3)."""
     follows = _follows(seen).sum(axis=(0, 1))
-    return float(-0.5 * (follows * np.log1p(-np.square(phi))).sum())
+    logarithms = np.log1p(-np.square(phi))
+    return float(-0.5 * (follows * logarithms).sum())
 
 
 @dataclass(frozen=True)
@@ -142,12 +146,15 @@ def likelihood(residual: Array, seen: Mask, lost: float = 0.0) -> Likelihood:
             estimated.
     """
     total = 0.0
-    sigmas, phis = [], []
+    sigmas: list[float] = []
+    phis: list[float] = []
     # every channel bears its part of what the fit has used
-    share = max(1.0 - lost / max(int(seen.sum()), 1), LEAST_SHARE)
+    samples = max(int(seen.sum()), 1)
+    share = max(1.0 - lost / samples, LEAST_SHARE)
     for c in range(residual.shape[2]):
         channel = slice(c, c + 1)
         here = seen[:, :, channel]
+        # nothing was seen of it: it has no likelihood, and no noise
         if not here.any():
             sigmas.append(np.nan)
             phis.append(0.0)
@@ -171,15 +178,18 @@ def _likeliest(residual: Array, seen: Mask, share: float) -> tuple[float, float,
         w = whitened(residual, seen, _unit(phi))
         variance = max(float((w * w).sum()) / count, TINY)
         value = -count * np.log(variance) + 2.0 * log_determinant(seen, phi)  # (4)
-        best = max(best, (value, phi, variance / share))
+        hypothesis = (value, phi, variance / share)
+        best = max(best, hypothesis)
     return best
 
 
 def _near(residual: Array, seen: Mask) -> Array:
     """Correlations worth a try: around the sample's own."""
     follows = _follows(seen)
-    former, latter = residual[:, :-1][follows], residual[:, 1:][follows]
+    former = residual[:, :-1][follows]
+    latter = residual[:, 1:][follows]
     power = float(former @ former)
+    # of zeros there is no correlation
     own = float(former @ latter) / power if power > 0 else 0.0
     around = np.clip(own + np.array(AROUND), LEAST_PHI, LARGEST_PHI)
     # white noise is always a hypothesis
@@ -209,9 +219,9 @@ def forgets(residual: Array, seen: Mask, found: Likelihood) -> float:
     for c, phi in enumerate(found.phi.tolist()):
         channel = slice(c, c + 1)
         here = seen[:, :, channel]
-        w = whitened(residual[:, :, channel], here, _unit(phi))[:, :, 0]
+        white = whitened(residual[:, :, channel], here, _unit(phi))
         count = max(int(here.sum()), 2)
-        statistic = count * (count + 2.0) * _correlated(w, count)
+        statistic = count * (count + 2.0) * _correlated(white[:, :, 0], count)  # (5)
         least = min(least, float(chdtrc(LAGS - 1, statistic)))
     return min(1.0, least * len(found.phi))
 
@@ -222,14 +232,19 @@ def _correlated(w: Array, count: int) -> float:
     power = max(float((w * w).sum()), TINY)
     total = 0.0
     for lag in range(1, min(LAGS, length - 1) + 1):
-        correlation = float((w[:, lag:] * w[:, :-lag]).sum()) / power
+        products = w[:, lag:] * w[:, :-lag]
+        correlation = float(products.sum()) / power
         # each run has a beginning of its own: so many pairs are lost in every one
         total += correlation**2 / max(count - lag * runs, 1)
     return total
 
 
 def surrogates(
-    residual: Array, seen: Mask, count: int, rng: np.random.Generator, largest: int = 6
+    residual: Array,
+    seen: Mask,
+    count: int,
+    rng: np.random.Generator,
+    largest: int = 6,
 ) -> Array:
     """Residuals (count, R, T, C) of the same spectrum that mean nothing: a sieve bootstrap.
 
@@ -252,13 +267,15 @@ def surrogates(
         here = seen[:, :, c]
         weights, innovations = _autoregression(residual[:, :, c], here, largest)
         drawn = rng.choice(innovations, size=(length + BURN_IN, count, runs))
-        driven = _driven(weights, drawn)[BURN_IN:]
-        result[:, :, :, c] = np.where(here, np.moveaxis(driven, 0, 2), 0.0)
+        # time comes first in what is driven, and last here
+        driven = np.moveaxis(_driven(weights, drawn)[BURN_IN:], 0, 2)
+        result[:, :, :, c] = np.where(here, driven, 0.0)
     return result
 
 
 def _driven(weights: Array, innovations: Array) -> Array:
     """The autoregression (6) of innovations (T, ...), in their place."""
+    # a sample reads those before it, which are finished by then
     for t in range(1, len(innovations)):
         for k, weight in enumerate(weights[:t], start=1):
             innovations[t] += weight * innovations[t - k]
@@ -272,7 +289,8 @@ def _autoregression(values: Array, seen: Mask, largest: int) -> tuple[Array, Arr
     weights = _most_plausible(covariances, int(seen.sum()))
     innovations = _innovations(filled, seen, weights)
     if innovations.size < FEWEST:
-        return np.zeros(0), filled[seen] if seen.any() else np.zeros(1)
+        samples = filled[seen] if seen.any() else np.zeros(1)
+        return np.zeros(0), samples
     # a mean of theirs would add up to an offset of the surrogates
     return weights, innovations - innovations.mean()
 
@@ -283,19 +301,23 @@ def _autocovariances(filled: Array, seen: Mask, largest: int) -> Array:
     covariances = []
     for lag in range(largest + 1):
         former, latter = slice(0, length - lag), slice(lag, length)
-        pairs = max(int((seen[:, latter] & seen[:, former]).sum()), 1)
-        covariances.append(float((filled[:, latter] * filled[:, former]).sum()) / pairs)
+        # what is missing adds nothing to the sum, so it must not count either
+        pairs = seen[:, latter] & seen[:, former]
+        products = filled[:, latter] * filled[:, former]
+        covariances.append(float(products.sum()) / max(int(pairs.sum()), 1))
     return np.array(covariances)
 
 
 def _most_plausible(covariances: Array, count: int) -> Array:
     """Weights (p,) of the order p that H. Akaike's criterion (1974) picks, n log var u + 2 p."""
-    best, weights = np.inf, np.zeros(0)
+    best = np.inf
+    weights = np.zeros(0)
     for order in range(len(covariances)):
         solved, variance = _yule_walker(covariances, order)
         criterion = count * np.log(max(variance, TINY)) + 2.0 * order
         if criterion < best - GAINED:
-            best, weights = criterion, solved
+            best = criterion
+            weights = solved
     return weights
 
 
@@ -303,6 +325,7 @@ def _innovations(filled: Array, seen: Mask, weights: Array) -> Array:
     """(n,) the u of (6), where all samples are there that it needs."""
     order, length = weights.size, seen.shape[1]
     predicted = np.zeros(1)
+    # a sample and all that it is predicted from
     complete = seen[:, order:]
     for k, weight in enumerate(weights, start=1):
         earlier = slice(order - k, length - k)
@@ -322,11 +345,15 @@ def _yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
     The variance is infinite where (6) would not die away, so that nothing prefers it.
     """
     power = covariances[0]
+    # white, or nothing at all
     if order == 0 or power <= 0:
         return np.zeros(0), float(power)
-    lags = np.abs(np.arange(order)[:, None] - np.arange(order))
+    numbers = np.arange(order)
+    lags = np.abs(numbers[:, None] - numbers)
     later = covariances[1 : order + 1]
-    weights = np.linalg.solve(covariances[lags] + RIDGE * power * np.eye(order), later)  # (7)
+    # (7), the matrix first
+    matrix = covariances[lags] + RIDGE * power * np.eye(order)
+    weights = np.linalg.solve(matrix, later)
     variance = float(power - weights @ later)
     # what (6) makes of one innovation is a sum of powers of these
     roots = np.roots(np.concatenate([[1.0], -weights]))

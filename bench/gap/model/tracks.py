@@ -46,17 +46,29 @@ class Track:
     guess: Array
     known: Mask
 
+    @property
+    def seconds(self) -> float:
+        """How long it takes."""
+        times = self.scenario.times
+        return float(times[-1] - times[0])
 
-def tracked(run: Run, recording: Recording, simulator: Simulated, states: Sequence[str]) -> Track:
+
+def tracked(
+    run: Run,
+    recording: Recording,
+    simulator: Simulated,
+    states: Sequence[str],
+) -> Track:
     """A run of a recording, for a simulator that observes its channels and has these states."""
-    observed = np.stack([run.channels[c.name] for c in simulator.channels], axis=1)
+    columns = [run.channels[c.name] for c in simulator.channels]
+    # a run's own constants hold in it alone
     constants = {**recording.constants, **run.constants}
     guesses = _guessed(run, simulator)
     fixed = {*run.initial, *_hidden(simulator)}
     return Track(
         name=run.name,
         scenario=Scenario(run.times, {}, run.inputs, constants),
-        observed=observed,
+        observed=np.stack(columns, axis=1),
         guess=np.array([guesses[name] for name in states]),
         known=np.array([name in fixed for name in states]),
     )
@@ -76,6 +88,7 @@ def _guessed(run: Run, simulator: Simulated) -> dict[str, float]:
             values[rate] = beginning(run.times, run.channels[rate])[0]
     if system.bounces and system.coordinates[-1] not in run.channels:
         values[system.coordinates[-1]] = _aloft(run, simulator)
+    # what is stated overrules every guess
     values.update(run.initial)
     return values
 
@@ -95,7 +108,8 @@ def _hidden(simulator: Simulated) -> set[str]:
     """States of coordinates that nothing recorded has to do with: taken to be at their defaults."""
     system, shown = simulator.system, {c.name for c in simulator.channels}
     hidden = set()
-    for axis, (coordinate, rate) in enumerate(zip(system.coordinates, system.rates, strict=False)):
+    pairs = zip(system.coordinates, system.rates, strict=False)
+    for axis, (coordinate, rate) in enumerate(pairs):
         about = {coordinate, rate, f"accel_{coordinate}"}
         # biases and springs act on the primary coordinate: it is never taken to be still
         if axis != system.primary and not about & shown:
@@ -125,5 +139,6 @@ def beginning(times: Array, values: Array) -> tuple[float, float]:
     # powers of time between 0 and 1, whatever the sampling, are well conditioned
     scale = float(t[-1]) or 1.0
     degree = 1 if t.size < BENT else 2
-    value, slope = np.polynomial.polynomial.polyfit(t / scale, y, degree)[:2]
+    coefficients = np.polynomial.polynomial.polyfit(t / scale, y, degree)
+    value, slope = coefficients[:2]
     return float(value), float(slope / scale)

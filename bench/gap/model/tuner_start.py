@@ -28,8 +28,9 @@ def tuned(name: str, world: World, noise: Noise, seed: int) -> Array:
     channels = world.observed.shape[2]
     # a tuner knows one table: the runs follow one another, all of them padded to one length
     observed = world.observed.reshape(-1, channels)
+    parameters = [world.parameters[i] for i in world.base]
     problem = Standalone(
-        parameters=[world.parameters[i] for i in world.base],
+        parameters=parameters,
         start=world.nominal()[world.base],
         observed=observed,
         scale=noise.sigma,
@@ -39,13 +40,20 @@ def tuned(name: str, world: World, noise: Noise, seed: int) -> Array:
     return recommended(name, problem, BUDGET, SECONDS, rng_for("explain", name, seed))
 
 
-def _evaluated(world: World, noise: Noise, observed: Array, base: Array) -> tuple[Array, Array]:
+def _evaluated(
+    world: World,
+    noise: Noise,
+    observed: Array,
+    base: Array,
+) -> tuple[Array, Array]:
     """Observations (n, T, C) of base parameters (n, b), and their losses (n,).
 
     The loss is the root mean square of scaled residuals, as in a comparison; what cannot be
     simulated is infinitely far.
     """
-    count, runs = len(base), len(world.tracks)
+    count = len(base)
+    runs = len(world.tracks)
+    # no effect acts: the coefficients behind the base parameters are zero
     theta = np.tile(world.nominal(), (count, 1))
     theta[:, world.base] = base
     simulated = world.simulate(
@@ -57,5 +65,6 @@ def _evaluated(world: World, noise: Noise, observed: Array, base: Array) -> tupl
     residuals = np.where(np.isfinite(observed), simulated - observed, 0.0)
     # a lane that was given up is NaN, which is no news here
     with np.errstate(invalid="ignore"):
-        losses = np.sqrt(np.square(residuals / noise.sigma).mean(axis=(1, 2)))
+        squares = np.square(residuals / noise.sigma)
+        losses = np.sqrt(squares.mean(axis=(1, 2)))
     return simulated, np.where(np.isfinite(losses), losses, np.inf)

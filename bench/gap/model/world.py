@@ -94,8 +94,11 @@ class World:
         free: Sequence[str] = (),
         candidates: Sequence[str] | None = None,
     ) -> None:
-        self.kind, self.recording, self.engine = kind, recording, engine
-        self.runs, self.extra = tuple(runs), tuple(extra)
+        self.kind = kind
+        self.recording = recording
+        self.engine = engine
+        self.runs = tuple(runs)
+        self.extra = tuple(extra)
         usable = library.library(kind.system)
         self.library = list(usable) if candidates is None else list(candidates)
         self.simulator, self._fine = self._simulators()
@@ -110,6 +113,7 @@ class World:
         self.slots = _slots(self.simulator, self.base.size)
         self._shifting, self._filtering = self._delaying()
 
+        # the runs; a system without coordinates names its states itself
         self.states = [*system.coordinates, *system.rates] or list(kind.states)
         self.tracks: tuple[Track, ...] = tuple(
             tracked(run, recording, self.simulator, self.states) for run in runs
@@ -118,7 +122,8 @@ class World:
         self.observed = self._padded()
         self.known: Mask = np.array([t.known for t in self.tracks])
         self.guess: Array = np.array([t.guess for t in self.tracks])
-        self.longest, self.travel = self._longest(), self._travel()
+        self.longest = self._longest()
+        self.travel = self._travel()
         self.simulations = 0
         self._parts: dict[float, list[Scenario]] = {}
 
@@ -127,6 +132,7 @@ class World:
         kind = self.kind
         effects: list[str | type[Effect]] = list(self.library)
         effects += [effect for effect in self.extra if effect.fits(kind.system)]
+        # in the simulator's order, whatever that of the table's columns
         recorded = self.runs[0].channels
         observe = [c.name for c in kind.channels if c.name in recorded]
         usual: dict[str, Any] = {}
@@ -152,7 +158,8 @@ class World:
 
     def _longest(self) -> float:
         """Seconds that the longest run takes."""
-        return max(float(t.scenario.times[-1] - t.scenario.times[0]) for t in self.tracks) or 1.0
+        # not zero: lengths of time are divided by it
+        return max(track.seconds for track in self.tracks) or 1.0
 
     def _travel(self) -> float:
         """The range of the primary coordinate in the run where it is largest; 0 where it is not
@@ -160,6 +167,7 @@ class World:
         """
         system = self.simulator.system
         name = system.coordinates[system.primary] if system.coordinates else ""
+        # an own simulator may have no coordinates at all
         if name not in self.channels:
             return 0.0
         values = self.observed[:, :, self.channels.index(name)]
@@ -173,11 +181,12 @@ class World:
         shifting: list[int] = []
         filtering: list[int] = []
         for effect in self.simulator.effects:
-            places = range(*self.slots[effect.name].indices(len(self.parameters)))
+            places = self.places(effect.name)
             if _moves_instants(effect):
                 shifting.extend(places)
             if isinstance(effect, Sensor) and effect.filters:
                 filtering.extend(places)
+        # the type matters where there is none: places of an empty list would be floats
         return np.array(shifting, dtype=np.intp), np.array(filtering, dtype=np.intp)
 
     @property
@@ -190,19 +199,33 @@ class World:
         """Every effect at hand, by name."""
         return {effect.name: effect for effect in self.simulator.effects}
 
+    def places(self, effect: str) -> range:
+        """Where an effect's coefficients stand in theta."""
+        slot = self.slots[effect]
+        return range(slot.start, slot.stop)
+
     def nominal(self) -> Array:
         """(P,) parameters at their nominal values, every effect off."""
         values = np.array([p.nominal for p in self.parameters])
+        # a coefficient of zero is an effect that does not act, whatever its nominal size
         values[self.base.size :] = 0.0
         return values
 
     def counted(self, share: float) -> Mask:
         """(R, T, C) the samples that are there in the first share of each run."""
-        first = np.arange(self.observed.shape[1]) < np.ceil(share * self.lengths)[:, None]
+        numbers = np.arange(self.observed.shape[1])
+        ends = np.ceil(share * self.lengths)
+        first = numbers < ends[:, None]
         counted: Mask = np.isfinite(self.observed) & first[:, :, None]
         return counted
 
-    def simulate(self, theta: Array, runs: Indices, states: Array, share: float = 1.0) -> Array:
+    def simulate(
+        self,
+        theta: Array,
+        runs: Indices,
+        states: Array,
+        share: float = 1.0,
+    ) -> Array:
         """Observations (L, T, C) of lanes.
 
         Args:
@@ -213,8 +236,8 @@ class World:
                 end of a shorter run, is NaN.
         """
         self.simulations += len(theta)
-        length = self.observed.shape[1]
-        result = np.full((len(theta), length, self.observed.shape[2]), np.nan)
+        _, length, channels = self.observed.shape
+        result = np.full((len(theta), length, channels), np.nan)
 
         # the slowest lane of a call sets its steps: those that need many do not go with the others
         active = theta != 0
@@ -238,6 +261,7 @@ class World:
             self._parts[share] = [
                 first_of(t.scenario, int(np.ceil(share * len(t.observed)))) for t in self.tracks
             ]
+        # lanes of one run share its scenario, which the simulator then prepares once
         scenarios = [self._parts[share][run] for run in runs]
         if not self.freed:
             return scenarios
@@ -255,7 +279,8 @@ class World:
     ) -> Array:
         """Observations of lanes that one simulator can take together."""
         # to the simulator a freed constant is none of its parameters
-        lanes = np.delete(theta, np.arange(self.own, self.base.size), axis=1)
+        freed = np.arange(self.own, self.base.size)
+        lanes = np.delete(theta, freed, axis=1)
         initial = dict(zip(self.states, states.T, strict=True))
         return simulator.simulate_lanes(lanes, scenarios, initial)
 
@@ -276,13 +301,16 @@ def _freed(name: str, simulator: Simulated, recording: Recording) -> Parameter:
         raise InputError(
             f"--free {name}: expected a constant that is not zero and the same in every run"
         )
+    # sorted, as a constant may be negative
     low, high = sorted((value / FREED, value * FREED))
-    return Parameter(name, constants[name].unit, value, (low, high), says=constants[name].says)
+    constant = constants[name]
+    return Parameter(name, constant.unit, value, (low, high), says=constant.says)
 
 
 def _slots(simulator: Simulated, first: int) -> dict[str, slice]:
     """Where each effect's coefficients stand, from the first place on."""
     slots = {}
+    # in the simulator's order, which is that of its parameters
     for effect in simulator.effects:
         last = first + len(effect.on(simulator.system))
         slots[effect.name] = slice(first, last)
