@@ -7,10 +7,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from bench.gap.assess import Assessor
 from bench.gap.causes.name import Finding, name
 from bench.gap.causes.rules import CHANCE
 from bench.gap.causes.search import Search
@@ -23,7 +23,7 @@ from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
 from bench.gap.report import show
 from bench.gap.report.story import Shown, Story, Tuned
-from bench.gap.verdict import Answer
+from bench.gap.verdict import Verdict
 from bench.problem.seeds import rng_for
 from bench.recordings.inspection import load
 from sims import effects as library
@@ -98,7 +98,9 @@ class _Explainer:
         )
         self.floor: Floor = noise_floor(self.fitting, self.recording)
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
-        self.answer = Answer(self.recording, self.fitting, self.measuring, self.floor, self.engine)
+        self.assessor = Assessor(
+            self.recording, self.fitting, self.measuring, self.floor, self.engine
+        )
         self._check()
 
     def _check(self) -> None:
@@ -130,7 +132,7 @@ class _Explainer:
         held_out = HeldOutRuns(self.measuring, self.noise) if self.measuring else None
         finding = name(search, held_out)
         self.say("measuring the gain")
-        verdict = self.answer.verdict(search, finding, rng, self.started)
+        verdict = self.assessor.verdict(search, finding, rng, self.started)
         story = self._story(search, base, finding, verdict)
         extended = self._extended(search, finding)
         for world in (self.fitting, self.measuring):
@@ -146,10 +148,8 @@ class _Explainer:
 
         return tuned(self.tuner, self.fitting, self.noise, self.seed)
 
-    def _story(
-        self, search: Search, base: Base, finding: Finding, verdict: dict[str, Any]
-    ) -> Story:
-        world, sigma = self.fitting, self.answer.sigma(finding)
+    def _story(self, search: Search, base: Base, finding: Finding, verdict: Verdict) -> Story:
+        world, sigma = self.fitting, self.assessor.sigma(finding)
         before, after = finding.base.fit.simulated, finding.model.fit.simulated
         places = show.places(world, before, after, sigma)
         held_out = None
@@ -179,7 +179,7 @@ class _Explainer:
         return Story(
             title,
             self.path,
-            verdict,
+            verdict.document(),
             channels,
             show.side(world, before, after),
             held_out,
@@ -192,7 +192,7 @@ class _Explainer:
         )
 
     def _tuned(self, search: Search, base: Base, finding: Finding) -> tuple[Tuned, ...]:
-        sides = [self.answer.numbers(search, model) for model in (finding.base, finding.model)]
+        sides = [self.assessor.numbers(search, model) for model in (finding.base, finding.model)]
         result = []
         for i in self.fitting.base.tolist():
             before, after = (_triple(side[i]) for side in sides)
@@ -242,7 +242,7 @@ class _Explainer:
         return lines
 
     def _extended(self, search: Search, finding: Finding) -> Extended:
-        world, numbers = self.fitting, self.answer.numbers(search, finding.model)
+        world, numbers = self.fitting, self.assessor.numbers(search, finding.model)
         own = {world.parameters[i].name: numbers[i] for i in range(world.own)}
         freed = {p.name: numbers[world.own + i].value for i, p in enumerate(world.freed)}
         added = {}

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from bench.gap.causes.rules import VerdictName
 from bench.gap.report import pictures
 from bench.gap.report.account import closes, interval
 from bench.gap.report.page import framed, page, write_report
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, estimate, joined, percent, with_unit
+from bench.gap.verdict import Cause, Verdict
 from sims import extended as extending
 from sims.base import InputError
 from sims.extended import Extended
@@ -30,25 +31,24 @@ class Explanation:
     """The result of `explain`.
 
     Attributes:
-        answer: as verdict.json.
+        answer: the verdict with its numbers; ``answer.document()`` is what verdict.json says.
         story: everything a person is told.
         extended: the extended simulator.
     """
 
-    answer: Mapping[str, Any]
+    answer: Verdict
     story: Story
     extended: Extended
 
     @property
-    def verdict(self) -> str:
+    def verdict(self) -> VerdictName:
         """``adequate``, ``named``, ``ambiguous``, ``partial``, ``unknown`` or ``unidentifiable``."""
-        return str(self.answer["verdict"])
+        return self.answer.verdict
 
     @property
-    def causes(self) -> Sequence[Mapping[str, Any]]:
-        """What the simulation lacks, as in verdict.json; empty where nothing was found."""
-        causes: Sequence[Mapping[str, Any]] = self.answer["causes"]
-        return causes
+    def causes(self) -> tuple[Cause, ...]:
+        """What the simulation lacks, strongest first; empty where nothing was found."""
+        return self.answer.causes
 
     @property
     def figures(self) -> tuple[str, ...]:
@@ -86,7 +86,7 @@ class Explanation:
 
     def _write_each(self, folder: Path) -> list[Path]:
         verdict, extended = folder / "verdict.json", folder / "extended.toml"
-        text = json.dumps(self.answer, indent=1, allow_nan=False)
+        text = json.dumps(self.answer.document(), indent=1, allow_nan=False)
         verdict.write_text(text + "\n", encoding="utf-8")
         extending.write(self.extended, extended)
         figures = pictures.draw(self.story, folder)
@@ -101,7 +101,7 @@ class Explanation:
 
     def _gain(self) -> str:
         """The share of the gap that is closed; empty where nothing was found or measured."""
-        held_out = self.answer["heldout"]
+        held_out = self.story.verdict["heldout"]
         if not self.causes or not closes(held_out):
             return ""
         share = percent(held_out["gap_closed"])
@@ -113,11 +113,11 @@ class Explanation:
         return framed(page(self.story, drawn, for_print=False))
 
 
-def _in_words(cause: Mapping[str, Any]) -> str:
+def _in_words(cause: Cause) -> str:
     """``drag.linear or friction.coulomb: coefficient 2.2×10⁻⁴ (2.0×10⁻⁴ to 2.4×10⁻⁴) N·m·s/rad``."""
-    effects = joined([cause["effect"], *cause["alternatives"]], "or")
+    effects = joined([cause.effect, *cause.alternatives], "or")
     numbers = [
-        f"{name} {with_unit(estimate(c['value'], c['low'], c['high']), c['unit'])}"
-        for name, c in cause["coefficients"].items()
+        f"{name} {with_unit(estimate(c.value, c.low, c.high), c.unit)}"
+        for name, c in cause.coefficients.items()
     ]
     return f"{effects}: {joined(numbers)}"

@@ -3,87 +3,151 @@ most.
 
 A T-optimal design over a few changes that an experimenter can make (A. C. Atkinson, V. V. Fedorov,
 Biometrika 62(1), 57, 1975, doi:10.1093/biomet/62.1.57), the rival's parameters held at what these
-data made of them.
+data made of them. Of a run x with T samples of C channels the two models differ by
+
+    apart(x) = sqrt(mean over t, c of ((y_model - y_rival) / sigma_c)^2)                       (1)
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bench.gap.model.models import Model, Models
-from bench.gap.model.world import World
+from bench.gap.model.world import Track, World
 from sims.base import Array, Scenario
 
 TELLING = 2.0
 """Two models that differ by less than this many sigmas, RMS, would not be told apart by one more
 run.
 """
+STARTS = (0.3, 2.0, -1.0)
+"""Shares of an initial state that are tried in its place."""
+AT_REST = 0.05
+"""An initial state below this has no share worth a try; the numbers above are taken as they are."""
+LOWEST = 1.0
+"""Height in metres from which what bounces is let go, at least."""
+INPUTS = (0.3, 3.0)
+"""Shares of an input that are tried in its place."""
 
 
-def next_experiment(models: Models, model: Model, rival: Model) -> dict[str, Any]:
-    """What to record next: a sentence, the change, and how far apart the two models then are in
-    units of the noise.
+@dataclass(frozen=True)
+class Experiment:
+    """What to record next.
+
+    Attributes:
+        says: a sentence.
+        change: by name, what differs from the first run that was fitted: seconds, an initial state,
+            the share of an input; None where no run is proposed.
+        apart: how far apart the two models then are in units of the noise, RMS; None likewise.
+    """
+
+    says: str
+    change: Mapping[str, float] | None = None
+    apart: float | None = None
+
+    def document(self) -> dict[str, Any]:
+        """As in verdict.json."""
+        if self.change is None or self.apart is None:
+            return {"says": self.says}
+        return {"says": self.says, "change": dict(self.change), "apart": self.apart}
+
+
+class _Run(NamedTuple):
+    """A run that could be recorded."""
+
+    says: str
+    change: dict[str, float]
+    scenario: Scenario
+    states: Array
+
+
+def next_experiment(models: Models, model: Model, rival: Model) -> Experiment:
+    """What to record next to tell a model from a rival.
+
+    Args:
+        models: among which both are.
+        model: the one that stands.
+        rival: what would explain the same.
     """
     world = models.world
-    best: tuple[float, str, dict[str, Any]] = (0.0, "", {})
-    for says, change, scenario, states in _changes(world):
-        apart = _apart(world, scenario, states, model, rival, models.noise.sigma)
-        if np.isfinite(apart) and apart > best[0]:
-            best = apart, says, change
-    added = [
-        " and ".join(sorted({*m.names} - {*o.names})) for m, o in ((model, rival), (rival, model))
-    ]
-    if best[0] < TELLING:
-        shown = ", ".join(c.name for c in world.kind.channels if c.name not in world.channels)
-        other = f"record {shown} besides" if shown else "measure one of the causes directly"
-        agree = f"No run of this kind would tell {added[0]} from {added[1]}: their predictions agree within the noise"
-        return {"says": f"{agree}; {other}", "change": {}, "apart": best[0]}
-    says = f"{best[1]}: there {added[0]} and {added[1]} differ by {best[0]:.3g} times the noise"
-    return {"says": says, "change": best[2], "apart": best[0]}
+    says, change, largest = "", {}, 0.0
+    for run in _runs(world):
+        apart = _apart(world, run, model, rival, models.noise.sigma)
+        # A run on which one of the simulations fails proposes nothing.
+        if np.isfinite(apart) and apart > largest:
+            says, change, largest = run.says, run.change, apart
+    mine = " and ".join(sorted({*model.names} - {*rival.names}))
+    other = " and ".join(sorted({*rival.names} - {*model.names}))
+    if largest < TELLING:
+        return Experiment(_no_run(world, mine, other), {}, largest)
+    says = f"{says}: there {mine} and {other} differ by {largest:.3g} times the noise"
+    return Experiment(says, change, largest)
 
 
-def _changes(world: World) -> Iterator[tuple[str, dict[str, Any], Scenario, Array]]:
+def _no_run(world: World, mine: str, other: str) -> str:
+    """What to do where no run of this kind would tell."""
+    unseen = ", ".join(c.name for c in world.kind.channels if c.name not in world.channels)
+    instead = f"record {unseen} besides" if unseen else "measure one of the causes directly"
+    return (
+        f"No run of this kind would tell {mine} from {other}: "
+        f"their predictions agree within the noise; {instead}"
+    )
+
+
+def _runs(world: World) -> Iterator[_Run]:
     """Runs like the first one, with more or less of what an experimenter has in hand."""
     track = world.tracks[0]
+    yield _longer(track)
+    yield from _elsewhere(world, track)
+    yield from _driven(track)
+
+
+def _longer(track: Track) -> _Run:
     times = track.scenario.times
-    longer = np.concatenate([times, times[-1] + (times[1:] - times[0])])
-    longest = {n: np.concatenate([u, u[1:]]) for n, u in track.scenario.inputs.items()}
-    yield (
-        "Record twice as long",
-        {"seconds": float(longer[-1] - longer[0])},
-        replace(track.scenario, times=longer, inputs=longest),
-        track.guess,
-    )
-    for name, unit in ((n, u) for n, u in zip(world.states, _units(world), strict=True)):
-        place = world.states.index(name)
-        for share in (0.3, 2.0, -1.0):
+    twice = np.concatenate([times, times[-1] + (times[1:] - times[0])])
+    # The inputs are given once more from the beginning.
+    inputs = {n: np.concatenate([u, u[1:]]) for n, u in track.scenario.inputs.items()}
+    scenario = replace(track.scenario, times=twice, inputs=inputs)
+    change = {"seconds": float(twice[-1] - twice[0])}
+    return _Run("Record twice as long", change, scenario, track.guess)
+
+
+def _elsewhere(world: World, track: Track) -> Iterator[_Run]:
+    """Started from elsewhere, one state at a time."""
+    system = world.simulator.system
+    height = len(system.coordinates) - 1
+    for place, (name, unit) in enumerate(zip(world.states, _units(world), strict=True)):
+        above_ground = system.bounces and place == height
+        for share in STARTS:
+            # Nothing is let go below the ground.
+            if above_ground and share < 0:
+                continue
             states = track.guess.copy()
-            states[place] = share * states[place] if abs(states[place]) > 0.05 else share
-            if (
-                world.simulator.system.bounces
-                and place == len(world.simulator.system.coordinates) - 1
-            ):
-                if share < 0:
-                    continue
-                states[place] = max(states[place], 1.0)
-            yield (
-                f"Start with {name} = {states[place]:.3g} {unit}",
-                {name: float(states[place])},
-                track.scenario,
-                states,
-            )
+            moving = abs(states[place]) > AT_REST
+            states[place] = share * states[place] if moving else share
+            if above_ground:
+                states[place] = max(states[place], LOWEST)
+            says = f"Start with {name} = {states[place]:.3g} {unit}"
+            yield _Run(says, {name: float(states[place])}, track.scenario, states)
+
+
+def _driven(track: Track) -> Iterator[_Run]:
+    """Driven more or less, one input at a time."""
     for name, signal in track.scenario.inputs.items():
-        for share in (0.3, 3.0):
+        for share in INPUTS:
             inputs = {**track.scenario.inputs, name: share * signal}
-            says = f"Make the input {name} {'smaller' if share < 1 else 'larger'}, {share:g} times what it was"
-            yield says, {name: share}, replace(track.scenario, inputs=inputs), track.guess
+            size = "smaller" if share < 1 else "larger"
+            says = f"Make the input {name} {size}, {share:g} times what it was"
+            scenario = replace(track.scenario, inputs=inputs)
+            yield _Run(says, {name: share}, scenario, track.guess)
 
 
 def _units(world: World) -> list[str]:
+    """Units of the states: of coordinates, of their rates, of what else there is."""
     system = world.simulator.system
     units = {channel.name: channel.unit for channel in world.kind.channels}
     lengths = [units.get(name, "m") for name in system.coordinates]
@@ -92,18 +156,21 @@ def _units(world: World) -> list[str]:
     return [*lengths, *rates]
 
 
-def _apart(
-    world: World, scenario: Scenario, states: Array, model: Model, rival: Model, sigma: Array
-) -> float:
-    theta = np.delete(np.stack([model.fit.theta, rival.fit.theta]), world.base[world.own :], axis=1)
-    freed = [p.name for p in world.freed]
-    scenarios = [
-        replace(scenario, constants={**scenario.constants, **dict(zip(freed, fitted, strict=True))})
-        for fitted in (m.fit.theta[world.own : world.base.size].tolist() for m in (model, rival))
-    ]
+def _apart(world: World, run: _Run, model: Model, rival: Model, sigma: Array) -> float:
+    """How far apart two models are on a run, (1)."""
+    both = [model.fit.theta, rival.fit.theta]
+    # Freed constants are fitted with the parameters, and reach the simulator as constants.
+    theta = np.delete(np.stack(both), world.base[world.own :], axis=1)
+    scenarios = []
+    for fitted in both:
+        values = fitted[world.own : world.base.size].tolist()
+        freed = dict(zip((p.name for p in world.freed), values, strict=True))
+        constants = {**run.scenario.constants, **freed}
+        scenarios.append(replace(run.scenario, constants=constants))
     initial = {
-        name: np.full(2, value) for name, value in zip(world.states, states.tolist(), strict=True)
+        name: np.full(2, value)
+        for name, value in zip(world.states, run.states.tolist(), strict=True)
     }
     seen = world.simulator.simulate_lanes(theta, scenarios, initial)
     world.simulations += 2
-    return float(np.sqrt(np.square((seen[0] - seen[1]) / sigma).mean()))
+    return float(np.sqrt(np.square((seen[0] - seen[1]) / sigma).mean()))  # (1)

@@ -1,201 +1,225 @@
-"""What verdict.json says: the causes, the numbers and their intervals, the held-out gain, the
-ranked candidates.
-"""
+"""The verdict: what explain answers, as an object and as verdict.json."""
 
 from __future__ import annotations
 
-import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bench.gap.causes.name import Finding
-from bench.gap.causes.score_test import tail
-from bench.gap.causes.search import Search
-from bench.gap.measure import Gain, gain, intervals
-from bench.gap.model.floor import Floor
-from bench.gap.model.models import Model
-from bench.gap.model.world import World
-from bench.gap.propose import next_experiment
-from sims.base import Array
+from bench.gap.causes.rules import MEANING, VerdictName
+from bench.gap.propose import Experiment
 from sims.extended import Number
-from sims.recording.recording import Recording
+
+Document = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Answer:
-    """Puts a finding into numbers.
+@dataclass(frozen=True, repr=False)
+class Cause:
+    """One effect that the simulator lacks.
 
     Attributes:
-        recording: what was explained.
-        fitting, measuring: its runs; None where none are held out.
-        floor: the noise.
-        engine: the engine's name; None for a simulator that steps itself.
+        effect: its name.
+        alternatives: effects that would explain the same share as well, the most plausible first.
+        says: the effect in a sentence that a person understands.
+        coefficients: its fitted numbers with their 95 % intervals, by name.
+        p_value: chance of a gain like its own if it were not there.
     """
 
-    recording: Recording
-    fitting: World
-    measuring: World | None
-    floor: Floor
-    engine: str | None
+    effect: str
+    alternatives: tuple[str, ...]
+    says: str
+    coefficients: Mapping[str, Number]
+    p_value: float
 
-    def verdict(
-        self, search: Search, finding: Finding, rng: np.random.Generator, started: float
-    ) -> dict[str, Any]:
-        """What verdict.json says; `started` is `time.perf_counter` at the beginning."""
-        world = self.fitting
-        numbers = self.numbers(search, finding.model)
-        causes = []
-        for cause in finding.causes:
-            effect = world.effects[cause.effect]
-            there = effect.on(world.simulator.system)
-            names = [c.name for c in there]
-            places = range(*world.slots[cause.effect].indices(len(world.parameters)))
-            causes.append(
-                {
-                    "effect": cause.effect,
-                    "alternatives": list(cause.alternatives),
-                    "says": effect.says,
-                    "coefficients": {
-                        n: _estimate(numbers[i]) for n, i in zip(names, places, strict=True)
-                    },
-                    "p_value": cause.p_value,
-                }
-            )
-        simulations = world.simulations + (self.measuring.simulations if self.measuring else 0)
-        result = {
-            "verdict": finding.verdict,
-            "system": self.recording.system,
-            "engine": self.engine or "its own",
-            "causes": causes,
-            "parameters": {
-                world.parameters[i].name: _estimate(numbers[i]) for i in world.base.tolist()
-            },
-            "heldout": self._heldout(finding, rng),
-            "candidates": self._candidates(search, finding),
-            "next_experiment": self._next(search, finding),
-            "simulations": int(simulations),
-            "seconds": 0.0,
+    def document(self) -> Document:
+        """As in verdict.json."""
+        return {
+            "effect": self.effect,
+            "alternatives": list(self.alternatives),
+            "says": self.says,
+            "coefficients": _estimates(self.coefficients),
+            "p_value": self.p_value,
         }
-        result["seconds"] = time.perf_counter() - started
-        return result
 
-    def numbers(self, search: Search, model: Model) -> dict[int, Number]:
-        """Every parameter and coefficient by its place; without an interval where it was not
-        fitted.
-        """
-        world = self.fitting
-        known = intervals(search, model)
-        result = {}
-        for place, parameter in enumerate(world.parameters):
-            value, low, high = known.get(place, (float(model.fit.theta[place]), np.nan, np.nan))
-            bounded = np.isfinite(low) and np.isfinite(high)
-            result[place] = Number(
-                value, parameter.unit, low if bounded else None, high if bounded else None
-            )
-        return result
-
-    def _counted(self) -> list[int]:
-        """Channels that share the unit of the one that sensor effects act on."""
-        world = self.fitting
-        units = [c.unit for c in world.simulator.channels]
-        reading = world.simulator.system.reading(world.channels)
-        return [c for c, unit in enumerate(units) if unit == units[world.channels.index(reading)]]
-
-    def sigma(self, finding: Finding) -> Array:
-        """(C,) the noise floor: stated, or what a model that leaves no structure leaves."""
-        left = finding.model.likelihood.sigma
-        usable = ~self.floor.stated & np.isfinite(left) & (left > self.floor.sigma)
-        return np.where(usable & (not finding.remains.structure), left, self.floor.sigma)
-
-    def _heldout(self, finding: Finding, rng: np.random.Generator) -> dict[str, Any] | None:
-        if (
-            self.measuring is None
-            or finding.measured is None
-            or finding.model.names not in finding.measured
-        ):
-            return None
-        counted = self._counted()
-        floor = float(np.sqrt(np.square(self.sigma(finding)[counted]).mean()))
-        before, after = (finding.measured[names].simulated for names in ((), finding.model.names))
-        if not (np.isfinite(before[np.isfinite(self.measuring.observed)]).all()):
-            return None
-        found = gain(self.measuring, before, after, counted, floor, rng)
-        return _heldout(found, self.fitting.simulator.channels[counted[0]].unit)
-
-    def _candidates(self, search: Search, finding: Finding) -> list[dict[str, Any]]:
-        """Every effect of the library with its evidence about the base model, the strongest first."""
-        if frozenset() not in search.scanned:
-            return []
-        scores = search.scanned[frozenset()][1]
-        base = search.models[frozenset()].likelihood.value
-        rows = []
-        for i, effect in enumerate(scores.effects):
-            alone = search.models.get(frozenset({effect}))
-            score = float(scores.score[i])
-            if alone is not None:
-                score = max(score, float(alone.likelihood.value - base))
-            p_value = tail(scores.by_chance, np.array([score - scores.chance[i]]))
-            rows.append(
-                {
-                    "effect": effect,
-                    "score": max(score, 0.0),
-                    "p_value": float(np.clip(p_value, 0.0, 1.0)),
-                    "heldout_gain": self._share(finding, (effect,)),
-                }
-            )
-        return sorted(rows, key=lambda row: -row["score"])
-
-    def _share(self, finding: Finding, names: tuple[str, ...]) -> float | None:
-        """Share of the held-out gap that a model closes; None where it was not measured."""
-        if self.measuring is None or finding.measured is None or names not in finding.measured:
-            return None
-        counted, seen = self._counted(), np.isfinite(self.measuring.observed)
-        floor = float(np.sqrt(np.square(self.sigma(finding)[counted]).mean()))
-        before, after = (
-            float(
-                np.sqrt(
-                    np.square(
-                        (self.measuring.observed - s)[..., counted][seen[..., counted]]
-                    ).mean()
-                )
-            )
-            for s in (finding.measured[()].simulated, finding.measured[names].simulated)
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Cause:
+        """From verdict.json."""
+        return cls(
+            document["effect"],
+            tuple(document["alternatives"]),
+            document["says"],
+            _numbers(document["coefficients"]),
+            document["p_value"],
         )
-        share = (before - max(after, floor)) / (before - floor) if before > floor * 1.001 else 0.0
-        return float(np.clip(share, -9.0, 1.0)) if np.isfinite(share) else None
 
-    def _next(self, search: Search, finding: Finding) -> dict[str, Any] | None:
-        if finding.verdict == "unidentifiable":
-            names = " and ".join(finding.vague)
-            differently = (
-                "they act differently from each other"
-                if len(finding.vague) > 1
-                else "it makes a difference"
-            )
-            return {"says": f"Measure {names} apart, or record runs in which {differently}"}
-        for cause in finding.causes:
-            for other in cause.alternatives:
-                rest = {n for n in finding.model.names if n != cause.effect}
-                rival = search.models.get(frozenset({*rest, other}))
-                if rival is not None:
-                    return next_experiment(search, finding.model, rival)
-        return None
+    def __repr__(self) -> str:
+        names = " or ".join([self.effect, *self.alternatives])
+        numbers = [f"{name} = {_short(number)}" for name, number in self.coefficients.items()]
+        return f"Cause({names}: {', '.join(numbers)})"
 
 
-def _estimate(number: Number) -> dict[str, Any]:
-    return {"value": number.value, "unit": number.unit, "low": number.low, "high": number.high}
+@dataclass(frozen=True, repr=False)
+class Heldout:
+    """Errors on held-out runs; None where the data give no number.
+
+    Attributes:
+        rmse_base: of the tuned base model, in the unit.
+        rmse_extended: of the extended model.
+        noise_floor: what a perfect model would leave.
+        gap_closed: (base - extended) / (base - floor).
+        low: end of its 95 % interval.
+        high: the other end.
+        unit: of the errors; empty if unknown.
+    """
+
+    rmse_base: float | None
+    rmse_extended: float | None
+    noise_floor: float | None
+    gap_closed: float | None
+    low: float | None
+    high: float | None
+    unit: str = ""
+
+    def document(self) -> Document:
+        """As in verdict.json, where what is no number is null."""
+        numbers = {
+            "rmse_base": self.rmse_base,
+            "rmse_extended": self.rmse_extended,
+            "noise_floor": self.noise_floor,
+            "gap_closed": self.gap_closed,
+            "low": self.low,
+            "high": self.high,
+        }
+        return {**numbers, "unit": self.unit}
+
+    def __repr__(self) -> str:
+        change = f"{_figure(self.rmse_base)} -> {_figure(self.rmse_extended)} {self.unit}".rstrip()
+        return f"Heldout({change}, floor {_figure(self.noise_floor)}, closed {_figure(self.gap_closed)})"
 
 
-def _heldout(found: Gain, unit: str) -> dict[str, Any] | None:
-    """As in verdict.json; an interval that the data do not give is null."""
-    values = {
-        "rmse_base": found.base,
-        "rmse_extended": found.extended,
-        "noise_floor": found.floor,
-        "gap_closed": found.closed,
-        "low": found.low,
-        "high": found.high,
+@dataclass(frozen=True, repr=False)
+class Candidate:
+    """One effect of the library, and the evidence for it about the base model.
+
+    Attributes:
+        effect: its name.
+        score: twice the gain in log likelihood by it alone.
+        p_value: chance of the best score of a library being as high with nothing missing.
+        heldout_gain: share of the gap on held-out runs that it closes alone; None if not measured.
+    """
+
+    effect: str
+    score: float
+    p_value: float
+    heldout_gain: float | None
+
+    def document(self) -> Document:
+        """As in verdict.json."""
+        return {
+            "effect": self.effect,
+            "score": self.score,
+            "p_value": self.p_value,
+            "heldout_gain": self.heldout_gain,
+        }
+
+    def __repr__(self) -> str:
+        return f"Candidate({self.effect}: score {self.score:.3g}, p {self.p_value:.2g})"
+
+
+@dataclass(frozen=True, repr=False)
+class Verdict:
+    """What explain answers.
+
+    Attributes:
+        verdict: one of six words.
+        system: of the recording.
+        engine: that stepped the simulator; ``its own`` where it steps itself.
+        causes: what the simulator lacks, strongest first.
+        parameters: the base parameters with their 95 % intervals, by name.
+        heldout: the gain on held-out runs; None where there are none, or the simulation failed.
+        candidates: the library, the strongest first; empty where nothing was scored.
+        next_experiment: what to record next; None where nothing is open.
+        simulations: how many were spent.
+        seconds: how long it took.
+    """
+
+    verdict: VerdictName
+    system: str
+    engine: str
+    causes: tuple[Cause, ...]
+    parameters: Mapping[str, Number]
+    heldout: Heldout | None
+    candidates: tuple[Candidate, ...]
+    next_experiment: Experiment | None
+    simulations: int
+    seconds: float
+
+    @property
+    def says(self) -> str:
+        """What the word means, in one sentence."""
+        return MEANING[self.verdict]
+
+    def document(self) -> Document:
+        """The content of verdict.json."""
+        proposed = self.next_experiment
+        return {
+            "verdict": self.verdict,
+            "system": self.system,
+            "engine": self.engine,
+            "causes": [cause.document() for cause in self.causes],
+            "parameters": _estimates(self.parameters),
+            "heldout": self.heldout.document() if self.heldout is not None else None,
+            "candidates": [candidate.document() for candidate in self.candidates],
+            "next_experiment": proposed.document() if proposed is not None else None,
+            "simulations": self.simulations,
+            "seconds": self.seconds,
+        }
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Verdict:
+        """From the content of a verdict.json that explain has written."""
+        heldout, proposed = document["heldout"], document["next_experiment"]
+        return cls(
+            document["verdict"],
+            document["system"],
+            document["engine"],
+            tuple(Cause.of(cause) for cause in document["causes"]),
+            _numbers(document["parameters"]),
+            Heldout(**heldout) if heldout is not None else None,
+            tuple(Candidate(**candidate) for candidate in document["candidates"]),
+            Experiment(**proposed) if proposed is not None else None,
+            document["simulations"],
+            document["seconds"],
+        )
+
+    def __repr__(self) -> str:
+        names = ", ".join(" or ".join([c.effect, *c.alternatives]) for c in self.causes)
+        found = f": {names}" if names else ""
+        return f"Verdict({self.verdict}{found}; {self.system}, {self.simulations} simulations)"
+
+
+def finite(value: float) -> float | None:
+    """A number as JSON has it: None where the data gave none."""
+    return value if np.isfinite(value) else None
+
+
+def _estimates(numbers: Mapping[str, Number]) -> Document:
+    """Numbers as in verdict.json, by name."""
+    return {
+        name: {"value": n.value, "unit": n.unit, "low": n.low, "high": n.high}
+        for name, n in numbers.items()
     }
-    return {**{k: v if np.isfinite(v) else None for k, v in values.items()}, "unit": unit}
+
+
+def _numbers(document: Mapping[str, Any]) -> dict[str, Number]:
+    return {name: Number(**estimate) for name, estimate in document.items()}
+
+
+def _short(number: Number) -> str:
+    return f"{number.value:.3g} {number.unit}"
+
+
+def _figure(value: float | None) -> str:
+    return "?" if value is None else f"{value:.3g}"

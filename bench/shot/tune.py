@@ -187,7 +187,7 @@ def _explained(recording: Path) -> tuple[Model, Effects]:
     reason = f"{found.verdict}: {', '.join(acting) or 'nothing'}"
     restitution = found.extended.parameters["restitution"].value
     seconds = perf_counter() - started
-    simulations = int(found.answer["simulations"])
+    simulations = found.answer.simulations
     model = Model(EXPLAINED, restitution, carried, simulations, seconds, "done", reason)
     return model, acting
 

@@ -47,7 +47,7 @@ def _answer(item, explain):
         try:
             found = getattr(importlib.import_module(module), function)(
                 path, system=None, engine="batch"
-            ).answer
+            ).answer.document()
             row["verdict"] = {name: value for name, value in found.items() if name != "candidates"}
         except Exception:
             row["error"] = traceback.format_exc(limit=-4)

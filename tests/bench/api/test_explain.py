@@ -16,12 +16,10 @@ def test_a_recording_is_explained_from_memory_as_from_its_file(swing, tmp_path):
     swing.write(tmp_path / "swing.csv")
     found = [simgap.explain(one) for one in (swing, swing.recording, tmp_path / "swing.csv")]
     assert [one.verdict for one in found] == ["named"] * 3
-    (cause,) = (
-        found[0].answer if isinstance(found[0].answer, dict) else found[0].answer.document()
-    )["causes"]
-    assert cause["effect"] == "drag.linear"
-    low, high = (cause["coefficients"]["coefficient"][end] for end in ("low", "high"))
-    assert low < 8e-4 < high
+    (cause,) = found[0].causes
+    assert cause.effect == "drag.linear"
+    drag = cause.coefficients["coefficient"]
+    assert drag.low < 8e-4 < drag.high
     # In the file numbers have nine digits.
     values = [one.extended.effects["drag.linear"]["coefficient"].value for one in found]
     assert values[0] == values[1] == pytest.approx(values[2], rel=1e-5)

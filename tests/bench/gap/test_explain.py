@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bench.gap.explain import explain
+from bench.gap.verdict import Verdict
 from bench.recordings.simulate import make
 from bench.registry import load_plugins, simulators
 from sims.base import InputError, Scenario
@@ -28,13 +29,15 @@ pytestmark = pytest.mark.usefixtures("fresh_registries")
 def explained(path, **options):
     """What explain finds, its verdict checked against the design's form."""
     found = explain(path, **options)
-    schema.check(json.dumps(found.answer, allow_nan=False))
-    assert found.story.verdict == found.answer
+    document = found.answer.document()
+    schema.check(json.dumps(document, allow_nan=False))
+    assert found.story.verdict == document
+    assert Verdict.of(document) == found.answer
     return found
 
 
 def names(found):
-    return [cause["effect"] for cause in found.answer["causes"]]
+    return [cause.effect for cause in found.causes]
 
 
 def noisy(seed=0, sigma=(0.003, 0.02)):
@@ -71,16 +74,16 @@ def test_too_short_a_recording_is_one_line(tmp_path):
 def test_many_runs_of_few_samples_have_a_verdict(tmp_path):
     runs = [part for k in range(4) for part in swings(np.arange(5) / 20, 3, seed=k)]
     found = explained(table(tmp_path, runs, noise=NOISE))
-    assert found.answer["verdict"] in ("adequate", "ambiguous")
-    assert found.answer["parameters"]["inertia"]["value"] == pytest.approx(3.3e-3, rel=0.1)
+    assert found.verdict in ("adequate", "ambiguous")
+    assert found.answer.parameters["inertia"].value == pytest.approx(3.3e-3, rel=0.1)
 
 
 @pytest.mark.parametrize("place", [0.0, 0.5])
 def test_a_recording_in_which_nothing_changes_says_so(tmp_path, place):
     found = explained(table(tmp_path, [(TIMES, 0 * TIMES + place, 0 * TIMES)] * 3))
-    assert found.answer["verdict"] == "unidentifiable"
+    assert found.verdict == "unidentifiable"
     assert found.story.vague == ("inertia",)
-    assert found.answer["next_experiment"]["says"] == (
+    assert found.answer.next_experiment.says == (
         "Measure inertia apart, or record runs in which it makes a difference"
     )
 
@@ -88,11 +91,11 @@ def test_a_recording_in_which_nothing_changes_says_so(tmp_path, place):
 def test_a_pendulum_that_is_held_aside_is_not_explained_by_one_name(tmp_path):
     runs = [(TIMES, 0.5 + q, qd) for q, qd in map(noisy, range(3))]
     found = explained(table(tmp_path, runs, noise=NOISE))
-    assert found.answer["verdict"] != "named"
-    if found.answer["causes"]:
+    assert found.verdict != "named"
+    if found.causes:
         assert {"force.bias", "input.bias"} <= {
             names(found)[0],
-            *found.answer["causes"][0]["alternatives"],
+            *found.causes[0].alternatives,
         }
 
 
@@ -110,23 +113,23 @@ def test_a_run_without_samples_is_one_line_and_one_without_a_channel_is_used(tmp
     found = explained(
         table(tmp_path, [runs[0], (*runs[1][:2], np.nan * TIMES), runs[2]], noise=NOISE)
     )
-    assert found.answer["parameters"]["inertia"]["value"] == pytest.approx(3.3e-3, rel=5e-3)
-    assert found.answer["verdict"] in ("adequate", "ambiguous")
+    assert found.answer.parameters["inertia"].value == pytest.approx(3.3e-3, rel=5e-3)
+    assert found.verdict in ("adequate", "ambiguous")
 
 
 def test_clean_swings_are_adequate(tmp_path):
     found = explained(table(tmp_path, swings(), noise=NOISE))
-    assert found.answer["verdict"] == "adequate"
-    inertia = found.answer["parameters"]["inertia"]
-    assert inertia["low"] < 3.3e-3 < inertia["high"]
-    assert inertia["high"] - inertia["low"] < 0.02 * 3.3e-3
-    assert found.answer["heldout"]["rmse_base"] == pytest.approx(0.003, rel=0.15)
+    assert found.verdict == "adequate"
+    inertia = found.answer.parameters["inertia"]
+    assert inertia.low < 3.3e-3 < inertia.high
+    assert inertia.high - inertia.low < 0.02 * 3.3e-3
+    assert found.answer.heldout.rmse_base == pytest.approx(0.003, rel=0.15)
 
 
 def test_a_gain_of_a_thousand_is_not_named_wrongly(tmp_path):
     runs = [(times, 1e3 * q, 1e3 * qd) for times, q, qd in swings()]
     found = explained(table(tmp_path, runs))
-    assert found.answer["verdict"] in ("unknown", "unidentifiable", "partial")
+    assert found.verdict in ("unknown", "unidentifiable", "partial")
 
 
 def test_values_that_cannot_be_are_one_line(tmp_path):
@@ -144,38 +147,38 @@ def test_what_does_not_fit_the_system_at_all_is_unknown(tmp_path):
     walks = [np.cumsum(0.05 * rng.standard_normal(60)) for _ in range(2)]
     runs = [(TIMES[:60], walk, 0.3 * rng.standard_normal(60)) for walk in walks]
     found = explained(table(tmp_path, runs, noise=NOISE))
-    assert found.answer["verdict"] == "unknown"
+    assert found.verdict == "unknown"
     assert any("channel q still misses by" in line for line in found.story.remains)
-    assert found.answer["heldout"]["rmse_extended"] > 10 * 0.003
+    assert found.answer.heldout.rmse_extended > 10 * 0.003
 
 
 def test_a_single_run_holds_its_last_third_out(tmp_path):
     (run,) = swings(np.arange(180) / 60, 1, {"drag.linear": 1.5e-3})
     found = explained(table(tmp_path, [run], noise=NOISE))
     assert names(found) == ["drag.linear"]
-    drag = found.answer["causes"][0]["coefficients"]["coefficient"]
-    assert drag["value"] == pytest.approx(1.5e-3, rel=0.03)
-    assert drag["low"] < 1.5e-3 < drag["high"]
-    held_out = found.answer["heldout"]
-    assert held_out["gap_closed"] > 0.9
-    assert held_out["low"] <= held_out["gap_closed"] <= held_out["high"]
+    drag = found.causes[0].coefficients["coefficient"]
+    assert drag.value == pytest.approx(1.5e-3, rel=0.03)
+    assert drag.low < 1.5e-3 < drag.high
+    held_out = found.answer.heldout
+    assert held_out.gap_closed > 0.9
+    assert held_out.low <= held_out.gap_closed <= held_out.high
     assert found.story.held_out.times[0][0] == pytest.approx(2.0)
 
 
 def test_a_free_swing_does_not_fix_gravity_and_length_besides(tmp_path):
     path = table(tmp_path, swings(), noise=NOISE)
     found = explained(path, free=("gravity", "length"))
-    assert found.answer["verdict"] == "unidentifiable"
+    assert found.verdict == "unidentifiable"
     assert set(found.story.vague) >= {"gravity", "length"}
-    says = found.answer["next_experiment"]["says"]
+    says = found.answer.next_experiment.says
     assert says.startswith("Measure ")
     assert says.endswith("apart, or record runs in which they act differently from each other")
     for name in ("gravity", "length"):
-        assert found.answer["parameters"][name]["low"] is None
+        assert found.answer.parameters[name].low is None
     one = explained(path, free=("gravity",))
-    assert one.answer["verdict"] == "unidentifiable", "only the ratio to the inertia shows"
+    assert one.verdict == "unidentifiable", "only the ratio to the inertia shows"
     assert one.story.vague == ("inertia", "gravity")
-    assert one.answer["parameters"]["gravity"]["low"] is None
+    assert one.answer.parameters["gravity"].low is None
 
 
 def test_a_torque_that_is_known_fixes_gravity(tmp_path):
@@ -187,18 +190,18 @@ def test_a_torque_that_is_known_fixes_gravity(tmp_path):
         )[0]
         runs.append((TIMES, *(seen + rng.standard_normal(seen.shape) * [0.003, 0.02]).T, push))
     found = explained(table(tmp_path, runs, noise=NOISE, inputs=("u",)), free=("gravity",))
-    assert found.answer["verdict"] == "adequate"
-    assert found.answer["parameters"]["gravity"]["value"] == pytest.approx(8.0, rel=0.01)
-    assert found.answer["parameters"]["inertia"]["value"] == pytest.approx(3.3e-3, rel=0.01)
-    assert found.extended.constants["gravity"] == found.answer["parameters"]["gravity"]["value"]
+    assert found.verdict == "adequate"
+    assert found.answer.parameters["gravity"].value == pytest.approx(8.0, rel=0.01)
+    assert found.answer.parameters["inertia"].value == pytest.approx(3.3e-3, rel=0.01)
+    assert found.extended.constants["gravity"] == found.answer.parameters["gravity"].value
 
 
 def test_other_engines_explain_too(tmp_path):
     path = table(tmp_path, swings(np.arange(40) / 40, 2), noise=NOISE)
     found = explained(path, engine="mujoco")
-    assert found.answer["engine"] == "mujoco"
-    assert found.answer["verdict"] in ("adequate", "ambiguous")
-    assert found.answer["parameters"]["inertia"]["value"] == pytest.approx(3.3e-3, rel=0.02)
+    assert found.answer.engine == "mujoco"
+    assert found.verdict in ("adequate", "ambiguous")
+    assert found.answer.parameters["inertia"].value == pytest.approx(3.3e-3, rel=0.02)
 
 
 def test_what_takes_no_effects_is_refused(tmp_path, spring):
@@ -227,13 +230,11 @@ def test_a_plugins_simulator_without_forces_is_explained(tmp_path):
     )
     write(truth, tmp_path / "bob.csv")
     found = explained(tmp_path / "bob.csv")
-    assert found.answer["engine"] == "its own"
-    assert {"drag.linear", "friction.coulomb"}.isdisjoint(
-        c["effect"] for c in found.answer["candidates"]
-    )
-    cause = found.answer["causes"][0]
-    assert "input.gain" in (cause["effect"], *cause["alternatives"])
-    assert {"stiffness", "damping"} == set(found.answer["parameters"])
+    assert found.answer.engine == "its own"
+    assert {"drag.linear", "friction.coulomb"}.isdisjoint(c.effect for c in found.answer.candidates)
+    cause = found.causes[0]
+    assert "input.gain" in (cause.effect, *cause.alternatives)
+    assert {"stiffness", "damping"} == set(found.answer.parameters)
 
 
 @pytest.mark.slow
@@ -244,8 +245,8 @@ def test_a_plugins_simulator_with_forces_is_explained(tmp_path):
     truth = Wish("puck", ["0.3"], ["drag.linear=0.15"], noise=["0.002"], initial=["v=0.2:1"])
     write(replace(truth, runs=2, seconds=0.8, rate=25), path)
     found = explained(path)
-    cause = found.answer["causes"][0]
-    assert "drag.linear" in (cause["effect"], *cause["alternatives"])
+    cause = found.causes[0]
+    assert "drag.linear" in (cause.effect, *cause.alternatives)
 
 
 def test_an_extended_simulator_is_scored_and_explained_as_its_system(tmp_path):
@@ -277,12 +278,9 @@ def test_an_extended_simulator_is_scored_and_explained_as_its_system(tmp_path):
         explain(path)
     again = explained(path, system="pendulum")
     assert names(again) == ["drag.linear"]
-    drag = again.answer["causes"][0]["coefficients"]["coefficient"]
-    assert (
-        drag["low"]
-        < found.answer["causes"][0]["coefficients"]["coefficient"]["value"]
-        < drag["high"]
-    )
+    drag = again.causes[0].coefficients["coefficient"]
+    first = found.causes[0].coefficients["coefficient"]
+    assert drag.low < first.value < drag.high
 
 
 def test_a_recording_is_not_changed(tmp_path):
@@ -291,4 +289,4 @@ def test_a_recording_is_not_changed(tmp_path):
     one, two = (explained(path, seed=seed) for seed in (0, 0))
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
     assert one.extended == two.extended
-    assert {**one.answer, "seconds": 0} == {**two.answer, "seconds": 0}
+    assert replace(one.answer, seconds=0) == replace(two.answer, seconds=0)

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from bench.gap import explanation
 from bench.gap.explanation import Explanation
+from bench.gap.verdict import Verdict
 from sims.base import InputError
 from sims.extended import Extended, Number
 from tests.bench.gap.stories import DRAG, EVIL, TILT, evil, story
@@ -29,7 +30,7 @@ EXTENDED = Extended(
 
 
 def explanation_of(story):
-    return Explanation(story.verdict, story, EXTENDED)
+    return Explanation(Verdict.of(story.verdict), story, EXTENDED)
 
 
 @pytest.fixture
@@ -39,8 +40,8 @@ def named():
 
 def test_its_parts_can_be_asked_for(named):
     assert named.verdict == "named"
-    assert [cause["effect"] for cause in named.causes] == ["drag.linear"]
-    assert named.answer["simulations"] == 1412
+    assert [cause.effect for cause in named.causes] == ["drag.linear"]
+    assert named.answer.simulations == 1412
 
 
 def test_shown_as_text_it_is_three_lines(named):
@@ -119,7 +120,7 @@ def test_it_is_written_into_a_folder_that_is_made(named, tmp_path):
     names = [f"{n}{e}" for n in named.figures for e in (".png", ".pdf")]
     assert [p.name for p in paths] == ["verdict.json", "extended.toml", *names, "report.html"]
     assert sorted(folder.iterdir()) == sorted(paths), "nothing else is left there"
-    assert json.loads(paths[0].read_text()) == named.answer
+    assert json.loads(paths[0].read_text()) == named.answer.document()
     again = named.write(folder)
     assert again == paths
 

@@ -31,12 +31,12 @@ def test_the_same_cause_is_named(system, engine, tmp_path):
     )
     path = tmp_path / "data.csv"
     write(wish, path)
-    verdict = explain(path, engine=engine).answer
-    assert verdict["engine"] == engine
-    (cause,) = verdict["causes"]
+    answer = explain(path, engine=engine).answer
+    assert answer.engine == engine
+    (cause,) = answer.causes
     name, size = effect.split("=")
-    assert name in (cause["effect"], *cause["alternatives"])
-    assert verdict["verdict"] in ("named", "ambiguous")
-    if cause["effect"] == name:
-        found = cause["coefficients"]["coefficient"]
-        assert found["value"] == pytest.approx(float(size), rel=0.2)
+    assert name in (cause.effect, *cause.alternatives)
+    assert answer.verdict in ("named", "ambiguous")
+    if cause.effect == name:
+        found = cause.coefficients["coefficient"]
+        assert found.value == pytest.approx(float(size), rel=0.2)

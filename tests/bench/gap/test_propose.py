@@ -36,22 +36,22 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
     made = small_swing(effects=["drag.quadratic=2e-4"])
     search, model, rival = rivals(made, [0.003, 0.02], effects, free=free)
     found = next_experiment(search, model, rival)
-    assert found["apart"] > TELLING
-    assert found["change"]
+    assert found.apart > TELLING
+    assert found.change
     said = re.fullmatch(
-        r"(.*): there drag.linear and drag.quadratic differ by (.*) times the noise", found["says"]
+        r"(.*): there drag.linear and drag.quadratic differ by (.*) times the noise", found.says
     )
-    assert float(said[2]) == pytest.approx(found["apart"], rel=0.01)
+    assert float(said[2]) == pytest.approx(found.apart, rel=0.01)
     if free:
         return
     track = search.world.tracks[0]
     initial = dict(zip(("q", "qd"), track.guess.tolist(), strict=True)) | {
-        k: v for k, v in found["change"].items() if k in ("q", "qd")
+        k: v for k, v in found.change.items() if k in ("q", "qd")
     }
     times = track.scenario.times
-    if "seconds" in found["change"]:
+    if "seconds" in found.change:
         times = np.arange(2 * times.size - 1) / 60
-        assert found["change"]["seconds"] == pytest.approx(times[-1])
+        assert found.change["seconds"] == pytest.approx(times[-1])
     seen = [
         Pendulum(
             fixed={name: m.fit.theta[search.world.slots[name]].tolist()}, time_step=1e-3
@@ -59,24 +59,24 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
         for name, m in zip(effects, (model, rival), strict=True)
     ]
     apart = np.sqrt(np.square((seen[0] - seen[1]) / [0.003, 0.02]).mean())
-    assert apart == pytest.approx(found["apart"], rel=0.05)
+    assert apart == pytest.approx(found.apart, rel=0.05)
 
 
 def test_equal_models_are_not_told_apart_by_any_run():
     made = small_swing()
     search, model, _ = rivals(made, [0.003, 0.02], ("drag.linear", "drag.quadratic"))
     found = next_experiment(search, model, model)
-    assert found["apart"] == 0
-    assert found["change"] == {}
-    assert found["says"].startswith("No run of this kind would tell")
-    assert found["says"].endswith("measure one of the causes directly")
+    assert found.apart == 0
+    assert found.change == {}
+    assert found.says.startswith("No run of this kind would tell")
+    assert found.says.endswith("measure one of the causes directly")
 
 
 def test_what_is_not_recorded_is_proposed_where_no_run_would_do():
     search, model, _ = rivals(
         small_swing(observe=["q"], noise=["0.003"]), 0.003, ("drag.linear", "drag.quadratic")
     )
-    assert next_experiment(search, model, model)["says"].endswith("record qd besides")
+    assert next_experiment(search, model, model).says.endswith("record qd besides")
 
 
 def test_an_input_is_made_smaller_or_larger():
@@ -85,7 +85,7 @@ def test_an_input_is_made_smaller_or_larger():
     search, model, rival = rivals(made, 0.003, ("input.deadband", "friction.coulomb"))
     before = search.world.simulations
     found = next_experiment(search, model, rival)
-    assert np.isfinite(found["apart"])
+    assert np.isfinite(found.apart)
     assert search.world.simulations - before == 2 * (1 + 6 + 2), (
         "twice as long, each state three ways, the input two"
     )

@@ -1,0 +1,201 @@
+"""Puts what was found into numbers: intervals, the held-out gain, the ranked candidates."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.gap.causes.alternatives import Evidence
+from bench.gap.causes.name import Finding
+from bench.gap.causes.score_test import tail
+from bench.gap.causes.search import Search
+from bench.gap.measure import Gain, gain, intervals
+from bench.gap.model.floor import Floor
+from bench.gap.model.models import Model, Names
+from bench.gap.model.world import World
+from bench.gap.propose import Experiment, next_experiment
+from bench.gap.verdict import Candidate, Cause, Heldout, Verdict, finite
+from sims.base import Array
+from sims.extended import Number
+from sims.recording.recording import Recording
+
+WORST = -9.0
+"""A candidate's share of the held-out gap is cut here: it has made things worse, by whatever."""
+
+
+@dataclass(frozen=True)
+class Assessor:
+    """Puts a finding into numbers.
+
+    Attributes:
+        recording: what was explained.
+        fitting, measuring: its runs; None where none are held out.
+        floor: the noise.
+        engine: the engine's name; None for a simulator that steps itself.
+    """
+
+    recording: Recording
+    fitting: World
+    measuring: World | None
+    floor: Floor
+    engine: str | None
+
+    def verdict(
+        self, search: Search, finding: Finding, rng: np.random.Generator, started: float
+    ) -> Verdict:
+        """The verdict on a finding.
+
+        Args:
+            search: that has found it.
+            finding: what was found.
+            rng: of the bootstrap.
+            started: `time.perf_counter` at the beginning.
+        """
+        world = self.fitting
+        numbers = self.numbers(search, finding.model)
+        causes = tuple(self._cause(cause, numbers) for cause in finding.causes)
+        parameters = {world.parameters[i].name: numbers[i] for i in world.base.tolist()}
+        # Counted before an experiment is proposed: what that simulates is not part of the answer.
+        simulations = world.simulations + (self.measuring.simulations if self.measuring else 0)
+        heldout = self._heldout(finding, rng)
+        candidates = self._candidates(search, finding)
+        proposed = self._next(search, finding)
+        return Verdict(
+            finding.verdict,
+            self.recording.system,
+            self.engine or "its own",
+            causes,
+            parameters,
+            heldout,
+            candidates,
+            proposed,
+            int(simulations),
+            time.perf_counter() - started,
+        )
+
+    def numbers(self, search: Search, model: Model) -> dict[int, Number]:
+        """Every parameter and coefficient by its place; without an interval where it was not
+        fitted.
+        """
+        fitted = intervals(search, model)
+        result = {}
+        for place, parameter in enumerate(self.fitting.parameters):
+            given = float(model.fit.theta[place]), np.nan, np.nan
+            value, low, high = fitted.get(place, given)
+            bounded = np.isfinite(low) and np.isfinite(high)
+            interval = (low, high) if bounded else (None, None)
+            result[place] = Number(value, parameter.unit, *interval)
+        return result
+
+    def sigma(self, finding: Finding) -> Array:
+        """(C,) the noise floor: stated, or what a model that leaves no structure leaves."""
+        left = finding.model.likelihood.sigma
+        # The estimate takes noise for white, so what is left of a good model may exceed it.
+        usable = ~self.floor.stated & np.isfinite(left) & (left > self.floor.sigma)
+        return np.where(usable & (not finding.remains.structure), left, self.floor.sigma)
+
+    def _cause(self, evidence: Evidence, numbers: dict[int, Number]) -> Cause:
+        world = self.fitting
+        effect = world.effects[evidence.effect]
+        coefficients = effect.on(world.simulator.system)
+        places = range(*world.slots[evidence.effect].indices(len(world.parameters)))
+        by_name = {c.name: numbers[i] for c, i in zip(coefficients, places, strict=True)}
+        return Cause(evidence.effect, evidence.alternatives, effect.says, by_name, evidence.p_value)
+
+    def _counted(self) -> list[int]:
+        """Channels that share the unit of the one that sensor effects act on."""
+        world = self.fitting
+        units = [channel.unit for channel in world.simulator.channels]
+        reading = world.simulator.system.reading(world.channels)
+        # Errors of different units have no sum.
+        unit = units[world.channels.index(reading)]
+        return [c for c, other in enumerate(units) if other == unit]
+
+    def _floor_of(self, finding: Finding) -> float:
+        """RMS of the noise over the channels that count."""
+        return float(np.sqrt(np.square(self.sigma(finding)[self._counted()]).mean()))
+
+    def _heldout(self, finding: Finding, rng: np.random.Generator) -> Heldout | None:
+        runs, measured, names = self.measuring, finding.measured, finding.model.names
+        if runs is None or measured is None or names not in measured:
+            return None
+        before, after = measured[()].simulated, measured[names].simulated
+        # The base model failed there, so there is no gap to speak of.
+        if not np.isfinite(before[np.isfinite(runs.observed)]).all():
+            return None
+        counted = self._counted()
+        result = gain(runs, before, after, counted, self._floor_of(finding), rng)
+        return _heldout(result, self.fitting.simulator.channels[counted[0]].unit)
+
+    def _candidates(self, search: Search, finding: Finding) -> tuple[Candidate, ...]:
+        """Every effect of the library with its evidence about the base model, the strongest first."""
+        scanned = search.scanned.get(frozenset())
+        if scanned is None:
+            return ()
+        scores, base = scanned.scores, search.base.likelihood.value
+        rows = []
+        for i, effect in enumerate(scores.effects):
+            score = float(scores.score[i])
+            # A fit may gain more than the linear score promises: far from the data it often does.
+            alone = search.models.get(frozenset({effect}))
+            if alone is not None:
+                score = max(score, float(alone.likelihood.value - base))
+            p_value = tail(scores.by_chance, np.array([score - scores.chance[i]]))
+            p_value = float(np.clip(p_value, 0.0, 1.0))
+            share = self._share(finding, (effect,))
+            rows.append(Candidate(effect, max(score, 0.0), p_value, share))
+        return tuple(sorted(rows, key=lambda row: -row.score))
+
+    def _share(self, finding: Finding, names: Names) -> float | None:
+        """Share of the held-out gap that a model closes; None where it was not measured."""
+        runs, measured = self.measuring, finding.measured
+        if runs is None or measured is None or names not in measured:
+            return None
+        counted = self._counted()
+        floor = self._floor_of(finding)
+        before = _rmse(runs, measured[()].simulated, counted)
+        after = _rmse(runs, measured[names].simulated, counted)
+        share = (before - max(after, floor)) / (before - floor) if before > floor * 1.001 else 0.0
+        return float(np.clip(share, WORST, 1.0)) if np.isfinite(share) else None
+
+    def _next(self, search: Search, finding: Finding) -> Experiment | None:
+        """What to record next; None where nothing is open."""
+        if finding.verdict == "unidentifiable":
+            return _apart(finding.vague)
+        for cause in finding.causes:
+            for other in cause.alternatives:
+                rest = {name for name in finding.model.names if name != cause.effect}
+                rival = search.models.get(frozenset({*rest, other}))
+                if rival is not None:
+                    return next_experiment(search, finding.model, rival)
+        return None
+
+
+def _rmse(world: World, simulated: Array, channels: list[int]) -> float:
+    """Error over the channels that count, in their unit."""
+    seen = np.isfinite(world.observed)[..., channels]
+    error = (world.observed - simulated)[..., channels][seen]
+    return float(np.sqrt(np.square(error).mean()))
+
+
+def _apart(vague: tuple[str, ...]) -> Experiment:
+    """What would fix parameters that the data do not."""
+    several = len(vague) > 1
+    how = "they act differently from each other" if several else "it makes a difference"
+    names = " and ".join(vague)
+    return Experiment(f"Measure {names} apart, or record runs in which {how}")
+
+
+def _heldout(found: Gain, unit: str) -> Heldout:
+    """As in the verdict; an interval that the data do not give is None."""
+    return Heldout(
+        finite(found.base),
+        finite(found.extended),
+        finite(found.floor),
+        finite(found.closed),
+        finite(found.low),
+        finite(found.high),
+        unit,
+    )

@@ -1,0 +1,94 @@
+"""The verdict as an object: what verdict.json says of it, and what a person sees of it."""
+
+import json
+from dataclasses import FrozenInstanceError, replace
+
+import pytest
+
+from bench.gap.causes.rules import MEANING
+from bench.gap.propose import Experiment
+from bench.gap.verdict import Candidate, Cause, Heldout, Verdict, finite
+from sims.extended import Number
+from tests.bench.gap import schema
+from tests.bench.gap.stories import HELD_OUT, story
+
+DRAG = Cause(
+    "drag.linear",
+    ("friction.coulomb",),
+    "motion is resisted in proportion to speed",
+    {"coefficient": Number(2.2e-4, "N*m*s/rad", 2e-4, 2.4e-4)},
+    1e-9,
+)
+TURN = Verdict(
+    "ambiguous",
+    "pendulum",
+    "batch",
+    (DRAG,),
+    {"inertia": Number(3.4e-3, "kg*m^2", None, None)},
+    Heldout(0.37, 0.045, 0.01, 0.9, None, None, "rad"),
+    (Candidate("drag.linear", 812.4, 1e-9, 0.9), Candidate("wind", 0.5, 1.0, None)),
+    Experiment("Record twice as long", {"seconds": 8.0}, 4.0),
+    412,
+    2.1,
+)
+
+
+def test_the_document_is_that_of_verdict_json_in_its_order():
+    text = json.dumps(TURN.document(), allow_nan=False)
+    assert schema.check(text) == TURN.document()
+    assert text == (
+        '{"verdict": "ambiguous", "system": "pendulum", "engine": "batch", "causes": [{"effect":'
+        ' "drag.linear", "alternatives": ["friction.coulomb"], "says": "motion is resisted in'
+        ' proportion to speed", "coefficients": {"coefficient": {"value": 0.00022, "unit":'
+        ' "N*m*s/rad", "low": 0.0002, "high": 0.00024}}, "p_value": 1e-09}], "parameters":'
+        ' {"inertia": {"value": 0.0034, "unit": "kg*m^2", "low": null, "high": null}}, "heldout":'
+        ' {"rmse_base": 0.37, "rmse_extended": 0.045, "noise_floor": 0.01, "gap_closed": 0.9,'
+        ' "low": null, "high": null, "unit": "rad"}, "candidates": [{"effect": "drag.linear",'
+        ' "score": 812.4, "p_value": 1e-09, "heldout_gain": 0.9}, {"effect": "wind", "score": 0.5,'
+        ' "p_value": 1.0, "heldout_gain": null}], "next_experiment": {"says": "Record twice as'
+        ' long", "change": {"seconds": 8.0}, "apart": 4.0}, "simulations": 412, "seconds": 2.1}'
+    )
+
+
+@pytest.mark.parametrize("word", MEANING)
+def test_it_is_read_back_from_the_document(word):
+    document = story(word, heldout={**HELD_OUT, "unit": "rad"}).verdict
+    verdict = Verdict.of(json.loads(json.dumps(document)))
+    assert verdict.verdict == word
+    assert verdict.document() == document
+    assert list(verdict.document()) == list(document)
+    assert verdict.says == MEANING[word]
+    assert Verdict.of(TURN.document()) == TURN
+    assert Verdict.of(TURN.document()) != replace(TURN, seconds=2.2)
+
+
+def test_what_is_missing_is_null():
+    document = replace(TURN, heldout=None, next_experiment=None, causes=()).document()
+    assert (document["heldout"], document["next_experiment"]) == (None, None)
+    assert document["causes"] == []
+    measured_apart = Experiment("Measure inertia apart").document()
+    assert measured_apart == {"says": "Measure inertia apart"}
+    nowhere = Experiment("No run would tell", {}, 0.4).document()
+    assert nowhere == {"says": "No run would tell", "change": {}, "apart": 0.4}
+    assert finite(0.25) == 0.25
+    assert finite(float("nan")) is finite(float("inf")) is None
+
+
+def test_it_is_shown_on_a_line():
+    assert repr(TURN) == (
+        "Verdict(ambiguous: drag.linear or friction.coulomb; pendulum, 412 simulations)"
+    )
+    assert repr(replace(TURN, causes=(), verdict="adequate")) == (
+        "Verdict(adequate; pendulum, 412 simulations)"
+    )
+    assert repr(DRAG) == "Cause(drag.linear or friction.coulomb: coefficient = 0.00022 N*m*s/rad)"
+    assert repr(TURN.heldout) == "Heldout(0.37 -> 0.045 rad, floor 0.01, closed 0.9)"
+    assert repr(Heldout(None, 0.1, None, None, None, None)) == (
+        "Heldout(? -> 0.1, floor ?, closed ?)"
+    )
+    assert repr(TURN.candidates[0]) == "Candidate(drag.linear: score 812, p 1e-09)"
+
+
+def test_it_cannot_be_changed():
+    with pytest.raises(FrozenInstanceError):
+        TURN.verdict = "named"
