@@ -2,6 +2,8 @@
 
 from types import SimpleNamespace
 
+from bench.gap.verdict import Verdict
+
 ADEQUATE = {
     "verdict": "adequate", "system": "", "engine": "batch", "causes": [], "parameters": {}, "heldout": None,
     "candidates": [], "next_experiment": None, "simulations": 1, "seconds": 0.0,
@@ -12,7 +14,7 @@ def sees_nothing(path, system=None, engine="batch"):
     """Everything is adequate."""
     assert path.exists()
     assert path.with_suffix(".toml").exists()
-    return SimpleNamespace(answer=ADEQUATE)
+    return SimpleNamespace(answer=Verdict.of(ADEQUATE))
 
 
 def crashes(path, system=None, engine="batch"):
