@@ -11,13 +11,13 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from sims import effects as library
 from sims import files
-from sims.base import InputError, Parameter, Simulator, unknown
+from sims.base import InputError, Parameter, Simulator
 from sims.simulated import Simulated, effect_parameters
 from sims.user_toml import fault, finite, known, names, read_toml, table, text
 
@@ -26,6 +26,12 @@ FORMAT = 1
 
 SPREAD = 0.2
 """The training range of a fitted number reaches at least this share of it to either side."""
+
+WIDTHS = 3.0
+"""It reaches at least this many half widths of the number's interval to either side."""
+
+_SMALLEST = 1e-12
+"""It reaches at least this far, in the number's unit, or it would be empty about 0."""
 
 _KEYS = (
     "format",
@@ -52,10 +58,10 @@ class Number:
 
     def table(self) -> dict[str, Any]:
         """As TOML, which has no null."""
-        interval = (
-            {} if self.low is None or self.high is None else {"low": self.low, "high": self.high}
-        )
-        return {"value": self.value, "unit": self.unit, **interval}
+        stated: dict[str, Any] = {"value": self.value, "unit": self.unit}
+        if self.low is not None and self.high is not None:
+            stated |= {"low": self.low, "high": self.high}
+        return stated
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,8 @@ class Extended:
         effects: coefficients by effect, in the order in which a signal passes them.
         constants: as the recording states them, and fitted ones.
         observe: channels that the recording had.
+        kind: the simulator's class of its system, where it is known: what `opened` and explain give
+            knows it.
     """
 
     name: str
@@ -81,6 +89,20 @@ class Extended:
     effects: Mapping[str, Mapping[str, Number]]
     constants: Mapping[str, float]
     observe: Sequence[str]
+    # No part of what was fitted: a file names the system, and whoever reads it knows the class.
+    kind: type[Simulated] | None = field(default=None, compare=False, repr=False)
+
+    def simulator(self) -> Simulated:
+        """The fitted simulator, ready to simulate: its parameters' nominal values are the fitted
+        ones.
+
+        Raises:
+            InputError: the class of its system is not known.
+        """
+        if self.kind is None:
+            remedy = "open its file with sims.extended.opened, or use simulator_of"
+            raise InputError(f"{self.name}: the class of system {self.system} is unknown; {remedy}")
+        return simulator_of(self, self.kind)()
 
 
 def write(extended: Extended, path: Path) -> None:
@@ -200,18 +222,14 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
     Raises:
         InputError: a parameter, effect, coefficient, constant or channel that does not exist.
     """
-    places = [p.name for p in kind.parameters]
-    for name in extended.parameters:
-        if name not in places:
-            raise unknown(f"parameter of system {extended.system}", name, places)
-    values = _coefficients(extended, kind)
-    own = [
-        _at(p, extended.parameters[p.name]) if p.name in extended.parameters else p
-        for p in kind.parameters
-    ]
-    names, observed = list(extended.effects), list(extended.observe)
+    known(f"parameter of system {extended.system}", extended.parameters, _names(kind))
+    fitted = extended.parameters
+    own = [_at(p, fitted[p.name]) if p.name in fitted else p for p in kind.parameters]
+    effects, observed = list(extended.effects), list(extended.observe)
     engine_of: dict[str, Any] = {"engine": extended.engine} if extended.engine else {}
-    fresh = kind(extended.constants, observed, effects=names, **engine_of)
+    values = _coefficients(extended, kind)
+    # Made once, so that whatever it refuses is refused here; it knows the coefficients' bounds.
+    fresh = kind(extended.constants, observed, effects=effects, **engine_of)
     added = [_at(p, n) for p, n in zip(fresh.parameters[len(own) :], values, strict=True)]
     fresh.close()
 
@@ -221,8 +239,9 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
         observe: Sequence[str] | None = None,
         **settings: Any,
     ) -> None:
-        known = {**extended.constants, **(constants or {})}
-        kind.__init__(self, known, observe or observed, effects=names, **{**engine_of, **settings})
+        stated = {**extended.constants, **(constants or {})}
+        chosen = {**engine_of, **settings}
+        kind.__init__(self, stated, observe or observed, effects=effects, **chosen)
         self.parameters = (*own, *added)
 
     body = {
@@ -232,15 +251,19 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
         # All such classes come from this one text and may have one name: their numbers tell them
         # apart, or a tuner trained in the one would be taken for trained in the other.
         "source_digest": hashlib.sha256(_written(extended).encode()).hexdigest(),
-        "made_of": tuple(library.get(name) for name in names),
+        "made_of": tuple(library.get(name) for name in effects),
     }
-    made: type[Simulated] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
-    made.name = extended.name
-    made.says = (
-        f"{extended.system} with {', '.join(names) or 'nothing added'}, fitted to: {extended.title}"
-    )
-    made.parameters = (*own, *added)
-    return made
+    simulator: type[Simulated] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
+    # A class of a system takes these from the system when it is made.
+    simulator.name = extended.name
+    what = ", ".join(effects) or "nothing added"
+    simulator.says = f"{extended.system} with {what}, fitted to: {extended.title}"
+    simulator.parameters = (*own, *added)
+    return simulator
+
+
+def _names(kind: type[Simulated]) -> list[str]:
+    return [parameter.name for parameter in kind.parameters]
 
 
 def refuse_extended(kind: type[Simulated]) -> None:
@@ -257,23 +280,23 @@ def _coefficients(extended: Extended, kind: type[Simulated]) -> list[Number]:
     """Every coefficient in the simulator's order."""
     values = []
     for name, numbers in extended.effects.items():
-        there = library.get(name).on(kind.system)
-        for given in numbers:
-            if given not in [c.name for c in there]:
-                raise unknown(f"coefficient of effect {name}", given, [c.name for c in there])
-        for p, c in zip(
-            effect_parameters(library.get(name), kind.system, extended.observe), there, strict=True
-        ):
-            values.append(numbers.get(c.name, Number(0.0, p.unit, None, None)))
+        effect = library.get(name)
+        coefficients = effect.on(kind.system)
+        known(f"coefficient of effect {name}", numbers, [c.name for c in coefficients])
+        parameters = effect_parameters(effect, kind.system, extended.observe)
+        for parameter, coefficient in zip(parameters, coefficients, strict=True):
+            off = Number(0.0, parameter.unit, None, None)
+            values.append(numbers.get(coefficient.name, off))
     return values
 
 
 def _at(parameter: Parameter, number: Number) -> Parameter:
     """The parameter with a fitted number for its nominal value, and a training range around it."""
-    reach = max(SPREAD * abs(number.value), 1e-12)
+    reach = max(SPREAD * abs(number.value), _SMALLEST)
     if number.low is not None and number.high is not None:
-        reach = max(reach, 3.0 * (number.high - number.low) / 2.0)
+        reach = max(reach, WIDTHS * (number.high - number.low) / 2.0)
     low, high = parameter.bounds
+    # What was fitted may lie outside what the library holds plausible; the box takes it in.
     low, high = min(low, number.value), max(high, number.value)
     inner = (max(low, number.value - reach), min(high, number.value + reach))
     training = inner if inner[0] < inner[1] else None
@@ -309,6 +332,6 @@ def opened(path: Path, find: Find) -> tuple[Extended, type[Simulated], type[Simu
         if not issubclass(kind, Simulated):
             raise InputError(f"system {extended.system} takes no effects")
         refuse_extended(kind)
-        return extended, kind, simulator_of(extended, kind)
+        return replace(extended, kind=kind), kind, simulator_of(extended, kind)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -259,6 +259,7 @@ class _Explainer:
             added,
             {**self.recording.constants, **freed},
             world.channels,
+            self.kind,
         )
 
 

@@ -8,7 +8,7 @@ from bench.cli import main
 from bench.recordings.simulate import make
 from bench.registry import load_plugins, simulators
 from sims.base import InputError, Scenario
-from sims.extended import SPREAD, Extended, Number, load, opened, read, write
+from sims.extended import SPREAD, Extended, Number, load, opened, read, simulator_of, write
 from sims.pendulum.simulator import Pendulum
 from tests.wishes import Wish
 
@@ -59,6 +59,39 @@ def test_the_loaded_simulator_is_the_fitted_one_to_the_last_bit(path):
         "length": 0.15,
         "gravity": 9.7,
     }
+
+
+def test_what_was_opened_gives_its_simulator_ready(path):
+    extended, kind, _ = opened(path, simulators.get)
+    theta = np.array([[3.1e-3, 7e-4, 0.013]])
+    scenario = Scenario(np.arange(90) / 60, {"q": 1.1})
+    ready, loaded = extended.simulator(), load(path, simulators.get)()
+    assert [p.nominal for p in ready.parameters] == theta[0].tolist()
+    np.testing.assert_array_equal(ready.simulate(theta, scenario), loaded.simulate(theta, scenario))
+    assert extended.kind is kind is Pendulum
+    assert extended == read(path), "the class is no part of what was fitted"
+
+
+def test_what_was_read_alone_does_not_know_its_simulator(path):
+    with pytest.raises(InputError, match="the class of system pendulum is unknown; open its file"):
+        read(path).simulator()
+
+
+def test_a_class_is_told_by_what_was_fitted(path):
+    kind = load(path, simulators.get)
+    assert kind.source_digest == load(path, simulators.get).source_digest
+    drag = {"drag.linear": {"coefficient": Number(8e-4, "N*m*s/rad", None, None)}}
+    for change in (
+        {"system": "other"},
+        {"parameters": {"inertia": Number(3.1e-3, "kg*m^2", None, None)}},
+        {"effects": drag},
+        {"effects": dict(reversed(MODEL.effects.items()))},
+        {"constants": {**MODEL.constants, "mass": 0.3}},
+        {"observe": ["q", "qd"]},
+    ):
+        other = simulator_of(replace(MODEL, **change), Pendulum)
+        assert other.source_digest != kind.source_digest, change
+        assert len(other.source_digest) == 64
 
 
 def test_the_training_range_is_about_the_interval(path):

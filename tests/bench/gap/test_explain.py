@@ -266,6 +266,9 @@ def test_an_extended_simulator_is_scored_and_explained_as_its_system(tmp_path):
     np.testing.assert_array_equal(
         load(model, simulators.get)().simulate(theta, scenario), by_hand.simulate(theta, scenario)
     )
+    np.testing.assert_array_equal(
+        found.extended.simulator().simulate(theta, scenario), by_hand.simulate(theta, scenario)
+    )
     made = make(
         Wish("pendulum_extended", noise=["q=0.003", "qd=0.02"], runs=3, seconds=1.5, rate=60)
     ).recording
