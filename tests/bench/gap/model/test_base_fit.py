@@ -1,23 +1,27 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from bench.gap.model.base_fit import evenly, fit_base
 from sims.ball.simulator import Ball
 from sims.pendulum.simulator import Pendulum
-from tests.bench.gap.made import recorded, recording, white, world
+from tests.bench.gap.made import recorded, recording, white, with_runs, world
 
 TIMES = np.arange(90) / 60
+"""A second and a half."""
+
+
+def ball():
+    return Ball(observe=["x", "z"])
 
 
 @pytest.mark.parametrize("inertia", [1.0e-3, 1.7e-3, 3.0e-3, 5.0e-3, 7.5e-3, 1.0e-2])
 def test_any_inertia_in_the_bounds_is_found(inertia):
-    made = recorded(
-        Pendulum(), [inertia], [{"q": 0.9}, {"q": -2.0, "qd": 4.0}], TIMES, [0.003, 0.02], seed=1
-    )
+    # from a wrong inertia, the end of a wide swing may be anywhere
+    starts = [{"q": 0.9}, {"q": -2.0, "qd": 4.0}]
+    sigma = [0.003, 0.02]
+    made = recorded(Pendulum(), [inertia], starts, TIMES, sigma, seed=1)
     there = world(made, candidates=[])
-    base = fit_base(there, white(there, [0.003, 0.02]))
+    base = fit_base(there, white(there, sigma))
     assert base.fit.theta[0] == pytest.approx(inertia, rel=3e-3)
     samples = np.isfinite(there.observed).sum()
     assert base.fit.cost / samples == pytest.approx(1.0, abs=0.2)
@@ -27,7 +31,8 @@ def test_any_inertia_in_the_bounds_is_found(inertia):
 @pytest.mark.parametrize("restitution", [0.35, 0.93])
 def test_restitution_is_found_through_many_bounces(restitution):
     starts = [{"z": 2.5, "vx": 0.5}, {"z": 1.5, "vz": 1.0}]
-    made = recorded(Ball(observe=["x", "z"]), [restitution], starts, np.arange(150) / 60, 0.005)
+    times = np.arange(150) / 60
+    made = recorded(ball(), [restitution], starts, times, 0.005)
     there = world(made, candidates=[])
     base = fit_base(there, white(there, 0.005))
     assert base.fit.theta[0] == pytest.approx(restitution, abs=2e-3)
@@ -35,27 +40,20 @@ def test_restitution_is_found_through_many_bounces(restitution):
 
 
 def test_restitution_that_a_fall_does_not_touch_is_reported_and_stays_nominal():
-    made = recorded(
-        Ball(observe=["x", "z"]),
-        [0.9],
-        [{"z": 20.0, "vx": 1.0}, {"z": 25.0}],
-        np.arange(60) / 60,
-        0.005,
-    )
+    # a second of fall from there is five metres
+    starts = [{"z": 20.0, "vx": 1.0}, {"z": 25.0}]
+    times = np.arange(60) / 60
+    made = recorded(ball(), [0.9], starts, times, 0.005)
     there = world(made, candidates=[])
     base = fit_base(there, white(there, 0.005))
     assert base.untouched == frozenset({0})
     assert base.fit.theta[0] == there.nominal()[0] == 0.5
     assert base.fit.free.size == 0
     assert base.fit.cost / np.isfinite(there.observed).sum() == pytest.approx(1.0, abs=0.2)
-    hit = replace(
-        made,
-        runs=made.runs + recorded(Ball(observe=["x", "z"]), [0.9], [{"z": 1.0}], TIMES, 0.005).runs,
-    )
-    again = world(
-        replace(hit, runs=tuple(replace(r, name=str(i)) for i, r in enumerate(hit.runs))),
-        candidates=[],
-    )
+
+    # one run that lands is enough
+    hit = recorded(ball(), [0.9], [{"z": 1.0}], TIMES, 0.005)
+    again = world(with_runs(made, [*made.runs, *hit.runs]), candidates=[])
     touched = fit_base(again, white(again, 0.005))
     assert not touched.untouched
     assert touched.fit.theta[0] == pytest.approx(0.9, abs=5e-3)
@@ -66,6 +64,7 @@ def test_a_given_start_is_where_it_begins():
     there = world(made, candidates=[])
     noise = white(there, [0.003, 0.02])
     many = fit_base(there, noise)
+    # what the many starts have cost
     before = there.simulations
     one = fit_base(there, noise, np.array([5.9e-3]))
     assert one.fit.theta[0] == pytest.approx(many.fit.theta[0], rel=1e-4)

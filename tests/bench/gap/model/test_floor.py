@@ -25,18 +25,18 @@ def test_stated_noise_is_believed_and_the_rest_estimated():
 def test_held_out_runs_tell_of_the_sensor_too():
     made = recording(runs=2, seconds=1, rate=100, noise=["q=0.004", "qd=0.03"], seed=4)
     few = replace(made, noise={})
-    louder = changed(
-        made.runs[1], qd=lambda v: v + 0.3 * np.random.default_rng(0).normal(size=v.size)
-    )
+    noise = np.random.default_rng(0).normal(size=100)
+    louder = changed(made.runs[1], qd=lambda v: v + 0.3 * noise)
     assert floor_of(few).sigma[1] == pytest.approx(0.03, rel=0.2)
     assert floor_of(replace(few, runs=(made.runs[0], louder))).sigma[1] > 0.06
 
 
 def test_rounding_is_noise():
     made = recording(runs=2, seconds=2, rate=100)
-    rounded = tuple(changed(run, q=lambda v: np.round(v / 0.05) * 0.05) for run in made.runs)
-    found = floor_of(replace(made, runs=rounded))
+    rounded = [changed(run, q=lambda v: np.round(v / 0.05) * 0.05) for run in made.runs]
+    found = floor_of(replace(made, runs=tuple(rounded)))
     assert found.step[0] == pytest.approx(0.05)
+    # an even distribution over one step
     assert found.sigma[0] == pytest.approx(0.05 / 12**0.5, rel=0.4)
     assert found.step[1] == 0
 
@@ -45,6 +45,7 @@ def test_without_noise_the_floor_is_a_share_of_the_range():
     made = recording(runs=2, seconds=2, rate=200, initial=["q=1.5"])
     found = floor_of(made)
     values = np.concatenate([run.channels["q"] for run in made.runs])
+    # all but the outermost fiftieth on each side
     spread = np.ptp(np.quantile(values, [0.02, 0.98]))
     assert 0.99e-4 * spread <= found.sigma[0] < 1e-3 * spread
     stated = floor_of(replace(made, noise={"q": 1e-9}))
@@ -53,8 +54,8 @@ def test_without_noise_the_floor_is_a_share_of_the_range():
 
 def test_a_channel_without_samples_still_has_a_floor():
     made = recording(runs=2, seconds=1, rate=50, noise=["0.01"])
-    empty = tuple(changed(run, qd=lambda v: np.full_like(v, np.nan)) for run in made.runs)
-    found = floor_of(replace(made, runs=empty, noise={}))
+    empty = [changed(run, qd=lambda v: np.full_like(v, np.nan)) for run in made.runs]
+    found = floor_of(replace(made, runs=tuple(empty), noise={}))
     assert found.sigma[1] == pytest.approx(1e-3 * 10.0), (
         "a thousandth of the channel's typical size"
     )

@@ -1,4 +1,4 @@
-"""Short pieces of runs: what they are, why they are, and what they bring to the fits of whole runs."""
+"""Short pieces of runs: what they are, why they are, and what they bring to fits of whole runs."""
 
 from dataclasses import replace
 
@@ -14,9 +14,10 @@ from sims.pendulum.simulator import Pendulum
 from tests.bench.gap.made import recorded, searched, white, with_runs, world
 
 TIMES = np.arange(0, 12.0, 0.02)
-LONG = recorded(
-    Pendulum(), [0.0035], [{"q": 1.2}, {"q": -0.8, "qd": 2.0}], TIMES, noise=[0.002, 0.01]
-)
+SIGMA = [0.002, 0.01]
+"""Of angle and rate."""
+STARTS = [{"q": 1.2}, {"q": -0.8, "qd": 2.0}]
+LONG = recorded(Pendulum(), [0.0035], STARTS, TIMES, noise=SIGMA)
 
 
 def test_pieces_are_the_runs_cut_up_and_nothing_else():
@@ -40,15 +41,17 @@ def test_what_is_known_of_the_beginning_is_known_of_the_first_piece_alone():
 
 
 def test_runs_too_short_for_two_pieces_are_left_alone():
-    short = recorded(Pendulum(), [0.0035], [{"q": 1.2}], np.arange(39) * 0.02, noise=[0.002, 0.01])
+    # one sample less than two pieces need
+    times = np.arange(39) * 0.02
+    short = recorded(Pendulum(), [0.0035], STARTS[:1], times, noise=SIGMA)
     assert pieces(world(short)) is None
-    assert len(pieces(world(with_runs(short, [*short.runs, LONG.runs[0]]))).tracks) == 1 + PIECES
+    both = with_runs(short, [*short.runs, LONG.runs[0]])
+    assert len(pieces(world(both)).tracks) == 1 + PIECES
 
 
 def test_over_pieces_the_sum_of_squares_has_one_minimum_where_whole_runs_have_many():
     there = world(LONG)
     cut = pieces(there)
-    sigma = np.array([0.002, 0.01])
 
     def minima(some):
         inertias = np.geomspace(0.0028, 0.0047, 40)
@@ -57,11 +60,12 @@ def test_over_pieces_the_sum_of_squares_has_one_minimum_where_whole_runs_have_ma
             theta = some.nominal()
             theta[0] = inertia
             starts.append(Start((), theta, some.guess))
-        fits = Fitter(some, white(some, sigma), parameters=False).fit(starts, 8)
+        # at each inertia the initial states that suit it
+        fits = Fitter(some, white(some, SIGMA), parameters=False).fit(starts, 8)
         cost = np.array([f.cost for f in fits])
-        return int(((cost[1:-1] < cost[:-2]) & (cost[1:-1] < cost[2:])).sum()), inertias[
-            cost.argmin()
-        ]
+        left, here, right = cost[:-2], cost[1:-1], cost[2:]
+        lower = (here < left) & (here < right)
+        return int(lower.sum()), inertias[cost.argmin()]
 
     many, _ = minima(there)
     one, best = minima(cut)
@@ -73,13 +77,15 @@ def test_over_pieces_the_sum_of_squares_has_one_minimum_where_whole_runs_have_ma
 def test_a_fit_of_pieces_begins_that_of_whole_runs_with_their_first_pieces():
     there = world(LONG)
     cut = pieces(there)
+    # on whole runs the fit from here ends beside the truth
     theta = cut.nominal()
-    theta[0] = 0.0045  # on whole runs the fit from here ends beside the truth
-    noise = [0.002, 0.01]
-    found = Fitter(cut, white(cut, noise)).fit([Start((), theta, cut.guess)], 12)[0]
+    theta[0] = 0.0045
+    begun = Start((), theta, cut.guess)
+    found = Fitter(cut, white(cut, SIGMA)).fit([begun], 12)[0]
     start = whole(there, found)
     assert start.states.tolist() == found.states[[0, PIECES]].tolist()
-    fits = Fitter(there, white(there, noise)).fit([start, Start((), theta, there.guess)], 20)
+    without = Start((), theta, there.guess)
+    fits = Fitter(there, white(there, SIGMA)).fit([start, without], 20)
     assert fits[0].theta[0] == pytest.approx(0.0035, rel=1e-3)
     assert fits[1].cost > 100.0 * fits[0].cost
 
@@ -88,13 +94,8 @@ def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkey
     for module in (search, moves):
         monkeypatch.setattr(module, "NOMINATED", 1)
     dragged = Pendulum(effects=["drag.quadratic"])
-    data = recorded(
-        dragged,
-        [0.0035, 4e-7],
-        [{"q": 1.2}, {"q": -0.8, "qd": 2.0}, {"q": 2.0}],
-        TIMES[:250],
-        [0.002, 0.01],
-    )
+    starts = [*STARTS, {"q": 2.0}]
+    data = recorded(dragged, [0.0035, 4e-7], starts, TIMES[:250], SIGMA)
     library = [
         "drag.linear",
         "drag.quadratic",
@@ -102,7 +103,7 @@ def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkey
         "friction.load",
         "spring.linear",
     ]
-    looking, _ = searched(data, [0.002, 0.01], candidates=library)
+    looking, _ = searched(data, SIGMA, candidates=library)
     found = settle(looking, looking.run())
     tried = {n for names in looking.models for n in names}
     assert {"drag.linear", "friction.coulomb", "friction.load"} <= tried
@@ -110,7 +111,7 @@ def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkey
 
 
 def test_what_bounces_is_left_whole():
-    falls = recorded(
-        Ball(observe=["z"]), [0.6], [{"z": 2.0}, {"z": 3.0}], np.arange(200) * 0.02, noise=0.002
-    )
+    times = np.arange(200) * 0.02
+    starts = [{"z": 2.0}, {"z": 3.0}]
+    falls = recorded(Ball(observe=["z"]), [0.6], starts, times, noise=0.002)
     assert pieces(world(falls)) is None

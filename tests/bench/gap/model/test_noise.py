@@ -14,7 +14,8 @@ def holes(shape, share, seed):
 
 
 def autocorrelation(values, lag):
-    here, later = (values[..., :-lag, :], values[..., lag:, :]) if lag else (values, values)
+    length = values.shape[-2]
+    here, later = values[..., : length - lag, :], values[..., lag:, :]
     return float((here * later).mean() / np.square(values).mean())
 
 
@@ -23,6 +24,7 @@ def test_whitening_makes_noise_that_remembers_independent_and_of_variance_one(ph
     noise = Noise(np.array([0.3, 7.0]), np.full(2, phi))
     made = correlated(np.random.default_rng(1), phi, noise.sigma, (40, 500, 2))
     white = whitened(made, everything(made), noise)
+    # whatever its unit, each channel
     for c in range(2):
         assert white[:, :, c].std() == pytest.approx(1.0, abs=0.015)
     for lag in (1, 2, 3):
@@ -34,20 +36,25 @@ def test_whitening_makes_noise_that_remembers_independent_and_of_variance_one(ph
 
 def test_whitening_by_hand_starts_anew_across_a_hole():
     noise = Noise(np.array([2.0]), np.array([0.6]))
-    values = np.array([1.0, 2.0, 99.0, 4.0, 5.0]).reshape(1, 5, 1)
-    seen = np.array([1, 1, 0, 1, 1], dtype=bool).reshape(1, 5, 1)
-    white = whitened(values, seen, noise)[0, :, 0]
-    np.testing.assert_allclose(
-        white, [0.5, (1.0 - 0.3) / 0.8, 0.0, 2.0, (2.5 - 1.2) / 0.8], rtol=1e-14
-    )
+    # what was not seen may be anything
+    values = np.array([1.0, 2.0, 99.0, 4.0, 5.0])
+    seen = np.array([True, True, False, True, True])
+    white = whitened(values.reshape(1, 5, 1), seen.reshape(1, 5, 1), noise)
+    # in units of sigma the values are 0.5, 1, -, 2 and 2.5; the root of 1 - 0.6² is 0.8
+    expected = [
+        0.5,
+        (1.0 - 0.6 * 0.5) / 0.8,
+        0.0,
+        2.0,
+        (2.5 - 0.6 * 2.0) / 0.8,
+    ]
+    np.testing.assert_allclose(white[0, :, 0], expected, rtol=1e-14)
 
 
 def test_whitening_treats_derivatives_like_the_samples():
     rng = np.random.default_rng(3)
-    values, noise = (
-        rng.normal(size=(3, 20, 2, 4)),
-        Noise(np.array([0.1, 3.0]), np.array([0.5, -0.2])),
-    )
+    values = rng.normal(size=(3, 20, 2, 4))
+    noise = Noise(np.array([0.1, 3.0]), np.array([0.5, -0.2]))
     seen = holes((3, 20, 2), 0.2, 5)
     together = whitened(values, seen, noise)
     for k in range(4):
@@ -68,14 +75,11 @@ def test_likelihood_is_that_of_the_normal_distribution(share):
     )
     half = log_determinant(seen, phi)
     assert 2 * half == pytest.approx(-np.linalg.slogdet(correlation)[1], rel=1e-9)
-    for other in np.linspace(
-        -0.4, 0.98, 70
-    ):  # nowhere is it higher by more than its grid is coarse
+    # nowhere is it higher by more than its grid is coarse
+    for other in np.linspace(-0.4, 0.98, 70):
         correlation = covariance_of(seen[:, :, 0], other)
-        there = (
-            -count * np.log(r @ np.linalg.solve(correlation, r) / count)
-            - np.linalg.slogdet(correlation)[1]
-        )
+        variance = r @ np.linalg.solve(correlation, r) / count
+        there = -count * np.log(variance) - np.linalg.slogdet(correlation)[1]
         assert there < found.value + 0.1
 
 
@@ -94,16 +98,17 @@ def test_each_channel_has_its_own_noise_and_holes_do_not_spoil_it():
     found = likelihood(np.where(seen, made, 0.0), seen)
     np.testing.assert_allclose(found.phi, phi, atol=0.03)
     np.testing.assert_allclose(found.sigma, sigma, rtol=0.06)
-    apart = [
-        likelihood(np.where(seen, made, 0.0)[..., [c]], seen[..., [c]]).value for c in range(2)
-    ]
+    residual = np.where(seen, made, 0.0)
+    apart = [likelihood(residual[..., [c]], seen[..., [c]]).value for c in range(2)]
     assert found.value == pytest.approx(sum(apart), rel=1e-12)
 
 
 def test_lost_degrees_of_freedom_enlarge_sigma_and_leave_the_value():
     made = np.random.default_rng(10).normal(size=(2, 50, 1))
     full, fewer = likelihood(made, everything(made)), likelihood(made, everything(made), 19.0)
-    assert fewer.sigma[0] / full.sigma[0] == pytest.approx((100 / 81) ** 0.5, rel=1e-12)
+    # 19 of 100 samples are taken off
+    ratio = fewer.sigma[0] / full.sigma[0]
+    assert ratio == pytest.approx((100 / 81) ** 0.5, rel=1e-12)
     assert fewer.value == full.value
 
 
@@ -120,16 +125,20 @@ def test_a_channel_without_samples_is_left_out():
 def test_surrogates_keep_variance_and_autocorrelation():
     rng = np.random.default_rng(12)
     made = rng.standard_normal((6, 700, 2))
-    for t in range(2, 700):  # a second-order autoregression that rings, and white noise beside it
-        made[:, t, 0] += 1.2 * made[:, t - 1, 0] - 0.6 * made[:, t - 2, 0]
+    # a second-order autoregression that rings, and white noise beside it
+    ringing = made[:, :, 0]
+    for t in range(2, 700):
+        ringing[:, t] += 1.2 * ringing[:, t - 1] - 0.6 * ringing[:, t - 2]
     made *= [0.01, 5.0]
     like = surrogates(made, everything(made), 60, np.random.default_rng(0))
     assert like.shape == (60, 6, 700, 2)
-    np.testing.assert_allclose(like.std(axis=(0, 1, 2)), made.std(axis=(0, 1)), rtol=0.05)
+    spread = like.std(axis=(0, 1, 2))
+    np.testing.assert_allclose(spread, made.std(axis=(0, 1)), rtol=0.05)
     for lag in range(1, 9):
         for c in range(2):
             kept = autocorrelation(like[..., [c]], lag)
-            assert kept == pytest.approx(autocorrelation(made[..., [c]], lag), abs=0.05), (lag, c)
+            own = autocorrelation(made[..., [c]], lag)
+            assert kept == pytest.approx(own, abs=0.05), (lag, c)
     apart = np.corrcoef(like[:, 0, :, 0])[np.triu_indices(60, 1)]
     assert abs(apart.mean()) < 0.01, "one surrogate tells nothing of another"
 
@@ -137,9 +146,9 @@ def test_surrogates_keep_variance_and_autocorrelation():
 def test_surrogates_are_the_same_for_a_seed_and_zero_where_nothing_was_seen():
     made = correlated(np.random.default_rng(13), 0.6, 1.0, (3, 100, 1))
     seen = holes(made.shape, 0.2, 14)
-    one, two, other = (
-        surrogates(np.where(seen, made, 0.0), seen, 7, np.random.default_rng(s)) for s in (5, 5, 6)
-    )
+    residual = np.where(seen, made, 0.0)
+    generators = [np.random.default_rng(seed) for seed in (5, 5, 6)]
+    one, two, other = (surrogates(residual, seen, 7, rng) for rng in generators)
     np.testing.assert_array_equal(one, two)
     assert not np.array_equal(one, other)
     assert (one[:, ~seen] == 0).all()
@@ -148,10 +157,14 @@ def test_surrogates_are_the_same_for_a_seed_and_zero_where_nothing_was_seen():
 
 def test_surrogates_of_nothing_are_nothing():
     seen = np.ones((1, 30, 1), dtype=bool)
-    assert not surrogates(np.zeros((1, 30, 1)), seen, 5, np.random.default_rng(0)).any()
-    few = surrogates(
-        np.array([1.0, -2.0, 3.0]).reshape(1, 3, 1), seen[:, :3], 9, np.random.default_rng(0)
-    )
+    nothing = np.zeros((1, 30, 1))
+    assert not surrogates(nothing, seen, 5, np.random.default_rng(0)).any()
+
+
+def test_surrogates_of_few_samples_are_those_samples():
+    seen = np.ones((1, 3, 1), dtype=bool)
+    values = np.array([1.0, -2.0, 3.0]).reshape(1, 3, 1)
+    few = surrogates(values, seen, 9, np.random.default_rng(0))
     assert set(np.abs(few).ravel()) <= {1.0, 2.0, 3.0}
 
 
@@ -161,9 +174,8 @@ def test_first_order_noise_is_told_from_structure_that_is_as_large():
     for seed in range(40):
         rng = np.random.default_rng(seed)
         noise = correlated(rng, 0.7, np.array([1.0, 5.0]), seen.shape)
-        wave = np.sin(np.arange(300) / 15.0 + rng.uniform(0, 6))[None, :, None] * np.ones(
-            seen.shape
-        )
+        wave = np.sin(np.arange(300) / 15.0 + rng.uniform(0, 6))[None, :, None]
+        # as loud as the first channel's noise, the same in all runs
         mixed = rng.standard_normal(seen.shape) * np.array([1.0, 5.0]) + 1.2 * wave
         for name, values in (("noise", noise), ("structure", mixed)):
             chances[name].append(forgets(values, seen, likelihood(values, seen)))
