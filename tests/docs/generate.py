@@ -1,19 +1,26 @@
 """Writes the pages below docs/reference from the code: commands from the parser, keys of an
-experiment from its fields and docstrings.
+experiment and of verdict.json from fields and docstrings, thresholds from the rules.
 
 Run by `python -m tests.docs.generate`; a test says when it has to be.
 """
 
 import argparse
+import ast
 import dataclasses
 import inspect
 import re
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any, Literal, get_args, get_origin, get_type_hints, is_typeddict
 
 from bench.cli import parser
+from bench.gap.causes import rules
+from bench.gap.causes.rules import MEANING
+from bench.gap.propose import Experiment as NextExperiment
+from bench.gap.verdict import Candidate, Cause, Heldout, Verdict
 from bench.problem.experiment import Experiment
 from bench.shot.settings import Settings
+from sims.extended import Number
 from tests.docs.pages import DOCS
 
 COMMAND = "python -m tests.docs.generate"
@@ -196,9 +203,86 @@ def default(field):
     return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
 
 
+# The verdict.
+
+KINDS = {
+    Cause: "a cause",
+    Number: "an estimate",
+    Heldout: "the gain on held-out runs",
+    Candidate: "a candidate",
+    NextExperiment: "the next experiment",
+}
+"""Objects in verdict.json, as the page calls them."""
+ESTIMATE = {
+    "value": "fitted",
+    "unit": "of the three numbers",
+    "low": "of its 95 % interval; null where the data do not bound it",
+    "high": "the other end",
+}
+"""A number says this in one sentence, which a table needs by its fields."""
+
+
+def verdict_keys():
+    """The six verdicts, every key of verdict.json, and the thresholds of the rules."""
+    words_of = [("verdict", "says"), *((f"`{name}`", text) for name, text in MEANING.items())]
+    parts = [
+        "What `simgap explain` writes for programs: one JSON object with these keys and no others; "
+        "in Python `found.answer`. How it is found is on the page [explain.md](../explain.md).",
+        "## The six verdicts",
+        table(*words_of),
+        "## The keys",
+        json_keys(Verdict, attributes(Verdict)),
+    ]
+    for cls, name in KINDS.items():
+        says = ESTIMATE if cls is Number else attributes(cls)
+        parts += [f"## {name[0].upper()}{name[1:]}", json_keys(cls, says)]
+    parts += ["`change` and `apart` are left out where no run is proposed."]
+    parts += ["## Thresholds of the rules", "In `bench/gap/causes/rules.py`.", thresholds(rules)]
+    return page("verdict.json", *parts)
+
+
+def json_keys(cls, says):
+    """A dataclass's fields as keys of a JSON object."""
+    rows = [("key", "type", "what")]
+    for field in dataclasses.fields(cls):
+        what = says[field.name].replace("``", "`").replace("None", "null").removesuffix(".")
+        rows.append((f"`{field.name}`", of_json(hints(cls)[field.name]), what))
+    return table(*rows)
+
+
+def of_json(hint):
+    """A type as one would say it of JSON."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if hint in KINDS:
+        return KINDS[hint]
+    if origin is Literal:
+        return "text"
+    if inspect.isclass(origin) and issubclass(origin, Mapping):
+        return f"object: by name, {of_json(inner[-1])}"
+    if inspect.isclass(origin) and issubclass(origin, Sequence):
+        return f"list of {of_json(inner[0]).removeprefix('a ')}s"
+    if inner:
+        return " or ".join(of_json(part) for part in inner)
+    return "null" if hint is type(None) else WORDS[hint]
+
+
+def thresholds(module):
+    """The numbers that a module names in capitals, each with its sentence."""
+    rows = [("threshold", "value", "what")]
+    body = ast.parse(inspect.getsource(module)).body
+    for statement, behind in pairwise(body):
+        sentence_behind = isinstance(behind, ast.Expr) and isinstance(behind.value, ast.Constant)
+        if isinstance(statement, ast.Assign) and sentence_behind:
+            (name,) = statement.targets
+            value = ast.literal_eval(statement.value)
+            rows.append((f"`{name.id}`", f"{value:g}", " ".join(behind.value.value.split())))
+    return table(*rows)
+
+
 PAGES = {
     "reference/commands.md": commands,
     "reference/experiment.md": experiment_keys,
+    "reference/verdict.md": verdict_keys,
 }
 """What writes each page."""
 

@@ -193,7 +193,7 @@ def test_the_camera_of_a_film(tmp_path):
 def test_the_verdict(explained):
     page = text_of("reference/verdict.md")
     answer = json.loads((explained / "out" / "verdict.json").read_text(encoding="utf-8"))
-    assert list(answer) == told("# verdict.json", page)
+    assert list(answer) == told("## The keys", page)
     (inertia,) = answer["parameters"].values()
     assert list(inertia) == told("## An estimate", page)
     assert list(answer["causes"][0]) == told("## A cause", page)
