@@ -130,7 +130,7 @@ class Assessor:
         return _heldout(result, self.fitting.simulator.channels[counted[0]].unit)
 
     def _candidates(self, search: Search, finding: Finding) -> tuple[Candidate, ...]:
-        """Every effect of the library with its evidence about the base model, the strongest first."""
+        """The whole library with its evidence about the base model, the strongest first."""
         scanned = search.scanned.get(frozenset())
         if scanned is None:
             return ()

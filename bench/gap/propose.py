@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.gap.model.models import Model, Models
-from bench.gap.model.world import Track, World
+from bench.gap.model.tracks import Track
+from bench.gap.model.world import World
 from sims.base import Array, Scenario
 
 TELLING = 2.0

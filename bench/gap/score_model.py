@@ -36,7 +36,8 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
     extended, kind, _ = opened(model, simulators.get)
     if (other := system_of(recording)) not in (extended.system, extended.name):
         raise InputError(
-            f"{recording}: expected a recording of {extended.system}, as {model} is; found one of {other}"
+            f"{recording}: expected a recording of {extended.system}, as {model} is; "
+            f"found one of {other}"
         )
     data = read_recording(recording, kind, whole=True)
     data = replace(data, constants={**extended.constants, **data.constants})

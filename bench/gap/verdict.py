@@ -96,7 +96,8 @@ class Heldout:
 
     def __repr__(self) -> str:
         change = f"{_figure(self.rmse_base)} -> {_figure(self.rmse_extended)} {self.unit}".rstrip()
-        return f"Heldout({change}, floor {_figure(self.noise_floor)}, closed {_figure(self.gap_closed)})"
+        floor, closed = _figure(self.noise_floor), _figure(self.gap_closed)
+        return f"Heldout({change}, floor {floor}, closed {closed})"
 
 
 @dataclass(frozen=True, repr=False)

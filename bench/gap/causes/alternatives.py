@@ -74,7 +74,7 @@ class Alternatives:
         )
 
     def _p_value(self, rest: Model, effect: str, gain: float) -> float:
-        """Chance of such a gain, or of the best score of the library, about the model without it."""
+        """Chance of such a gain, or of the best score of all, about the model without it."""
         search, key = self.search, frozenset(rest.names)
         known = search.scanned.get(key)
         scores = search.scan(rest) if known is None else known.scores
@@ -117,7 +117,7 @@ class Alternatives:
         return behind
 
     def _is_plausible(self, effect: str) -> bool:
-        """Whether the coefficients with which an effect explains the gap are what one would expect."""
+        """Whether an effect explains the gap with coefficients that one would expect."""
         world = self.search.world
         having = [m for m in self.search.models.values() if effect in m.names]
         if not having:

@@ -4,6 +4,13 @@ of it may begin.
 An effect's coefficients scale it (a drag), shape it (a period), or modify it (the speed of a wind
 without which there is drag in still air). Those that scale give a direction each; those that shape
 or modify are laid on a grid, since a trajectory says nothing of them while the effect is off.
+
+With y(c) the simulated runs at coefficients c, the direction of a coefficient that scales is
+
+    d = (y(c) - y(0)) / c                                                                      (1)
+
+at a c so small that y is linear in it; where an effect has no such c (a limit changes nothing until
+the input reaches it) the direction is the whole change at one size, and holds there alone.
 """
 
 from __future__ import annotations
@@ -26,11 +33,16 @@ LEVELS = (0.15, 0.35, 0.6, 0.85, 0.95, 0.99)
 """Shares of the largest input at which limits, dead bands and plays are tried besides."""
 NOTHING = 1e-11
 """Share of the largest observation below which a change is rounding."""
-SHAPES, FREQUENCIES, SPREAD = 12, 96, 1.5
-"""Sizes tried of a shape, frequencies at most, and how much closer slow ones lie than fast ones, as
-a power.
-"""
+SHAPES = 12
+"""Sizes tried of a shape."""
+FREQUENCIES = 96
+"""Frequencies tried at most."""
+SPREAD = 1.5
+"""How much closer slow frequencies lie than fast ones, as a power."""
 MODIFIED = (-0.7, -0.25, 0.0, 0.25, 0.7)
+"""Shares of its plausible range at which a coefficient that modifies is tried."""
+SHIFTS = (-1.0, -0.5, 0.5, 1.0)
+"""Cycles over the longest run by which what repeats is made faster or slower."""
 
 
 @dataclass(frozen=True)
@@ -74,48 +86,74 @@ def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
     """
     probes = [probe for name in names for probe in _first(world, name)]
     values = _responses(world, at, probes)
-    moves = _moving(world, probes, values)
-    again = list(_modified(world, probes, moves))
-    kept = np.flatnonzero(moves)
-    probes, values = [probes[i] for i in kept], values[..., kept]
-    if again:
-        more = _responses(world, at, again)
-        probes, values = [*probes, *again], np.concatenate([values, more], axis=3)
+    acting = _acting(world, probes, values)
+    # Only the first answers say which coefficients modify, and only of effects that act at all.
+    modified = list(_modified(world, probes, acting))
+    places = np.flatnonzero(acting)
+    probes, values = [probes[i] for i in places], values[..., places]
+    if modified:
+        more = _responses(world, at, modified)
+        probes, values = [*probes, *modified], np.concatenate([values, more], axis=3)
     return Directions(tuple(probes), values)
 
 
 def _first(world: World, name: str) -> Iterator[Probe]:
-    parameters = effect_parameters(world.effects[name], world.simulator.system, world.channels)
+    """Every coefficient that scales an effect, at every shape, a little of it each."""
+    parameters = _parameters(world, name)
+    # A coefficient that cannot be zero does not scale: it says where or how the others act.
     shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
+    scaling = [i for i in range(len(parameters)) if i not in shaping]
     grids = [_grid(world, parameters[i]) for i in shaping]
     group = 0
     for point in product(*grids):
-        for place, p in enumerate(parameters):
-            if place in shaping:
-                continue
+        for place in scaling:
+            low, high = parameters[place].bounds
             c = np.zeros(len(parameters))
             c[shaping] = point
-            c[place] = SMALL * p.bounds[1]
-            yield Probe(name, group, place, c, p.bounds[0] < 0)
+            c[place] = SMALL * high
+            yield Probe(name, group, place, c, low < 0)
         group += 1
-    if world.effects[name].coefficients[0].of == "input" and parameters[0].bounds[0] == 0:
-        largest = max(
-            float(np.abs(next(iter(t.scenario.inputs.values()), np.zeros(1))).max())
-            for t in world.tracks
-        )
-        for level in LEVELS:
-            if largest > 0:
-                yield Probe(name, group, 0, np.array([level * largest]), False, True)
-                group += 1
+    of_input = world.effects[name].coefficients[0].of == "input"
+    if of_input and parameters[0].bounds[0] == 0:
+        yield from _limits(world, name, group)
+
+
+def _limits(world: World, name: str, group: int) -> Iterator[Probe]:
+    """Limits, dead bands and plays of a size that the input reaches."""
+    largest = max(_largest_input(world))
+    if not largest > 0:
+        return
+    for number, level in enumerate(LEVELS, start=group):
+        yield Probe(name, number, 0, np.array([level * largest]), False, True)
+
+
+def _largest_input(world: World) -> Iterator[float]:
+    """Of each run, of its first input."""
+    for track in world.tracks:
+        signal = next(iter(track.scenario.inputs.values()), np.zeros(1))
+        yield float(np.abs(signal).max())
+
+
+def _parameters(world: World, name: str) -> Sequence[Parameter]:
+    """The coefficients of an effect, with their units and plausible ranges."""
+    return effect_parameters(world.effects[name], world.simulator.system, world.channels)
 
 
 def _grid(world: World, parameter: Parameter) -> Array:
+    """Sizes to try of a coefficient that shapes."""
     low, high = parameter.bounds
     if parameter.unit == "Hz":
-        return _frequencies(min(max(low, CYCLES / world.longest), high / 2.0), high, world.longest)
-    if parameter.name.endswith(".period") and (travel := world.travel) > 0:
-        return 1.0 / _frequencies(1.0 / high, 1.0 / low, travel)
+        # What comes and goes must do so once in a run, or any slow change would be periodic.
+        slowest = min(max(low, CYCLES / world.longest), high / 2.0)
+        return _frequencies(slowest, high, world.longest)
+    if _is_period(world, parameter):
+        return 1.0 / _frequencies(1.0 / high, 1.0 / low, world.travel)
     return np.geomspace(low, high, SHAPES)
+
+
+def _is_period(world: World, parameter: Parameter) -> bool:
+    """Whether a coefficient is a period over position, of runs that go anywhere."""
+    return parameter.name.endswith(".period") and world.travel > 0
 
 
 def neighbours(world: World, fit: Fit) -> Iterator[Start]:
@@ -125,55 +163,65 @@ def neighbours(world: World, fit: Fit) -> Iterator[Start]:
     for name in fit.effects:
         for place in range(*world.slots[name].indices(len(world.parameters))):
             parameter, value = world.parameters[place], float(fit.theta[place])
-            for cycles in (-1.0, -0.5, 0.5, 1.0):
-                if parameter.unit == "Hz":
-                    moved = value + cycles / world.longest
-                elif parameter.name.endswith(".period") and world.travel > 0 and value > 0:
-                    moved = 1.0 / max(
-                        1.0 / value + cycles / world.travel, 1.0 / parameter.bounds[1]
-                    )
-                else:
-                    break
+            for moved in _shifted(world, parameter, value):
                 theta = fit.theta.copy()
                 theta[place] = np.clip(moved, *parameter.bounds)
                 yield Start(fit.effects, theta, fit.states)
 
 
+def _shifted(world: World, parameter: Parameter, value: float) -> Iterator[float]:
+    """A frequency or a period, by parts of a cycle faster and slower; nothing else."""
+    for cycles in SHIFTS:
+        if parameter.unit == "Hz":
+            yield value + cycles / world.longest
+        elif _is_period(world, parameter) and value > 0:
+            # A shift beyond the longest period would turn its sign.
+            yield 1.0 / max(1.0 / value + cycles / world.travel, 1.0 / parameter.bounds[1])
+
+
 def _frequencies(low: float, high: float, extent: float) -> Array:
     """Frequencies from low to high, half a cycle over the extent apart where they lie closest."""
     count = int(np.clip(2.0 * (high - low) * extent, 4, FREQUENCIES))
-    found: Array = low + (high - low) * np.linspace(0.0, 1.0, count) ** SPREAD
-    return found
+    frequencies: Array = low + (high - low) * np.linspace(0.0, 1.0, count) ** SPREAD
+    return frequencies
 
 
-def _moving(world: World, probes: Sequence[Probe], values: Array) -> Mask:
+def _acting(world: World, probes: Sequence[Probe], values: Array) -> Mask:
     """(K,) which probes change more than rounding does."""
-    sizes = np.array([1.0 if p.fixed else p.c[p.place] for p in probes])
-    changes = np.abs(values).max(axis=(0, 1), initial=0.0) * np.abs(sizes)
-    moving: Mask = (
-        changes > NOTHING * np.nanmax(np.abs(world.observed), axis=(0, 1))[:, None]
-    ).any(axis=0)
-    return moving
+    largest = np.abs(values).max(axis=(0, 1), initial=0.0)
+    changes = largest * np.abs(_sizes(probes))
+    rounding = NOTHING * np.nanmax(np.abs(world.observed), axis=(0, 1))
+    acting: Mask = (changes > rounding[:, None]).any(axis=0)
+    return acting
 
 
-def _modified(world: World, probes: Sequence[Probe], moves: Mask) -> Iterator[Probe]:
+def _sizes(probes: Sequence[Probe]) -> Array:
+    """(K,) of the coefficient that scales; one where the direction is the whole change."""
+    return np.array([1.0 if p.fixed else p.c[p.place] for p in probes])
+
+
+def _modified(world: World, probes: Sequence[Probe], acting: Mask) -> Iterator[Probe]:
     """Grid points of coefficients that change nothing by themselves but belong to an effect that
     acts.
     """
-    acting = {p.effect for p, m in zip(probes, moves, strict=True) if m}
-    idle: dict[str, list[Probe]] = {}
-    for p, m in zip(probes, moves, strict=True):
-        if not m and p.effect in acting and not p.fixed and p.group == 0:
-            idle.setdefault(p.effect, []).append(p)
-    for name, modifiers in idle.items():
-        first = next(p for p, m in zip(probes, moves, strict=True) if m and p.effect == name)
-        parameters = effect_parameters(world.effects[name], world.simulator.system, world.channels)
-        for group, point in enumerate(product(MODIFIED, repeat=len(modifiers)), start=1):
-            if any(point):
-                c = first.c.copy()
-                for modifier, share in zip(modifiers, point, strict=True):
-                    c[modifier.place] = share * parameters[modifier.place].bounds[1]
-                yield Probe(name, group, first.place, c, first.signed)
+    leading: dict[str, Probe] = {}
+    for probe, acts in zip(probes, acting, strict=True):
+        if acts:
+            leading.setdefault(probe.effect, probe)
+    modifiers: dict[str, list[Probe]] = {}
+    for probe, acts in zip(probes, acting, strict=True):
+        if not acts and probe.effect in leading and not probe.fixed and probe.group == 0:
+            modifiers.setdefault(probe.effect, []).append(probe)
+    for name, idle in modifiers.items():
+        first, parameters = leading[name], _parameters(world, name)
+        for group, point in enumerate(product(MODIFIED, repeat=len(idle)), start=1):
+            # All at zero is the effect as it was tried first.
+            if not any(point):
+                continue
+            c = first.c.copy()
+            for modifier, share in zip(idle, point, strict=True):
+                c[modifier.place] = share * parameters[modifier.place].bounds[1]
+            yield Probe(name, group, first.place, c, first.signed)
 
 
 def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
@@ -182,8 +230,7 @@ def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
     """
     changed = simulate_with(world, at, [(p.effect, p.c) for p in probes])
     values = np.nan_to_num(np.moveaxis(changed - at.simulated, 0, -1))
-    sizes = np.array([1.0 if p.fixed else p.c[p.place] for p in probes])
-    result: Array = values / sizes
+    result: Array = values / _sizes(probes)  # (1)
     return result
 
 
@@ -195,6 +242,7 @@ def simulate_with(world: World, at: Fit, added: Sequence[tuple[str, Array]]) -> 
     theta = np.tile(at.theta, (len(added), 1))
     for row, (name, c) in zip(theta, added, strict=True):
         row[world.slots[name]] = c
+    # All candidates of all runs in one call: the engine steps its lanes at once.
     seen = world.simulate(
         np.repeat(theta, runs, axis=0),
         np.tile(np.arange(runs), len(added)),

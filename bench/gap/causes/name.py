@@ -1,4 +1,4 @@
-"""Names the cause: asks one question after another, and says which of six verdicts the answers make.
+"""Names the cause: asks one question after another, and judges by the answers.
 
 Does anything move? Are the base parameters fixed? Which effects did the search find, and do they
 stand against their rivals? Do held-out runs bear them out? What would do as well? What is left? The
@@ -147,7 +147,7 @@ def _is_unexplained(search: Search, model: Model, left: Remains) -> bool:
 
 
 def closed(search: Search, model: Model, left: Remains) -> float:
-    """Share of the gap on the fitted runs that a model closes, all channels in units of their noise.
+    """Share of the gap on the fitted runs that a model closes, channels in units of noise.
 
     With b and a the RMS that the base model and this one leave in units of the noise, it is
     (b - max(a, 1)) / (b - 1); 0 where the base model leaves no gap.

@@ -20,9 +20,14 @@ from sims.base import Array
 
 WHITE = 3
 """So many of the best by sum of squares alone are refitted besides: far from the data, noise that
-remembers explains almost anything."""
+remembers explains almost anything.
+"""
 PROMISING = 0.25
 """Candidates are refitted that promise at least this share of the best one's score."""
+SHARES = (1.0, 0.25)
+"""Of the size that a score says; the score is linear, so less of it is tried too."""
+REACHES = (0.2, 0.7, 1.5)
+"""Shares of the plausible range at which a fit of one coefficient begins besides."""
 
 
 def nominated(
@@ -37,32 +42,37 @@ def nominated(
     """Where to begin with the most promising candidates, at what scores say and at less; with all
     in patience.
     """
-    promise = scores.score - scores.chance
-    order = np.argsort(-promise, kind="stable")
-    chosen = [i for i in order if patient or promise[i] >= PROMISING * promise[order[0]]]
-    if not patient:
-        near = [
-            i for i in np.argsort(-scores.white, kind="stable")[:WHITE] if i not in chosen[:most]
-        ]
-        chosen = chosen[:most] + near
-    result = []
-    for i in chosen:
+    numbered = []
+    for i in _promising(scores, most, patient):
         name = scores.effects[i]
+        # The peaks of an effect are fitted apart: each may end in a minimum of its own.
         for peak, (group, scored) in enumerate(scores.peaks[i]):
-            result += [
-                (peak, _with(world, model, name, c))
-                for c in _sizes(world, found, group, scored, name)
-            ]
-    return _nearest(world, noise, result, HORIZONS[0][0] if patient else 1.0)
+            for c in _sizes(world, found, group, scored, name):
+                numbered.append((peak, _with(world, model, name, c)))
+    # In patience the fit begins with the first part of the runs, so the nearest is asked there.
+    share = HORIZONS[0][0] if patient else 1.0
+    return _nearest(world, noise, numbered, share)
+
+
+def _promising(scores: Scores, most: int, patient: bool) -> list[int]:
+    """Places of the candidates to refit, the most promising first."""
+    promise = scores.score - scores.chance
+    order: list[int] = np.argsort(-promise, kind="stable").tolist()
+    if patient:
+        return order
+    good = [i for i in order if promise[i] >= PROMISING * promise[order[0]]][:most]
+    by_squares = np.argsort(-scores.white, kind="stable")[:WHITE].tolist()
+    return good + [i for i in by_squares if i not in good]
 
 
 def _with(world: World, model: Model, name: str, c: Array) -> Start:
     """The model with one more effect, which takes the place of those that it contains."""
-    theta, held = model.fit.theta.copy(), world.effects[name].contains
+    theta, contained = model.fit.theta.copy(), world.effects[name].contains
     theta[world.slots[name]] = c
-    for part in set(held) & set(model.names):
+    for part in set(contained) & set(model.names):
         theta[world.slots[part]] = 0.0
-    return Start((*(n for n in model.names if n not in held), name), theta, model.fit.states)
+    rest = [n for n in model.names if n not in contained]
+    return Start((*rest, name), theta, model.fit.states)
 
 
 def _sizes(
@@ -73,21 +83,25 @@ def _sizes(
     """
     bounds = coefficient_bounds(world, name)
     first = found.probes[group.columns[0]]
+    # A direction that is one whole change says nothing of other sizes.
     if first.fixed:
         yield first.c
         return
-    for share in (1.0, 0.25):
+    for share in SHARES:
         c = first.c.copy()
         for column, size in zip(group.columns, scored, strict=True):
             place = found.probes[column].place
             c[place] = share * float(np.clip(size, *bounds[place]))
         yield c
-    if len(group.columns) == 1:
-        reach = world.parameters[world.slots[name].start + first.place].bounds[1]
-        for share in (0.2, 0.7, 1.5, *((-0.2, -0.7, -1.5) if first.signed else ())):
-            c = first.c.copy()
-            c[first.place] = share * reach
-            yield c
+    # Of several coefficients the range says nothing about how they go together.
+    if len(group.columns) > 1:
+        return
+    reach = world.parameters[world.slots[name].start + first.place].bounds[1]
+    negative = tuple(-share for share in REACHES) if first.signed else ()
+    for share in (*REACHES, *negative):
+        c = first.c.copy()
+        c[first.place] = share * reach
+        yield c
 
 
 def _nearest(
@@ -106,9 +120,12 @@ def _nearest(
     seen = seen.reshape(len(starts), runs, *seen.shape[1:])
     counted = world.counted(share)
     best: dict[tuple[int, Names], tuple[float, Start]] = {}
-    for (number, start), part in zip(numbered, seen, strict=True):
-        left = np.where(counted, world.observed - part, 0.0) / noise.sigma
+    for (number, start), simulated in zip(numbered, seen, strict=True):
+        left = np.where(counted, world.observed - simulated, 0.0) / noise.sigma
         cost = float(np.square(left).sum())
-        if cost < best.get((number, start.effects), (np.inf,))[0]:
-            best[number, start.effects] = cost, start
+        key = (number, start.effects)
+        nearest = best[key][0] if key in best else np.inf
+        # A simulation that failed has a cost that is no number, and is never the nearest.
+        if cost < nearest:
+            best[key] = cost, start
     return [start for _, start in best.values()]

@@ -1,8 +1,8 @@
 """Which of six verdicts a state of affairs is, and every threshold that decides it.
 
 `bench.gap.causes.name` asks the questions, in order; the answers are rules here, one function each.
-Errors are in units of the noise unless said otherwise: RMS 1 is noise alone, and an *excess* is that
-RMS less one, so that 0 is a model that leaves nothing but noise.
+Errors are in units of the noise unless said otherwise: RMS 1 is noise alone, and an *excess* is
+that RMS less one, so that 0 is a model that leaves nothing but noise.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ STILL = 6.0
 AT_REST = 3.0
 """What the base model leaves of a recording without motion is below so many sigmas of the noise."""
 VAGUE = 0.5
-"""A base parameter is not fixed by the data if its 1 sigma is more than this share of its bounds."""
+"""A base parameter is not fixed if its 1 sigma is more than this share of its bounds."""
 EXCESS = 0.05
 """What is left may exceed the stated noise by this share: no sensor is known better."""
 SIGMAS = 4.0
@@ -54,7 +54,7 @@ HELPS = 0.1
 SWITCH = 7.0
 """Twice the log likelihood by which two models must differ to be told apart: odds of 33 to 1."""
 SIMILAR = 1.2
-"""Where structure is left, causes are alike that leave no more than so many times the same excess."""
+"""Where structure is left, causes are alike that leave less than so many times the same excess."""
 AT_THE_NOISE = 0.1
 """An excess below this is as good as none, and ratios of excesses are not taken of less."""
 EXPLAINED = 0.7

@@ -8,6 +8,31 @@ twice the gain in log likelihood, each hypothesis with the correlation of noise 
 so that noise that remembers is no cause. What the best of a whole library reaches by chance is
 found by doing the same to surrogate residuals (max-statistic calibration; P. H. Westfall, S. S.
 Young 1993).
+
+Residual e, directions D and Jacobian J are whitened by W(phi), a first-order autoregression, run by
+run, where phi is common to all channels. For a sample t that follows another, and a first one f,
+
+    (W a)'(W b) = a_f b_f + (a_t b_t - phi (a_t b_t-1 + a_t-1 b_t) + phi^2 a_t-1 b_t-1)
+                  / (1 - phi^2), summed over f and t                                           (1)
+
+so four products of the samples serve every phi. What the model's own freedom absorbs is taken out
+of each product of two columns a and b by a Schur complement, the initial states of each run first
+and the parameters of all runs after (the theorem of R. Frisch, F. V. Waugh and M. C. Lovell):
+
+    <a, b> = a'b - a'J (J'J)^-1 J'b                                                            (2)
+
+With G = <D, D> and h = <D, e> a group of directions explains h'G^-1 h of the sum of squares <e, e>.
+The sigma of n samples estimated besides, twice the log likelihood is, up to a constant,
+
+    l(phi) = log det W'W - n log(<e, e> - h'G^-1 h)                                            (3)
+
+and the score of an effect is the likelihood ratio, either side at its own correlation,
+
+    score = max over phi and groups of l(phi) - max over phi of l(phi) without directions      (4)
+
+For effects k and surrogates s, with chance_k the 90 % quantile of score_k over s, the p value is
+
+    p = P(max over k of (score_k(s) - chance_k) >= max over k of (score_k - chance_k))         (5)
 """
 
 from __future__ import annotations
@@ -30,15 +55,31 @@ ABSORBED = 1e-12
 """Of a direction's sum of squares less than this share is left where the model's own freedom
 absorbs it.
 """
-MANY, PEAKS = 12, 3
-"""An effect with more shapes than the first is begun from so many of them."""
+MANY = 12
+"""An effect with more shapes than this is begun from several of them."""
+PEAKS = 3
+"""From so many."""
 RANK = 1e-9
 """Directions below this share of the largest eigenvalue of their scaled products are none."""
+LUCK = 0.9
+"""Quantile over surrogates that is an effect's chance."""
+EXTREME = 0.8
+"""Quantile over surrogates beyond which their tail is taken for exponential."""
+BEYOND = 0.2
+"""The share of them that lies there."""
+FEWEST = 20
+"""Of fewer surrogates no tail is guessed."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Columns that act together: their places among the directions, and which must not be negative."""
+    """Columns that act together.
+
+    Attributes:
+        effect: whose they are.
+        columns: their places among the directions.
+        positive: which of them must not be negative.
+    """
 
     effect: str
     columns: tuple[int, ...]
@@ -76,9 +117,35 @@ class Scores:
     white: Array
 
 
+class Parts(NamedTuple):
+    """Products of samples that eq. (1) puts together."""
+
+    first: Array
+    """of samples without a forerunner."""
+    now: Array
+    """of samples with one."""
+    mixed: Array
+    """of those with their forerunners, both ways."""
+    before: Array
+    """of the forerunners."""
+
+    def at(self, phi: float) -> Array:
+        """The products after whitening by a correlation."""
+        follow = self.now - phi * self.mixed + phi * phi * self.before
+        return self.first + follow / (1.0 - phi * phi)  # (1)
+
+
+class _Run(NamedTuple):
+    """Products of one run: of residuals with themselves, of columns, of columns with residuals."""
+
+    squares: Parts
+    columns: Parts
+    cross: Parts
+
+
 class Products:
     """Inner products of residuals and directions after all that the model's own freedom absorbs is
-    taken out.
+    taken out, eq. (2).
 
     Whitening by a correlation phi mixes products of samples with themselves and with those before
     them, so that one pass over the samples serves every phi. All are computed run by run, since
@@ -89,65 +156,81 @@ class Products:
         self, at: Fit, residuals: Array, directions: Array, seen: Mask, sigma: Array
     ) -> None:
         self._own, self._states = at.free.size, at.jacobian.shape[3] - at.free.size
-        self._directions, self._runs = directions.shape[3], []
+        self._runs: list[_Run] = []
         follows = np.zeros_like(seen)
         follows[:, 1:] = seen[:, 1:] & seen[:, :-1]
         for r in range(len(seen)):
-            left = np.concatenate([at.jacobian[r], directions[r]], axis=2) / sigma[:, None]
-            right = residuals[r] / sigma[:, None]
-            self._runs.append(_laid(left, right, seen[r], follows[r]))
+            columns = np.concatenate([at.jacobian[r], directions[r]], axis=2) / sigma[:, None]
+            scaled = residuals[r] / sigma[:, None]
+            self._runs.append(_products(columns, scaled, seen[r], follows[r]))
 
     def projected(self, phi: float) -> tuple[Array, Array, Array]:
-        """Sums of squares (S,) of the residuals, products of directions (K, K) and of both (K, S)."""
+        """Products of eq. (2) after whitening by a correlation.
+
+        Returns:
+            Sums of squares (S,) of the residuals, products of directions (K, K) and of both (K, S).
+        """
+        q = self._own
+        total, cross, normal, whole = self._without_states(phi)
+        # (2) once more, for the parameters that all runs share.
+        inverse = _inverse(normal[:q, :q])
+        total = total - np.einsum("ks,kl,ls->s", cross[:q], inverse, cross[:q])
+        gram = normal[q:, q:] - normal[q:, :q] @ inverse @ normal[:q, q:]
+        both = cross[q:] - normal[q:, :q] @ (inverse @ cross[:q])
+        # Of directions that are absorbed only rounding is left, which would explain at random.
+        acting = np.diagonal(gram) > ABSORBED * whole
+        gram = np.where(acting[:, None] & acting, (gram + gram.T) / 2.0, 0.0)
+        return np.maximum(total, 0.0), gram, np.where(acting[:, None], both, 0.0)
+
+    def _without_states(self, phi: float) -> tuple[Array, Array, Array, Array]:
+        """Sums over runs of what each run's initial states leave: of residuals, of both, of
+        parameters and directions; and the squares of directions before anything is taken out.
+        """
         q, s = self._own, self._states
+        own = slice(q, q + s)
         total: Array = np.zeros(())
-        normal, cross, whole = total, total, total
-        for squares, products, mixed in self._runs:
-            n, c, t = (
-                part[0] + (part[1] - phi * part[2] + phi * phi * part[3]) / (1.0 - phi * phi)
-                for part in (products, mixed, squares)
-            )
-            own = slice(q, q + s)
+        cross, normal, whole = total, total, total
+        for run in self._runs:
+            n, c, t = run.columns.at(phi), run.cross.at(phi), run.squares.at(phi)
             whole = whole + np.diagonal(n)[q + s :]
             rest = np.r_[0:q, q + s : len(n)]
+            # (2) with the initial states of this run for J.
             inverse = _inverse(n[own, own])
             total = total + t - np.einsum("ks,kl,ls->s", c[own], inverse, c[own])
             cross = cross + c[rest] - n[rest][:, own] @ (inverse @ c[own])
             normal = normal + n[np.ix_(rest, rest)] - n[rest][:, own] @ inverse @ n[own][:, rest]
-        inverse = _inverse(normal[:q, :q])
-        total = total - np.einsum("ks,kl,ls->s", cross[:q], inverse, cross[:q])
-        gram = normal[q:, q:] - normal[q:, :q] @ inverse @ normal[:q, q:]
-        kept = np.diagonal(gram) > ABSORBED * whole  # of the others only rounding is left
-        gram = np.where(kept[:, None] & kept, (gram + gram.T) / 2.0, 0.0)
-        both = np.where(kept[:, None], cross[q:] - normal[q:, :q] @ (inverse @ cross[:q]), 0.0)
-        return np.maximum(total, 0.0), gram, both
+        return total, cross, normal, whole
 
 
-Parts = tuple[Array, Array, Array, Array]
+def _products(columns: Array, residuals: Array, seen: Mask, follows: Mask) -> _Run:
+    """The products of one run.
 
-
-def _laid(left: Array, right: Array, seen: Mask, follows: Mask) -> tuple[Parts, Parts, Parts]:
-    """Products of samples without a forerunner, of those with one, of both with each other, and of
-    the forerunners.
+    Args:
+        columns: (T, C, M) Jacobian and directions, in sigmas.
+        residuals: (T, C, S) in sigmas.
+        seen: (T, C) which samples there are.
+        follows: (T, C) which of them have a forerunner.
     """
-    here, later = seen & ~follows, follows[1:]
-    first, second = (_rows(part, here) for part in (left, right))
-    now, then = ((_rows(part[1:], later), _rows(part[:-1], later)) for part in (left, right))
-    mixed = now[0].T @ now[1]
-    products = (first.T @ first, now[0].T @ now[0], mixed + mixed.T, now[1].T @ now[1])
-    cross = (
-        first.T @ second,
-        now[0].T @ then[0],
-        now[0].T @ then[1] + now[1].T @ then[0],
-        now[1].T @ then[1],
+    first, later = seen & ~follows, follows[1:]
+    x_first, e_first = (_rows(part, first) for part in (columns, residuals))
+    x_now, e_now = (_rows(part[1:], later) for part in (columns, residuals))
+    x_before, e_before = (_rows(part[:-1], later) for part in (columns, residuals))
+    mixed = x_now.T @ x_before
+    return _Run(
+        Parts(
+            np.square(e_first).sum(axis=0),
+            np.square(e_now).sum(axis=0),
+            2.0 * (e_now * e_before).sum(axis=0),
+            np.square(e_before).sum(axis=0),
+        ),
+        Parts(x_first.T @ x_first, x_now.T @ x_now, mixed + mixed.T, x_before.T @ x_before),
+        Parts(
+            x_first.T @ e_first,
+            x_now.T @ e_now,
+            x_now.T @ e_before + x_before.T @ e_now,
+            x_before.T @ e_before,
+        ),
     )
-    squares = (
-        np.square(second).sum(axis=0),
-        np.square(then[0]).sum(axis=0),
-        2.0 * (then[0] * then[1]).sum(axis=0),
-        np.square(then[1]).sum(axis=0),
-    )
-    return squares, products, cross
 
 
 def _rows(values: Array, mask: Mask) -> Array:
@@ -158,69 +241,88 @@ def _rows(values: Array, mask: Mask) -> Array:
 def _inverse(normal: Array) -> Array:
     """Of a positive semidefinite matrix; directions that hardly count are left out."""
     scale = np.sqrt(np.maximum(np.diagonal(normal), 0.0))
+    # A row of zeros stays one: divided by infinity it has no part in any direction.
     scale = np.where(scale > 0, scale, np.inf)
     if not scale.size:
         return normal
     values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
-    kept = values > RANK * max(float(values[-1]), 1e-300)
-    result: Array = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T / np.outer(scale, scale)
+    counted = values > RANK * max(float(values[-1]), 1e-300)
+    some = vectors[:, counted]
+    result: Array = (some / values[counted]) @ some.T / np.outer(scale, scale)
     return result
 
 
 def groups(directions: Directions) -> list[Group]:
     """The directions that act together."""
-    found: dict[tuple[str, int], list[int]] = {}
+    places: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(directions.probes):
-        found.setdefault((probe.effect, probe.group), []).append(i)
-    return [
-        Group(name, tuple(columns), tuple(not directions.probes[i].signed for i in columns))
-        for (name, _), columns in found.items()
-    ]
+        places.setdefault((probe.effect, probe.group), []).append(i)
+    members = []
+    for (effect, _), columns in places.items():
+        positive = tuple(not directions.probes[i].signed for i in columns)
+        members.append(Group(effect, tuple(columns), positive))
+    return members
 
 
 def explained(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
     """Sum of squares (S,) that a group explains, and its coefficients (k, S): the best choice of
     its columns.
 
-    Coefficients that must not be negative are held at zero where they would be.
+    Coefficients that must not be negative are held at zero where they would be: the least squares
+    of the constraint are those of some choice of columns, so all are tried (C. L. Lawson, R. J.
+    Hanson, Solving Least Squares Problems, 1974, chapter 23).
     """
     count = len(group.columns)
     if count > SMALL:
         return _jointly(gram, cross, group)
-    best, coefficients = np.zeros(cross.shape[1]), np.zeros((count, cross.shape[1]))
-    scale = np.sqrt(np.maximum(np.diagonal(gram), 0.0))
+    samples = cross.shape[1]
+    best, coefficients = np.zeros(samples), np.zeros((count, samples))
     for size in range(1, count + 1):
         for chosen in combinations(range(count), size):
-            columns = [group.columns[i] for i in chosen]
-            if not (scale[columns] > 0).all():
+            solved = _solved(gram, cross, [group.columns[i] for i in chosen])
+            if solved is None:
                 continue
-            normal = gram[np.ix_(columns, columns)] / np.outer(scale[columns], scale[columns])
-            if np.linalg.eigvalsh(normal)[0] < RANK:
-                continue
-            right = cross[columns] / scale[columns, None]
-            solved = np.linalg.solve(normal, right)
-            gain = np.einsum("ks,ks->s", solved, right)
-            allowed = np.ones(cross.shape[1], dtype=bool)
-            for i, row in zip(chosen, solved, strict=True):
+            gain, c, scaled = solved
+            allowed = np.ones(samples, dtype=bool)
+            for i, row in zip(chosen, scaled, strict=True):
                 if group.positive[i]:
                     allowed &= row >= 0
+            # More columns must explain more than rounding: else the fewer stand.
             better = allowed & (gain > best * (1.0 + 1e-9))
             best = np.where(better, gain, best)
             whole = np.zeros_like(coefficients)
-            whole[list(chosen)] = solved / scale[columns, None]
+            whole[list(chosen)] = c
             coefficients = np.where(better, whole, coefficients)
     return best, coefficients
+
+
+def _solved(gram: Array, cross: Array, columns: list[int]) -> tuple[Array, Array, Array] | None:
+    """h'G^-1 h (S,) of some columns, G^-1 h (k, S), and that in units of the columns' lengths; None
+    where columns are absorbed or alike.
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 0.0))
+    if not (scale > 0).all():
+        return None
+    normal = gram[np.ix_(columns, columns)] / np.outer(scale, scale)
+    if np.linalg.eigvalsh(normal)[0] < RANK:
+        return None
+    right = cross[columns] / scale[:, None]
+    scaled = np.linalg.solve(normal, right)
+    gain = np.einsum("ks,ks->s", scaled, right)
+    return gain, scaled / scale[:, None], scaled
 
 
 def _jointly(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
     """The same for a group of many columns, none of them held."""
     columns = list(group.columns)
     scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 1e-300))
-    values, vectors = np.linalg.eigh(gram[np.ix_(columns, columns)] / np.outer(scale, scale))
-    kept = values > RANK * values[-1]
-    right = vectors[:, kept].T @ (cross[columns] / scale[:, None])
-    gain: Array = np.einsum("ks,ks->s", right, right / values[kept, None])
-    return gain, (vectors[:, kept] @ (right / values[kept, None])) / scale[:, None]
+    scaled = gram[np.ix_(columns, columns)] / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(scaled)
+    counted = values > RANK * values[-1]
+    some, weights = vectors[:, counted], values[counted, None]
+    right = some.T @ (cross[columns] / scale[:, None])
+    gain: Array = np.einsum("ks,ks->s", right, right / weights)
+    return gain, (some @ (right / weights)) / scale[:, None]
 
 
 def score(
@@ -241,39 +343,42 @@ def score(
         noise: sigma weighs channels against each other; its correlation is not used.
         surrogate: (S, R, T, C) residuals that mean nothing.
     """
+    # One column for the residual and one for each surrogate: all are scored in the same products.
     everything = residual[..., None]
     if surrogate is not None:
         everything = np.concatenate([everything, np.moveaxis(surrogate, 0, -1)], axis=3)
     members = groups(directions)
-    names = list(dict.fromkeys(g.effect for g in members))
-    count, shape = int(seen.sum()), (len(names), everything.shape[3])
-    nothing, white = np.full(shape[1], -np.inf), np.zeros(len(names))
-    best = np.full(shape, -np.inf)
-    which: dict[str, list[_Found]] = {
-        n: [_Found(-np.inf, g, np.zeros(0), 0.0) for g in members if g.effect == n] for n in names
-    }
+    names = list(dict.fromkeys(group.effect for group in members))
+    count, columns = int(seen.sum()), everything.shape[3]
+    without, white = np.full(columns, -np.inf), np.zeros(len(names))
+    best = np.full((len(names), columns), -np.inf)
+    hypotheses: dict[str, list[_Hypothesis]] = {name: [] for name in names}
+    for group in members:
+        hypotheses[group.effect].append(_Hypothesis(-np.inf, group, np.zeros(0), 0.0))
     products = Products(at, everything, directions.values, seen, noise.sigma)
     for phi in GRID:
         total, gram, cross = products.projected(phi)
         determinant = 2.0 * log_determinant(seen, np.full(seen.shape[2], phi))
+        # What is explained whole leaves rounding, of which the logarithm has a bound.
         floor = 1e-12 * total + 1e-300
-        nothing = np.maximum(nothing, determinant - count * np.log(np.maximum(total, floor)))
+        nothing = determinant - count * np.log(np.maximum(total, floor))  # (3), no directions
+        without = np.maximum(without, nothing)
         for row, name in enumerate(names):
-            for i, found in enumerate(which[name]):
-                gain, c = explained(gram, cross, found.group)
-                value = determinant - count * np.log(np.maximum(total - gain, floor))
-                if value[0] > found.value:
-                    which[name][i] = _Found(float(value[0]), found.group, c[:, 0], phi)
+            for i, hypothesis in enumerate(hypotheses[name]):
+                gain, c = explained(gram, cross, hypothesis.group)
+                left = np.maximum(total - gain, floor)
+                value = determinant - count * np.log(left)  # (3)
+                if value[0] > hypothesis.value:
+                    group = hypothesis.group
+                    hypotheses[name][i] = _Hypothesis(float(value[0]), group, c[:, 0], phi)
                 best[row] = np.maximum(best[row], value)
                 if phi == 0:
-                    white[row] = max(
-                        white[row],
-                        count * float(np.log(total[0] / max(total[0] - gain[0], floor[0]))),
-                    )
-    return _ranked(names, best - nothing, which, white)
+                    ratio = count * float(np.log(total[0] / max(total[0] - gain[0], floor[0])))
+                    white[row] = max(white[row], ratio)
+    return _ranked(names, best - without, hypotheses, white)  # (4)
 
 
-class _Found(NamedTuple):
+class _Hypothesis(NamedTuple):
     """The likeliest hypothesis about a group: twice its log likelihood, coefficients, correlation
     of the noise.
     """
@@ -284,45 +389,57 @@ class _Found(NamedTuple):
     phi: float
 
 
-def _peaks(found: Sequence[_Found]) -> tuple[Peak, ...]:
+def _peaks(hypotheses: Sequence[_Hypothesis]) -> tuple[Peak, ...]:
     """The best, and of a dozen and more the next that are better than their neighbours."""
-    values = np.array([f.value for f in found])
-    around = np.concatenate([[-np.inf], values, [-np.inf]])
-    local = (
-        (values >= around[:-2]) & (values >= around[2:])
-        if len(found) > MANY
-        else values == values.max()
-    )
-    order = [i for i in np.argsort(-values, kind="stable") if local[i]]
-    return tuple((found[i].group, found[i].c) for i in order[: PEAKS if len(found) > MANY else 1])
+    values = np.array([hypothesis.value for hypothesis in hypotheses])
+    several = len(hypotheses) > MANY
+    peaks = values == values.max()
+    if several:
+        # Neighbours of the best are the same answer once more, so only local maxima count.
+        around = np.concatenate([[-np.inf], values, [-np.inf]])
+        peaks = (values >= around[:-2]) & (values >= around[2:])
+    order = [i for i in np.argsort(-values, kind="stable") if peaks[i]]
+    chosen = order[: PEAKS if several else 1]
+    return tuple((hypotheses[i].group, hypotheses[i].c) for i in chosen)
 
 
 def _ranked(
-    names: Sequence[str], gains: Array, which: dict[str, list[_Found]], white: Array
+    names: Sequence[str], gains: Array, hypotheses: dict[str, list[_Hypothesis]], white: Array
 ) -> Scores:
-    observed, chance = gains[:, 0], np.zeros(len(names))
-    p_value = 1.0
-    if gains.shape[1] > 1:
-        chance = np.quantile(gains[:, 1:], 0.9, axis=1)
-        p_value = tail(gains[:, 1:] - chance[:, None], observed - chance)
+    """The scores in order, and how likely the best is by chance.
+
+    Args:
+        names: (E,) effects.
+        gains: (E, 1 + S) scores of the residual, then of the surrogates.
+        hypotheses: the likeliest of each effect's groups.
+        white: (E,) scores without correlation.
+    """
+    observed, drawn = gains[:, 0], gains[:, 1:]
+    chance, p_value = np.zeros(len(names)), 1.0
+    if drawn.shape[1]:
+        # An effect with many shapes gains more by chance, and must not set the level for the rest.
+        chance = np.quantile(drawn, LUCK, axis=1)
+        p_value = tail(drawn - chance[:, None], observed - chance)  # (5)
     order = np.argsort(-observed, kind="stable")
     ranked = [names[i] for i in order]
-    phi = max(which[ranked[0]], key=lambda found: found.value).phi if ranked else 0.0
+    phi = 0.0
+    if ranked:
+        phi = max(hypotheses[ranked[0]], key=lambda hypothesis: hypothesis.value).phi
     return Scores(
         tuple(ranked),
         observed[order],
         chance[order],
-        tuple(_peaks(which[n]) for n in ranked),
+        tuple(_peaks(hypotheses[name]) for name in ranked),
         p_value,
         phi,
-        (gains[:, 1:] - chance[:, None])[order],
+        (drawn - chance[:, None])[order],
         white[order],
     )
 
 
 def tail(by_chance: Array, observed: Array) -> float:
     """Probability that the largest of a column of `by_chance` (E, S) reaches the largest of
-    `observed` (E,).
+    `observed` (E,), eq. (5).
 
     Beyond the most extreme fifth of the surrogates the tail is taken for exponential, as that of a
     likelihood ratio is.
@@ -332,8 +449,10 @@ def tail(by_chance: Array, observed: Array) -> float:
     largest, value = np.sort(by_chance.max(axis=0)), float(observed.max())
     count = largest.size
     above = int((largest >= value).sum())
-    begin = largest[int(0.8 * count)]
-    if value <= begin or count < 20:
+    extreme = largest[int(EXTREME * count) :]
+    begin = extreme[0]
+    if value <= begin or count < FEWEST:
+        # The residual counts among its surrogates, so that no p value is zero.
         return (1.0 + above) / (1.0 + count)
-    mean = max(float((largest[int(0.8 * count) :] - begin).mean()), 1e-9)
-    return float(0.2 * np.exp(-(value - begin) / mean))
+    mean = max(float((extreme - begin).mean()), 1e-9)
+    return float(BEYOND * np.exp(-(value - begin) / mean))

@@ -1,7 +1,7 @@
 """What the models of a recording seem to lack: each scored against the whole library, once.
 
-A model is scored by a linear test (`bench.gap.causes.score_test`); whether it lacks something is then
-asked of that score and of the size of what it leaves.
+A model is scored by a linear test (`bench.gap.causes.score_test`); whether it lacks something is
+then asked of that score and of the size of what it leaves.
 """
 
 from __future__ import annotations

@@ -159,7 +159,7 @@ def beam(search: Search, size: int) -> list[Model]:
 
 
 def is_hopeless(search: Search, larger: Model) -> bool:
-    """Whether a model of several effects is so far from the data that one more is not worth a try."""
+    """Whether a model of several effects is too far from the data for one more to be tried."""
     singles = [search.excess(m) for m in search.models.values() if len(m.names) == 1]
     of_base = HOPELESS * search.excess(search.base)
     of_single = IDLE * min(singles, default=np.inf)

@@ -61,7 +61,7 @@ def rivals(search: Search, model: Model) -> list[Model]:
 
 
 def _is_near(search: Search, other: Model, model: Model) -> bool:
-    """By merit, or by what is left over the noise, since merit is misled where structure is left."""
+    """By merit, or by what is left over the noise: merit is misled where structure is left."""
     if abs(model.merit - other.merit) < NEAR:
         return True
     return search.excess(other) < NEARLY * search.excess(model)

@@ -11,8 +11,8 @@ A hat of width w around a centre m of a variable z (time, position or speed) is 
     f(z) = c max(1 - |z - m| / w, 0) d                                                         (1)
 
 with d its direction. Neighbours overlap by half, so the sum of a family over one variable is any
-force that is linear between `BINS` knots. How well sigma is known that is estimated from n samples of
-noise with a correlation phi between neighbours is (M. S. Bartlett's formula of 1946 at lag 0)
+force that is linear between `BINS` knots. How well sigma is known that is estimated from n samples
+of noise with a correlation phi between neighbours is (M. S. Bartlett's formula of 1946 at lag 0)
 
     sd(sigma) / sigma = sqrt((1 + phi^2) / (1 - phi^2) / (2 n))                                (2)
 """
@@ -41,7 +41,7 @@ SURROGATES = 150
 SLOW = 0.05
 """Share of a speed that is seldom exceeded over which dry friction turns its sign."""
 SIZE = 1e-4
-"""Strength of a hat that is simulated, as a share of a typical force: its response is linear there."""
+"""Strength of a simulated hat as a share of a typical force: its response is linear there."""
 TYPICAL = {"point": 2.0, "linear": 5.0, "rotary": 0.5}
 """A typical force of each kind of system: m/s^2, N, N m."""
 

@@ -80,6 +80,6 @@ class Trial:
         it has not learnt.
         """
         own = np.nan_to_num(model.likelihood.sigma)
-        # What is left of fitted runs is the noise where it has no structure; else only the floor is.
+        # What is left of fitted runs is noise where it has no structure; else only the floor is.
         noise = np.maximum(self.runs.noise.sigma, np.where(left.structure, 0.0, own))
         return is_missed(self.excess((), noise), self.excess(model.names, noise))
