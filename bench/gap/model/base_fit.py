@@ -62,7 +62,8 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
         given: (b,) base parameters to start from, those of a tuner; else a grid of starts over the
             bounds.
     """
-    starts = [Start((), theta, world.guess) for theta in _starts(world, given)]
+    thetas = _starts(world, given)
+    starts = [Start((), theta, world.guess) for theta in thetas]
     # to simulate a start costs far less than to fit it, so the field is thinned first
     if len(starts) > KEPT:
         order = np.argsort(_costs(world, noise, starts), kind="stable")
@@ -159,4 +160,5 @@ def _touched(world: World, fit: Fit, place: int, noise: Noise) -> bool:
     change = fit.jacobian[..., columns[0]] * (high - low) / noise.sigma
     # only where a sample could show it
     shown = change[np.isfinite(world.observed)]
-    return float(np.sqrt(np.square(shown).sum())) > TOUCHED
+    sigmas = np.sqrt(np.square(shown).sum())
+    return float(sigmas) > TOUCHED

@@ -46,7 +46,8 @@ def noise_floor(world: World, recording: Recording) -> Floor:
     sigmas, stated, steps, doubts = [], [], [], []
     for channel in world.simulator.channels:
         signals = [(run.times, run.channels[channel.name]) for run in recording.runs]
-        values = np.concatenate([y[np.isfinite(y)] for _, y in signals])
+        samples = [y[np.isfinite(y)] for _, y in signals]
+        values = np.concatenate(samples)
         # even where it is stated: a step tells that the channel is quantised
         estimate = estimated(signals)
         known = recording.noise.get(channel.name, 0.0) > 0

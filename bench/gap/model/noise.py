@@ -166,7 +166,11 @@ def likelihood(residual: Array, seen: Mask, lost: float = 0.0) -> Likelihood:
     return Likelihood(total, np.array(sigmas), np.array(phis))
 
 
-def _likeliest(residual: Array, seen: Mask, share: float) -> tuple[float, float, float]:
+def _likeliest(
+    residual: Array,
+    seen: Mask,
+    share: float,
+) -> tuple[float, float, float]:
     """Of one channel (R, T, 1): the highest value of (4), with its correlation and variance.
 
     The variance is over the share of the samples that the fit has left; the value counts them all,
@@ -176,8 +180,11 @@ def _likeliest(residual: Array, seen: Mask, share: float) -> tuple[float, float,
     best = (-np.inf, 0.0, 0.0)
     for phi in _near(residual, seen):
         w = whitened(residual, seen, _unit(phi))
-        variance = max(float((w * w).sum()) / count, TINY)
-        value = -count * np.log(variance) + 2.0 * log_determinant(seen, phi)  # (4)
+        power = float((w * w).sum())
+        variance = max(power / count, TINY)
+        # (4), whose determinant is that of whitening
+        determinant = 2.0 * log_determinant(seen, phi)
+        value = -count * np.log(variance) + determinant
         hypothesis = (value, phi, variance / share)
         best = max(best, hypothesis)
     return best
@@ -191,7 +198,8 @@ def _near(residual: Array, seen: Mask) -> Array:
     power = float(former @ former)
     # of zeros there is no correlation
     own = float(former @ latter) / power if power > 0 else 0.0
-    around = np.clip(own + np.array(AROUND), LEAST_PHI, LARGEST_PHI)
+    tried = own + np.array(AROUND)
+    around = np.clip(tried, LEAST_PHI, LARGEST_PHI)
     # white noise is always a hypothesis
     correlations: Array = np.unique(np.append(around, 0.0))
     return correlations
