@@ -20,6 +20,8 @@ from methods.learning.responses import responses
 
 _ROUNDING = 1e-9
 """Numbers that differ by less than this share of their size are alike."""
+_NORMAL = 1.4826
+"""Standard deviations of a normal distribution in one median distance from its median."""
 
 
 @dataclass(frozen=True)
@@ -50,15 +52,22 @@ class Circumstances:
         """
         initial = np.array([scene.initial for scene in scenes])
         driven = _vary(np.array([scene.inputs for scene in scenes]))
+        # where scenarios are alike nothing is to be told, and every input would be a constant
         if not driven and not _vary(initial):
             return None
-        untold = cls(np.empty(initial.shape[1] + driven), np.empty(0), initial.shape[1])
-        numbers = [
-            untold.numbers(o, lengths, scene) for o, scene in zip(observations, scenes, strict=True)
-        ]
-        table = np.concatenate(numbers)
+        count = initial.shape[1]
+        # stands for the map to be: one number beyond the initial values says that it is driven
+        unscaled = cls(np.empty(count + driven), np.empty(0), count)
+        table = np.concatenate(
+            [
+                unscaled.numbers(observation, lengths, scene)
+                for observation, scene in zip(observations, scenes, strict=True)
+            ]
+        )
+        # medians: a fitted coefficient is far off where a run hardly moves
         centre = np.median(table, axis=0)
-        return cls(centre, 1.4826 * np.median(np.abs(table - centre), axis=0), initial.shape[1])
+        distances = np.abs(table - centre)
+        return cls(centre, _NORMAL * np.median(distances, axis=0), count)
 
     @property
     def driven(self) -> bool:
@@ -67,10 +76,12 @@ class Circumstances:
 
     def numbers(self, observations: Array, lengths: tuple[int, ...], scene: Scene) -> Array:
         """What is read (n, K) of observations (n, T, C) in one scene, SI units and samples."""
-        told = np.broadcast_to(scene.initial, (len(observations), len(scene.initial)))
+        shape = len(observations), len(scene.initial)
+        initial = np.broadcast_to(scene.initial, shape)
         if not self.driven:
-            return told
-        return np.concatenate([told, responses(observations, scene.inputs, lengths)], axis=1)
+            return initial
+        coefficients = responses(observations, scene.inputs, lengths)
+        return np.concatenate([initial, coefficients], axis=1)
 
     def __call__(self, observations: Array, lengths: tuple[int, ...], scene: Scene) -> Array:
         """Network inputs (n, K) of observations (n, T, C); far from what training saw they grow as
@@ -82,17 +93,20 @@ class Circumstances:
         numbers = self.numbers(observations, lengths, scene)
         if len(scene.initial) != self.initial or numbers.shape[1] != len(self.centre):
             raise ValueError(
-                f"the network is told {len(self.centre)} numbers of a scenario, this one gives {numbers.shape[1]}; "
+                f"the network is told {len(self.centre)} numbers of a scenario, "
+                f"this one gives {numbers.shape[1]}; "
                 "train on scenarios with the same inputs and channels"
             )
-        scale = np.where(self.spread > 0, 1.0 / np.where(self.spread > 0, self.spread, 1.0), 0.0)
+        says = self.spread > 0
+        # a number that never varied in training gets no weight, whatever it is now
+        scale = np.where(says, 1.0 / np.where(says, self.spread, 1.0), 0.0)
+        # arcsinh is the identity near zero and a logarithm far out: outliers do not saturate units
         return np.asarray(np.arcsinh((numbers - self.centre) * scale), dtype=np.float64)
 
 
 def _vary(numbers: Array) -> bool:
     """Whether any number (scenarios, ...) differs between scenarios."""
-    return (
-        bool(np.any(np.ptp(numbers, axis=0) > _ROUNDING * np.abs(numbers).max(axis=0)))
-        if numbers.size
-        else False
-    )
+    if not numbers.size:
+        return False
+    sizes = np.abs(numbers).max(axis=0)
+    return bool(np.any(np.ptp(numbers, axis=0) > _ROUNDING * sizes))

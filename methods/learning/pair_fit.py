@@ -16,6 +16,13 @@ from methods.learning.pair_network import Design, Sides, Watched, estimate, shap
 from methods.learning.reader import Reader, Reading
 from methods.learning.rehearsal import Rehearsal, rehearse
 
+_OWN = "own-"
+"""Begins the names of the arrays of a proposed side that reads something of its own."""
+_CALM = 2.0
+"""A target is as clean as simulations up to this many times their own roughness."""
+_HEARD = 50.0
+"""A target counts as noisy from so small a part (one in 50) of the noise prepared for."""
+
 
 @dataclass(frozen=True)
 class Look:
@@ -59,12 +66,13 @@ class Fitted:
         """Choose the inputs and train the network on them; `alone` as in `pair_network.train`."""
         read = Reader.learned(data, reading)
         proposed = Reader.learned(data.pure, reading.proposed) if reading.proposed else read
-        seen = None
+        watched = None
         if look is not None:
-            seen = Watched(
-                _sides(proposed, read, look.held_out), look.held_out.parameters, look.epoch
-            )
-        weights = train(_sides(proposed, read, data), data.parameters, design, rng, alone, seen)
+            held_out = look.held_out
+            rows = _sides(proposed, read, held_out)
+            watched = Watched(rows, held_out.parameters, look.epoch)
+        rows = _sides(proposed, read, data)
+        weights = train(rows, data.parameters, design, rng, alone, watched)
         return cls(design, read, weights, proposed)
 
     def difference(self, proposed: Array, target: Array) -> Array:
@@ -73,12 +81,12 @@ class Fitted:
 
     def state(self) -> dict[str, Array]:
         """Everything as plain arrays."""
-        own = (
-            {}
-            if self.proposed is self.read
-            else {f"own-{k}": v for k, v in self.proposed.state().items()}
-        )
-        return own | self.read.state() | self.weights
+        state = self.read.state() | self.weights
+        if self.proposed is self.read:
+            return state
+        # both sides' arrays have the same names
+        own = {_OWN + name: array for name, array in self.proposed.state().items()}
+        return own | state
 
     @classmethod
     def restored(cls, state: dict[str, Array], design: Design, reading: Reading) -> Fitted:
@@ -87,8 +95,11 @@ class Fitted:
         Raises:
             ValueError: arrays of other names or shapes, or numbers that are not finite.
         """
-        own = {name[4:]: array for name, array in state.items() if name.startswith("own-")}
-        common = {name: array for name, array in state.items() if not name.startswith("own-")}
+        own: dict[str, Array] = {}
+        common: dict[str, Array] = {}
+        for name, array in state.items():
+            part = own if name.startswith(_OWN) else common
+            part[name.removeprefix(_OWN)] = array
         read, arrays = Reader.restored(common, reading)
         proposed = Reader.restored(own, reading.proposed)[0] if reading.proposed else read
         dim = arrays.get("output.bias", np.empty(0)).size
@@ -98,15 +109,17 @@ class Fitted:
         for name, shape in expected.items():
             if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
                 raise ValueError(
-                    f"array {name}: expected finite numbers of shape {shape}, found {arrays[name].shape}"
+                    f"array {name}: expected finite numbers of shape {shape}, "
+                    f"found {arrays[name].shape}"
                 )
         return cls(design, read, {name: arrays[name] for name in expected}, proposed)
 
 
 def _sides(proposed: Reader, target: Reader, data: Rehearsal) -> Sides:
     """Input rows of both sides; a side of its own sees simulations, which no sensor spoils."""
-    seen = target.table(data)
-    return Sides(seen if proposed is target else proposed.table(data.pure), seen)
+    rows = target.table(data)
+    own = rows if proposed is target else proposed.table(data.pure)
+    return Sides(own, rows)
 
 
 @dataclass(frozen=True)
@@ -143,19 +156,19 @@ class Prepared:
         kind of target.
         """
         spread = data.flat.std(axis=(0, 1))
-        limit = 2.0 * roughness(data.flat, data.lengths).max(axis=0) + reading.noise / 50.0 * spread
+        own = roughness(data.flat, data.lengths).max(axis=0)
+        limit = _CALM * own + reading.noise / _HEARD * spread
 
         def noisy() -> Fitted:
-            seen = look and look("noisy")
-            if seen:
-                seen = replace(
-                    seen,
-                    held_out=seen.held_out.spoilt(reading.noise * spread, np.random.default_rng(0)),
-                )
-            return Fitted.train(
-                design, data.spoilt(reading.noise * spread, rng), rng, reading, alone, seen
-            )
+            noise = reading.noise * spread
+            looking = look and look("noisy")
+            if looking:
+                # noise of its own stream: what is learned is the same whether anybody looks
+                spoilt = looking.held_out.spoilt(noise, np.random.default_rng(0))
+                looking = replace(looking, held_out=spoilt)
+            return Fitted.train(design, data.spoilt(noise, rng), rng, reading, alone, looking)
 
+        # a sensor whose errors last looks as smooth as a clean target: then there is one network
         if reading.noise and not reading.clean:
             network = noisy()
             return cls(network, network, limit)
@@ -171,20 +184,20 @@ class Prepared:
         """From one simulation (1, T, C) to h(simulation, target), (dim,); NaN where the simulation
         failed.
         """
-        network, missing = self.suited(task), np.isnan(task.observed)
+        network = self.suited(task)
         alike = network.proposed is network.read
-        hidden = missing if alike else None
-        known = (
-            network.read(task.observed[None], task.lengths, task.scene, hidden)[0]
-            if alike
-            else None
-        )
+        # hidden in the simulation too, so that the truth gives the target's own row
+        hidden = np.isnan(task.observed) if alike else None
+        row = None
+        if alike:
+            # the target's row is the same for every simulation, unless gaps are bridged by it
+            row = network.read(task.observed[None], task.lengths, task.scene, hidden)[0]
 
         def difference(observations: Array) -> Array:
-            if not np.isfinite(observations).all():  # nothing was seen
+            if not np.isfinite(observations).all():
                 return np.full(task.dim, np.nan)
             proposed = network.proposed(observations, task.lengths, task.scene, hidden)[0]
-            target = known
+            target = row
             if target is None:
                 whole = _bridged(task, observations[0], network)
                 target = network.read(whole[None], task.lengths, task.scene)[0]
@@ -215,7 +228,8 @@ class Prepared:
         limit = np.array(parts["limit"].get("", np.nan), dtype=np.float64)
         if limit.ndim != 1 or not np.isfinite(limit).all():
             raise ValueError(
-                f"array limit: expected finite numbers of shape (channels,), found shape {limit.shape}"
+                "array limit: expected finite numbers of shape (channels,), "
+                f"found shape {limit.shape}"
             )
         two = bool(reading.noise) and reading.clean
         if two != bool(parts["noisy"]):
@@ -233,10 +247,12 @@ def _bridged(task: Task, shown: Array, network: Fitted) -> Array:
     """
     sensor = network.proposed.reading.part(shown)
     whole = task.observed.copy()
+    # a map from one number to one: from several channels nobody knows which shows what
     if sensor.shape[-1] != 1:
         return whole
     ends = np.cumsum(task.lengths)
     for first, end in zip(ends - task.lengths, ends, strict=True):
+        # columns of the copy, so that they are filled in place
         for channel in network.read.reading.part(whole[first:end]).T:
             channel[:] = bridged(channel, sensor[first:end, 0])
     return whole
@@ -276,15 +292,29 @@ class PairTuner(Tuner):
         scenarios, each = self.layout(simulator.dim)
         data = rehearse(simulator, rng, budget, scenarios, each)
         look = None
-        if (watch := self.watch) is not None:
+        watch = self.watch
+        if watch is not None:
+            ground = watch.ground
+            # simulations of their own, from a stream of their own: training does not notice
             apart = rehearse(
-                watch.ground, np.random.default_rng(0), watch.ground.budget, scenarios, max(each, 2)
+                ground,
+                np.random.default_rng(0),
+                ground.budget,
+                scenarios,
+                max(each, 2),
             )
 
             def look(stage: str) -> Look:
                 return Look(apart, partial(watch.epoch, stage))
 
-        self._fitted = Prepared.train(self.design(), data, rng, self.reading(), self.alone, look)
+        self._fitted = Prepared.train(
+            self.design(),
+            data,
+            rng,
+            self.reading(),
+            self.alone,
+            look,
+        )
 
     def state(self) -> dict[str, Array]:
         """The network's weights and what it reads, by name; empty before `fit`."""

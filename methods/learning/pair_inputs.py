@@ -4,6 +4,14 @@ Pure numpy, so that tuning needs no torch. An observation (T, C) becomes a row o
 steps: each run is resampled to a fixed number of points (RESAMPLE in Algorithm 1, arXiv
 1907.11200); rates of change and sorted copies are added; each number is centred, and weighed by how
 faithfully it followed the parameters in training.
+
+With x a number, d its parameters' differences from their mean within a scenario, and strictness s:
+
+    (1)  x - mean = d slopes + left over, by least squares in each scenario
+    (2)  faith of a parameter = e / (e + s * left over), e = |slope| * spread of the parameter
+    (3)  weight = (largest faith, each parameter's scaled to the same maximum)^2, per deviation
+    (4)  weight of circumstances = (b / (b + s * w))^2, per deviation, with b and w the standard
+         deviations between and within scenarios
 """
 
 from __future__ import annotations
@@ -11,9 +19,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from methods.base import Array
 from methods.learning.rehearsal import Rehearsal
+
+_PARTS = 8
+"""Parts of a run in which its roughness is looked at."""
+_LEAST_PART = 16
+"""Third differences in such a part, at least."""
+_NORMAL = 0.6745
+"""Median of the size of a normal variable, in its standard deviations."""
+_THIRD: float = 20.0**0.5
+"""Third differences of white noise vary so many times as much: 1 + 9 + 9 + 1 is 20."""
+_EXACT = 1e-9
+"""Of the largest deviation: what is left over below it is rounding."""
+_LEAST_DEVIATION = 1e-3
+"""Of the largest deviation: a number that varies less is not scaled up further."""
+_ZERO = 1e-300
+"""Keeps a quotient of nothing and nothing finite."""
 
 
 def resample(observations: Array, lengths: tuple[int, ...], points: int) -> Array:
@@ -42,17 +66,25 @@ def resample(observations: Array, lengths: tuple[int, ...], points: int) -> Arra
     for run, length in enumerate(lengths):
         series = observations[:, first : first + length].transpose(0, 2, 1)
         first += length
+        # interpolation at the samples themselves would give them back; most runs need none
         if length == points and not np.isnan(series).any():
             out[:, run] = series
             continue
-        here, at = np.arange(length), np.linspace(0, length - 1, points)
+        samples = np.arange(length)
+        at = np.linspace(0, length - 1, points)
         for i in range(n):
             for c in range(channels):
-                there = ~np.isnan(series[i, c])
-                out[i, run, c] = (
-                    np.interp(at, here[there], series[i, c, there]) if there.any() else np.nan
-                )
+                out[i, run, c] = _interpolated(at, samples, series[i, c])
     return out.reshape(n, len(lengths) * channels, points)
+
+
+def _interpolated(at: Array, samples: NDArray[np.intp], values: Array) -> Array:
+    """Values (points,) between those samples that are there; NaN where none is."""
+    there = ~np.isnan(values)
+    if not there.any():
+        return np.full(len(at), np.nan)
+    between: Array = np.interp(at, samples[there], values[there])
+    return between
 
 
 def described(series: Array) -> Array:
@@ -69,7 +101,12 @@ def described(series: Array) -> Array:
         (n, series * (4 * points - 2)).
     """
     rates = np.diff(series, axis=-1)
-    parts = (series, rates, np.sort(series, axis=-1), np.sort(rates, axis=-1))
+    parts = (
+        series,
+        rates,
+        np.sort(series, axis=-1),
+        np.sort(rates, axis=-1),
+    )
     return np.concatenate(parts, axis=-1).reshape(len(series), -1)
 
 
@@ -90,13 +127,25 @@ def roughness(observations: Array, lengths: tuple[int, ...]) -> Array:
     """
     out = np.zeros((observations.shape[0], observations.shape[2]))
     for run in np.split(observations, np.cumsum(lengths)[:-1], axis=1):
+        # a parabola has no third differences, so smooth motion leaves next to nothing
         thirds = np.abs(np.diff(run, n=3, axis=1))
-        parts = np.array_split(thirds, min(8, max(1, thirds.shape[1] // 16)), axis=1)
+        count = min(_PARTS, max(1, thirds.shape[1] // _LEAST_PART))
+        parts = np.array_split(thirds, count, axis=1)
         for i, c in np.ndindex(out.shape):
-            seen = [part[i, ~np.isnan(part[i, :, c]), c] for part in parts]
-            calmest = min((float(np.median(part)) for part in seen if part.size), default=0.0)
-            out[i, c] = max(out[i, c], calmest / (0.6745 * 20.0**0.5))
+            calmest = _calmest([part[i, :, c] for part in parts])
+            noise = calmest / (_NORMAL * _THIRD)
+            out[i, c] = max(float(out[i, c]), noise)
     return out
+
+
+def _calmest(parts: list[Array]) -> float:
+    """The smallest of the parts' medians, without NaN; 0 where nothing is there."""
+    medians = []
+    for part in parts:
+        there = part[~np.isnan(part)]
+        if there.size:
+            medians.append(float(np.median(there)))
+    return min(medians, default=0.0)
 
 
 @dataclass(frozen=True)
@@ -133,14 +182,18 @@ class Inputs:
         chosen = self.chosen.astype(np.intp)
         if chosen.max() >= rows.shape[1]:
             raise ValueError(
-                f"the network reads number {chosen.max()} of an observation, this one gives {rows.shape[1]}; "
+                f"the network reads number {chosen.max()} of an observation, "
+                f"this one gives {rows.shape[1]}; "
                 "train on observations of the same runs and channels"
             )
-        scaled = (rows[:, chosen] - self.centre) * self.gain
-        return np.nan_to_num(scaled)  # a series that is not there at all says nothing: its mean
+        centred = rows[:, chosen] - self.centre
+        scaled = centred * self.gain
+        # a series that is not there at all says nothing: its mean
+        return np.nan_to_num(scaled)
 
 
 def _rows(observations: Array, lengths: tuple[int, ...], points: int, plain: bool) -> Array:
+    """All numbers (n, D) that observations (n, T, C) offer."""
     series = resample(observations, lengths, points)
     return series.reshape(len(series), -1) if plain else described(series)
 
@@ -148,20 +201,19 @@ def _rows(observations: Array, lengths: tuple[int, ...], points: int, plain: boo
 def raw_inputs(observations: Array, lengths: tuple[int, ...], points: int) -> Inputs:
     """The published inputs: resampled series in SI units, neither centred nor scaled."""
     size = _rows(observations[:1], lengths, points, plain=True).shape[1]
-    return Inputs(points, True, np.arange(size, dtype=np.float64), np.zeros(size), np.ones(size))
+    every = np.arange(size, dtype=np.float64)
+    return Inputs(points, True, every, np.zeros(size), np.ones(size))
 
 
 def weighed_inputs(data: Rehearsal, points: int, most: int, strictness: float) -> Inputs:
     """Choose and scale inputs by how faithfully they follow the parameters.
 
-    Within each scenario every candidate number is fitted as a linear function of the parameters.
-    What the fit leaves over (jumps, curvature, noise) makes a number a poor guide, above all
-    outside the training range, where it jumps and bends on. The weight is (e / (e + strictness *
-    left over))^2 per unit of standard deviation within a scenario, where e is what one parameter
-    explains; the largest over the parameters counts, each parameter's weights being scaled to the
-    same maximum, so that one that is seen easily does not hide the others. A number that no
-    parameter touches but that differs between scenarios tells the circumstances; it weighs (b / (b
-    + strictness * w))^2, with b and w its standard deviations between and within scenarios.
+    Within each scenario every candidate number is fitted as a linear function of the parameters
+    (1). What the fit leaves over (jumps, curvature, noise) makes a number a poor guide, above all
+    outside the training range, where it jumps and bends on: that is weighed by (2) and (3). Each
+    parameter's weights are scaled to the same maximum, so that one that is seen easily does not
+    hide the others. A number that no parameter touches but that differs between scenarios tells the
+    circumstances; it weighs (4).
 
     Args:
         data: the training simulations.
@@ -175,27 +227,35 @@ def weighed_inputs(data: Rehearsal, points: int, most: int, strictness: float) -
     rows = _rows(data.flat, data.lengths, points, plain=False)
     grouped = rows.reshape(*data.parameters.shape[:2], -1)
     spread, explained, left = _followed(data.parameters, grouped)
-    deviation, between = rows.std(axis=0), grouped.mean(axis=1).std(axis=0)
-    floor = 1e-9 * max(float(deviation.max()), 1e-300)
-    faith = explained / (explained + strictness * left + floor)
+    deviation = rows.std(axis=0)
+    between = grouped.mean(axis=1).std(axis=0)
+    floor = _EXACT * max(float(deviation.max()), _ZERO)
+    faith = explained / (explained + strictness * left + floor)  # (2)
     best = faith.max(axis=1, keepdims=True)
-    following = np.max((faith / np.where(best > 0, best, 1.0)) ** 2, axis=0)
-    context = (between / (between + strictness * spread + floor)) ** 2
-    kept = np.sort(np.argsort(-np.maximum(following, context), kind="stable")[:most])
-    gain = np.maximum(_per(following[kept], spread[kept]), _per(context[kept], deviation[kept]))
-    size = np.sqrt(np.mean((gain * deviation[kept]) ** 2)) if most else 1.0
+    share = faith / np.where(best > 0, best, 1.0)
+    following = np.max(share**2, axis=0)  # (3)
+    context = (between / (between + strictness * spread + floor)) ** 2  # (4)
+    # a stable order, so that equal weights choose the same numbers everywhere
+    order = np.argsort(-np.maximum(following, context), kind="stable")
+    chosen = np.sort(order[:most])
+    by_parameters = _per(following[chosen], spread[chosen])
+    by_context = _per(context[chosen], deviation[chosen])
+    gain = np.maximum(by_parameters, by_context)
+    # the network's initial weights and rate are made for inputs of mean square 1
+    size = np.sqrt(np.mean((gain * deviation[chosen]) ** 2)) if most else 1.0
     return Inputs(
         points,
         False,
-        kept.astype(np.float64),
-        rows[:, kept].mean(axis=0),
+        chosen.astype(np.float64),
+        rows[:, chosen].mean(axis=0),
         gain / size if size > 0 else gain,
     )
 
 
 def _per(weight: Array, deviation: Array) -> Array:
     """Weight per unit of deviation, bounded where there is hardly any."""
-    scaled: Array = weight / (deviation + 1e-3 * deviation.max(initial=0.0) + 1e-300)
+    least = _LEAST_DEVIATION * deviation.max(initial=0.0)
+    scaled: Array = weight / (deviation + least + _ZERO)
     return scaled
 
 
@@ -204,14 +264,22 @@ def _followed(parameters: Array, rows: Array) -> tuple[Array, Array, Array]:
     D), the rest (D,).
     """
     scenarios, each, dim = parameters.shape
+    count = rows.shape[2]
     offsets = parameters - parameters.mean(axis=1, keepdims=True)
-    free = max(each - 1 - dim, 1) / each  # the fit itself takes this share of the rest away
-    total, rest = np.zeros(rows.shape[2]), np.zeros(rows.shape[2])
-    explained = np.zeros((dim, rows.shape[2]))
+    # a fit of 1 + dim numbers leaves this share of what a fit of none would leave of noise
+    free = max(each - 1 - dim, 1) / each
+    total = np.zeros(count)
+    rest = np.zeros(count)
+    explained = np.zeros((dim, count))
     for delta, values in zip(offsets, rows, strict=True):
         centred = values - values.mean(axis=0)
-        slopes = np.linalg.lstsq(delta, centred, rcond=None)[0]
+        slopes = np.linalg.lstsq(delta, centred, rcond=None)[0]  # (1)
+        left_over = centred - delta @ slopes
         total += np.mean(centred**2, axis=0)
-        rest += np.mean((centred - delta @ slopes) ** 2, axis=0) / free
+        rest += np.mean(left_over**2, axis=0) / free
         explained += np.mean(delta**2, axis=0)[:, None] * slopes**2
-    return np.sqrt(total / scenarios), np.sqrt(explained / scenarios), np.sqrt(rest / scenarios)
+    return (
+        np.sqrt(total / scenarios),
+        np.sqrt(explained / scenarios),
+        np.sqrt(rest / scenarios),
+    )

@@ -3,6 +3,14 @@
 Training uses torch (imported where it is needed); the forward pass used in tuning is plain numpy in
 double precision. Source: arXiv 1907.11200, section III and Eq. 1; layer sizes and training from the
 authors' released code.
+
+With a and b the input rows of the proposed and the target side, u the units, [ ] concatenation:
+
+    (1)  n(a, b) = Wo u(Wj [u(Wp a), u(Wt b)]), each W with its bias; published: tanh of it
+    (2)  h(a, b) = (n(a, b) - n(b, a)) / 2, so that h(o, o) = 0; published: h = n
+    (3)  loss = mean |h - difference|^2 / (|difference|^2 + relative^2) + lambda |weights|^2
+
+Eq. 1 of the paper is (3) without the denominator: there the difference's size does not matter.
 """
 
 from __future__ import annotations
@@ -24,6 +32,13 @@ LAYERS = ("proposed", "target", "joined", "output")
 """The fully connected layers; each has a `.weight` (inputs, outputs) and a `.bias` (outputs,)."""
 
 _LOG_2 = float(np.log(2.0))
+"""Softplus at zero; taken off, a unit that hears nothing says nothing."""
+_TAMED = 30.0
+"""Divides relative squared errors; to Adam only their ratio to the weights' penalty matters."""
+_SPREAD = 1.7
+"""Limit of initial weights times the root of a layer's inputs: a variance close to 1 / inputs."""
+_COOLING = 0.99
+"""Factor on the published rate from epoch to epoch."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +81,8 @@ PUBLISHED = Design(
     relative=0.0,
     adam=False,
     rate=0.1,
-    weight_decay=0.5e-2,  # torch's weight_decay 1e-2 is the gradient of half of it times the squared norm
+    # torch's weight_decay 1e-2 is the gradient of half of it times the squared norm
+    weight_decay=0.5e-2,
     epochs=200,
     batch=50,
 )
@@ -76,10 +92,16 @@ def shapes(inputs: tuple[int, int], width: int, dim: int) -> dict[str, tuple[int
     """Shape of every weight array by name, in the order of the network; inputs of the proposed and
     the target side.
     """
-    sizes = ((inputs[0], width), (inputs[1], width), (2 * width, width), (width, dim))
+    sizes = (
+        (inputs[0], width),
+        (inputs[1], width),
+        (2 * width, width),
+        (width, dim),
+    )
     named: dict[str, tuple[int, ...]] = {}
     for layer, (fan_in, fan_out) in zip(LAYERS, sizes, strict=True):
-        named[f"{layer}.weight"], named[f"{layer}.bias"] = (fan_in, fan_out), (fan_out,)
+        named[f"{layer}.weight"] = fan_in, fan_out
+        named[f"{layer}.bias"] = (fan_out,)
     return named
 
 
@@ -98,6 +120,7 @@ def estimate(weights: dict[str, Array], design: Design, proposed: Array, target:
     w = weights
 
     def unit(x: Array) -> Array:
+        # smooth ones bend gently beyond the training range, where rectified ones have a corner
         return np.logaddexp(0.0, x) - _LOG_2 if design.smooth else np.maximum(x, 0.0)
 
     def branch(x: Array, layer: str) -> Array:
@@ -105,14 +128,12 @@ def estimate(weights: dict[str, Array], design: Design, proposed: Array, target:
 
     def joined(a: Array, b: Array) -> Array:
         both = np.concatenate([branch(a, "proposed"), branch(b, "target")], axis=-1)
-        out: Array = (
-            unit(both @ w["joined.weight"] + w["joined.bias"]) @ w["output.weight"]
-            + w["output.bias"]
-        )
+        hidden = branch(both, "joined")
+        out: Array = hidden @ w["output.weight"] + w["output.bias"]  # (1)
         return np.tanh(out) if design.bounded else out
 
     if design.antisymmetric:
-        return (joined(proposed, target) - joined(target, proposed)) / 2.0
+        return (joined(proposed, target) - joined(target, proposed)) / 2.0  # (2)
     return joined(proposed, target)
 
 
@@ -164,23 +185,24 @@ def train(
     """
     import torch
 
-    with (
-        reproducible(device := "cuda" if torch.cuda.is_available() else "cpu"),
-        torch.enable_grad(),
-    ):
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    with reproducible(device), torch.enable_grad():
+        # drawn on the CPU everywhere: only sums differ from device to device
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         inputs = (rows.proposed.shape[-1], rows.target.shape[-1])
         weights = _initial(inputs, parameters.shape[-1], design, generator, device)
-        loss = _loss(design, weights, alone)
         _descend(
-            loss,
+            _loss(design, weights, alone),
             list(weights.values()),
             _data(rows, parameters, device),
             design,
             generator,
             watched,
         )
-        return {name: w.detach().cpu().numpy().astype(np.float64) for name, w in weights.items()}
+        trained: dict[str, Array] = {}
+        for name, weight in weights.items():
+            trained[name] = weight.detach().cpu().numpy().astype(np.float64)
+        return trained
 
 
 @contextmanager
@@ -188,12 +210,13 @@ def reproducible(device: str) -> Iterator[None]:
     """Sums in a fixed order; on the CPU the machine's other cores are left to other runs."""
     import torch
 
-    threads, deterministic = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    threads = torch.get_num_threads()
+    deterministic = torch.are_deterministic_algorithms_enabled()
+    # a sum shared out over threads depends on how many there are
     torch.set_num_threads(1)
     if device == "cuda":
-        os.environ.setdefault(
-            "CUBLAS_WORKSPACE_CONFIG", ":4096:8"
-        )  # cuBLAS's condition for a fixed order
+        # cuBLAS's condition for a fixed order
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
         torch.use_deterministic_algorithms(True)
     try:
         yield
@@ -203,14 +226,16 @@ def reproducible(device: str) -> Iterator[None]:
 
 
 def _data(rows: Sides, parameters: Array, device: str) -> tuple[Any, Any, Any]:
+    """Rows of both sides and parameters as tensors; one tensor where both sides read the same."""
     import torch
 
-    x, y = (
-        torch.as_tensor(array, dtype=torch.float32, device=device)
-        for array in (rows.proposed, parameters)
-    )
+    def tensor(array: Array) -> Any:
+        return torch.as_tensor(array, dtype=torch.float32, device=device)
+
+    proposed = tensor(rows.proposed)
     same = rows.target is rows.proposed
-    return x, x if same else torch.as_tensor(rows.target, dtype=torch.float32, device=device), y
+    target = proposed if same else tensor(rows.target)
+    return proposed, target, tensor(parameters)
 
 
 def _initial(
@@ -222,16 +247,20 @@ def _initial(
     weights: dict[str, Any] = {}
     fan_in = 1
     for name, shape in shapes(inputs, design.width, dim).items():
-        fan_in = shape[0] if name.endswith("weight") else fan_in
-        limit = (1.0 if not design.adam else 1.7 if name.endswith("weight") else 0.0) / fan_in**0.5
-        weights[name] = (
-            ((torch.rand(shape, generator=generator) * 2 - 1) * limit).to(device).requires_grad_()
-        )
+        is_weight = name.endswith("weight")
+        # a layer's bias follows its weights and has their number of inputs
+        fan_in = shape[0] if is_weight else fan_in
+        gain = 1.0
+        if design.adam:
+            gain = _SPREAD if is_weight else 0.0
+        limit = gain / fan_in**0.5
+        uniform = torch.rand(shape, generator=generator) * 2 - 1
+        weights[name] = (uniform * limit).to(device).requires_grad_()
     return weights
 
 
 def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any, Any], Any]:
-    """The data term of Eq. 1 of both sides' rows (n, m, D), (n, m, E) and parameters (n, m, dim)."""
+    """The data term of (3) of both sides' rows (n, m, D), (n, m, E) and parameters (n, m, dim)."""
     import torch
     from torch.nn.functional import softplus
 
@@ -242,28 +271,29 @@ def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any,
         return unit(x @ w[f"{layer}.weight"] + w[f"{layer}.bias"])
 
     def joined(a: Any, b: Any) -> Any:
-        both = torch.cat([a, b], dim=-1)
-        out = (
-            unit(both @ w["joined.weight"] + w["joined.bias"]) @ w["output.weight"]
-            + w["output.bias"]
-        )
+        hidden = branch(torch.cat([a, b], dim=-1), "joined")
+        out = hidden @ w["output.weight"] + w["output.bias"]  # (1)
         return torch.tanh(out) if design.bounded else out
 
     def objective(x: Any, seen: Any, y: Any) -> Any:
+        b = branch(seen, "target")
         if alone:
-            b = branch(seen, "target")
-            error = joined(unit(w["proposed.bias"]).expand_as(b), b) - y
+            # a proposed input of zero leaves the branch's bias
+            silent = unit(w["proposed.bias"]).expand_as(b)
+            error = joined(silent, b) - y
             return (error**2).sum(dim=-1).mean()
         # antisymmetric: half of the ordered pairs will do, the other half are mirror images
         one, other = torch.triu_indices(x.shape[1], x.shape[1], offset=1)
-        a, b = branch(x, "proposed"), branch(seen, "target")
+        a = branch(x, "proposed")
         h = joined(a[:, one], b[:, other])
         if design.antisymmetric:
-            h = (h - joined(a[:, other], b[:, one])) / 2.0
+            h = (h - joined(a[:, other], b[:, one])) / 2.0  # (2)
         difference = y[:, other] - y[:, one]
         squares = ((h - difference) ** 2).sum(dim=-1)
         if design.relative:
-            squares = squares / ((difference**2).sum(dim=-1) + design.relative**2) / 30.0
+            # small differences are what the last steps are made of: they must not drown
+            sizes = (difference**2).sum(dim=-1) + design.relative**2
+            squares = squares / sizes / _TAMED  # (3)
         return squares.mean()
 
     return objective
@@ -277,6 +307,7 @@ def _descend(
     generator: torch.Generator,
     watched: Watched | None,
 ) -> None:
+    """Change the weights, in place, by gradients of (3)."""
     import torch
 
     x, seen, y = data
@@ -284,7 +315,9 @@ def _descend(
     kind = torch.optim.Adam if design.adam else torch.optim.SGD
     optimiser: Any = kind(weights, lr=design.rate)
     for epoch in range(design.epochs):
-        falling = 0.5 + 0.5 * np.cos(np.pi * epoch / design.epochs) if design.adam else 0.99**epoch
+        falling = _COOLING**epoch
+        if design.adam:
+            falling = 0.5 + 0.5 * np.cos(np.pi * epoch / design.epochs)
         for group in optimiser.param_groups:
             group["lr"] = design.rate * float(falling)
         order = torch.randperm(len(x), generator=generator)
@@ -293,14 +326,13 @@ def _descend(
             batch = order[first : first + design.batch].to(x.device)
             optimiser.zero_grad()
             error = loss(x[batch], seen[batch], y[batch])
-            (error + design.weight_decay * sum((v**2).sum() for v in weights)).backward()  # Eq. 1
+            # in the loss and not torch's option, so that it is Eq. 1 for Adam too
+            penalty = design.weight_decay * sum((v**2).sum() for v in weights)
+            (error + penalty).backward()
             optimiser.step()
             losses.append(error.detach())
         if watched and held_out:
             with torch.no_grad():
-                watched.epoch(
-                    epoch + 1,
-                    design.epochs,
-                    float(torch.stack(losses).mean()),
-                    float(loss(*held_out)),
-                )
+                training_loss = float(torch.stack(losses).mean())
+                held_out_loss = float(loss(*held_out))
+            watched.epoch(epoch + 1, design.epochs, training_loss, held_out_loss)

@@ -19,7 +19,9 @@ def quietly(rng: np.random.Generator) -> Iterator[None]:
     """
     import torch
 
-    legacy, seed = np.random.get_state(), int(rng.integers(2**62))  # noqa: NPY002 - packages may draw from it
+    # packages draw from NumPy's and torch's global generators, which belong to the caller
+    legacy = np.random.get_state()  # noqa: NPY002 - it is what is guarded
+    seed = int(rng.integers(2**62))
     with (
         torch.random.fork_rng(devices=[]),
         reproducible("cpu"),
@@ -28,7 +30,7 @@ def quietly(rng: np.random.Generator) -> Iterator[None]:
     ):
         warnings.simplefilter("ignore")
         torch.manual_seed(seed)
-        np.random.seed(seed % 2**32)  # noqa: NPY002
+        np.random.seed(seed % 2**32)  # noqa: NPY002 - it takes 32 bits
         try:
             yield
         finally:
@@ -36,7 +38,7 @@ def quietly(rng: np.random.Generator) -> Iterator[None]:
 
 
 class Silent:
-    """A tracker of training that keeps nothing; the package's own writes into the working folder."""
+    """A tracker of training that keeps nothing; the package's own writes files where it runs."""
 
     log_dir = None
 

@@ -13,8 +13,12 @@ from methods.learning.circumstances import Circumstances
 from methods.learning.pair_inputs import Inputs, raw_inputs, weighed_inputs
 from methods.learning.rehearsal import Rehearsal
 
-_SEEN, _TOLD = ("chosen", "centre", "gain"), ("centre", "spread", "initial")
+_SEEN = ("chosen", "centre", "gain")
+"""Arrays of `Inputs` that are stored."""
+_TOLD = ("centre", "spread", "initial")
+"""Arrays of `Circumstances` that are stored."""
 _NONE = np.empty(0)
+"""Stands for an array that is not there."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,8 @@ class Reading:
         """
         if self.channels is None:
             return observations
-        first, last = (min(c, observations.shape[-1] - 1) for c in self.channels)
+        most = observations.shape[-1] - 1
+        first, last = (min(channel, most) for channel in self.channels)
         return observations[..., first : last + 1]
 
 
@@ -77,18 +82,20 @@ class Reader:
         data = data._replace(observations=reading.part(data.observations))
         if reading.raw:
             return cls(reading, raw_inputs(data.flat, data.lengths, reading.points))
-        told = (
-            Circumstances.learned(data.scenes, data.observations, data.lengths)
-            if reading.told
-            else None
-        )
-        most = reading.inputs if told is None or not told.driven else 0
-        return cls(reading, weighed_inputs(data, reading.points, most, reading.strictness), told)
+        told = None
+        if reading.told:
+            told = Circumstances.learned(data.scenes, data.observations, data.lengths)
+        # where inputs vary, samples mean something else in each scenario: responses alone are read
+        driven = told is not None and told.driven
+        most = 0 if driven else reading.inputs
+        seen = weighed_inputs(data, reading.points, most, reading.strictness)
+        return cls(reading, seen, told)
 
     @property
     def size(self) -> int:
         """Numbers in a row."""
-        return self.seen.chosen.size + (0 if self.told is None else self.told.centre.size)
+        told = 0 if self.told is None else self.told.centre.size
+        return self.seen.chosen.size + told
 
     def __call__(
         self,
@@ -115,25 +122,26 @@ class Reader:
         rows = self.seen(observations, lengths)
         if self.told is None:
             return rows
-        return np.concatenate([rows, self.told(observations, lengths, scene)], axis=1)
+        further = self.told(observations, lengths, scene)
+        return np.concatenate([rows, further], axis=1)
 
     def table(self, data: Rehearsal) -> Array:
         """Input rows (scenarios, each, D) of training simulations."""
         if self.told is None:
-            return self.seen(self.reading.part(data.flat), data.lengths).reshape(
-                *data.parameters.shape[:2], -1
-            )
+            # all scenarios in one call: nothing depends on which a simulation was made in
+            rows = self.seen(self.reading.part(data.flat), data.lengths)
+            return rows.reshape(*data.parameters.shape[:2], -1)
         each = zip(data.observations, data.scenes, strict=True)
         return np.array([self(observations, data.lengths, scene) for observations, scene in each])
 
     def state(self) -> dict[str, Array]:
         """Everything as plain arrays."""
-        state = {f"inputs.{name}": np.asarray(getattr(self.seen, name)) for name in _SEEN}
+        state: dict[str, Array] = {}
+        for name in _SEEN:
+            state[f"inputs.{name}"] = np.asarray(getattr(self.seen, name))
         if self.told is not None:
-            state |= {
-                f"told.{name}": np.asarray(getattr(self.told, name), dtype=np.float64)
-                for name in _TOLD
-            }
+            for name in _TOLD:
+                state[f"told.{name}"] = np.asarray(getattr(self.told, name), dtype=np.float64)
         return state
 
     @classmethod
@@ -144,25 +152,23 @@ class Reader:
             ValueError: arrays that are missing or of other shapes, or numbers that are not finite.
         """
         rest = {name: np.array(array, dtype=np.float64) for name, array in state.items()}
-        kept = [f"inputs.{name}" for name in _SEEN]
-        kept += (
-            [f"told.{name}" for name in _TOLD]
-            if any(name.startswith("told.") for name in rest)
-            else []
-        )
+        names = [f"inputs.{name}" for name in _SEEN]
+        if any(name.startswith("told.") for name in rest):
+            names += [f"told.{name}" for name in _TOLD]
+        # one array of each part says how long the others must be
         sizes = {part: rest.get(f"{part}.centre", _NONE).shape for part in ("inputs", "told")}
-        for name in kept:
+        for name in names:
             shape = () if name == "told.initial" else sizes[name.partition(".")[0]]
             if name not in rest:
                 raise ValueError(f"expected array {name}, found {sorted(state)[:4]}")
-            if rest[name].shape != shape or len(shape) > 1 or not np.isfinite(rest[name]).all():
+            array = rest[name]
+            if array.shape != shape or len(shape) > 1 or not np.isfinite(array).all():
                 raise ValueError(
-                    f"array {name}: expected finite numbers of shape {shape}, found {rest[name].shape}"
+                    f"array {name}: expected finite numbers of shape {shape}, found {array.shape}"
                 )
         if not sizes["inputs"][0] + sum(sizes["told"]):
             raise ValueError("expected a network that reads something, found one without inputs")
-        read = [rest.pop(name) for name in kept]
-        told = Circumstances(read[3], read[4], int(read[5])) if read[3:] else None
-        return cls(
-            reading, Inputs(reading.points, reading.raw, read[0], read[1], read[2]), told
-        ), rest
+        chosen, centre, gain, *own = (rest.pop(name) for name in names)
+        seen = Inputs(reading.points, reading.raw, chosen, centre, gain)
+        told = Circumstances(own[0], own[1], int(own[2])) if own else None
+        return cls(reading, seen, told), rest

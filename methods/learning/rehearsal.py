@@ -8,6 +8,9 @@ import numpy as np
 
 from methods.base import Array, Practice, Scene
 
+_LEAST = 2
+"""Scenarios; from one alone nobody learns what scenarios differ in."""
+
 
 class Rehearsal(NamedTuple):
     """Training simulations: several in each scenario.
@@ -38,8 +41,9 @@ class Rehearsal(NamedTuple):
 
     def spoilt(self, noise: Array, rng: np.random.Generator) -> Rehearsal:
         """The same with white noise of standard deviations (C,) added."""
-        noisy = self.observations + noise * rng.standard_normal(self.observations.shape)
-        return self._replace(observations=noisy, unspoilt=self.pure)
+        errors = noise * rng.standard_normal(self.observations.shape)
+        # the proposed side of a network sees simulations, so they are kept as they were
+        return self._replace(observations=self.observations + errors, unspoilt=self.pure)
 
 
 def rehearse(
@@ -51,23 +55,27 @@ def rehearse(
     Raises:
         ValueError: the budget does not last for two scenarios.
     """
+    # whole scenarios only: pairs are made within one
     count = min(scenarios, budget // each)
-    if count < 2:
+    if count < _LEAST:
         raise ValueError(
             f"{budget} training simulations are fewer than two scenarios of {each} need"
         )
-    parameters, observations, scenes = [], [], []
+    parameters = []
+    observations = []
+    scenes = []
     for _ in range(count):
         points = simulator.sample(rng, each)
-        seen = simulator.simulate(rng, points)
-        whole = np.isfinite(seen).all(axis=(1, 2))
-        if whole.all():
+        simulated = simulator.simulate(rng, points)
+        # a scenario with a failed simulation goes as a whole: arrays need as many in each
+        if np.isfinite(simulated).all():
             parameters.append(points)
-            observations.append(seen)
+            observations.append(simulated)
             scenes.append(simulator.scene)
-    if len(parameters) < 2:
+    if len(parameters) < _LEAST:
         raise ValueError(
-            f"of {count} training scenarios, {len(parameters)} could be simulated; at least 2 are needed"
+            f"of {count} training scenarios, {len(parameters)} could be simulated; "
+            f"at least {_LEAST} are needed"
         )
     lengths = tuple(simulator.lengths)
     return Rehearsal(np.array(parameters), np.array(observations), lengths, tuple(scenes))

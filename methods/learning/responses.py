@@ -1,10 +1,17 @@
 """How an observation responds to the inputs of its scenario: coefficients of a fitted equation of
 motion.
 
-Each channel's acceleration is fitted by what the channels and inputs do at the time. The fit is in
-weak form (D. Messenger, D. Bortz, Weak SINDy, Multiscale Model. Simul. 19, 2021,
-doi:10.1137/20M1343166): both sides are multiplied by bumps and integrated by parts, so that no
-noisy signal is differentiated twice.
+Each channel's acceleration is fitted by what the channels q and inputs u do at the time:
+
+    (1)  q'' = k0 + k1 q + k3 q^3 + kf sense(q') + ku u + kd q'
+
+The fit is in weak form (D. Messenger, D. Bortz, Weak SINDy, Multiscale Model. Simul. 19, 2021,
+doi:10.1137/20M1343166): both sides are multiplied by a bump w that is zero at both ends, and
+integrated by parts, so that no noisy signal is differentiated twice:
+
+    (2)  integral of w q'' = integral of w'' q,   integral of w q' = -integral of w' q
+
+    (3)  w(s) = (1 - s^2)^4, s from -1 to 1 over the bump
 """
 
 from __future__ import annotations
@@ -17,6 +24,12 @@ from methods.learning.pair_inputs import resample
 
 _SIDE_BY_SIDE = 12
 """Bumps that would fill a run; they overlap, each moved by an eighth of its width."""
+_LEAST = 7
+"""Samples of the shortest run that holds a bump of half width 3."""
+_STEEPNESS = 10.0
+"""A rate of change is wholly one way at a fraction of its mean size."""
+_ZERO = 1e-300
+"""Added to sizes by which is divided: a signal that is nothing stays nothing."""
 _RIDGE = 1e-6
 """Per mean square of a regressor: two that say the same, a constant input and 1, share a
 coefficient.
@@ -33,55 +46,70 @@ def responses(observations: Array, inputs: Array, lengths: tuple[int, ...]) -> A
         lengths: samples of each run; one of fewer than seven gives none.
 
     Returns:
-        (n, runs * C * (2 + 4 C + U)).
+        (n, runs * C * (1 + 4 C + U)): for each channel those of (1), every term of every channel.
     """
-    found, first = [np.empty((len(observations), 0))], 0
+    coefficients = [np.empty((len(observations), 0))]
+    first = 0
     for length in lengths:
-        part = slice(first, first := first + length)
-        if length >= 7:
-            series = np.nan_to_num(resample(observations[:, part], (length,), length)).transpose(
-                0, 2, 1
-            )
-            found.append(_response(series, inputs[part]))
-    return np.concatenate(found, axis=1)
+        run = slice(first, first + length)
+        first += length
+        if length < _LEAST:
+            continue
+        # resampling to the run's own length bridges what is missing and changes nothing else
+        whole = resample(observations[:, run], (length,), length)
+        series = np.nan_to_num(whole).transpose(0, 2, 1)
+        coefficients.append(_response(series, inputs[run]))
+    return np.concatenate(coefficients, axis=1)
 
 
 def _response(series: Array, inputs: Array) -> Array:
     """(n, C * R) of one run: series (n, T, C), inputs (T, U)."""
     half = max(3, series.shape[1] // (2 * _SIDE_BY_SIDE))
+    width = half + 1
     s = np.arange(-half, half + 1) / (half + 1.0)
-    bump, slope = (1 - s**2) ** 4, -8 * s * (1 - s**2) ** 3 / (half + 1)
-    bend = (48 * s**2 * (1 - s**2) ** 2 - 8 * (1 - s**2) ** 3) / (half + 1) ** 2
+    inside = 1 - s**2
+    bump = inside**4  # (3)
+    # its derivatives by samples, w' and w''
+    slope = -8 * s * inside**3 / width
+    bend = (48 * s**2 * inside**2 - 8 * inside**3) / width**2
+    stride = max(1, half // 4)
 
     def integral(signal: Array, kernel: Array) -> Array:
-        windows = sliding_window_view(signal, len(s), axis=1)[:, :: max(1, half // 4)]
+        windows = sliding_window_view(signal, len(s), axis=1)[:, ::stride]
         return np.asarray(windows @ kernel, dtype=np.float64)
 
-    held = (
-        inputs + np.concatenate([inputs[:1], inputs[:-1]])
-    ) / 2.0  # an input is held until the next sample
-    told = np.broadcast_to(held, (len(series), *inputs.shape))
-    beside = np.concatenate(
-        [np.ones_like(told[..., :1]), series, series**3, _sense(series), told], axis=2
-    )
-    regressors = np.concatenate([integral(beside, bump), -integral(series, slope)], axis=2)
-    return _fitted(regressors, integral(series, bend)).reshape(len(series), -1)
+    # an input is held until the next sample: around a sample it is half the old, half the new one
+    earlier = np.concatenate([inputs[:1], inputs[:-1]])
+    held = (inputs + earlier) / 2.0
+    driven = np.broadcast_to(held, (len(series), *inputs.shape))
+    constant = np.ones_like(driven[..., :1])
+    # the terms of (1) but the last, which has a derivative of its own
+    plain = np.concatenate([constant, series, series**3, _sense(series), driven], axis=2)
+    regressors = np.concatenate([integral(plain, bump), -integral(series, slope)], axis=2)  # (2)
+    accelerations = integral(series, bend)  # (2)
+    return _fitted(regressors, accelerations).reshape(len(series), -1)
 
 
 def _sense(series: Array) -> Array:
     """Smoothed signs of the rates of change (n, T, C): what dry friction follows."""
+    # slopes of straight lines through seven samples; noise would turn a single difference's sign
     reach = np.arange(-3, 4)
+    line = reach / (reach**2).sum()
     padded = np.pad(series, ((0, 0), (3, 3), (0, 0)), mode="edge")
-    rates = sliding_window_view(padded, len(reach), axis=1) @ (reach / (reach**2).sum())
-    typical = np.abs(rates).mean(axis=1, keepdims=True) + 1e-300
-    return np.asarray(np.tanh(10.0 * rates / typical), dtype=np.float64)
+    rates = sliding_window_view(padded, len(reach), axis=1) @ line
+    typical = np.abs(rates).mean(axis=1, keepdims=True) + _ZERO
+    # tanh in place of a sign, which would jump where noise crosses zero
+    return np.asarray(np.tanh(_STEEPNESS * rates / typical), dtype=np.float64)
 
 
 def _fitted(regressors: Array, values: Array) -> Array:
     """Least squares (n, R, C) of values (n, J, C) on regressors (n, J, R), each lane for itself."""
-    size = np.sqrt((regressors**2).mean(axis=1, keepdims=True)) + 1e-300
+    # scaled to mean square 1, so that the ridge means the same for every regressor
+    size = np.sqrt((regressors**2).mean(axis=1, keepdims=True)) + _ZERO
     scaled = regressors / size
     across = scaled.transpose(0, 2, 1)
-    normal = across @ scaled / scaled.shape[1] + _RIDGE * np.eye(scaled.shape[2])
-    coefficients = np.linalg.solve(normal, across @ values / scaled.shape[1])
+    count = scaled.shape[1]
+    ridge = _RIDGE * np.eye(scaled.shape[2])
+    normal = across @ scaled / count + ridge
+    coefficients = np.linalg.solve(normal, across @ values / count)
     return np.asarray(coefficients / size.transpose(0, 2, 1), dtype=np.float64)

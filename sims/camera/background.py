@@ -15,8 +15,21 @@ from sims.camera.render import Image
 MOST = 25
 """Frames of which the background is the median."""
 _PIXELS = 5_000
+"""Pixels of a picture that the first pass looks at, about."""
 _CUT = 0.5
+"""Share of the pixels that change where the film is cut or the camera moves."""
 _STEP = 12
+"""Grey levels; less is noise or a shadow's edge, and no other picture."""
+_GRAIN = 4
+"""Grey levels of compression beyond the camera's noise, which is told by the median."""
+_NEAR = 1.3
+"""Of a ball's radius: how far around its middle it hides the background, with its soft edge."""
+_EDGE = 3
+"""Pixels beyond that, which compression spoils."""
+_NORMAL = 1.4826
+"""Standard deviations of normal noise in its median magnitude."""
+_WORST = 1.5
+"""The largest of three such magnitudes is taken for so many times one of them."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +51,7 @@ class Survey:
     def shots(self) -> list[tuple[int, int]]:
         """First and behind the last frame between cuts."""
         edges = [0, *self.cuts, len(self.times)]
+        # none between two cuts in a row
         return [(a, b) for a, b in pairwise(edges) if b > a]
 
 
@@ -47,23 +61,29 @@ def survey(frames: Iterable[tuple[float, Image]]) -> Survey:
     Raises:
         InputError: the picture changes its size.
     """
-    times, moved, cuts = [], [], []
-    size, before = (0, 0), None
+    times = []
+    moved = []
+    cuts = []
+    size = 0, 0
+    before = None
     for number, (time, picture) in enumerate(frames):
         if number and picture.shape[1::-1] != size:
-            raise InputError(
-                f"frame {number}: expected {size[0]} x {size[1]} px as before, found another size"
-            )
-        size = picture.shape[1], picture.shape[0]
-        skip = max(1, int((picture.shape[0] * picture.shape[1] / _PIXELS) ** 0.5))
+            expected = f"{size[0]} x {size[1]} px as before"
+            raise InputError(f"frame {number}: expected {expected}, found another size")
+        height, width = picture.shape[:2]
+        size = width, height
+        skip = max(1, int((height * width / _PIXELS) ** 0.5))
         coarse = picture[::skip, ::skip].astype(np.int16)
-        change = np.abs(coarse - (coarse if before is None else before)).max(axis=2)
+        earlier = coarse if before is None else before
+        change = np.abs(coarse - earlier).max(axis=2)
         if np.mean(change > _STEP) > _CUT:
             cuts.append(number)
+            # what changed is the picture, and no ball has moved
             change[:] = 0
         times.append(time)
         # small changes are noise; they would make a resting picture look busy
-        moved.append(float(np.maximum(change - 2 * np.median(change) - 4, 0).mean()))
+        beyond = change - 2 * np.median(change) - _GRAIN
+        moved.append(float(np.maximum(beyond, 0).mean()))
         before = coarse
     return Survey(np.array(times), np.array(moved), tuple(cuts), size)
 
@@ -73,16 +93,22 @@ def chosen(moved: Array, most: int = MOST) -> list[int]:
 
     Evenly in time, a ball that comes to rest would be in most of them and so in the median.
     """
-    way = np.cumsum(moved + 1e-3 * moved.sum() / max(1, len(moved)) + 1e-12)
-    marks = np.linspace(way[0], way[-1], min(most, len(moved)))
-    return sorted(set(np.searchsorted(way, marks - 1e-12).clip(0, len(moved) - 1).tolist()))
+    count = len(moved)
+    # a little for every frame, so that a film in which nothing moves still has marks
+    least = 1e-3 * moved.sum() / max(1, count)
+    way = np.cumsum(moved + least + 1e-12)
+    marks = np.linspace(way[0], way[-1], min(most, count))
+    places = np.searchsorted(way, marks - 1e-12).clip(0, count - 1)
+    return sorted(set(places.tolist()))
 
 
 def median(pictures: list[Image]) -> Image:
     """The median of pictures, pixel by pixel."""
     stack = np.stack(pictures)
-    stack.partition(len(stack) // 2, axis=0)
-    result: Image = stack[len(stack) // 2].copy()
+    half = len(stack) // 2
+    # a partition finds the middle without sorting, and stays in whole grey levels
+    stack.partition(half, axis=0)
+    result: Image = stack[half].copy()
     return result
 
 
@@ -100,16 +126,23 @@ def without(
         before: the background as it was taken to be.
         shaded: (n, height, width) where shadow is besides.
     """
-    rows, columns = np.mgrid[: before.shape[0], : before.shape[1]]
-    hidden = np.zeros((len(pictures), *rows.shape), bool) if shaded is None else shaded.copy()
+    height, width = before.shape[:2]
+    rows, columns = np.mgrid[:height, :width]
+    nowhere = np.zeros((len(pictures), height, width), bool)
+    hidden = nowhere if shaded is None else shaded.copy()
     for mask, there in zip(hidden, balls, strict=True):
         for u, v, radius in there:
-            mask |= np.hypot(columns - u, rows - v) < 1.3 * radius + 3
+            far = np.hypot(columns - u, rows - v)
+            mask |= far < _NEAR * radius + _EDGE
+    # elsewhere the median stands: never hidden, or hidden in all pictures
     ever = hidden.any(axis=0) & ~hidden.all(axis=0)
-    values = np.where(hidden[:, ever, None], np.nan, np.stack(pictures)[:, ever].astype(np.float32))
+    colours = np.stack(pictures)[:, ever].astype(np.float32)
+    values = np.where(hidden[:, ever, None], np.nan, colours)
     result = before.copy()
     if ever.any():
-        result[ever] = (_median_of_seen(values) + 0.5).astype(np.uint8)
+        middle = _median_of_seen(values)
+        # half a level, since the conversion to whole ones cuts off
+        result[ever] = (middle + 0.5).astype(np.uint8)
     return result
 
 
@@ -117,12 +150,12 @@ def _median_of_seen(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """The median over the first axis without NaN, of which not all are; numpy's own takes four
     times as long.
     """
-    ranked = np.sort(values, axis=0)  # NaN last
+    # NaN come last, so the count of the others says where the middle is
+    ranked = np.sort(values, axis=0)
     count = np.isfinite(values).sum(axis=0, keepdims=True)
-    low, high = (
-        np.take_along_axis(ranked, place, axis=0)[0] for place in ((count - 1) // 2, count // 2)
-    )
-    result: NDArray[np.float32] = (low + high) / 2
+    low = np.take_along_axis(ranked, (count - 1) // 2, axis=0)
+    high = np.take_along_axis(ranked, count // 2, axis=0)
+    result: NDArray[np.float32] = (low[0] + high[0]) / 2
     return result
 
 
@@ -130,14 +163,15 @@ def noise(pictures: list[Image], background: Image) -> float:
     """1 sigma of the camera in grey levels of its worst colour, from pictures in which little
     differs.
     """
-    worst = [
-        _difference(picture, background) for picture in pictures[:: max(1, len(pictures) // 8)]
-    ]
-    return float(
-        1.4826 * np.median(np.stack(worst)) / 1.5
-    )  # the largest of three magnitudes is 1.5 times one
+    # a few tell: each has as many numbers as pixels
+    every = max(1, len(pictures) // 8)
+    worst = [_difference(picture, background) for picture in pictures[::every]]
+    return float(_NORMAL * np.median(np.stack(worst)) / _WORST)
 
 
 def _difference(picture: Image, background: Image) -> NDArray[np.int16]:
-    result: NDArray[np.int16] = np.abs(picture.astype(np.int16) - background).max(axis=2)
+    """The largest difference (height, width) over the colours."""
+    # whole numbers without sign would wrap round
+    apart = np.abs(picture.astype(np.int16) - background)
+    result: NDArray[np.int16] = apart.max(axis=2)
     return result

@@ -2,6 +2,27 @@
 
 Pixels are (u, v): u to the right, v down, (0, 0) the centre of the upper left pixel, as OpenCV
 counts them. World coordinates are metres, z up. Pixels are square and the lens does not distort.
+
+With (X, Y, Z) a point in the camera's frame (right, down, depth), f the focal length in pixels and
+(u0, v0) the pixel of the optical axis:
+
+    (1)  (X, Y, Z) = axes (point - position)
+    (2)  u = u0 + f X / Z,  v = v0 + f Y / Z
+    (3)  f = (height / 2) / tan(field of view / 2)
+
+(R. Hartley, A. Zisserman, Multiple View Geometry, 2004, chapter 6). A sphere of radius r at
+distance d, seen at the angle t from the optical axis, fills a cone of half angle p with
+
+    (4)  sin p = r / d
+
+whose section with the picture plane Z = 1 is an ellipse, its long axis on the line to the middle of
+the picture, from tan(t - p) to tan(t + p):
+
+    (5)  centre a = (tan(t - p) + tan(t + p)) / 2,  half length (tan(t + p) - tan(t - p)) / 2
+
+and half width b, from a point (a, b, 1) of the cone, the axis of which is (sin t, 0, cos t):
+
+    (6)  (a sin t + cos t)^2 = cos(p)^2 (a^2 + b^2 + 1)
 """
 
 from __future__ import annotations
@@ -16,6 +37,7 @@ from numpy.typing import ArrayLike
 from sims.base import Array, InputError, frozen
 
 _REFINEMENTS = 4
+"""Rounds in which the offset between outline and projected centre is taken off."""
 
 
 @dataclass(frozen=True)
@@ -39,15 +61,21 @@ class Camera:
     size: tuple[int, int] = (100, 100)
 
     def __post_init__(self) -> None:
-        numbers = [self.azimuth, self.distance, self.height, self.field_of_view, *self.target]
+        numbers = [
+            self.azimuth,
+            self.distance,
+            self.height,
+            self.field_of_view,
+            *self.target,
+        ]
         if not np.isfinite(numbers).all():
             raise InputError(f"camera: expected finite numbers, found {numbers}")
+        # seen from straight above, the picture would have no upright
         if self.distance <= 0:
             raise InputError(f"camera: distance: expected more than 0 m, found {self.distance:g}")
-        if not 0 < self.field_of_view < 180:
-            raise InputError(
-                f"camera: field_of_view: expected 0 to 180 degrees, found {self.field_of_view:g}"
-            )
+        angle = self.field_of_view
+        if not 0 < angle < 180:
+            raise InputError(f"camera: field_of_view: expected 0 to 180 degrees, found {angle:g}")
         if len(self.size) != 2 or min(self.size) < 2:
             raise InputError(f"camera: size: expected two numbers of pixels, found {self.size}")
 
@@ -62,7 +90,9 @@ class Camera:
             rng: what is drawn comes from here.
             pixels: width and height of the picture.
         """
-        azimuth, distance, height = rng.uniform((0.0, 5.0, 5.0), (2 * math.pi, 10.0, 8.0)).tolist()
+        low = 0.0, 5.0, 5.0
+        high = 2 * math.pi, 10.0, 8.0
+        azimuth, distance, height = rng.uniform(low, high).tolist()
         return cls(azimuth, distance, height, size=(pixels, pixels))
 
     def resized(self, width: int, height: int) -> Camera:
@@ -73,38 +103,40 @@ class Camera:
     def position(self) -> Array:
         """Where it stands (3,), m."""
         x, y, _ = self.target
-        return frozen(
-            [
-                x + self.distance * math.cos(self.azimuth),
-                y + self.distance * math.sin(self.azimuth),
-                self.height,
-            ]
-        )
+        x += self.distance * math.cos(self.azimuth)
+        y += self.distance * math.sin(self.azimuth)
+        return frozen([x, y, self.height])
 
     @cached_property
     def focal(self) -> float:
         """Focal length in pixels."""
-        return 0.5 * self.size[1] / math.tan(math.radians(self.field_of_view) / 2)
+        half_angle = math.radians(self.field_of_view) / 2
+        return 0.5 * self.size[1] / math.tan(half_angle)  # (3)
 
     @cached_property
     def middle(self) -> Array:
         """The pixel (2,) of the optical axis."""
-        return frozen([(self.size[0] - 1) / 2, (self.size[1] - 1) / 2])
+        # pixels are counted from their centres, so the middle of 100 is 49.5
+        width, height = self.size
+        return frozen([(width - 1) / 2, (height - 1) / 2])
 
     @cached_property
     def axes(self) -> Array:
         """Rows: the picture's right, its down, and the viewing direction, as unit vectors of the
         world (3, 3).
         """
+        # up in the picture is up in the world as far as the view allows
         forward = np.asarray(self.target) - self.position
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, (0.0, 0.0, 1.0))
         right /= np.linalg.norm(right)
-        return frozen([right, np.cross(forward, right), forward])
+        down = np.cross(forward, right)
+        return frozen([right, down, forward])
 
     def seen(self, points: ArrayLike) -> Array:
         """World points (..., 3) in the camera's frame (..., 3), m: right, down, depth."""
-        result: Array = (np.asarray(points, dtype=np.float64) - self.position) @ self.axes.T
+        away = np.asarray(points, dtype=np.float64) - self.position
+        result: Array = away @ self.axes.T  # (1)
         return result
 
     def depth(self, points: ArrayLike) -> Array:
@@ -119,8 +151,10 @@ class Camera:
         the camera.
         """
         seen = self.seen(points)
-        depth = np.where(seen[..., 2:] > 0, seen[..., 2:], np.nan)
-        result: Array = self.middle + self.focal * seen[..., :2] / depth
+        depth = seen[..., 2:]
+        # what is behind would appear turned about the middle
+        depth = np.where(depth > 0, depth, np.nan)
+        result: Array = self.middle + self.focal * seen[..., :2] / depth  # (2)
         return result
 
     def outline(self, points: ArrayLike, radius: float) -> tuple[Array, Array]:
@@ -128,9 +162,7 @@ class Camera:
         longer first, px.
 
         The longer axis points to the middle of the picture, and the centre lies a little further
-        out than the projection of the sphere's own centre. With t the angle between optical axis
-        and sphere, and p the angle that the sphere fills, sin p = radius / distance, its ends lie
-        at tan(t - p) and tan(t + p).
+        out than the projection of the sphere's own centre.
 
         Args:
             points: centres (..., 3), m; NaN comes back for one that is not wholly before the
@@ -138,19 +170,27 @@ class Camera:
             radius: of the sphere, m.
         """
         seen = self.seen(points)
+        sideways = seen[..., :2]
+        depth = seen[..., 2]
         far = np.linalg.norm(seen, axis=-1)
-        aside = np.hypot(seen[..., 0], seen[..., 1])
+        aside = np.hypot(sideways[..., 0], sideways[..., 1])
         with np.errstate(invalid="ignore", divide="ignore"):
-            half = np.arcsin(radius / far)
-            tilt = np.arctan2(aside, seen[..., 2])
+            half = np.arcsin(radius / far)  # (4)
+            tilt = np.arctan2(aside, depth)
+            # a cone that reaches the plane of the camera itself has no ellipse
             tilt = np.where(tilt + half < math.pi / 2, tilt, np.nan)
-            near_end, far_end = np.tan(tilt - half), np.tan(tilt + half)
-            away = (near_end + far_end) / 2
-            # the cone (x . c)^2 = cos(p)^2 |x|^2 cut by the picture plane, at its middle
-            across = ((away * np.sin(tilt) + np.cos(tilt)) / np.cos(half)) ** 2 - away**2 - 1
-            direction = seen[..., :2] / np.where(aside > 0, aside, 1.0)[..., None]
+            near_end = np.tan(tilt - half)
+            far_end = np.tan(tilt + half)
+            away = (near_end + far_end) / 2  # (5)
+            lean = away * np.sin(tilt) + np.cos(tilt)
+            across = (lean / np.cos(half)) ** 2 - away**2 - 1  # (6), b^2
+            # in the middle of the picture any direction will do
+            divisor = np.where(aside > 0, aside, 1.0)
+            direction = sideways / divisor[..., None]
         centre = self.middle + self.focal * away[..., None] * direction
-        return centre, self.focal * np.stack([(far_end - near_end) / 2, np.sqrt(across)], axis=-1)
+        longer = (far_end - near_end) / 2  # (5)
+        shorter = np.sqrt(across)
+        return centre, self.focal * np.stack([longer, shorter], axis=-1)
 
     def apparent_radius(self, points: ArrayLike, radius: float) -> Array:
         """Radius (...) in pixels of the circle that covers as much of the picture as the sphere
@@ -164,17 +204,26 @@ class Camera:
         """Heights (...) at which a ball on the vertical through (x, y) has its outline nearest to
         `centres` (..., 2).
 
-        A point on that vertical is linear in z, so both its picture equations are; the small offset
-        between outline and projected centre is taken off in a few rounds.
+        A point on that vertical is linear in z, base + z up, so both equations (2) are when
+        multiplied by Z; with k = (u - u0, v - v0) / f they read
+
+            (7)  (base_XY - k base_Z) + z (up_XY - k up_Z) = 0
+
+        and are solved for z by least squares. The small offset between outline and projected centre
+        is taken off in a few rounds.
         """
         pixels = np.asarray(centres, dtype=np.float64)
-        base, up = self.seen((x, y, 0.0)), self.axes[:, 2]
+        base = self.seen((x, y, 0.0))
+        up = self.axes[:, 2]
         shift: Array = np.zeros_like(pixels)
         z: Array = np.full(pixels.shape[:-1], np.nan)
         for _ in range(_REFINEMENTS):
             ratio = (pixels - shift - self.middle) / self.focal
-            constant, slope = base[:2] - ratio * base[2], up[:2] - ratio * up[2]
-            z = -(constant * slope).sum(axis=-1) / (slope * slope).sum(axis=-1)
-            points = np.stack([np.full_like(z, x), np.full_like(z, y), z], axis=-1)
-            shift = self.outline(points, radius)[0] - self.project(points)
+            constant = base[:2] - ratio * base[2]
+            slope = up[:2] - ratio * up[2]
+            z = -(constant * slope).sum(axis=-1) / (slope * slope).sum(axis=-1)  # (7)
+            everywhere = np.ones_like(z)
+            points = np.stack([x * everywhere, y * everywhere, z], axis=-1)
+            centre, _ = self.outline(points, radius)
+            shift = centre - self.project(points)
         return z

@@ -11,14 +11,21 @@ from sims.base import Array
 from sims.camera.spots import Spot
 
 _PATIENCE = 15
+"""Pictures for which a thing may be lost from view and still be the same."""
 _ALIKE = (0.65, 1.55)
+"""Between these a radius may be of another picture's: the way towards the camera, and blur."""
 _LEAST = 3
+"""Pictures that show a thing; what fewer show is noise."""
 _CHANCE = 0.5
+"""Share of the rays that agree on a circle by chance."""
 _MEMORY = 20
 """Pictures over which the colour of a path is averaged."""
-_TINGE, _SHARE = 25.0, 0.45
-"""Grey levels, and share of the contrast with the background, by which a thing's colour may vary.
-"""
+_TINGE = 25.0
+"""Grey levels by which a thing's colour may vary."""
+_SHARE = 0.45
+"""Share of its contrast with the background by which it may vary as well."""
+_BEHIND = 3
+"""Median radii from a path's line within which another path may be its continuation."""
 _BLEEDS = 1.5
 """Pixels over which video files, which keep colours at half the resolution, mix a ball's with the
 background's.
@@ -35,8 +42,11 @@ class Path:
 
     def add(self, frame: int, spot: Spot) -> None:
         """Go on with a spot of one more picture."""
-        weight = 1.0 / min(len(self.spots) + 1, _MEMORY)
-        self.tone = (1.0 - weight) * self.tone + weight * np.array(spot.colour)
+        # a plain mean at first, later one that forgets: light changes along the way
+        count = len(self.spots) + 1
+        weight = 1.0 / min(count, _MEMORY)
+        colour = np.array(spot.colour)
+        self.tone = (1.0 - weight) * self.tone + weight * colour
         self.frames.append(frame)
         self.spots.append(spot)
 
@@ -45,16 +55,19 @@ class Path:
         bounce turns it.
         """
         last = self.spots[-1]
+        u, v = last.u, last.v
+        # of one picture nobody knows where it goes
         if len(self.spots) < 2:
-            return last.u, last.v, 4 * last.radius + 10
-        gap, before = self.frames[-1] - self.frames[-2], self.spots[-2]
-        du, dv = (last.u - before.u) / gap, (last.v - before.v) / gap
+            return u, v, 4 * last.radius + 10
+        before = self.spots[-2]
+        gap = self.frames[-1] - self.frames[-2]
+        du = (u - before.u) / gap
+        dv = (v - before.v) / gap
         wait = frame - self.frames[-1]
-        return (
-            last.u + du * wait,
-            last.v + dv * wait,
-            2 * float(np.hypot(du, dv)) * wait + last.radius + 2,
-        )
+        # twice the way: one that turns round is as far from where it should be
+        speed = float(np.hypot(du, dv))
+        reach = 2 * speed * wait + last.radius + 2
+        return u + du * wait, v + dv * wait, reach
 
     def near(self, frame: int, spot: Spot) -> float:
         """Distance of a spot from where this should be, as a share of what is allowed; infinite for
@@ -65,7 +78,10 @@ class Path:
         """
         u, v, reach = self.expected(frame)
         off = float(np.hypot(spot.u - u, spot.v - v)) / reach
-        if off > 1 or not _ALIKE[0] < spot.radius / self.spots[-1].radius < _ALIKE[1]:
+        if off > 1:
+            return np.inf
+        low, high = _ALIKE
+        if not low < spot.radius / self.spots[-1].radius < high:
             return np.inf
         unlike = self.unlike(spot.colour, spot.contrast)
         return off + unlike if unlike <= 1 else np.inf
@@ -74,10 +90,15 @@ class Path:
         """How far a colour is from this one's, as a share of what light and compression may do to
         it.
         """
+        # the smaller the ball, the more of it is mixed with the background
         tinge = _TINGE * (1.0 + _BLEEDS / self.spots[-1].radius)
-        return float(np.abs(self.tone - colour).max()) / max(
-            tinge, _SHARE * contrast, _SHARE * self.contrast
+        allowed = max(
+            tinge,
+            _SHARE * contrast,
+            _SHARE * self.contrast,
         )
+        apart = np.abs(self.tone - colour)
+        return float(apart.max()) / allowed
 
     @property
     def contrast(self) -> float:
@@ -107,7 +128,7 @@ class Path:
         Counted in pictures alone, a remnant of shadow that is there all the time would outweigh a
         ball.
         """
-        return sum((s.agree - _CHANCE) * s.radius for s in self.spots)
+        return sum((spot.agree - _CHANCE) * spot.radius for spot in self.spots)
 
 
 def linked(pictures: Sequence[Sequence[Spot]]) -> list[Path]:
@@ -115,47 +136,71 @@ def linked(pictures: Sequence[Sequence[Spot]]) -> list[Path]:
     done: list[Path] = []
     live: list[Path] = []
     for frame, spots in enumerate(pictures):
-        done += [p for p in live if frame - p.frames[-1] > _PATIENCE]
-        live = [p for p in live if frame - p.frames[-1] <= _PATIENCE]
-        pairs = sorted(
-            (p.near(frame, s), i, k) for i, p in enumerate(live) for k, s in enumerate(spots)
-        )
-        paths, taken = set(), set()
-        for distance, i, k in pairs:
-            if not np.isfinite(distance) or i in paths or k in taken:
-                continue
-            paths.add(i)
-            taken.add(k)
-            live[i].add(frame, spots[k])
+        done += [path for path in live if frame - path.frames[-1] > _PATIENCE]
+        live = [path for path in live if frame - path.frames[-1] <= _PATIENCE]
+        taken = _continued(live, frame, spots)
+        # what continues nothing begins something
         for k, spot in enumerate(spots):
             if k not in taken:
-                live.append(Path())
-                live[-1].add(frame, spot)
-    return sorted(
-        (p for p in done + live if len(p.frames) >= _LEAST),
-        key=lambda p: -p.weight * (p.travel > p.radius),
-    )
+                path = Path()
+                path.add(frame, spot)
+                live.append(path)
+    paths = [path for path in done + live if len(path.frames) >= _LEAST]
+    # what stays where it is comes last, whatever speaks for it
+    return sorted(paths, key=lambda path: -path.weight * (path.travel > path.radius))
+
+
+def _continued(live: Sequence[Path], frame: int, spots: Sequence[Spot]) -> set[int]:
+    """Add each spot to the path that it suits best; the numbers of the spots that suit one."""
+    pairs = []
+    for i, path in enumerate(live):
+        for k, spot in enumerate(spots):
+            distance = path.near(frame, spot)
+            if np.isfinite(distance):
+                pairs.append((distance, i, k))
+    paths: set[int] = set()
+    taken: set[int] = set()
+    # the nearest pair first; a path gets one spot, and a spot one path
+    for _, i, k in sorted(pairs):
+        if i in paths or k in taken:
+            continue
+        paths.add(i)
+        taken.add(k)
+        live[i].add(frame, spots[k])
+    return taken
 
 
 def joined(paths: Sequence[Path]) -> tuple[Path, list[Path]]:
     """The first path with those that go on where it was lost from view, and the other paths."""
-    main, others = paths[0], []
-    frames, spots = list(main.frames), list(main.spots)
+    main = paths[0]
+    others = []
+    frames = list(main.frames)
+    spots = list(main.spots)
+    low, high = _ALIKE
     for path in paths[1:]:
+        # one ball is in one place: what shows in the same picture is another thing
         apart = not set(path.frames) & set(frames)
-        alike = _ALIKE[0] < path.radius / main.radius < _ALIKE[1]
+        alike = low < path.radius / main.radius < high
         alike &= main.unlike(path.tone.tolist(), path.contrast) <= 1
-        if apart and alike and _aside(main.places, path.places) < 3 * main.radius:
+        aside = _aside(main.places, path.places)
+        if apart and alike and aside < _BEHIND * main.radius:
             frames += path.frames
             spots += path.spots
         else:
             others.append(path)
     order = np.argsort(frames).tolist()
-    return Path([frames[i] for i in order], [spots[i] for i in order], main.tone), others
+    whole = Path(
+        [frames[i] for i in order],
+        [spots[i] for i in order],
+        main.tone,
+    )
+    return whole, others
 
 
 def _aside(line: Array, points: Array) -> float:
     """Median distance of points from the straight line along which other points lie."""
     middle = line.mean(axis=0)
+    # the last axis is the one across, along which the line's points differ least
     _, _, axes = np.linalg.svd(line - middle, full_matrices=False)
-    return float(np.median(np.abs((points - middle) @ axes[-1])))
+    across = (points - middle) @ axes[-1]
+    return float(np.median(np.abs(across)))

@@ -14,6 +14,13 @@ _CONTRAST = 0.3
 seen by anyone.
 """
 _WAVES = 6
+"""Waves of which the ground's pattern is the sum."""
+_LOWEST = np.pi / 6
+"""rad above the ground, of the light: 30 degrees."""
+_HIGHEST = np.pi / 2.25
+"""rad above the ground, of the light: 80 degrees."""
+_BALL_VALUE = (0.15, 1.0)
+"""Brightness of balls, of 1: any but black."""
 
 
 @dataclass(frozen=True)
@@ -47,29 +54,36 @@ class Look:
         """A look by chance: light 30 to 80 degrees above the ground, any colours that can be told
         apart.
         """
-        azimuth, above = rng.uniform(0, 2 * np.pi), rng.uniform(np.pi / 6, np.pi / 2.25)
+        # the order of the draws is part of what a seed means
+        azimuth = rng.uniform(0, 2 * np.pi)
+        above = rng.uniform(_LOWEST, _HIGHEST)
         flat = np.cos(above)
-        light = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(above)]
+        light = [
+            flat * np.cos(azimuth),
+            flat * np.sin(azimuth),
+            np.sin(above),
+        ]
         ground = _colour(rng, saturation=(0.0, 0.4), value=(0.3, 0.85))
-        ball = _colour(rng, saturation=(0.0, 1.0), value=(0.15, 1.0))
+        ball = _colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
         while np.max(np.abs(np.subtract(ball, ground))) < _CONTRAST:
-            ball = _colour(rng, saturation=(0.0, 1.0), value=(0.15, 1.0))
+            ball = _colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
         sky = _colour(rng, saturation=(0.0, 0.3), value=(0.7, 1.0))
-        bearing, length = rng.uniform(0, 2 * np.pi, _WAVES), rng.uniform(0.5, 6.0, _WAVES)
-        phase, amplitude = rng.uniform(0, 2 * np.pi, _WAVES), rng.uniform(0.0, 0.04, _WAVES)
-        waves = np.stack(
-            [length * np.cos(bearing), length * np.sin(bearing), phase, amplitude], axis=1
-        )
-        shadow, noise = rng.uniform(0.2, 0.6), rng.uniform(0.5, 2.5)
+        bearing = rng.uniform(0, 2 * np.pi, _WAVES)
+        length = rng.uniform(0.5, 6.0, _WAVES)
+        phase = rng.uniform(0, 2 * np.pi, _WAVES)
+        amplitude = rng.uniform(0.0, 0.04, _WAVES)
+        across = length * np.cos(bearing)
+        along = length * np.sin(bearing)
+        waves = np.stack([across, along, phase, amplitude], axis=1)
         return cls(
             frozen(light),
             ball,
             ground,
             sky,
             frozen(waves),
-            shadow,
-            noise,
-            int(rng.integers(14, 24)),
+            shadow=rng.uniform(0.2, 0.6),
+            noise=rng.uniform(0.5, 2.5),
+            crf=int(rng.integers(14, 24)),
         )
 
     def pattern(self, x: Array, y: Array) -> Array:
@@ -81,6 +95,9 @@ class Look:
 
 
 def _colour(
-    rng: np.random.Generator, saturation: tuple[float, float], value: tuple[float, float]
+    rng: np.random.Generator,
+    saturation: tuple[float, float],
+    value: tuple[float, float],
 ) -> tuple[float, float, float]:
+    """Any hue, with saturation and value from these ranges."""
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(*value))

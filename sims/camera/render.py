@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sims import bullet
 from sims.base import Array
@@ -25,10 +25,27 @@ from sims.camera.sphere import sphere
 
 Image: TypeAlias = NDArray[np.uint8]
 """A picture (height, width, 3), red, green, blue."""
+Colours: TypeAlias = NDArray[np.float32]
+"""The same while it is worked at, in grey levels; or each pixel's share (height, width, 1)."""
+Window: TypeAlias = tuple[int, int, int, int]
+"""A part of a picture: left, top, behind its right, below its bottom."""
 
-_NEAR, _FAR = 0.2, 200.0
+_NEAR = 0.2
+"""m from the camera; what is closer is not drawn."""
+_FAR = 200.0
+"""m from the camera; what is further is not drawn."""
 _GROUND = 60.0
-_MARGIN, _SMALL = 2, 20
+"""m, half the side of the ground."""
+_THICKNESS = 0.05
+"""m, half that of the ground, whose upper side is at height 0."""
+_MARGIN = 2
+"""Pixels around the ball's outline that are rendered with it."""
+_SMALL = 20
+"""Pixels; a ball of a smaller radius is rendered three times finer, a larger one twice."""
+_SHARPEST = 0.02
+"""Of the ball's radius: half the width of a shadow's edge where the ball lies on the ground."""
+_SUN = 0.01
+"""rad; how much wider the edge gets with the way from ball to ground, as from the sun's disc."""
 
 
 class Stage:
@@ -42,23 +59,31 @@ class Stage:
     """
 
     def __init__(self, camera: Camera, look: Look, radius: float, rng: np.random.Generator) -> None:
-        self.camera, self.look, self.radius, self._rng = camera, look, radius, rng
+        self.camera = camera
+        self.look = look
+        self.radius = radius
+        self._rng = rng
         p = bullet.engine()
         self._client: int = p.connect(p.DIRECT)
         self.close = weakref.finalize(self, p.disconnect, self._client)
-        ground = self._body(p.GEOM_BOX, look.ground, halfExtents=[_GROUND, _GROUND, 0.05])
-        p.resetBasePositionAndOrientation(
-            ground, (0, 0, -0.05), (0, 0, 0, 1), physicsClientId=self._client
-        )
+        extents = [_GROUND, _GROUND, _THICKNESS]
+        ground = self._body(p.GEOM_BOX, look.ground, halfExtents=extents)
+        self._place(ground, (0, 0, -_THICKNESS))
         width, height = camera.size
+        everything = 0, 0, width, height
         self._rays = self._directions()
-        picture, covered = self._render((0, 0, width, height), 1, ground)
+        picture, covered = self._render(everything, 1, ground)
+        # frames are rendered without it: it does not change
         p.removeBody(ground, physicsClientId=self._client)
         self._still = self._background(picture, covered)
         points, faces = sphere()
-        corners = (radius * points).tolist()
         self._ball = self._body(
-            p.GEOM_MESH, look.ball, vertices=corners, indices=faces, normals=points.tolist()
+            p.GEOM_MESH,
+            look.ball,
+            vertices=(radius * points).tolist(),
+            indices=faces,
+            # of the sphere and not of its faces, so that shading is smooth
+            normals=points.tolist(),
         )
 
     def film(self, positions: Iterable[Array]) -> Iterator[Image]:
@@ -68,17 +93,29 @@ class Stage:
     def frame(self, position: Array) -> Image:
         """The picture with the ball's centre at `position` (3,), m."""
         picture = self._still.copy()
+        # the shadow first: the ball may hide a part of it
         self._cast_shadow(picture, position)
         self._draw_ball(picture, position)
         if self.look.noise > 0:
-            picture += self.look.noise * self._rng.standard_normal(picture.shape, dtype=np.float32)
+            grain = self._rng.standard_normal(picture.shape, dtype=np.float32)
+            picture += self.look.noise * grain
+        # half a level, since the conversion to whole ones cuts off
         return (picture + 0.5).clip(0, 255).astype(np.uint8)
+
+    def _place(self, body: int, position: ArrayLike) -> None:
+        bullet.engine().resetBasePositionAndOrientation(
+            body, position, (0, 0, 0, 1), physicsClientId=self._client
+        )
 
     def _body(self, shape: int, colour: tuple[float, float, float], **size: object) -> int:
         p = bullet.engine()
         visual = p.createVisualShape(
-            shape, rgbaColor=[*colour, 1.0], physicsClientId=self._client, **size
+            shape,
+            rgbaColor=[*colour, 1.0],
+            physicsClientId=self._client,
+            **size,
         )
+        # no mass and no collision shape: nothing is simulated here
         body: int = p.createMultiBody(0.0, -1, visual, physicsClientId=self._client)
         return body
 
@@ -86,76 +123,99 @@ class Stage:
         """For each pixel the world vector (height, width, 3) along which the camera looks."""
         v, u = np.mgrid[: self.camera.size[1], : self.camera.size[0]]
         right, down, forward = self.camera.axes
-        a, b = (
-            (u - self.camera.middle[0]) / self.camera.focal,
-            (v - self.camera.middle[1]) / self.camera.focal,
-        )
+        # (2) of sims.camera.camera, for depth 1 and turned round
+        middle_u, middle_v = self.camera.middle
+        a = (u - middle_u) / self.camera.focal
+        b = (v - middle_v) / self.camera.focal
         result: Array = a[..., None] * right + b[..., None] * down + forward
         return result
 
-    def _background(
-        self, picture: NDArray[np.float32], covered: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def _background(self, picture: Colours, covered: Colours) -> Colours:
+        """The scene without the ball, from the rendered ground and its share of each pixel.
+
+        Keeps for shadows where the ground is that each pixel shows, and whether it shows any.
+        """
+        # a ray meets the ground where its height is 0
         with np.errstate(divide="ignore"):
             far = -self.camera.position[2] / self._rays[..., 2]
+        # without the second, what is above the horizon would meet it behind the camera
         meets = (covered[..., 0] > 0.5) & (far > 0)
-        points = self.camera.position + np.where(meets, far, 0.0)[..., None] * self._rays
+        along = np.where(meets, far, 0.0)
+        points = self.camera.position + along[..., None] * self._rays
         self._points = points.astype(np.float32)
         self._open = meets
         bright = self.look.pattern(points[..., 0], points[..., 1])
+        ground = picture * bright[..., None]
         sky = 255 * np.array(self.look.sky)
-        return np.where(meets[..., None], picture * bright[..., None], sky).astype(np.float32)
+        return np.where(meets[..., None], ground, sky).astype(np.float32)
 
-    def _cast_shadow(self, picture: NDArray[np.float32], position: Array) -> None:
+    def _cast_shadow(self, picture: Colours, position: Array) -> None:
         """Darken the ground from which the ball hides the light; its edge is as soft as the sun's
         disc is wide.
         """
         light = self.look.light
-        stretch, travel = 1 / light[2], position[2] / light[2]
+        stretch = 1 / light[2]
+        travel = position[2] / light[2]
+        # where the line through the ball's centre along the light meets the ground
         foot = position - travel * light
-        corners = foot + self.radius * stretch * 1.1 * np.array(
-            [(a, b, 0.0) for a in (-1, 1) for b in (-1, 1)]
+        signs = np.array(
+            [
+                (-1, -1, 0.0),
+                (-1, 1, 0.0),
+                (1, -1, 0.0),
+                (1, 1, 0.0),
+            ]
         )
+        # a slanting light makes the disc an ellipse, longer by the stretch
+        corners = foot + self.radius * stretch * 1.1 * signs
         window = _window(self.camera.project(corners), self.camera.size)
         if window is None:
             return
-        place = np.s_[window[1] : window[3], window[0] : window[2]]
+        left, top, right, bottom = window
+        place = np.s_[top:bottom, left:right]
         away = self._points[place] - foot.astype(np.float32)
+        # distance from that line, by Pythagoras; rounding may make it slightly imaginary
         along = away @ light.astype(np.float32)
-        distance = np.sqrt(np.maximum((away * away).sum(axis=-1) - along * along, 0))
-        soft = 0.02 * self.radius + 0.01 * travel
-        hidden = np.clip((self.radius + soft - distance) / (2 * soft), 0, 1) * self._open[place]
-        picture[place] *= (1 - self.look.shadow * hidden)[..., None].astype(np.float32)
+        far = (away * away).sum(axis=-1)
+        squares = far - along * along
+        distance = np.sqrt(np.maximum(squares, 0))
+        soft = _SHARPEST * self.radius + _SUN * travel
+        depth = (self.radius + soft - distance) / (2 * soft)
+        hidden = np.clip(depth, 0, 1) * self._open[place]
+        left_over = 1 - self.look.shadow * hidden
+        picture[place] *= left_over[..., None].astype(np.float32)
 
-    def _draw_ball(self, picture: NDArray[np.float32], position: Array) -> None:
+    def _draw_ball(self, picture: Colours, position: Array) -> None:
+        """Lay the ball over the picture, each pixel by the share that the ball has of it."""
         centre, (longer, _) = self.camera.outline(position, self.radius)
         reach = longer + _MARGIN
         if not np.isfinite(reach):
             return
-        window = _window(np.array([centre - reach, centre + reach]), self.camera.size)
+        around = np.array([centre - reach, centre + reach])
+        window = _window(around, self.camera.size)
         if window is None:
             return
-        p = bullet.engine()
-        p.resetBasePositionAndOrientation(
-            self._ball, position, (0, 0, 0, 1), physicsClientId=self._client
-        )
-        ball, covered = self._render(window, 3 if longer < _SMALL else 2, self._ball)
-        place = np.s_[window[1] : window[3], window[0] : window[2]]
+        self._place(self._ball, position)
+        fine = 3 if longer < _SMALL else 2
+        ball, covered = self._render(window, fine, self._ball)
+        left, top, right, bottom = window
+        place = np.s_[top:bottom, left:right]
         picture[place] = covered * ball + (1 - covered) * picture[place]
 
-    def _render(
-        self, window: tuple[int, int, int, int], fine: int, body: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _render(self, window: Window, fine: int, body: int) -> tuple[Colours, Colours]:
         """A window (left, top, right, bottom) of the picture: colours of `body`, and its share of
         each pixel.
         """
         p = bullet.engine()
         camera = self.camera
         left, top, right, bottom = window
-        width, height = right - left, bottom - top
+        width = right - left
+        height = bottom - top
+        # metres on the near plane that a pixel shows
         at = _NEAR / camera.focal
         # the renderer counts pixels from their corner: half a fine pixel, measured on spheres
-        u, v = camera.middle - (0.5 / fine, -0.5 / fine)
+        shift = 0.5 / fine
+        u, v = camera.middle - (shift, -shift)
         projection = p.computeProjectionMatrix(
             at * (left - 0.5 - u),
             at * (right - 0.5 - u),
@@ -175,20 +235,26 @@ class Stage:
             renderer=p.ER_TINY_RENDERER,
             physicsClientId=self._client,
         )
-        there = np.reshape(bodies, (height, fine, width, fine, 1)) == body
+        # fine pixels in groups that make one each; colours of the body alone are averaged
+        grouped = height, fine, width, fine
+        there = np.reshape(bodies, (*grouped, 1)) == body
         share = there.mean(axis=(1, 3), dtype=np.float32)
-        colour = np.reshape(colours, (height, fine, width, fine, 4))[..., :3]
+        colour = np.reshape(colours, (*grouped, 4))[..., :3]
         sums = np.where(there, colour, 0).sum(axis=(1, 3), dtype=np.float32)
-        return sums / np.maximum(share * fine**2, 1), share
+        count = np.maximum(share * fine**2, 1)
+        return sums / count, share
 
 
-def _window(pixels: Array, size: tuple[int, int]) -> tuple[int, int, int, int] | None:
+def _window(pixels: Array, size: tuple[int, int]) -> Window | None:
     """The part of the picture (left, top, right, bottom) that holds `pixels` (n, 2); None if they
     lie outside.
     """
     if not np.isfinite(pixels).all():
         return None
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    left, top = (max(0, math.floor(x)) for x in low)
-    right, bottom = (min(end, math.ceil(x) + 1) for x, end in zip(high, size, strict=True))
-    return (left, top, right, bottom) if left < right and top < bottom else None
+    left, top = (max(0, math.floor(x)) for x in pixels.min(axis=0))
+    last_u, last_v = pixels.max(axis=0)
+    right = min(size[0], math.ceil(last_u) + 1)
+    bottom = min(size[1], math.ceil(last_v) + 1)
+    if left < right and top < bottom:
+        return left, top, right, bottom
+    return None

@@ -11,17 +11,29 @@ from numpy.typing import NDArray
 
 from sims.base import Array, InputError
 from sims.camera import background
+from sims.camera.circle import Circle
 from sims.camera.link import Path, joined, linked
 from sims.camera.render import Image
 from sims.camera.spots import Finder, Spot
 
 _LEAST_FRAMES = 5
+"""Frames that must show the ball."""
 _WINDOW = 9
+"""Samples in a row from which noise is told, and below which no path is steadied."""
 _FEW = 8
+"""Pictures on which both treatments of shadow are tried."""
 _HELD = 200_000_000
 """Bytes of frames that are kept in memory."""
 _FEWEST = 3
+"""Pictures that must lack a thing before the background is said to have it."""
 _MISFIT = 0.2
+"""Share by which a radius may miss the line of its path."""
+_SHADOWS = 0.8
+"""Share of the agreement without shadows' treatment that suffices to treat them."""
+_ROUNDS = 10
+"""Rounds of reweighed least squares."""
+_SURE = 0.02
+"""Pixels; radii are not known better."""
 
 
 @dataclass(frozen=True)
@@ -70,26 +82,23 @@ def track(frames: Iterable[tuple[float, Image]]) -> Track:
     notes: list[str] = []
     first, end = _shot(survey, notes)
     numbers = [first + k for k in background.chosen(survey.moved[first:end])]
-    pictures = [picture for number, (_, picture) in enumerate(frames) if number in set(numbers)]
+    wanted = set(numbers)
+    pictures = [picture for number, (_, picture) in enumerate(frames) if number in wanted]
     finder = _finder(pictures)
-    spots = [finder.spots(p) if first <= k < end else [] for k, (_, p) in enumerate(frames)][
-        first:end
-    ]
+    spots = []
+    for number, (_, picture) in enumerate(frames):
+        if first <= number < end:
+            spots.append(finder.spots(picture))
     paths = linked(spots)
     if not paths:
         raise InputError(_nothing(end - first, sum(map(bool, spots))))
     path, others = joined(paths)
+    # what hardly moves may be a ball, but not one whose fall can be measured
     if len(path.frames) < _LEAST_FRAMES or path.travel < path.radius:
         raise InputError(_nothing(end - first, len(path.frames)))
     _others(path, others, notes)
-    return _made(
-        survey.times[first:end],
-        path,
-        survey.size,
-        notes,
-        finder,
-        {n - first: p for n, p in zip(numbers, pictures, strict=True)},
-    )
+    shown = {n - first: p for n, p in zip(numbers, pictures, strict=True)}
+    return _measured(survey.times[first:end], path, survey.size, notes, finder, shown)
 
 
 class _Kept:
@@ -105,31 +114,39 @@ class _Kept:
         if self._kept is not None:
             yield from self._kept
             return
-        kept, held = [], 0
+        frames = []
+        held = 0
         for time, picture in self._source:
             held += picture.nbytes
             if held <= _HELD:
-                kept.append((time, picture))
+                frames.append((time, picture))
             else:
-                kept.clear()
+                # too many: what is held so far goes at once
+                frames.clear()
             yield time, picture
         if held <= _HELD:
-            self._kept = kept
+            self._kept = frames
 
 
 def _nothing(frames: int, some: int) -> str:
+    """The message that there is no ball, though something round is in `some` of the frames."""
     seen = f"something round in {some} of {frames} frames, but nothing" if some else "nothing"
-    return f"no ball found: {seen} that moves and stays round; film with a fixed camera and a ball unlike its background"
+    return (
+        f"no ball found: {seen} that moves and stays round; "
+        "film with a fixed camera and a ball unlike its background"
+    )
 
 
 def _shot(survey: background.Survey, notes: list[str]) -> tuple[int, int]:
+    """First and behind the last frame of the longest part without a cut."""
     shots = survey.shots()
-    first, end = max(shots, key=lambda s: s[1] - s[0])
+    first, end = max(shots, key=lambda shot: shot[1] - shot[0])
     if len(shots) > 1:
-        cuts = ", ".join(f"{survey.times[c]:.2f} s" for c in survey.cuts[:5])
+        cuts = ", ".join(f"{survey.times[cut]:.2f} s" for cut in survey.cuts[:5])
         span = f"{survey.times[first]:.2f} to {survey.times[end - 1]:.2f} s"
         notes.append(
-            f"the film is cut or the camera moves (at {cuts}); only the longest part is tracked, {span}"
+            f"the film is cut or the camera moves (at {cuts}); "
+            f"only the longest part is tracked, {span}"
         )
     if end - first < _LEAST_FRAMES:
         raise InputError(
@@ -144,42 +161,58 @@ def _finder(pictures: list[Image]) -> Finder:
     """
     plain = background.median(pictures)
     every = max(1, len(pictures) // _FEW)
+    # twice: what the first background hides is seen against the second
     for _ in range(2):
         sigma = background.noise(pictures, plain)
-        finders = [Finder(plain, sigma, shadows) for shadows in (True, False)]
+        careful = Finder(plain, sigma, shadows=True)
+        careless = Finder(plain, sigma, shadows=False)
+        by_careful = [careful.spots(p, ghosts=True) for p in pictures[::every]]
+        by_careless = [careless.spots(p, ghosts=True) for p in pictures[::every]]
         # a ball of the ground's own hue is itself taken for shadow; then shadow must be borne
-        tried = [[finder.spots(p, ghosts=True) for p in pictures[::every]] for finder in finders]
-        good = [
-            sum(max((s.agree for s in spots if not s.ghost), default=0.0) for spots in each)
-            for each in tried
-        ]
-        chosen = 0 if good[0] >= 0.8 * good[1] else 1
-        best, known = finders[chosen], tried[chosen]
-        found = [
-            known[i // every] if i % every == 0 else best.spots(p, ghosts=True)
-            for i, p in enumerate(pictures)
-        ]
+        if _roundness(by_careful) >= _SHADOWS * _roundness(by_careless):
+            best, known = careful, by_careful
+        else:
+            best, known = careless, by_careless
+        found = []
+        for i, picture in enumerate(pictures):
+            if i % every == 0:
+                found.append(known[i // every])
+            else:
+                found.append(best.spots(picture, ghosts=True))
         hiding = _hiding(found)
-        shaded = _shaded([best.unshaded(p) for p in pictures]) if best.shadows else None
+        shaded = None
+        if best.shadows:
+            shaded = _shaded([best.unshaded(picture) for picture in pictures])
         plain = background.without(pictures, hiding, plain, shaded)
     return Finder(plain, sigma, best.shadows)
 
 
-def _hiding(found: list[list[Spot]]) -> list[list[tuple[float, float, float]]]:
+def _roundness(pictures: list[list[Spot]]) -> float:
+    """Share of rays that agree on each picture's best circle, added up."""
+    return sum(
+        max((spot.agree for spot in spots if not spot.ghost), default=0.0) for spots in pictures
+    )
+
+
+def _hiding(found: list[list[Spot]]) -> list[list[Circle]]:
     """Where something hides the background in each picture.
 
     A ball that rests for most of the film, or its shadow, gets into the median. Pictures that lack
     it there show the background, and the others do not.
     """
-    balls = [[(s.u, s.v, s.radius) for s in spots if not s.ghost] for spots in found]
-    ghosts = [[(s.u, s.v, s.radius) for s in spots if s.ghost] for spots in found]
+    balls: list[list[Circle]] = []
+    ghosts: list[list[Circle]] = []
+    for spots in found:
+        balls.append([(s.u, s.v, s.radius) for s in spots if not s.ghost])
+        ghosts.append([(s.u, s.v, s.radius) for s in spots if s.ghost])
     for one in [ghost for there in ghosts for ghost in there]:
         lacking = [any(_same(one, other) for other in there) for there in ghosts]
-        if sum(lacking) >= _FEWEST:
-            balls = [
-                there if lacks else [*there, one]
-                for there, lacks in zip(balls, lacking, strict=True)
-            ]
+        # one or two pictures may lack it by mistake
+        if sum(lacking) < _FEWEST:
+            continue
+        for there, lacks in zip(balls, lacking, strict=True):
+            if not lacks:
+                there.append(one)
     return balls
 
 
@@ -192,26 +225,29 @@ def _shaded(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
     return result
 
 
-def _same(a: tuple[float, float, float], b: tuple[float, float, float]) -> bool:
-    return abs(a[0] - b[0]) + abs(a[1] - b[1]) < 0.3 * b[2] + 0.5 and 0.7 < a[2] / b[2] < 1.4
+def _same(a: Circle, b: Circle) -> bool:
+    """Whether two circles are of one thing that stays where it is."""
+    apart = abs(a[0] - b[0]) + abs(a[1] - b[1])
+    return apart < 0.3 * b[2] + 0.5 and 0.7 < a[2] / b[2] < 1.4
 
 
 def _others(path: Path, others: Sequence[Path], notes: list[str]) -> None:
-    rivals = [
-        p
-        for p in others
-        if len(set(p.frames) & set(path.frames)) >= max(8, 0.25 * len(path.frames))
-        and p.travel > 2 * p.radius
-        and 0.4 < p.radius / path.radius < 2.5
-    ]
-    if rivals:
-        shared = len(set(rivals[0].frames) & set(path.frames))
-        notes.append(
-            f"a second ball, or its shadow, moves in {shared} of the same frames; the clearer one is tracked"
-        )
+    """Note that something else moved beside the ball."""
+    frames = set(path.frames)
+    for other in others:
+        shared = len(frames & set(other.frames))
+        # in passing, small or at rest it is no second ball
+        beside = shared >= max(8, 0.25 * len(path.frames))
+        moves = other.travel > 2 * other.radius
+        if beside and moves and 0.4 < other.radius / path.radius < 2.5:
+            notes.append(
+                f"a second ball, or its shadow, moves in {shared} of the same frames; "
+                "the clearer one is tracked"
+            )
+            return
 
 
-def _made(
+def _measured(
     times: Array,
     path: Path,
     size: tuple[int, int],
@@ -219,28 +255,37 @@ def _made(
     finder: Finder,
     pictures: dict[int, Image],
 ) -> Track:
+    """The track of a path, with noise and notes; `pictures` are a few of the frames."""
     columns = np.full((3, len(times)), np.nan)
     steady, misfits = _steadied(path.spots)
-    for frame, spot in zip(path.frames, steady, strict=True):
-        columns[:, frame] = spot.u, spot.v, spot.radius
-    columns[:, [f for f, wrong in zip(path.frames, misfits, strict=True) if wrong]] = np.nan
+    for frame, spot, misfit in zip(path.frames, steady, misfits, strict=True):
+        # an empty cell is better than something else's place
+        if not misfit:
+            columns[:, frame] = spot.u, spot.v, spot.radius
     u, v, radius = columns
     gone = int(np.isnan(u).sum())
     if gone:
         notes.append(
-            f"{gone} of {len(times)} frames show no ball that could be measured; their cells are empty"
+            f"{gone} of {len(times)} frames show no ball that could be measured; "
+            "their cells are empty"
         )
-    noise = (
-        max(rough(u), rough(v))
-        if len(times) > _WINDOW
-        else float(np.median([s.scatter for s in path.spots]))
+    noise = np.nan
+    if len(times) > _WINDOW:
+        noise = max(rough(u), rough(v))
+    # too short or all at rest: how far edges lie off their circles is the next best
+    if not (np.isfinite(noise) and noise > 0):
+        noise = float(np.median([spot.scatter for spot in path.spots]))
+    return Track(
+        times,
+        u,
+        v,
+        radius,
+        noise,
+        size,
+        tuple(notes),
+        finder.background,
+        pictures,
     )
-    noise = (
-        noise
-        if np.isfinite(noise) and noise > 0
-        else float(np.median([s.scatter for s in path.spots]))
-    )
-    return Track(times, u, v, radius, noise, size, tuple(notes), finder.background, pictures)
 
 
 def _steadied(spots: list[Spot]) -> tuple[list[Spot], list[bool]]:
@@ -252,21 +297,28 @@ def _steadied(spots: list[Spot]) -> tuple[list[Spot], list[bool]]:
     """
     if len(spots) < _WINDOW:
         return spots, [False] * len(spots)
-    places = np.array([(1.0, s.u, s.v) for s in spots])
-    centre, spread = places.mean(axis=0), np.maximum(np.ptp(places, axis=0), 1.0)
-    axes = np.linalg.svd((places - centre)[:, 1:], full_matrices=False)[2]
-    along = (places - centre)[:, 1:] @ axes[0] / spread[1:].max()
+    places = np.array([(spot.u, spot.v) for spot in spots])
+    offsets = places - places.mean(axis=0)
+    spread = np.maximum(np.ptp(places, axis=0), 1.0)
+    # how far along the path's own direction, about -1 to 1
+    axes = np.linalg.svd(offsets, full_matrices=False)[2]
+    along = offsets @ axes[0] / spread.max()
     basis = np.stack([np.ones_like(along), along], axis=1)
     radius = np.array([s.radius for s in spots])
     weights = np.ones_like(radius)
     line = np.zeros(2)
-    for _ in range(10):
-        line = np.linalg.lstsq(basis * weights[:, None], radius * weights, rcond=None)[0]
+    for _ in range(_ROUNDS):
+        weighed = basis * weights[:, None]
+        line = np.linalg.lstsq(weighed, radius * weights, rcond=None)[0]
         rest = np.abs(radius - basis @ line)
-        weights = 1 / (1 + (rest / max(float(np.median(rest)), 0.02)) ** 2)
+        # heavy tails: what was measured at something else must not bend the line
+        width = max(float(np.median(rest)), _SURE)
+        weights = 1 / (1 + (rest / width) ** 2)
     fitted = np.maximum(basis @ line, 0.5)
-    wrong = np.abs(radius - fitted) > np.maximum(_MISFIT * fitted, 1.0)
-    return [s.with_radius(float(r)) for s, r in zip(spots, fitted, strict=True)], wrong.tolist()
+    allowed = np.maximum(_MISFIT * fitted, 1.0)
+    wrong = np.abs(radius - fitted) > allowed
+    steady = [s.with_radius(float(r)) for s, r in zip(spots, fitted, strict=True)]
+    return steady, wrong.tolist()
 
 
 def rough(values: Array) -> float:
@@ -279,12 +331,15 @@ def rough(values: Array) -> float:
         return float("nan")
     windows = sliding_window_view(values, _WINDOW)
     windows = windows[np.isfinite(windows).all(axis=1)]
-    windows = windows[
-        np.ptp(windows, axis=1)
-        > 1e-3 * max(float(np.ptp(values[np.isfinite(values)])), 1e-12) * _WINDOW
-    ]
+    # at rest the same pixels give the same error again and again, which is no scatter
+    there = values[np.isfinite(values)]
+    travel = max(float(np.ptp(there)), 1e-12)
+    windows = windows[np.ptp(windows, axis=1) > 1e-3 * travel * _WINDOW]
     if not len(windows):
         return float("nan")
-    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, _WINDOW), 4))[0]
+    # what is left by a cubic, of four numbers, has four degrees of freedom less
+    cubic = np.vander(np.linspace(-1, 1, _WINDOW), 4)
+    basis = np.linalg.qr(cubic)[0]
     rest = windows - windows @ basis @ basis.T
-    return float(np.sqrt(np.median((rest**2).sum(axis=1)) / (_WINDOW - 4)))
+    squares = (rest**2).sum(axis=1)
+    return float(np.sqrt(np.median(squares) / (_WINDOW - 4)))

@@ -24,6 +24,9 @@ _TICKS = 90_000
 rates.
 """
 _DEFAULT_RATE = 30.0
+"""Frames a second of a file that states neither times nor a rate."""
+_HEAD = 64
+"""Bytes from which is told what a file is that no reader knows."""
 
 
 def write_video(
@@ -63,11 +66,10 @@ def write_video(
 def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None:
     av = imported("av")
     ticks = np.rint((times - times[0]) * _TICKS).astype(int)
-    rate = (
-        Fraction(len(times) - 1, 1) / Fraction(max(1, int(ticks[-1])), _TICKS)
-        if len(times) > 1
-        else Fraction(30)
-    )
+    rate = Fraction(30)
+    if len(times) > 1:
+        seconds = Fraction(max(1, int(ticks[-1])), _TICKS)
+        rate = Fraction(len(times) - 1, 1) / seconds
     # the index stands first, so that a file cut short can still be read up to the cut
     with av.open(str(path), "w", options={"movflags": "faststart"}) as file:
         stream = file.add_stream("libx264", rate=rate.limit_denominator(1000))
@@ -76,7 +78,13 @@ def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None
         # the same bytes on every processor and in every run: x264's fast paths alone give another
         # file now and then
         exact = {"x264-params": "cpu-independent=1"}
-        stream.options = {"crf": str(crf), "preset": "veryfast", "bf": "0", **exact}
+        stream.options = {
+            "crf": str(crf),
+            "preset": "veryfast",
+            # no frames between frames, so that they are stored in the order of their times
+            "bf": "0",
+            **exact,
+        }
         stream.codec_context.time_base = Fraction(1, _TICKS)
         converter = av.video.reformatter.VideoReformatter()
         for tick, picture in zip(ticks.tolist(), frames, strict=True):
@@ -88,10 +96,10 @@ def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None
                     )
             # one converter on one thread: PyAV's own starts as many threads as there are cores for
             # every frame
-            frame = converter.reformat(
-                av.VideoFrame.from_ndarray(picture, format="rgb24"), format="yuv420p", threads=1
-            )
-            frame.pts, frame.time_base = tick, Fraction(1, _TICKS)
+            coloured = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame = converter.reformat(coloured, format="yuv420p", threads=1)
+            frame.pts = tick
+            frame.time_base = Fraction(1, _TICKS)
             file.mux(stream.encode(frame))
         file.mux(stream.encode(None))
 
@@ -124,7 +132,10 @@ class Video:
     def __iter__(self) -> Iterator[tuple[float, Image]]:
         """Time in seconds and picture of each frame that can be read; times increase."""
         self.notes = []
-        last, count, dropped, broken, stated = -np.inf, 0, 0, False, 0
+        last = -np.inf
+        count = 0
+        dropped = 0
+        broken = False
         with self._open() as file:
             stated = file.streams.video[0].frames
             for seconds, picture in self._decoded(file):
@@ -133,6 +144,7 @@ class Video:
                     break
                 time = count / self.fps if self.fps else seconds
                 count += 1
+                # a recording's times increase; a file's need not
                 if time <= last:
                     dropped += 1
                     continue
@@ -161,22 +173,23 @@ class Video:
         stream = file.streams.video[0]
         stream.thread_count = 1
         rate = float(stream.average_rate or _DEFAULT_RATE)
-        number, converter = 0, av.video.reformatter.VideoReformatter()
+        converter = av.video.reformatter.VideoReformatter()
+        number = 0
         try:
             for frame in file.decode(stream):
                 seconds = frame.time if frame.time is not None else number / rate
-                yield (
-                    seconds,
-                    _upright(converter.reformat(frame, format="rgb24", threads=1), frame.rotation),
-                )
+                picture = converter.reformat(frame, format="rgb24", threads=1)
+                yield seconds, _upright(picture, frame.rotation)
                 number += 1
         except av.FFmpegError:
             yield np.nan, None
 
     def _judge(self, count: int, stated: int, broken: bool, dropped: int) -> None:
+        """Note what was wrong with a pass; refuse a file of which nothing was read."""
         if not count:
             raise InputError(
-                f"{self.path}: no frame of it can be read; the file is damaged or breaks off too early"
+                f"{self.path}: no frame of it can be read; "
+                "the file is damaged or breaks off too early"
             )
         if broken or count < stated:
             of = f" of {stated}" if stated > count else ""
@@ -186,17 +199,19 @@ class Video:
 
 
 def _upright(frame: Any, degrees: float) -> Image:
+    """The picture as a viewer shows it: telephones store how they were held."""
     picture: Image = frame.to_ndarray()
-    turns = round(degrees / 90) % 4  # telephones store how they were held
+    turns = round(degrees / 90) % 4
     return np.ascontiguousarray(np.rot90(picture, turns)) if turns else picture
 
 
 def _why_not(path: Path) -> str:
     """Why a file that no reader knows is none, from how it begins."""
     with path.open("rb") as file:
-        start = file.read(64)
+        start = file.read(_HEAD)
     if not start:
         return "expected a video, found an empty file"
+    # an MP4 file begins so, and its index may stand at the end
     if start[4:8] == b"ftyp":
         return "breaks off before its index, so no frame can be found; copy the whole file again"
     text = all(32 <= byte < 127 or byte in b"\t\r\n" for byte in start)
