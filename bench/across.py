@@ -1,21 +1,36 @@
-"""Statistics of one comparison, and of several together: tables as CSV, figures beside them."""
+"""Several comparisons together: ranks over problems, a joint runtime distribution, ERT and pairs of
+each.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from bench.analysis.curves import Curves, Rows, primary
+from bench.analysis.curves import Curves
 from bench.analysis.paired import PROBLEMS, nemenyi, pairs, ranks
-from bench.analysis.runtimes import ert_table, solved, thresholds
-from bench.figures.style import Styles
+from bench.analysis.runtimes import ert_table, solved
+from bench.analysis.statistics import Statistics
+from bench.figures import runtimes
+from bench.figures.comparison import statistics_of
+from bench.figures.style import Styles, save
 from bench.problem.experiment import Entry, Experiment
 from bench.report import NEEDED
 from bench.store.folder import read
+from bench.store.journal import replace_text
 from sims.base import Array, InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_TUNERS = 3
+"""Tuners that Friedman's test needs at least."""
 
 
 def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> None:
@@ -25,57 +40,124 @@ def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> No
     Raises:
         InputError: a folder is not that of a comparison, or they share no tuners.
     """
-    import matplotlib
+    together = read_together(folders)
+    out.mkdir(parents=True, exist_ok=True)
+    for name, text in together.tables().items():
+        replace_text(out / f"{name}.csv", text)
+    means = together.ranked.mean().sort_values().round(2)
+    count = len(together.ranked)
+    say(f"mean rank over {count} problems (1 is best)\n{means.to_string()}")
+    if not together.comparable:
+        say(f"no critical-difference diagram: it needs {PROBLEMS} problems and {_TUNERS} tuners")
+    for name, figure in together.figures().items():
+        say(f"figure  {save(figure, out / 'figures' / name)[0]}")
 
-    matplotlib.use("Agg")
-    from bench.figures import runtimes as figures
 
-    all_curves, erts, shares = [], [], []
+def read_together(folders: Sequence[Path]) -> Together:
+    """Read several comparisons.
+
+    Raises:
+        InputError: a folder is not that of a comparison, or they share no tuners.
+    """
+    parts = []
     for folder in folders:
         stored = read(folder, NEEDED)
         if stored.runs.empty:
             raise InputError(f"{folder}: holds no runs")
-        metric, runs, in_widths = primary(stored.runs)
-        curves = Rows(runs, stored.statuses, stored.experiment.budget).curves(metric)
-        spread, levels = thresholds(curves, in_widths)
-        erts.append(ert_table(curves, levels, stored.experiment.budget))
-        shares += _shares(curves, spread)
-        all_curves.append(curves)
-    tuners = [t for t in all_curves[0].tuners() if all(t in c.tuners() for c in all_curves)]
+        parts.append(Part(statistics_of(stored), stored.experiment.budget))
+    first, *others = (part.statistics.curves.tuners() for part in parts)
+    tuners = [t for t in first if all(t in other for other in others)]
     if not tuners:
         raise InputError(f"{', '.join(map(str, folders))}: have no tuner in common")
-    out.mkdir(parents=True, exist_ok=True)
-    pd.concat(erts).to_csv(out / "ert.csv", index=False)
-    pd.concat([pairs(c) for c in all_curves]).to_csv(out / "pairs.csv", index=False)
-    ranked = pd.concat([ranks(c) for c in all_curves])[tuners].rank(axis=1)
-    ranked.to_csv(out / "ranks.csv", index_label="problem")
-    say(
-        f"mean rank over {len(ranked)} problems (1 is best)\n{ranked.mean().sort_values().round(2).to_string()}"
-    )
-    experiment = Experiment(
-        "all", f"{len(ranked)} problems", tuners=tuple(Entry(t, t) for t in tuners)
-    )
-    table = pd.DataFrame(
-        [{"tuner": t, "run": t, "k": 0, "rank": r} for t, r in ranked.mean().items()]
-    )
-    style = Styles(experiment, table, "rank")
-    joint = {t: np.mean([share[t] for share in shares], axis=0) for t in tuners}
-    made = [figures.joint_runtime_figure(out, experiment, style, joint)]
-    if len(ranked) >= PROBLEMS and len(tuners) >= 3:
-        friedman, p_values = nemenyi(ranked)
-        p_values.to_csv(out / "nemenyi.csv", index_label="tuner")
-        made.append(figures.rank_figure(out, ranked, p_values, friedman))
-    else:
-        say(f"no critical-difference diagram: it needs {PROBLEMS} problems and 3 tuners")
-    for path in made:
-        say(f"figure  {path}")
+    return Together(parts, tuners)
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of the comparisons: its statistics and its budget."""
+
+    statistics: Statistics
+    budget: int
+
+
+@dataclass(frozen=True)
+class Together:
+    """Several comparisons.
+
+    Attributes:
+        parts: the comparisons, each with one problem a range.
+        tuners: labels of those that all comparisons have.
+    """
+
+    parts: Sequence[Part]
+    tuners: Sequence[str]
+
+    @cached_property
+    def ranked(self) -> pd.DataFrame:
+        """Ranks among the common tuners: a row a problem, a column a tuner, 1 is best."""
+        each = pd.concat([ranks(part.statistics.curves) for part in self.parts])
+        # Ranks among all tuners have gaps where some are left out.
+        return each[list(self.tuners)].rank(axis=1)
+
+    @property
+    def comparable(self) -> bool:
+        """Whether there are problems and tuners enough for Friedman's and Nemenyi's tests."""
+        return len(self.ranked) >= PROBLEMS and len(self.tuners) >= _TUNERS
+
+    @cached_property
+    def tests(self) -> tuple[float, pd.DataFrame]:
+        """Friedman's p-value, and Nemenyi's of each pair of tuners; only where `comparable`."""
+        return nemenyi(self.ranked)
+
+    def tables(self) -> dict[str, str]:
+        """ert, pairs, ranks, and nemenyi where `comparable`: CSV by name."""
+        parts = [(part.statistics, part.budget) for part in self.parts]
+        ert = pd.concat([ert_table(s.curves, s.levels, budget) for s, budget in parts])
+        paired = pd.concat([pairs(s.curves) for s, _ in parts])
+        texts = {
+            "ert": ert.to_csv(index=False),
+            "pairs": paired.to_csv(index=False),
+            "ranks": self.ranked.to_csv(index_label="problem"),
+        }
+        if self.comparable:
+            texts["nemenyi"] = self.tests[1].to_csv(index_label="tuner")
+        return texts
+
+    def figures(self) -> dict[str, Figure]:
+        """runtime-distribution, and critical-difference where `comparable`."""
+        drawn = {"runtime-distribution": self._joint_figure()}
+        if self.comparable:
+            friedman, p_values = self.tests
+            drawn["critical-difference"] = runtimes.rank_figure(self.ranked, p_values, friedman)
+        return drawn
+
+    def _joint_figure(self) -> Figure:
+        title = f"{len(self.ranked)} problems"
+        experiment = Experiment("all", title, tuners=tuple(Entry(t, t) for t in self.tuners))
+        # A tuner's style and place in the legend go by its mean rank, as if that were an error.
+        rows = [
+            {"tuner": tuner, "run": tuner, "k": 0, "rank": rank}
+            for tuner, rank in self.ranked.mean().items()
+        ]
+        style = Styles(experiment, pd.DataFrame(rows), "rank")
+        return runtimes.joint_runtime_figure(experiment, style, self._shares())
+
+    def _shares(self) -> dict[str, Array]:
+        """By tuner: the share reached after 0..100 hundredths of the budget, the mean of problems."""
+        each = [
+            problem
+            for part in self.parts
+            for problem in _shares(part.statistics.curves, part.statistics.spread)
+        ]
+        return {t: np.mean([problem[t] for problem in each], axis=0) for t in self.tuners}
 
 
 def _shares(curves: Curves, spread: Array) -> list[dict[str, Array]]:
     """Of each range: by tuner, the share reached after 0..100 hundredths of the budget."""
     budget = curves.values.shape[1] - 1
     points = np.floor(np.linspace(0, budget, 101)).astype(np.int64)
-    return [
-        {t: solved(part.of(tuner=t), spread, points) for t in part.tuners()}
-        for part in (curves.of(range=str(kind)) for kind in dict.fromkeys(curves.keys["range"]))
-    ]
+    shares = []
+    for kind in dict.fromkeys(curves.keys["range"]):
+        part = curves.of(range=str(kind))
+        shares.append({t: solved(part.of(tuner=t), spread, points) for t in part.tuners()})
+    return shares

@@ -36,6 +36,8 @@ EVEN_COLUMNS = [
 ]
 COSTS: Array = np.logspace(-6, 3, 181)
 """Seconds that a simulation may take."""
+SHARED = 100
+"""Targets that share one training where it is asked who wins at which cost."""
 
 
 @dataclass(frozen=True)

@@ -71,9 +71,11 @@ def film(options: argparse.Namespace) -> int:
 
 def track(options: argparse.Namespace) -> int:
     """Track a ball, write the recording and its picture."""
+    from bench.figures.track import drawn
     from bench.recordings.tracking import write
 
-    found = write(options.video, options.out, options.ball_diameter, options.fps, options.scale)
+    diameter, fps, scale = options.ball_diameter, options.fps, options.scale
+    found = write(options.video, options.out, drawn, diameter, fps, scale)
     for note in found.notes:
         print(f"simgap: {options.video}: {note}", file=sys.stderr)
     for line in found.lines:

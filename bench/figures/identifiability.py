@@ -1,9 +1,7 @@
-"""Tables and figures of what data identify: spectra, directions, errors along them, and prediction."""
+"""Figures of what data identify: spectra, directions, errors along them, and prediction."""
 
 from __future__ import annotations
 
-import textwrap
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,90 +9,85 @@ import pandas as pd
 
 from bench.analysis.spectra import COLUMNS
 from bench.figures.errors import samples_panel
-from bench.figures.style import CAPTION, TITLES, Styles, finish, save
+from bench.figures.style import (
+    BLUE,
+    CAPTION,
+    SOFT,
+    TITLES,
+    VERMILION,
+    Styles,
+    below,
+    blank,
+    finish,
+    plain,
+)
 from bench.problem.experiment import Experiment
 from bench.problem.identifiability import STIFF
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-_FLOOR, _CEILING = (
-    1e-6,
-    1e4,
-)  # 1 sigma in training ranges, beyond which a figure shows no difference
+_FLOOR = 1e-6
+"""1 sigma in training widths below which a figure shows no difference."""
+_CEILING = 1e4
+"""1 sigma in training widths above which a figure shows no difference."""
+_LEAST_SHARE = 0.05
+"""Share of a parameter in a direction below which it is not written."""
 _WHERE = {"in": "truth in training range", "wide": "truth in bounds"}
+_MARKS = (("o", BLUE), ("^", VERMILION))
+"""Of the ranges, in their order."""
 _ROWS = {
     "stiff_error": "along stiff directions\n[training widths]",
     "sloppy_error": "along sloppy directions\n[training widths]",
     "heldout_error": "of prediction,\nRMSE of {channel}",
 }
+"""Metrics, and what their axes say."""
 
 
-def identifiability_figures(
-    folder: Path, experiment: Experiment, runs: pd.DataFrame, channel: str
-) -> list[Path]:
-    """Draw what there is: the spectra of identifiability.csv, and the errors along directions and
-    of prediction.
-
-    Args:
-        folder: the comparison's.
-        experiment: what was compared.
-        runs: rows of runs.parquet.
-        channel: the error channel with its unit, e.g. ``q [rad]``.
-    """
-    table = folder / "identifiability.csv"
-    made = [spectra_figure(folder, experiment, pd.read_csv(table))] if table.is_file() else []
-    return made + errors_figure(folder, experiment, runs, channel)
-
-
-def spectra_figure(folder: Path, experiment: Experiment, table: pd.DataFrame) -> Path:
+def spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
     """Left: 1 sigma of every direction, a mark a target. Right: which parameters make up each
     direction.
-    """
-    from matplotlib import pyplot as plt
 
+    Args:
+        experiment: what was compared.
+        table: rows of identifiability.csv.
+    """
     names = [c for c in table.columns if c not in COLUMNS]
-    figure, (left, right) = plt.subplots(
-        1, 2, figsize=(4.8 + 0.8 * len(names), 2.2 + 0.4 * len(names)), width_ratios=[1, 1.25]
-    )
-    _spectra(left, table, len(names))
-    _directions(right, table, names)
+    size = (4.8 + 0.8 * len(names), 2.2 + 0.4 * len(names))
+    figure, axes = blank(1, 2, size, width_ratios=[1, 1.25])
+    _spectra(axes[0, 0], table, len(names))
+    _directions(axes[0, 1], table, names)
     figure.suptitle(f"{experiment.title or experiment.name}: what the data can know", fontsize=11)
     caption = (
         "From the Fisher information at each target's truth (Cramér–Rao bound). "
-        f"Stiff: 1 sigma below {STIFF:g} of the training width (dashed). Right: mean over targets of the squared "
-        "component."
+        f"Stiff: 1 sigma below {STIFF:g} of the training width (dashed). "
+        "Right: mean over targets of the squared component."
     )
-    figure.supxlabel(
-        textwrap.fill(caption, int(15 * figure.get_figwidth())), fontsize=7.5, color="#444444"
-    )
-    return save(folder, "identifiability", figure)
+    below(figure, caption, letters=15)
+    return figure
 
 
-def _spectra(axis: Axes, table: pd.DataFrame, dim: int) -> None:
+def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
     """Every target's 1 sigma along each direction, the ranges beside each other."""
     ranges = list(dict.fromkeys(table["range"]))
-    for place, (kind, look) in enumerate(
-        zip(ranges, (("o", "#0072B2"), ("^", "#D55E00")), strict=False)
-    ):
+    for place, (kind, (marker, colour)) in enumerate(zip(ranges, _MARKS, strict=False)):
         part = table[table["range"] == kind]
-        spread = (
-            part.groupby("direction").cumcount() / max(part["target"].nunique() - 1, 1) - 0.5
-        ) * 0.3
-        sigma = part["sigma"].clip(_FLOOR, _CEILING)
-        label = f"{_WHERE.get(kind, kind)} (n = {part['target'].nunique()})"
-        across = part["direction"] + spread + (place - 0.5 * (len(ranges) - 1)) * 0.4
+        targets = part["target"].nunique()
+        # Marks of one direction stand side by side within 0.3, the ranges 0.4 apart.
+        within = (part.groupby("direction").cumcount() / max(targets - 1, 1) - 0.5) * 0.3
+        across = part["direction"] + within + (place - 0.5 * (len(ranges) - 1)) * 0.4
         axis.plot(
             across,
-            sigma,
-            look[0],
-            color=look[1],
+            part["sigma"].clip(_FLOOR, _CEILING),
+            marker,
+            color=colour,
             markersize=3.5,
             alpha=0.75,
             linestyle="none",
-            label=label,
+            label=f"{_WHERE.get(kind, kind)} (n = {targets})",
         )
-    axis.axhline(STIFF, color="#444444", linewidth=0.8, linestyle="--")
+    axis.axhline(STIFF, color=SOFT, linewidth=0.8, linestyle="--")
     for name, above in (("sloppy", 3), ("stiff", -9)):
         axis.annotate(
             name,
@@ -105,20 +98,22 @@ def _spectra(axis: Axes, table: pd.DataFrame, dim: int) -> None:
             fontsize=8,
         )
     axis.set_yscale("log")
-    axis.set_ylim(bottom=axis.get_ylim()[0] / 10)  # room for the legend
-    axis.set_xticks(range(1, dim + 1))
+    # Room for the legend.
+    axis.set_ylim(bottom=axis.get_ylim()[0] / 10)
+    axis.set_xticks(range(1, directions + 1))
     axis.set_xlabel("direction, the stiffest first")
     axis.set_ylabel("1 sigma that no estimate can beat\n[training widths]")
-    axis.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
-    axis.spines[["top", "right"]].set_visible(False)
+    plain(axis)
     axis.legend(fontsize=7.5, frameon=False, loc="lower right")
 
 
 def _directions(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
     """Shares of the parameters in each direction, as a grid of numbers."""
-    shares = (table.set_index("direction")[names] ** 2).groupby(level=0).mean().to_numpy().T
+    # A direction has length 1, so that its squared components are shares; their signs are arbitrary.
+    squares = table.set_index("direction")[names] ** 2
+    shares = squares.groupby(level=0).mean().to_numpy().T
     axis.imshow(shares, cmap="Greys", vmin=0.0, vmax=1.0, aspect="auto")
-    for row, column in np.argwhere(shares >= 0.05):
+    for row, column in np.argwhere(shares >= _LEAST_SHARE):
         share = float(shares[row, column])
         axis.text(
             column,
@@ -135,55 +130,46 @@ def _directions(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
     axis.set_title("share of each parameter", fontsize=9)
 
 
-def errors_figure(
-    folder: Path, experiment: Experiment, runs: pd.DataFrame, channel: str
-) -> list[Path]:
+def directional(experiment: Experiment, runs: pd.DataFrame) -> list[str]:
+    """Metrics of `directions_figure` that the runs have.
+
+    None of a recording: its held-out runs are drawn with its errors.
+    """
+    if "real" in experiment.ranges:
+        return []
+    return [m for m in _ROWS if m in runs and runs[m].notna().any()]
+
+
+def directions_figure(experiment: Experiment, runs: pd.DataFrame, channel: str) -> Figure:
     """Errors along stiff and along sloppy directions, and of prediction, against simulations; a
     column a range.
 
-    Nothing where the runs have none of them, or are those of a recording, which has a figure of its
-    own.
+    Args:
+        experiment: what was compared.
+        runs: rows of runs.parquet, which have some metric of `directional`.
+        channel: the error channel with its unit, e.g. ``q [rad]``.
     """
-    from matplotlib import pyplot as plt
-
-    present = [m for m in _ROWS if m in runs and runs[m].notna().any()]
-    if not present or "real" in experiment.ranges:
-        return []
+    metrics = directional(experiment, runs)
     ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
-    figure, axes = plt.subplots(
-        len(present),
-        len(ranges),
-        figsize=(1.8 + 4.0 * len(ranges), 1.2 + 2.3 * len(present)),
-        squeeze=False,
-        sharey="row",
-        sharex=True,
-    )
-    style = Styles(experiment, runs, present[0])
-    for row, metric in zip(axes, present, strict=True):
+    size = (1.8 + 4.0 * len(ranges), 1.2 + 2.3 * len(metrics))
+    figure, axes = blank(len(metrics), len(ranges), size, sharey="row", sharex=True)
+    style = Styles(experiment, runs, metrics[0])
+    for row, metric in zip(axes, metrics, strict=True):
         for axis, kind in zip(row, ranges, strict=True):
             part = runs[(runs["range"] == kind) & runs[metric].notna()]
-            axis.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
-            axis.spines[["top", "right"]].set_visible(False)
+            plain(axis)
             if part.empty:
-                axis.text(
-                    0.5, 0.5, "no target has any", ha="center", transform=axis.transAxes, fontsize=8
-                )
+                middle = {"ha": "center", "transform": axis.transAxes}
+                axis.text(0.5, 0.5, "no target has any", fontsize=8, **middle)
                 continue
             samples_panel(axis, part, metric, experiment.budget, style)
             axis.set_title(f"{TITLES[kind]} ({part['target'].nunique()} targets)", fontsize=9)
-            axis.set_ylabel(
-                "error " + _ROWS[metric].format(channel=channel) + "\nmedian"
-                if axis is row[0]
-                else "",
-                fontsize=9,
-            )
-            if metric != present[-1]:
+            if axis is row[0]:
+                what = _ROWS[metric].format(channel=channel)
+                axis.set_ylabel(f"error {what}\nmedian", fontsize=9)
+            # Rows share their horizontal axis: it is named under the last.
+            if metric != metrics[-1]:
                 axis.set_xlabel("")
-    finish(
-        figure,
-        [a for row in axes for a in row],
-        style,
-        experiment,
-        CAPTION + " A sloppy direction is one that the target's data do not fix.",
-    )
-    return [save(folder, "stiff-sloppy-prediction", figure)]
+    caption = f"{CAPTION} A sloppy direction is one that the target's data do not fix."
+    finish(figure, [a for row in axes for a in row], style, experiment, caption)
+    return figure

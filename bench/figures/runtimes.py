@@ -5,17 +5,17 @@ mean ranks.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from bench.analysis.amortisation import COSTS, Price, break_even, winners
+from bench.analysis.amortisation import COSTS, SHARED, Price, break_even, winners
 from bench.analysis.curves import Curves
 from bench.analysis.runtimes import percentile_interval, resampled, solved
 from bench.analysis.table import checkpoints
-from bench.figures.style import Styles, canvas, finish, save
+from bench.figures.errors import simulations_axis
+from bench.figures.style import INK, TITLES, Styles, blank, canvas, finish
 from bench.problem.experiment import Experiment
 from sims.base import Array
 
@@ -23,195 +23,182 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-TITLES = {
-    "in": "Targets in the training range",
-    "wide": "Targets anywhere in the bounds",
-    "real": "Recording",
-}
-SHARED = 100
-"""Targets that share one training in the figure of costs."""
+Prices = Mapping[str, Mapping[str, Price]]
+"""By range of targets, by tuner."""
+_POINTS = 60
+"""Numbers of simulations at which a distribution is drawn, on a logarithmic scale."""
+_MOST_TARGETS = 1e4
+"""That may share a training in the figure of amortisation."""
+_WIDE = 30.0
+"""Factor of cost over which a tuner must win for its name to fit above its part of the strip."""
 
 
-def runtime_figure(
-    folder: Path, experiment: Experiment, style: Styles, curves: Curves, spread: Array
-) -> Path:
-    """Share of (run, threshold) pairs that are reached, against simulations."""
+def runtime_figure(experiment: Experiment, style: Styles, curves: Curves, spread: Array) -> Figure:
+    """Share of (run, threshold) pairs that are reached, against simulations.
+
+    Args:
+        experiment: what was compared.
+        style: of its tuners.
+        curves: of the deciding metric, all ranges.
+        spread: thresholds of that metric.
+    """
     ranges = list(dict.fromkeys(curves.keys["range"]))
     figure, axes = canvas(len(ranges))
     budget = curves.values.shape[1] - 1
-    points = np.unique(
-        np.concatenate([[0], np.geomspace(1, budget, 60).astype(int), checkpoints(budget)])
-    )
-    marks = [int(np.flatnonzero(points == k)[0]) for k in checkpoints(budget)]
+    ticks = checkpoints(budget)
+    between = np.geomspace(1, budget, _POINTS).astype(int)
+    points = np.unique(np.concatenate([[0], between, ticks]))
+    marks = [int(np.flatnonzero(points == k)[0]) for k in ticks]
     for axis, kind in zip(axes, ranges, strict=True):
         part = curves.of(range=str(kind))
         for tuner in part.tuners():
             share = solved(part.of(tuner=tuner), spread, points)
-            axis.step(
-                points, share, where="post", markevery=marks, markersize=4.5, **style.of(tuner)
-            )
-        axis.set_xscale("symlog", linthresh=1, linscale=0.5)
-        ticks = checkpoints(budget)
-        axis.set_xticks(ticks, [str(k) for k in ticks])
-        axis.minorticks_off()
-        axis.set_xlim(-0.08, budget * 1.1)
+            look = style.of(tuner)
+            axis.step(points, share, where="post", markevery=marks, markersize=4.5, **look)
+        simulations_axis(axis, budget)
         axis.set_ylim(-0.02, 1.02)
-        axis.set_xlabel("simulations used on the target")
         axis.set_ylabel("share of (run, threshold) pairs reached for good")
-        axis.set_title(
-            f"{TITLES[str(kind)]} ({part.keys['target'].nunique()} targets)", fontsize=10
-        )
+        targets = part.keys["target"].nunique()
+        axis.set_title(f"{TITLES[str(kind)]} ({targets} targets)", fontsize=10)
     caption = (
-        f"{len(spread)} thresholds from {spread[0]:.2g} to {spread[-1]:.2g} on a logarithmic scale. Reached: the "
-        "recommendation's error stays at or below it from there on. A failed run reaches none."
+        f"{len(spread)} thresholds from {spread[0]:.2g} to {spread[-1]:.2g} on a logarithmic scale. "
+        "Reached: the recommendation's error stays at or below it from there on. "
+        "A failed run reaches none."
     )
     finish(figure, axes, style, experiment, caption)
-    return save(folder, "runtime-distribution", figure)
+    return figure
 
 
 def amortisation_figure(
-    folder: Path,
-    experiment: Experiment,
-    style: Styles,
-    held: Mapping[str, Mapping[str, Price]],
-    level: float,
-) -> Path:
+    experiment: Experiment, style: Styles, prices: Prices, level: float
+) -> Figure:
     """Simulations in total against the number of targets, training included, with the break-even
     points.
+
+    Args:
+        experiment: what was compared.
+        style: of its tuners.
+        prices: of reaching `level`.
+        level: of the deciding metric.
     """
-    figure, axes = canvas(len(held))
-    targets = np.logspace(0, 4, 200)
-    for axis, (kind, prices) in zip(axes, held.items(), strict=True):
-        for tuner, price in prices.items():
+    figure, axes = canvas(len(prices))
+    targets = np.logspace(0, np.log10(_MOST_TARGETS), 200)
+    for axis, (kind, by_tuner) in zip(axes, prices.items(), strict=True):
+        for tuner, price in by_tuner.items():
             ert = float(price.effort.ert())
+            # Who never gets there has no line: it would be at infinity.
             if np.isfinite(ert):
                 total = price.fit_simulations + targets * ert
                 axis.plot(targets, total, markevery=25, markersize=4.5, **style.of(tuner))
-        _mark_even(axis, prices)
+        _mark_even(axis, by_tuner)
         axis.set_xscale("log")
         axis.set_yscale("log")
         axis.set_xlabel("number of targets")
         axis.set_ylabel("simulations in total, training included")
         axis.set_title(TITLES[kind], fontsize=10)
     caption = (
-        f"To reach an error of {level:.2g} for good: training + targets × expected simulations (ERT). Rings: a learned "
-        "tuner passes a search tuner; bars: 95 % bootstrap interval. A tuner without a line never got there."
+        f"To reach an error of {level:.2g} for good: training + targets × expected simulations "
+        "(ERT). Rings: a learned tuner passes a search tuner; bars: 95 % bootstrap interval. "
+        "A tuner without a line never got there."
     )
     finish(figure, axes, style, experiment, caption)
-    return save(folder, "amortisation", figure)
+    return figure
 
 
 def _mark_even(axis: Axes, prices: Mapping[str, Price]) -> None:
     """A ring at each break-even point, with its 95 % interval as a bar."""
-    for learned in prices.values():
-        for search in prices.values():
-            if learned.fit_simulations and not search.fit_simulations:
-                even = float(break_even(learned, search))
-                if 1 <= even <= 1e4:
-                    total = even * float(search.effort.ert())
-                    picked = resampled(len(learned.effort.successes), "break-even")
-                    low, high = np.clip(
-                        percentile_interval(break_even(learned, search, picked)), 1, 1e4
-                    )
-                    axis.plot(
-                        [low, high],
-                        [total, total],
-                        color="#333333",
-                        linewidth=1.0,
-                        alpha=0.6,
-                        zorder=4,
-                    )
-                    axis.plot(
-                        even,
-                        total,
-                        "o",
-                        markersize=9,
-                        markerfacecolor="none",
-                        color="#333333",
-                        zorder=5,
-                    )
+    learning = [p for p in prices.values() if p.fit_simulations]
+    searching = [p for p in prices.values() if not p.fit_simulations]
+    for learned in learning:
+        for search in searching:
+            even = float(break_even(learned, search))
+            if not 1 <= even <= _MOST_TARGETS:
+                continue
+            total = even * float(search.effort.ert())
+            picked = resampled(len(learned.effort.successes), "break-even")
+            # Some resamples may never break even: their bar ends where the figure does.
+            spread = percentile_interval(break_even(learned, search, picked))
+            ends = np.clip(spread, 1, _MOST_TARGETS)
+            axis.plot(ends, [total, total], color=INK, linewidth=1.0, alpha=0.6, zorder=4)
+            axis.plot(even, total, "o", markersize=9, markerfacecolor="none", color=INK, zorder=5)
 
 
-def cost_figure(
-    folder: Path,
-    experiment: Experiment,
-    style: Styles,
-    held: Mapping[str, Mapping[str, Price]],
-    level: float,
-) -> Path:
-    """Seconds a target against the cost of a simulation; a strip below names who needs the least."""
-    figure, axes = canvas(len(held))
-    for axis, (kind, prices) in zip(axes, held.items(), strict=True):
-        for tuner, price in prices.items():
+def cost_figure(experiment: Experiment, style: Styles, prices: Prices, level: float) -> Figure:
+    """Seconds a target against the cost of a simulation; a strip below names who needs the least.
+    Arguments as of `amortisation_figure`.
+    """
+    figure, axes = canvas(len(prices))
+    for axis, (kind, by_tuner) in zip(axes, prices.items(), strict=True):
+        for tuner, price in by_tuner.items():
             if np.isfinite(price.effort.ert()):
-                axis.plot(
-                    COSTS,
-                    price.seconds(COSTS, SHARED),
-                    markevery=20,
-                    markersize=4.5,
-                    **style.of(tuner),
-                )
+                seconds = price.seconds(COSTS, SHARED)
+                axis.plot(COSTS, seconds, markevery=20, markersize=4.5, **style.of(tuner))
         axis.set_xscale("log")
         axis.set_yscale("log")
-        for low, high, tuner in winners(prices, SHARED):
-            colour = style.of(tuner)["color"]
-            axis.axvspan(low, high, ymin=0.0, ymax=0.035, color=colour, linewidth=0)
-            if high / low > 30:
-                axis.annotate(
-                    tuner,
-                    (np.sqrt(low * high), 0.045),
-                    xycoords=("data", "axes fraction"),
-                    ha="center",
-                    fontsize=7.5,
-                )
+        _strip(axis, by_tuner, style)
         axis.set_xlabel("seconds that one simulation takes")
         axis.set_ylabel("seconds for one target")
         axis.set_title(TITLES[kind], fontsize=10)
     caption = (
-        f"To reach an error of {level:.2g} for good: ERT × seconds of a simulation + seconds of the tuner as measured; "
-        f"training shared by {SHARED} targets. The strip names who needs least."
+        f"To reach an error of {level:.2g} for good: ERT × seconds of a simulation + seconds of the "
+        f"tuner as measured; training shared by {SHARED} targets. The strip names who needs least."
     )
     finish(figure, axes, style, experiment, caption)
-    return save(folder, "who-wins-at-which-cost", figure)
+    return figure
 
 
-def rank_figure(
-    folder: Path, ranked: pd.DataFrame, p_values: pd.DataFrame, friedman: float
-) -> Path:
+def _strip(axis: Axes, prices: Mapping[str, Price], style: Styles) -> None:
+    """Who needs the least time at each cost, as a coloured strip at the foot of a panel."""
+    for low, high, tuner in winners(prices, SHARED):
+        colour = style.of(tuner)["color"]
+        axis.axvspan(low, high, ymin=0.0, ymax=0.035, color=colour, linewidth=0)
+        if high / low > _WIDE:
+            axis.annotate(
+                tuner,
+                (np.sqrt(low * high), 0.045),
+                xycoords=("data", "axes fraction"),
+                ha="center",
+                fontsize=7.5,
+            )
+
+
+def rank_figure(ranked: pd.DataFrame, p_values: pd.DataFrame, friedman: float) -> Figure:
     """Critical-difference diagram: mean ranks over problems, bars join what cannot be told apart at
     5 %.
+
+    Args:
+        ranked: ranks, a row a problem, a column a tuner.
+        p_values: Nemenyi's, of each pair of tuners.
+        friedman: p-value of Friedman's test.
     """
-    from matplotlib import pyplot as plt
     from scikit_posthocs import critical_difference_diagram
 
-    figure: Figure = plt.figure(figsize=(8.5, 1.6 + 0.28 * ranked.shape[1]))
-    axis = figure.add_subplot()
+    figure, axes = blank(1, 1, (8.5, 1.6 + 0.28 * ranked.shape[1]))
+    axis = axes[0, 0]
     critical_difference_diagram(ranked.mean(axis=0), p_values, ax=axis, label_props={"fontsize": 9})
-    axis.set_title(
-        f"Mean rank over {len(ranked)} problems, 1 is best (Friedman p = {friedman:.2g}; bars: Nemenyi p > 0.05)",
-        fontsize=10,
-    )
-    return save(folder, "critical-difference", figure)
+    tests = f"Friedman p = {friedman:.2g}; bars: Nemenyi p > 0.05"
+    axis.set_title(f"Mean rank over {len(ranked)} problems, 1 is best ({tests})", fontsize=10)
+    return figure
 
 
 def joint_runtime_figure(
-    folder: Path, experiment: Experiment, style: Any, shares: Mapping[str, Array]
-) -> Path:
-    """Runtime distributions over all problems; `shares` after 0, 1, 2, ... hundredths of each
-    problem's budget.
+    experiment: Experiment, style: Styles, shares: Mapping[str, Array]
+) -> Figure:
+    """Runtime distributions over all problems.
+
+    Args:
+        experiment: stands for all of them.
+        style: of their tuners.
+        shares: by tuner, reached after 0, 1, 2, ... hundredths of each problem's budget.
     """
     figure, axes = canvas(1)
+    axis = axes[0]
     for tuner, share in shares.items():
-        axes[0].step(
-            np.arange(len(share)),
-            share,
-            where="post",
-            markevery=10,
-            markersize=4.5,
-            **style.of(tuner),
-        )
-    axes[0].set_xlabel("simulations used, in hundredths of the problem's budget")
-    axes[0].set_ylabel("share of (run, threshold) pairs reached for good")
-    axes[0].set_ylim(-0.02, 1.02)
+        hundredths = np.arange(len(share))
+        look = style.of(tuner)
+        axis.step(hundredths, share, where="post", markevery=10, markersize=4.5, **look)
+    axis.set_xlabel("simulations used, in hundredths of the problem's budget")
+    axis.set_ylabel("share of (run, threshold) pairs reached for good")
+    axis.set_ylim(-0.02, 1.02)
     finish(figure, axes, style, experiment, "Mean over problems, each with equal weight.")
-    return save(folder, "runtime-distribution", figure)
+    return figure

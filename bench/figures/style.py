@@ -1,13 +1,17 @@
-"""How figures of comparisons look: palette, markers, canvas, legend, and how they are saved.
+"""How figures look and how they are saved: palette, markers, canvas, legend, files.
 
 Made for print: every tuner has its own marker and line style beside its colour, colours differ in
-lightness.
+lightness. No figure here is made by pyplot: a notebook's backend, settings and open figures stay as
+they are.
 """
 
 from __future__ import annotations
 
+import os
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,31 +19,56 @@ import numpy as np
 import pandas as pd
 
 from bench.problem.experiment import Experiment
+from sims.base import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Okabe and Ito's eight colours, safe for colour-blind readers: M. Okabe, K. Ito, Color Universal
+# Design, 2002.
+BLACK = "#000000"
+ORANGE = "#E69F00"
+BLUE = "#0072B2"
+SKY = "#56B4E9"
+VERMILION = "#D55E00"
+GREEN = "#009E73"
+PURPLE = "#CC79A7"
 
-# Okabe and Ito's colours, safe for colour-blind readers, in an order that alternates dark and
-# light.
-_COLOURS = (
-    "#000000",
-    "#E69F00",
-    "#0072B2",
-    "#56B4E9",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#7F7F7F",
-    "#5B3A8E",
-    "#A6761D",
-)
+# Further ones where eight do not suffice, apart from the others in lightness.
+GREY = "#7F7F7F"
+VIOLET = "#5B3A8E"
+BROWN = "#A6761D"
+RUST = "#A03C00"
 
+# Greys by what they are for, from dark to light.
+INK = "#333333"
+"""Marks that belong to no tuner."""
+SOFT = "#444444"
+"""Captions, and lines at a threshold."""
+ZERO = "#555555"
+"""The line at zero of a residual."""
+APART = "#888888"
+"""Lines between runs."""
+JOIN = "#999999"
+"""Lines that join what belongs together."""
+CHANCE = "#A8A8A8"
+"""Bars over what chance alone gives."""
+SLOPE = "#BBBBBB"
+"""The incline of a bounce shot."""
+BAND = "#CFCFCF"
+"""What noise alone gives, and what is not needed."""
+GROUND = "#E4E4E4"
+"""Behind held-out runs."""
+SHADE = "#EEEEEE"
+"""Behind the part of a film that is recorded."""
+
+# Dark and light in turn, so that neighbours differ in grey too.
+_COLOURS = (BLACK, ORANGE, BLUE, SKY, VERMILION, GREEN, PURPLE, GREY, VIOLET, BROWN)
 
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
 
-
+# Eight against ten colours: the pairs repeat only after forty tuners.
 _LINES = (
     "-",
     "--",
@@ -51,23 +80,26 @@ _LINES = (
     (0, (8, 2)),
 )
 
+DPI = 160
+"""Dots an inch of the PNG files."""
 
 FLOOR = 1e-9
 """Errors below this are drawn here: less than rounding in the observation."""
 
-
 CAPTION = (
-    "Line: median over targets of the recommendation's error (mean over seeds). Band or bar: 95 % bootstrap interval "
-    f"of the median. Errors below {FLOOR:g} are drawn there."
+    "Line: median over targets of the recommendation's error (mean over seeds). "
+    "Band or bar: 95 % bootstrap interval of the median. "
+    f"Errors below {FLOOR:g} are drawn there."
 )
-
 
 TITLES = {
     "in": "Targets in the training range",
     "wide": "Targets anywhere in the bounds",
+    "real": "Recording",
     "obs_error": "Runs tuned on",
     "heldout_error": "Held-out runs, open loop",
 }
+"""What a panel shows: a range of targets, or runs of a recording."""
 
 
 class Styles:
@@ -77,10 +109,10 @@ class Styles:
 
     def __init__(self, experiment: Experiment, runs: pd.DataFrame, metric: str) -> None:
         present = set(runs["tuner"].unique())
+        # A place counts tuners that did not run too: a colour means the same in every figure.
         self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
-        last = (
-            runs.drop_duplicates("run", keep="last").groupby("tuner")[metric].median()
-        )  # rows stand in order of k
+        # Rows stand in order of k, so the last of a run is what it delivered.
+        last = runs.drop_duplicates("run", keep="last").groupby("tuner")[metric].median()
         self.order: Sequence[str] = sorted(
             self._places, key=lambda label: float(last.get(label, np.inf))
         )
@@ -101,17 +133,41 @@ class Styles:
         return (self._places[tuner] - (len(self._places) - 1) / 2) * 0.6 / max(len(self._places), 1)
 
 
+def blank(
+    rows: int,
+    columns: int,
+    size: tuple[float, float],
+    layout: Any = "constrained",
+    **options: Any,
+) -> tuple[Figure, Any]:
+    """A figure and its (rows, columns) panels, unknown to pyplot.
+
+    Args:
+        rows: of panels.
+        columns: of panels.
+        size: width and height in inches.
+        layout: matplotlib's layout engine; None where the margins are set by hand.
+        **options: of `matplotlib.figure.Figure.subplots`.
+    """
+    # Matplotlib takes most of a second to load, and most commands draw nothing.
+    from bench.figures.picture import Picture
+
+    figure = Picture(figsize=size, layout=layout)
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+
+
 def canvas(panels: int) -> tuple[Figure, list[Axes]]:
     """A figure with so many panels side by side, which share their vertical axis."""
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(
-        1, panels, figsize=(1.2 + 4.3 * panels, 4.6), squeeze=False, sharey=True
-    )
+    figure, axes = blank(1, panels, (1.2 + 4.3 * panels, 4.6), sharey=True)
     for axis in axes[0]:
-        axis.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
-        axis.spines[["top", "right"]].set_visible(False)
+        plain(axis)
     return figure, list(axes[0])
+
+
+def plain(axis: Axes) -> None:
+    """A faint grid, and no frame above and to the right."""
+    axis.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
+    axis.spines[["top", "right"]].set_visible(False)
 
 
 def finish(
@@ -124,7 +180,8 @@ def finish(
 ) -> None:
     """Legend, title and caption."""
     handles: dict[str, Any] = {}
-    for axis in reversed(axes):  # a panel may lack a tuner that another has
+    # A panel may lack a tuner that another has; of those in both, the first panel's is shown.
+    for axis in reversed(axes):
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
     labels = [label for label in style.order if label in handles]
     figure.legend(
@@ -141,19 +198,59 @@ def finish(
         if axis.get_ylabel() == axes[0].get_ylabel():
             axis.set_ylabel("")
     figure.suptitle(experiment.title or experiment.name, fontsize=11)
-    figure.supxlabel(
-        textwrap.fill(caption, int(17 * figure.get_figwidth())), fontsize=7.5, color="#444444"
-    )
+    below(figure, caption, letters=17)
 
 
-def save(folder: Path, name: str, figure: Figure) -> Path:
-    """Write a figure as PNG and PDF below `folder`/figures and close it; returns the PNG."""
-    from matplotlib import pyplot as plt
+def below(figure: Figure, caption: str, letters: int) -> None:
+    """A caption under the figure, in lines of so many letters for each inch of its width."""
+    lines = textwrap.fill(caption, int(letters * figure.get_figwidth()))
+    figure.supxlabel(lines, fontsize=7.5, color=SOFT)
 
-    target = folder / "figures"
-    target.mkdir(exist_ok=True)
-    figure.set_layout_engine("constrained")
-    figure.savefig(target / f"{name}.png", dpi=160)
-    figure.savefig(target / f"{name}.pdf", metadata={"CreationDate": None})
-    plt.close(figure)
-    return target / f"{name}.png"
+
+def png(figure: Figure, dpi: int = DPI) -> bytes:
+    """A figure as the bytes of a PNG file."""
+    file = BytesIO()
+    figure.savefig(file, format="png", dpi=dpi)
+    return file.getvalue()
+
+
+def pdf(figure: Figure) -> bytes:
+    """A figure as the bytes of a PDF file."""
+    file = BytesIO()
+    # Without its date a file is the same whenever it is made.
+    figure.savefig(file, format="pdf", metadata={"CreationDate": None})
+    return file.getvalue()
+
+
+def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
+    """Write a figure as PNG and PDF, both whole or neither; folders are made where they are missing.
+
+    Args:
+        figure: what to write.
+        path: of the files without their endings.
+        dpi: dots an inch of the PNG.
+
+    Returns:
+        The PNG and the PDF.
+
+    Raises:
+        InputError: the folder cannot be made or written to.
+    """
+    contents = {f"{path.name}.png": png(figure, dpi), f"{path.name}.pdf": pdf(figure)}
+    drafts = {name: path.with_name(f".{name}.{os.getpid()}.partial") for name in contents}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for name, content in contents.items():
+            drafts[name].write_bytes(content)
+        # Both are on the disk by now: a full one has shown itself before anything is replaced.
+        return [draft.replace(path.with_name(name)) for name, draft in drafts.items()]
+    except OSError as error:
+        _discard(drafts.values())
+        raise InputError(f"{path.parent}: cannot be written ({error.strerror})") from None
+
+
+def _discard(drafts: Iterable[Path]) -> None:
+    """Delete what was begun, as far as the folder lets us."""
+    for draft in drafts:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)

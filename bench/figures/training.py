@@ -4,62 +4,64 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.figures.style import save
+from bench.figures.style import BLUE, ORANGE, blank, save
+from sims.base import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Row = tuple[int, str, int, float, float]
+"""Seed, stage, epoch, training loss, held-out loss."""
 _STAGES = {"clean": "Network for targets without noise", "noisy": "Network for noisy targets"}
 
 
 def draw(folder: Path, title: str, rows: Sequence[Row]) -> Path:
     """Draw the losses into `folder`/figures; returns the PNG.
 
-    Args:
-        folder: where to.
-        title: above the figure.
-        rows: seed, stage, epoch, training loss, held-out loss.
+    Raises:
+        InputError: the folder cannot be made or written to.
     """
-    import matplotlib
+    return save(loss_figure(title, rows), folder / "figures" / "loss")[0]
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
 
+def loss_figure(title: str, rows: Sequence[Row]) -> Figure:
+    """Loss against epoch, a panel a stage.
+
+    Args:
+        title: above the figure.
+        rows: of all epochs.
+    """
     stages = list(dict.fromkeys(row[1] for row in rows))
     seeds = sorted({row[0] for row in rows})
-    figure, axes = plt.subplots(
-        1, len(stages), figsize=(1.0 + 4.0 * len(stages), 3.4), sharey=True, squeeze=False
-    )
-    for ax, stage in zip(axes[0], stages, strict=True):
+    figure, axes = blank(1, len(stages), (1.0 + 4.0 * len(stages), 3.4), sharey=True)
+    for axis, stage in zip(axes[0], stages, strict=True):
         for seed in seeds:
             values = np.array([row[2:] for row in rows if row[:2] == (seed, stage)])
-            first = seed == seeds[0]
-            ax.plot(
-                values[:, 0],
-                values[:, 1],
-                "-",
-                color="#0072B2",
-                lw=1.2,
-                label="training" if first else None,
-            )
-            ax.plot(
-                values[:, 0],
-                values[:, 2],
-                "--",
-                color="#E69F00",
-                lw=1.2,
-                label="held out" if first else None,
-            )
-        ax.set(
+            # The first seed speaks for all in the legend.
+            _lines(axis, values.T, named=seed == seeds[0])
+        axis.set(
             title=_STAGES.get(stage, stage),
             xlabel="epoch (pass over the training data)",
             yscale="log",
         )
-        ax.grid(alpha=0.3)
+        axis.grid(alpha=0.3)
     axes[0, 0].set_ylabel("loss (weighted squared error of\nthe estimated difference)")
     axes[0, 0].legend()
-    figure.suptitle(
-        f"{title} (held out: others); {len(seeds)} training{'s' * (len(seeds) > 1)}", fontsize=11
-    )
-    return save(folder, "loss", figure)
+    count = f"{len(seeds)} training{'s' * (len(seeds) > 1)}"
+    figure.suptitle(f"{title} (held out: others); {count}", fontsize=11)
+    return figure
+
+
+def _lines(axis: Axes, values: Array, named: bool) -> None:
+    """One training: `values` are (3, epochs): epoch, training loss, held-out loss."""
+    epochs, training, held_out = values
+    for losses, line, colour, name in (
+        (training, "-", BLUE, "training"),
+        (held_out, "--", ORANGE, "held out"),
+    ):
+        axis.plot(epochs, losses, line, color=colour, lw=1.2, label=name if named else None)

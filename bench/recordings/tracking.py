@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from bench.recordings import metres
-from bench.recordings.picture import drawn
 from sims.ball.system import BallSystem
 from sims.base import InputError, frozen
 from sims.camera.files import beside, read_filmed
@@ -18,6 +18,7 @@ from sims.recording.recording import Recording, Run
 from sims.recording.write import refuse_existing, write_recording
 
 _DIGITS = 9
+"""Of the numbers in the table: more than a pixel's noise has."""
 
 
 class Found(NamedTuple):
@@ -27,14 +28,24 @@ class Found(NamedTuple):
     lines: tuple[str, ...]
 
 
+Draw = Callable[[Track, metres.Heights, slice, str], tuple[bytes, bytes]]
+"""Draws a track, its heights, the frames that are recorded, and a title: PNG and PDF."""
+
+
 def write(
-    video: Path, out: Path, diameter: float | None, fps: float | None, scale: str | None
+    video: Path,
+    out: Path,
+    draw: Draw,
+    diameter: float | None = None,
+    fps: float | None = None,
+    scale: str | None = None,
 ) -> Found:
     """Track `video`; write `out`, its description, and the track's picture beside it.
 
     Args:
         video: the film.
         out: NAME.csv, a new file.
+        draw: makes the picture, see `bench.figures.track.drawn`.
         diameter: of the ball, m.
         fps: frames a second instead of the file's time stamps.
         scale: "camera", "diameter" or "fall"; None for the best there is.
@@ -45,40 +56,51 @@ def write(
     if out.suffix != ".csv":
         raise InputError(f"--out {out}: expected a name that ends in .csv")
     pictures = [out.with_suffix(".png"), out.with_suffix(".pdf")]
+    # Before the work: tracking a film takes a while.
     refuse_existing([out, out.with_suffix(".toml"), *pictures])
     if diameter is not None and not (np.isfinite(diameter) and diameter > 0):
         raise InputError(f"--ball-diameter {diameter:g}: expected more than 0 m")
+
     film = Video(video, fps)
     try:
         seen = track(film)
         heights = _heights(seen, video, diameter, scale)
     except InputError as error:
+        # Some of what can go wrong names the film already, some does not know it.
         text = str(error)
         raise InputError(text if text.startswith(str(video)) else f"{video}: {text}") from None
+
     first, last = metres.released(seen), int(seen.seen[-1])
+    part = slice(first, last + 1)
     notes = [*film.notes, *seen.notes, *heights.notes]
     if first > seen.seen[0]:
-        notes.append(
-            f"the ball is held until {seen.times[first]:.2f} s; what is before that is left out"
-        )
-    part = slice(first, last + 1)
-    z = heights.z[part]
-    noise = float(np.nanmax([rough(z), metres.scatter(seen.times[part], z), 0.0]))
-    if not noise > 0:
-        noise = seen.noise * heights.radius / float(np.nanmedian(seen.radius))
-    shown = dict(
-        zip(pictures, drawn(seen, heights, part, f"{video.name}: {heights.how}"), strict=True)
-    )
-    write_recording(
-        out, _recording(seen, heights, noise, part, video), BallSystem, digits=_DIGITS, beside=shown
-    )
-    count = int(np.isfinite(heights.z[part]).sum())
+        until = f"the ball is held until {seen.times[first]:.2f} s"
+        notes.append(f"{until}; what is before that is left out")
+    noise = _noise(seen, heights, part)
+
+    # The recording and its pictures are published together: neither is left without the other.
+    contents = draw(seen, heights, part, f"{video.name}: {heights.how}")
+    shown = dict(zip(pictures, contents, strict=True))
+    recording = _recording(seen, heights, noise, part, video)
+    write_recording(out, recording, BallSystem, digits=_DIGITS, beside=shown)
+
+    count, frames = int(np.isfinite(heights.z[part]).sum()), part.stop - part.start
     lines = (
-        f"{out}: {count} of {part.stop - part.start} frames with the ball, z in metres {heights.how}",
+        f"{out}: {count} of {frames} frames with the ball, z in metres {heights.how}",
         f"noise of one sample: {seen.noise:.2g} px, {1e3 * noise:.2g} mm",
         f"{pictures[0]}: the track",
     )
     return Found(tuple(notes), lines)
+
+
+def _noise(seen: Track, heights: metres.Heights, part: slice) -> float:
+    """1 sigma of a height, m: the larger of what neighbours and what flights scatter by."""
+    z = heights.z[part]
+    noise = float(np.nanmax([rough(z), metres.scatter(seen.times[part], z), 0.0]))
+    if noise > 0:
+        return noise
+    # Neither tells in a few frames: that of the pixels, at the scale of the ball's middle size.
+    return seen.noise * heights.radius / float(np.nanmedian(seen.radius))
 
 
 def _heights(seen: Track, video: Path, diameter: float | None, scale: str | None) -> metres.Heights:

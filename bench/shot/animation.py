@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.figures.style import BLUE, VERMILION, blank
 from bench.shot.deal import RECORDINGS, Deal
-from bench.shot.pictures import end_of, label_of, shot_panel
+from bench.shot.pictures import Shown, end_of, shot_panel, thrown
 from bench.shot.settings import Settings
-from bench.shot.throw import RATE, throw
-from bench.shot.tune import Model
+from bench.shot.throw import RATE
 from sims.ball.simulator import Ball
 from sims.base import Array, InputError
 from sims.camera.render import Image
@@ -22,8 +22,12 @@ from sims.camera.video import Video
 from sims.recording.recording import read_recording
 
 _FRAMES_PER_SECOND = 12
+"""Of the animation."""
 _SLOWER = 2.0
-_HOLD = 9  # frames at the end
+"""Shots are shown so many times slower than they are."""
+_HOLD = 9
+"""Frames for which the end is shown."""
+_DPI = 70
 
 
 class Film(NamedTuple):
@@ -35,6 +39,33 @@ class Film(NamedTuple):
     tracks: list[Array]
 
 
+class _Moving(NamedTuple):
+    """A flown path (T, 3) until sample `end`, its line, and the ball at the line's end."""
+
+    path: Array
+    end: int
+    line: Any
+    ball: Any
+
+    def show(self, sample: int) -> None:
+        now = min(sample, self.end - 1)
+        self.line.set_data(self.path[: now + 1, 0], self.path[: now + 1, 2])
+        self.ball.set_data(self.path[now : now + 1, 0], self.path[now : now + 1, 2])
+
+
+class _Filmed(NamedTuple):
+    """The panel of the film: the picture, the track so far, and a ring around its end."""
+
+    picture: Any
+    track: Any
+    ring: Any
+
+    def show(self, picture: Image, track: Array) -> None:
+        self.picture.set_data(picture)
+        self.track.set_data(*track.T)
+        self.ring.set_data(*track[-1:].T)
+
+
 def animate(
     folder: Path, settings: Settings, example: tuple[Deal, list[str]], kept: Mapping[str, Any]
 ) -> Path:
@@ -44,72 +75,61 @@ def animate(
     Returns:
         The file.
     """
-    from matplotlib import pyplot as plt
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     dealt, methods = example
-    models = {model["method"]: Model(**model) for model in kept[dealt.name]["models"]}
-    throws = {method: throw(dealt, settings, models[method]) for method in methods}
-    top = max(float(np.nanmax(t.flown[:, 2])) for t in throws.values()) + 0.1
     film = _film(folder / RECORDINGS / f"{dealt.name}.mp4")
     beside = int(bool(film.pictures))
-    figure, axes = plt.subplots(
+    # Margins are set once, below: an engine that sets them anew would make the panels shake.
+    figure, axes = blank(
         1,
         len(methods) + beside,
-        figsize=(2.9 * len(methods) + 1.5 * beside, 3.2),
-        squeeze=False,
+        (2.9 * len(methods) + 1.5 * beside, 3.2),
+        layout=None,
         gridspec_kw={"width_ratios": [0.5] * beside + [1] * len(methods)},
     )
-    moving = []
-    for axis, method in zip(axes[0, beside:], methods, strict=True):
-        shot_panel(axis, dealt, label_of(method), models[method], throws[method], top)
-        line = axis.lines[-1]
-        line.set_data([], [])
-        (ball,) = axis.plot(
-            [], [], marker="o", color="#D55E00", markeredgecolor="black", markersize=7
-        )
-        moving.append(
-            (
-                throws[method].flown,
-                end_of(throws[method].flown, dealt.scene.hoop_z - 0.12),
-                line,
-                ball,
-            )
-        )
-    seen = _film_panel(axes[0, 0], film) if beside else []
+    shot = thrown(settings, dealt, methods, kept)
+    panels = zip(axes[0, beside:], methods, strict=True)
+    moving = [_shot_panel(axis, dealt, method, shot) for axis, method in panels]
+    filmed = _film_panel(axes[0, 0], film) if beside else None
     step = RATE / _FRAMES_PER_SECOND / _SLOWER
-    shots = int(np.ceil(max(end for _, end, _, _ in moving) / step)) + 1
+    shots = int(np.ceil(max(one.end for one in moving) / step)) + 1
 
     def show(frame: int) -> list[Any]:
-        if frame < len(film.pictures):
-            picture, track, ring = seen
-            picture.set_data(film.pictures[frame])
-            track.set_data(*film.tracks[frame].T)
-            ring.set_data(*film.tracks[frame][-1:].T)
-            return []
-        for path, end, line, ball in moving:
-            now = min(round((frame - len(film.pictures)) * step), end - 1)
-            line.set_data(path[: now + 1, 0], path[: now + 1, 2])
-            ball.set_data(path[now : now + 1, 0], path[now : now + 1, 2])
+        later = frame - len(film.pictures)
+        if filmed is not None and later < 0:
+            filmed.show(film.pictures[frame], film.tracks[frame])
+        else:
+            for one in moving:
+                one.show(round(later * step))
         return []
 
     figure.tight_layout()
-    made = folder / "figures" / "shot.gif"
+    path = folder / "figures" / "shot.gif"
     frames = len(film.pictures) + shots + _HOLD
-    FuncAnimation(figure, show, frames=frames).save(made, PillowWriter(_FRAMES_PER_SECOND), dpi=70)
-    plt.close(figure)
-    return made
+    writer = PillowWriter(_FRAMES_PER_SECOND)
+    FuncAnimation(figure, show, frames=frames).save(path, writer, dpi=_DPI)
+    return path
 
 
-def _film_panel(axis: Any, film: Film) -> list[Any]:
+def _shot_panel(axis: Any, dealt: Deal, method: str, shot: Shown) -> _Moving:
+    """One method's panel, before anything has moved."""
+    shot_panel(axis, dealt, method, shot)
+    line = axis.lines[-1]
+    line.set_data([], [])
+    (ball,) = axis.plot([], [], marker="o", color=VERMILION, markeredgecolor="black", markersize=7)
+    path = shot.throws[method].flown
+    return _Moving(path, end_of(path, dealt.scene), line, ball)
+
+
+def _film_panel(axis: Any, film: Film) -> _Filmed:
     picture = axis.imshow(film.pictures[0])
-    (track,) = axis.plot([], [], color="#0072B2", linewidth=0.7)
-    (ring,) = axis.plot(
-        [], [], "o", markersize=9, markerfacecolor="none", markeredgecolor="#D55E00"
-    )
+    (track,) = axis.plot([], [], color=BLUE, linewidth=0.7)
+    look = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": VERMILION}
+    (ring,) = axis.plot([], [], "o", **look)
     axis.set_title("one drop,\nfilmed and tracked", fontsize=9)
     axis.set(xticks=[], yticks=[])
-    return [picture, track, ring]
+    return _Filmed(picture, track, ring)
 
 
 def _film(path: Path) -> Film:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.figures.track import drawn
 from bench.recordings import tracking
 from sims.base import Array
 from sims.camera.camera import Camera
@@ -60,4 +61,4 @@ def filmed(
         film, stage.film(places), times, look.crf, {beside(film): described(Filmed(camera, radius))}
     )
     stage.close()
-    tracking.write(film, path, None, None, "camera")
+    tracking.write(film, path, drawn, scale="camera")

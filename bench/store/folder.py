@@ -173,14 +173,21 @@ def write_results(
 
 
 class Stored(NamedTuple):
-    """A comparison read back: experiment, runs, statuses, and (simulations, seconds) of one
-    training by tuner.
+    """A comparison read back.
+
+    Attributes:
+        experiment: what was compared.
+        runs: rows of runs.parquet.
+        statuses: rows of status.csv.
+        costs: (simulations, seconds) of one training, by tuner.
+        spectra: rows of identifiability.csv; None where there is no such file.
     """
 
     experiment: Experiment
     runs: pd.DataFrame
     statuses: pd.DataFrame
     costs: dict[str, tuple[float, float]]
+    spectra: pd.DataFrame | None = None
 
 
 def read(folder: Path, columns: Sequence[str] | None = None) -> Stored:
@@ -216,11 +223,12 @@ def read(folder: Path, columns: Sequence[str] | None = None) -> Stored:
                 f"{folder}: not a complete comparison: no column {', '.join(sorted(missing))}"
             )
         costs = _costs(training)
+        spectra = pd.read_csv(known) if (known := folder / "identifiability.csv").exists() else None
     except (OSError, ValueError, KeyError, ArrowException) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{folder}: not a complete comparison: {first_line(error)}") from None
-    return Stored(experiment, runs, statuses, costs)
+    return Stored(experiment, runs, statuses, costs, spectra)
 
 
 def _costs(training: pd.DataFrame) -> dict[str, tuple[float, float]]:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.figures.style import save
+from bench.figures.style import BLACK, BLUE, JOIN, ORANGE, VERMILION, blank, save
 from bench.problem.experiment import load
 from bench.problem.problem import Problem
 from bench.problem.seeds import rng_for
@@ -255,12 +255,11 @@ def cost(study):
 
 
 def path_figure(table):
-    from matplotlib import pyplot as plt
-
     names = [v.says for v in path()]
-    figure, axes = plt.subplots(1, 2, figsize=(10.0, 4.6), sharey=True)
+    figure, grid = blank(1, 2, (10.0, 4.6), sharey=True)
+    axes = grid[0]
     kinds = {"in": "Targets in the training range", "wide": "Targets anywhere"}
-    curves = ((1, "#E69F00", "s", ":"), (3, "#0072B2", "o", "-"), (10, "#000000", "^", "--"))
+    curves = ((1, ORANGE, "s", ":"), (3, BLUE, "o", "-"), (10, BLACK, "^", "--"))
     for ax, (kind, title) in zip(axes, kinds.items(), strict=True):
         part = table[table["range"] == kind].set_index("variant").loc[names]
         for k, colour, marker, line in curves:
@@ -284,9 +283,8 @@ def path_figure(table):
 
 
 def differences_figure(study, kept):
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(9.0, 4.2), sharex=True, sharey=True)
+    figure, grid = blank(1, 2, (9.0, 4.2), sharex=True, sharey=True)
+    axes = grid[0]
     names = {
         "published": "Published network",
         "+ Broyden's step = tunenet": "This project's network",
@@ -300,18 +298,16 @@ def differences_figure(study, kept):
         network = kept[key].fitted().clean
         pairs = [network.read(seen[:, i], (seen.shape[2],), NOTHING) for i in (0, 1)]
         h, true = network.difference(*pairs)[:, 0], points[:, 1] - points[:, 0]
-        ax.plot([-1, 1], [-1, 1], color="#999999", lw=1)
+        ax.plot([-1, 1], [-1, 1], color=JOIN, lw=1)
         ax.plot(
             true[~inside],
             h[~inside],
             "x",
-            color="#D55E00",
+            color=VERMILION,
             ms=4,
             label="one of them outside the training range",
         )
-        ax.plot(
-            true[inside], h[inside], "o", color="#0072B2", ms=3, label="both in the training range"
-        )
+        ax.plot(true[inside], h[inside], "o", color=BLUE, ms=3, label="both in the training range")
         ax.set(title=title, xlabel="true difference of restitution [1]", ylim=(-1.5, 1.5))
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("estimated difference [1]")
@@ -323,12 +319,11 @@ def differences_figure(study, kept):
 
 
 def spread_figure(spread):
-    from matplotlib import pyplot as plt
-
-    figure, ax = plt.subplots(figsize=(5.2, 4.2))
+    figure, grid = blank(1, 1, (5.2, 4.2))
+    ax = grid[0, 0]
     marks = (
-        ("in", "o", "#0072B2", "targets in the training range"),
-        ("wide", "x", "#D55E00", "targets anywhere"),
+        ("in", "o", BLUE, "targets in the training range"),
+        ("wide", "x", VERMILION, "targets anywhere"),
     )
     for kind, marker, colour, label in marks:
         part = spread[spread["range"] == kind]
@@ -341,7 +336,7 @@ def spread_figure(spread):
             label=f"{label} ({len(part)})",
         )
     line = np.array([spread["spread"].min(), spread["spread"].max()])
-    ax.plot(line, line, color="#999999", label="error = spread")
+    ax.plot(line, line, color=JOIN, label="error = spread")
     ax.set(
         xscale="log",
         yscale="log",
@@ -355,9 +350,6 @@ def spread_figure(spread):
 
 
 def main():
-    import matplotlib
-
-    matplotlib.use("Agg")
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("results/tunenet-study"))
     parser.add_argument("--targets", type=int, default=TARGETS)
@@ -382,9 +374,9 @@ def main():
         print(
             f"{kind}: rank correlation {ranks:.2f}, within 2 spreads {within:.0%}, median error/spread {ratio:.2g}"
         )
-    save(options.out, "path", path_figure(table))
-    save(options.out, "differences", differences_figure(study, kept))
-    save(options.out, "spread", spread_figure(spread))
+    save(path_figure(table), options.out / "figures" / "path")
+    save(differences_figure(study, kept), options.out / "figures" / "differences")
+    save(spread_figure(spread), options.out / "figures" / "spread")
 
 
 if __name__ == "__main__":

@@ -9,30 +9,51 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bench.figures.style import BAND, BLUE, CHANCE, INK, JOIN, SKY, VERMILION, ZERO
 from bench.gap.report.story import Place, Profile, Story
 from bench.gap.report.words import clean, labelled, name_of, number, probability
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOST_RUNS, MOST_PLACES, MOST_PROFILES, MOST_CANDIDATES = 8, 6, 4, 12
-BEFORE: Mapping[str, Any] = {"color": "#D55E00", "linestyle": (0, (5, 2)), "linewidth": 1.3}
-AFTER: Mapping[str, Any] = {"color": "#0072B2", "linestyle": "-", "linewidth": 1.5}
+MOST_RUNS = 8
+"""Runs that are shown, the worst."""
+MOST_PLACES = 6
+"""Channels that are shown, and phases, the worst of each."""
+MOST_PROFILES = 4
+MOST_CANDIDATES = 12
+BEFORE: Mapping[str, Any] = {"color": VERMILION, "linestyle": (0, (5, 2)), "linewidth": 1.3}
+"""Curves of the tuned base model: dashed, to be told apart in grey."""
+AFTER: Mapping[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5}
+"""Curves of the extended model."""
 OPEN: Mapping[str, Any] = {
     "marker": "s",
     "markersize": 6,
     "markerfacecolor": "white",
-    "color": "#D55E00",
+    "color": VERMILION,
 }
-FILLED: Mapping[str, Any] = {"marker": "o", "markersize": 5.5, "color": "#0072B2"}
-_LOOKS: Mapping[str, Mapping[str, Any]] = {
-    "found": {"facecolor": "#0072B2"},
-    "found, but cannot be told apart": {"facecolor": "#56B4E9", "hatch": "///"},
-    "not needed": {"facecolor": "#CFCFCF"},
-}
+"""Marks of the tuned base model: open squares, to be told apart in grey."""
+FILLED: Mapping[str, Any] = {"marker": "o", "markersize": 5.5, "color": BLUE}
+"""Marks of the extended model."""
 GAIN = "gain on held-out runs"
-BAND, _SPAN_FOR_LOG = "#CFCFCF", 8.0
-_FLOOR, _ALONE = "1: noise floor", "what noise alone gives"
+_LOOKS: Mapping[str, Mapping[str, Any]] = {
+    "found": {"facecolor": BLUE},
+    "found, but cannot be told apart": {"facecolor": SKY, "hatch": "///"},
+    "not needed": {"facecolor": BAND},
+}
+"""Bars of the candidates by their standing."""
+_SPAN_FOR_LOG = 8.0
+"""Factor between the largest and the least value from which on an axis is logarithmic."""
+_FLOOR = "1: noise floor"
+_ALONE = "what noise alone gives"
+_WIDEST = 0.9
+"""Longest bar of chance to either side of 1, so that it ends before 0."""
+_NEXT = 1.0
+"""Distance of a row of places from the one above."""
+_NEXT_KIND = 2.1
+"""Distance of the first row of another kind, with room for its heading."""
+_FIRST = 1.0
+"""Where the first row stands."""
 
 
 def label(name: object, unit: str = "1", most: int = 30) -> str:
@@ -57,10 +78,33 @@ def chosen_places(places: Sequence[Place]) -> list[Place]:
 
 def places_panel(axis: Axes, places: Sequence[Place], story: Story) -> None:
     """Dots by run, channel and phase, with the stretch that noise alone would give."""
+    rows = _rows_of(axis, places)
+    # The RMS of n samples of noise scatters by 1 / sqrt(2 n) about 1; drawn are two sigmas.
+    noise = [min(2 / (2 * p.samples) ** 0.5, _WIDEST) for p in places]
+    ones = np.ones(len(rows))
+    axis.errorbar(ones, rows, xerr=noise, fmt="none", ecolor=CHANCE, elinewidth=7, label=_ALONE)
+    axis.axvline(1.0, color=INK, linewidth=1.0, linestyle=":", label=_FLOOR)
+    squares, dots = [p.before for p in places], [p.after for p in places]
+    if changed(story):
+        axis.hlines(rows, dots, squares, color=JOIN, linewidth=0.9)
+        axis.plot(dots, rows, linestyle="", label="after", **FILLED)
+    name = "before" if changed(story) else "simulated (tuned)"
+    axis.plot(squares, rows, linestyle="", label=name, **OPEN)
+    _decades(axis, [*squares, *(dots if changed(story) else []), 1.0])
+    axis.set_yticks(rows, [f"{label(p.label, most=18)} ({p.samples})" for p in places])
+    axis.set_ylim(rows[-1] + 0.7, -0.1)
+    axis.set_xlabel("RMS of the residual, in units of the noise")
+
+
+def _rows_of(axis: Axes, places: Sequence[Place]) -> list[float]:
+    """The height of each place, downwards; writes a heading above the first of each kind."""
     rows: list[float] = []
     for i, place in enumerate(places):
         new = i == 0 or places[i - 1].kind != place.kind
-        rows.append((rows[-1] if rows else -0.6) + (2.1 if new and rows else 1.6 if new else 1.0))
+        if not rows:
+            rows.append(_FIRST)
+        else:
+            rows.append(rows[-1] + (_NEXT_KIND if new else _NEXT))
         if new:
             axis.text(
                 -0.035,
@@ -72,41 +116,15 @@ def places_panel(axis: Axes, places: Sequence[Place], story: Story) -> None:
                 fontsize=8.5,
                 weight="bold",
             )
-    noise = [min(2 / (2 * p.samples) ** 0.5, 0.9) for p in places]
-    axis.errorbar(
-        np.ones(len(rows)),
-        rows,
-        xerr=noise,
-        fmt="none",
-        ecolor="#A8A8A8",
-        elinewidth=7,
-        label=_ALONE,
-    )
-    axis.axvline(1.0, color="#333333", linewidth=1.0, linestyle=":", label=_FLOOR)
-    squares, dots = [p.before for p in places], [p.after for p in places]
-    if changed(story):
-        axis.hlines(rows, dots, squares, color="#999999", linewidth=0.9)
-        axis.plot(dots, rows, linestyle="", label="after", **FILLED)
-    axis.plot(
-        squares,
-        rows,
-        linestyle="",
-        label="before" if changed(story) else "simulated (tuned)",
-        **OPEN,
-    )
-    _decades(axis, [*squares, *(dots if changed(story) else []), 1.0])
-    axis.set_yticks(rows, [f"{label(p.label, most=18)} ({p.samples})" for p in places])
-    axis.set_ylim(rows[-1] + 0.7, -0.1)
-    axis.set_xlabel("RMS of the residual, in units of the noise")
+    return rows
 
 
 def in_order(axis: Axes) -> tuple[list[Any], list[str]]:
     """Handles and labels of a legend in the order in which a reader meets them."""
-    found = dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    labels = [
-        name for name in ("before", "simulated (tuned)", "after", _FLOOR, _ALONE) if name in found
-    ]
-    return [found[name] for name in labels], labels
+    handles = dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    order = ("before", "simulated (tuned)", "after", _FLOOR, _ALONE)
+    labels = [name for name in order if name in handles]
+    return [handles[name] for name in labels], labels
 
 
 def _decades(axis: Axes, values: Sequence[float]) -> None:
@@ -117,8 +135,10 @@ def _decades(axis: Axes, values: Sequence[float]) -> None:
         return
     axis.set_xscale("log")
     low, high = there.min() / 1.4, there.max() * 1.4
+    # The more decades, the fewer numbers in each: labels must not touch.
     steps = (1, 2, 5) if high / low < 200 else (1, 3) if high / low < 1000 else (1,)
-    ticks = [s * 10.0**e for e in range(-6, 10) for s in steps if low <= s * 10.0**e <= high]
+    numbers = [step * 10.0**exponent for exponent in range(-6, 10) for step in steps]
+    ticks = [number for number in numbers if low <= number <= high]
     axis.set_xticks(ticks, [f"{t:g}" for t in ticks])
     axis.set_xticks([], minor=True)
     axis.set_xlim(low, high)
@@ -128,26 +148,28 @@ def telling(profiles: Sequence[Profile]) -> list[Profile]:
     """The profiles in which the residual before stands out most, one for each variable before a
     second for any.
     """
-    ranked = sorted((p for p in profiles if np.isfinite(_standing(p))), key=lambda p: -_standing(p))
-    variables = [p.variable for p in ranked]
+    usable = [p for p in profiles if np.isfinite(_standing(p))]
+    strongest_first = sorted(usable, key=lambda p: -_standing(p))
+    variables = [p.variable for p in strongest_first]
     again = [name in variables[:i] for i, name in enumerate(variables)]
-    return [ranked[i] for i in np.argsort(again, kind="stable")[:MOST_PROFILES]]
+    # A stable sort by "seen before": first ones come first, each group by strength.
+    order = np.argsort(again, kind="stable")
+    return [strongest_first[i] for i in order[:MOST_PROFILES]]
 
 
 def _standing(profile: Profile) -> float:
+    """Mean square of the residual in standard errors, 1 by chance; NaN for too few bins."""
     there = np.isfinite(profile.before) & (profile.error > 0)
-    return (
-        float(np.mean((profile.before[there] / profile.error[there]) ** 2))
-        if there.sum() > 1
-        else float("nan")
-    )
+    if there.sum() < 2:
+        return float("nan")
+    return float(np.mean((profile.before[there] / profile.error[there]) ** 2))
 
 
 def profile_panel(axis: Axes, profile: Profile, unit: str, extended: bool) -> None:
     """The mean residual of a channel, with its unit, against a variable."""
     there = np.isfinite(profile.before)
     x, bars = profile.centres[there], 2 * profile.error[there]
-    axis.axhline(0, color="#555555", linewidth=0.6)
+    axis.axhline(0, color=ZERO, linewidth=0.6)
     looks = [(profile.before, {**BEFORE, **OPEN, "markersize": 4.5, "linewidth": 1.0})]
     if extended:
         looks.append((profile.after, {**AFTER, **FILLED, "markersize": 3.5, "linewidth": 1.2}))
@@ -161,12 +183,14 @@ def profile_panel(axis: Axes, profile: Profile, unit: str, extended: bool) -> No
 def ranked(story: Story) -> list[Mapping[str, Any]]:
     """The candidates to show, the highest score first; what is found is among them."""
     ordered = sorted(story.verdict["candidates"], key=_size, reverse=True)
+    # What is found stays, however low it scores beside what it made needless.
     others = [c for c in ordered if standing(story, c["effect"]) == "not needed"]
     beyond = others[max(0, MOST_CANDIDATES - len(ordered) + len(others)) :]
     return [c for c in ordered if c not in beyond]
 
 
 def _size(candidate: Mapping[str, Any]) -> float:
+    """The score; 0 where none was worked out."""
     return float(candidate["score"] or 0.0)
 
 
@@ -176,9 +200,9 @@ def scores_panel(axis: Axes, story: Story, found: Sequence[Mapping[str, Any]]) -
     sizes = [max(_size(c), 0.0) for c in found]
     for row, size, c in zip(rows, sizes, found, strict=True):
         axis.barh(row, size, height=0.62, edgecolor="white", **_LOOKS[standing(story, c["effect"])])
-        said = f"{number(c['score'])}  ({probability(c['p_value'])})"
+        text = f"{number(c['score'])}  ({probability(c['p_value'])})"
         axis.annotate(
-            said, (size, row), (4, 0), textcoords="offset points", va="center", fontsize=8
+            text, (size, row), (4, 0), textcoords="offset points", va="center", fontsize=8
         )
     axis.set_yticks(rows, [label(name_of(c["effect"]), most=34) for c in found])
     axis.set_ylim(len(found) - 0.4, -0.6)
@@ -193,9 +217,9 @@ def gains_panel(axis: Axes, story: Story, found: Sequence[Mapping[str, Any]]) ->
     rows = np.arange(len(found))
     gains = [np.nan if c["heldout_gain"] is None else c["heldout_gain"] for c in found]
     colours = [_LOOKS[standing(story, c["effect"])]["facecolor"] for c in found]
-    axis.axvline(0, color="#555555", linewidth=0.6)
-    axis.hlines(rows, 0, gains, color="#999999", linewidth=0.9)
-    axis.scatter(gains, rows, c=colours, edgecolors="#333333", s=36, zorder=3)
+    axis.axvline(0, color=ZERO, linewidth=0.6)
+    axis.hlines(rows, 0, gains, color=JOIN, linewidth=0.9)
+    axis.scatter(gains, rows, c=colours, edgecolors=INK, s=36, zorder=3)
     axis.set_xlabel(GAIN)
     axis.tick_params(left=False)
 
@@ -213,5 +237,6 @@ def standings(story: Story) -> tuple[list[Any], list[str]]:
     from matplotlib.patches import Patch
 
     there = {standing(story, c["effect"]) for c in story.verdict["candidates"]}
+    # Bars of one look need no legend where nothing is found.
     names = [name for name in _LOOKS if name in there] if there != {"not needed"} else []
     return [Patch(edgecolor="white", **_LOOKS[name]) for name in names], names

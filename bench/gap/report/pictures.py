@@ -8,19 +8,20 @@ mathematics.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bench.figures import style
+from bench.figures.style import BAND, ZERO, blank
 from bench.gap.report.account import sides
 from bench.gap.report.panels import (
     AFTER,
-    BAND,
     BEFORE,
     changed,
     chosen_places,
@@ -35,15 +36,22 @@ from bench.gap.report.panels import (
     telling,
 )
 from bench.gap.report.story import Side, Story
-from sims.base import Array, InputError, unknown
+from sims.base import Array, unknown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DPI = 130
-MOST_POINTS, MOST_CHANNELS = 3000, 3
+"""Dots an inch: the page shows figures at about this width."""
+MOST_POINTS = 3000
+"""Samples of a run that are drawn; of a longer one the extremes of each part are."""
+MOST_CHANNELS = 3
+"""Channels of the run that are shown, the worst."""
 _WIDTHS = {1: 8.6, 2: 10.0, 3: 12.5}
+"""Inches by the number of channels."""
+_HEADING = 0.22
+"""Inches from the upper edge to the middle of a heading."""
 _STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
@@ -51,12 +59,13 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "legend.frameon": False,
     "text.usetex": False,
-    "text.parse_math": False,  # names come from files
+    # Names come from files: a dollar sign in one is a dollar sign.
+    "text.parse_math": False,
 }
 
 
 def names(story: Story) -> tuple[str, ...]:
-    """The figures that a story has: without places or candidates there is nothing to draw of them."""
+    """The figures that a story has: without places or candidates there is nothing to draw."""
     there = {
         "overview": True,
         "where": bool(chosen_places(story.places)),
@@ -74,20 +83,17 @@ def figure(story: Story, name: str) -> Figure:
     known = names(story)
     if name not in known:
         raise unknown("figure", name, known)
-    makers = {"overview": _overview, "where": _where, "candidates": _candidates}
-    with _style():
-        made = makers[name](story)
-        # Ticks take their looks from the settings of the moment that they are first needed.
-        made.draw_without_rendering()
-    return made
+    with _styled():
+        drawn = _MAKERS[name](story)
+        # Ticks take their looks from the settings of the moment in which they are first needed.
+        drawn.draw_without_rendering()
+    return drawn
 
 
 def png(story: Story, name: str) -> bytes:
     """One figure as the bytes of a PNG file."""
-    file = BytesIO()
-    with _style():
-        _save_png(figure(story, name), file)
-    return file.getvalue()
+    with _styled():
+        return style.png(figure(story, name), DPI)
 
 
 def draw(story: Story, folder: Path) -> list[Path]:
@@ -98,34 +104,21 @@ def draw(story: Story, folder: Path) -> list[Path]:
         InputError: the folder cannot be made or written to.
     """
     paths = []
-    with _style():
+    with _styled():
         for name in names(story):
-            paths += _save(figure(story, name), folder, name)
+            paths += style.save(figure(story, name), folder / name, DPI)
     return paths
 
 
 @contextmanager
-def _style() -> Iterator[None]:
+def _styled() -> Iterator[None]:
+    """The settings of these figures, for as long as they are made or written."""
     from matplotlib import rc_context
 
     with rc_context(_STYLE), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph")  # a title may be in any script
+        # A title may be in any script; what the font lacks is drawn as a box.
+        warnings.filterwarnings("ignore", message="Glyph")
         yield
-
-
-def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    paths = [folder / f"{name}.png", folder / f"{name}.pdf"]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        _save_png(figure, paths[0])
-        figure.savefig(paths[1], metadata={"CreationDate": None})
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
-    return paths
-
-
-def _save_png(figure: Figure, file: Path | BytesIO) -> None:
-    figure.savefig(file, format="png", dpi=DPI, pil_kwargs={"compress_level": 3})
 
 
 class Shot(NamedTuple):
@@ -145,9 +138,8 @@ def worst(story: Story) -> Shot:
     sigma = np.array([c.sigma for c in story.channels])
     squares = ((side.observed - side.before) / sigma) ** 2
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", RuntimeWarning
-        )  # a run or channel without a sample has no mean
+        # A run or channel without a sample has no mean, and is not the worst.
+        warnings.simplefilter("ignore", RuntimeWarning)
         row = int(np.argmax(np.nan_to_num(np.nanmean(squares, axis=(1, 2)))))
         by_channel = np.nan_to_num(np.nanmean(squares[row], axis=0))
     channels = np.argsort(-by_channel, kind="stable")[:MOST_CHANNELS]
@@ -157,7 +149,8 @@ def worst(story: Story) -> Shot:
 def _overview(story: Story) -> Figure:
     shot = worst(story)
     count = len(shot.channels)
-    figure, axes = _canvas(2, count, (_WIDTHS[count], 5.2), sharex=True, height_ratios=(3, 2))
+    size = (_WIDTHS[count], 5.2)
+    figure, axes = blank(2, count, size, layout=None, sharex=True, height_ratios=(3, 2))
     for column, c in enumerate(shot.channels):
         _signal(axes[0][column], axes[1][column], story, shot, c)
     samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
@@ -177,98 +170,115 @@ def _overview(story: Story) -> Figure:
 def _signal(above: Axes, below: Axes, story: Story, shot: Shot, c: int) -> None:
     """One channel: measured and simulated, and under it what the simulation leaves."""
     channel, side = story.channels[c], shot.side
-    length = len(side.times[shot.row])
-    measured, before, after = (
-        a[shot.row, :length, c] for a in (side.observed, side.before, side.after)
-    )
-    rows = kept(measured)
-    t, measured, before, after = (a[rows] for a in (side.times[shot.row], measured, before, after))
+    times = side.times[shot.row]
+    # Behind the end of a shorter run there is nothing.
+    signals = [a[shot.row, : len(times), c] for a in (side.observed, side.before, side.after)]
+    rows = kept(signals[0])
+    t = times[rows]
+    measured, before, after = (signal[rows] for signal in signals)
+
     size = 3.6 if rows.size < 250 else 2.6
-    above.plot(
-        t,
-        measured,
-        "o",
-        color="black",
-        markersize=size,
-        markeredgewidth=0,
-        label="measured",
-        zorder=4,
-    )
+    marks: dict[str, Any] = {"color": "black", "markersize": size, "markeredgewidth": 0}
+    above.plot(t, measured, "o", label="measured", zorder=4, **marks)
     tuned = "simulated before (tuned)" if changed(story) else "simulated (tuned)"
     above.plot(t, before, label=tuned, zorder=3, **BEFORE)
-    below.axhspan(
-        -2 * channel.sigma,
-        2 * channel.sigma,
-        color=BAND,
-        linewidth=0,
-        label="±2σ: 95 % of the noise",
-        zorder=0,
-    )
-    below.axhline(0, color="#555555", linewidth=0.6, zorder=1)
+    noise, band = 2 * channel.sigma, "±2σ: 95 % of the noise"
+    below.axhspan(-noise, noise, color=BAND, linewidth=0, label=band, zorder=0)
+    below.axhline(0, color=ZERO, linewidth=0.6, zorder=1)
     below.plot(t, measured - before, zorder=3, **{**BEFORE, "linewidth": 1.0})
     if changed(story):
+        # Wide and behind: where both agree, before is seen dashed upon after.
         above.plot(t, after, label="simulated after", zorder=2, **{**AFTER, "linewidth": 3.2})
         below.plot(t, measured - after, zorder=2, **{**AFTER, "linewidth": 0.8})
+
     above.set_ylabel(label(channel.name, channel.unit, 14))
     below.set_ylabel(label("residual", channel.unit))
     below.set_xlabel("time [s]; residual: measured − simulated")
     above.margins(x=0.01)
     for axis in (above, below):
         axis.locator_params(nbins=6)
+    # Noise fills no panel: its band must be seen as narrow.
     _at_least(below, 3 * channel.sigma)
 
 
-def kept(values: Array) -> Any:
+def kept(values: Array) -> NDArray[np.intp]:
     """Places of at most about `MOST_POINTS` samples that look the same: the least and largest of
     each stretch.
     """
     if values.size <= MOST_POINTS:
         return np.arange(values.size)
     edges = np.linspace(0, values.size, MOST_POINTS // 2 + 1).astype(int)
+    # A missing sample is neither the least nor the largest.
     low, high = np.nan_to_num(values, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
-    stretches = [*pairwise(edges)]
-    chosen = [a + np.argmin(low[a:b]) for a, b in stretches] + [
-        a + np.argmax(high[a:b]) for a, b in stretches
-    ]
+    chosen = []
+    for begin, end in pairwise(edges):
+        chosen += [begin + np.argmin(low[begin:end]), begin + np.argmax(high[begin:end])]
     return np.unique(chosen)
 
 
 def _at_least(axis: Axes, size: float) -> None:
+    """Widen a vertical axis to so much to either side of zero."""
     low, high = axis.get_ylim()
     axis.set_ylim(min(low, -size), max(high, size))
 
 
+class _Sheet(NamedTuple):
+    """A figure laid out in inches, so that margins stay as they are while it grows.
+
+    Attributes:
+        figure: what is laid out.
+        width: of it.
+        height: of it.
+    """
+
+    figure: Figure
+    width: float
+    height: float
+
+    def across(self, inches: float) -> float:
+        """A distance from the left as a share of the width."""
+        return inches / self.width
+
+    def up(self, inches: float) -> float:
+        """A distance from below as a share of the height."""
+        return inches / self.height
+
+    def heading(self, inches: float, text: str) -> None:
+        """Write a heading so far from the left."""
+        y = 1 - self.up(_HEADING)
+        self.figure.text(self.across(inches), y, text, fontsize=11, va="center")
+
+
+_PROFILES_FROM = 6.0
+"""Inches from the left at which the profiles begin."""
+
+
 def _where(story: Story) -> Figure:
+    """Left the places, right the profiles that tell most."""
     places, profiles = chosen_places(story.places), telling(story.profiles)
     columns, rows = -(-len(profiles) // 2), min(2, len(profiles))
-    width, tall = (
-        5.2 + (3.1 * columns if columns != 1 else 4.4),
-        max(2.6 + 0.27 * len(places), 1.5 + 1.9 * rows),
-    )
-    figure, axes = _canvas(1, 1, (width, tall))
-    axis = axes[0][0]
-    axis.set_position((1.9 / width, 1.0 / tall, 3.1 / width, 1 - 1.4 / tall))
+    # A single column of profiles gets more width than one of several.
+    width = 5.2 + (3.1 * columns if columns != 1 else 4.4)
+    height = max(2.6 + 0.27 * len(places), 1.5 + 1.9 * rows)
+    figure, axes = blank(1, 1, (width, height), layout=None)
+    sheet, axis = _Sheet(figure, width, height), axes[0, 0]
+    axis.set_position((1.9 / width, 1.0 / height, 3.1 / width, 1 - 1.4 / height))
     places_panel(axis, places, story)
-    figure.text(0.15 / width, 1 - 0.22 / tall, "Where the gap is", fontsize=11, va="center")
+    sheet.heading(0.15, "Where the gap is")
     figure.legend(*in_order(axis), loc="lower left", ncols=2, fontsize=8.5, columnspacing=1.0)
     if not profiles:
         return figure
-    figure.text(
-        6.0 / width,
-        1 - 0.22 / tall,
-        "What it follows: mean residual in bins",
-        fontsize=11,
-        va="center",
-    )
+
+    sheet.heading(_PROFILES_FROM, "What it follows: mean residual in bins")
     note = "residual: measured − simulated; bars: ±2 standard errors"
-    figure.text(6.0 / width, 0.2 / tall, note, fontsize=8.5, va="center")
+    figure.text(sheet.across(_PROFILES_FROM), sheet.up(0.2), note, fontsize=8.5, va="center")
     grid = figure.add_gridspec(
         rows,
         columns,
-        left=6.0 / width,
-        right=1 - 0.12 / width,
-        bottom=0.85 / tall,
-        top=1 - 0.5 / tall,
+        left=sheet.across(_PROFILES_FROM),
+        right=1 - sheet.across(0.12),
+        bottom=sheet.up(0.85),
+        top=1 - sheet.up(0.5),
         hspace=0.45,
         wspace=0.42,
     )
@@ -280,24 +290,23 @@ def _where(story: Story) -> Figure:
 
 
 def _candidates(story: Story) -> Figure:
-    found, total = ranked(story), len(story.verdict["candidates"])
-    tall = 1.75 + 0.28 * len(found)
-    figure, axes = _canvas(1, 2, (9.4, tall), sharey=True, width_ratios=(3, 2))
-    scores_panel(axes[0][0], story, found)
-    gains_panel(axes[0][1], story, found)
-    some = f", the best {len(found)} of {total}" if len(found) < total else ""
-    figure.text(0.015, 1 - 0.22 / tall, f"Candidate causes{some}", fontsize=11, va="center")
+    """Left the scores, right the gains on held-out runs."""
+    shown, total = ranked(story), len(story.verdict["candidates"])
+    width, height = 9.4, 1.75 + 0.28 * len(shown)
+    figure, axes = blank(1, 2, (width, height), layout=None, sharey=True, width_ratios=(3, 2))
+    scores_panel(axes[0, 0], story, shown)
+    gains_panel(axes[0, 1], story, shown)
+    some = f", the best {len(shown)} of {total}" if len(shown) < total else ""
+    y = 1 - _HEADING / height
+    figure.text(0.015, y, f"Candidate causes{some}", fontsize=11, va="center")
     figure.legend(*standings(story), loc="upper right", ncols=3, fontsize=8.5)
-    figure.subplots_adjust(
-        left=0.25, right=0.985, bottom=0.68 / tall, top=1 - 0.45 / tall, wspace=0.06
-    )
+    bottom, top = 0.68 / height, 1 - 0.45 / height
+    figure.subplots_adjust(left=0.25, right=0.985, bottom=bottom, top=top, wspace=0.06)
     return figure
 
 
-def _canvas(
-    rows: int, columns: int, size: tuple[float, float], **options: Any
-) -> tuple[Figure, Sequence[Sequence[Axes]]]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size)
-    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+_MAKERS: Mapping[str, Callable[[Story], Figure]] = {
+    "overview": _overview,
+    "where": _where,
+    "candidates": _candidates,
+}

@@ -84,13 +84,12 @@ def test_without_the_camera_the_fall_gives_the_scale(drop, tmp_path, capsys):
     assert np.nanmax(z) == pytest.approx(3.6, abs=0.4)
 
 
-def test_a_picture_that_cannot_be_drawn_leaves_nothing_behind(drop, tmp_path, monkeypatch):
+def test_a_picture_that_cannot_be_drawn_leaves_nothing_behind(drop, tmp_path):
     def broken(*_):
         raise RuntimeError("out of paint")
 
-    monkeypatch.setattr(tracking, "drawn", broken)
     with pytest.raises(RuntimeError, match="out of paint"):
-        tracking.write(drop / "drop.mp4", tmp_path / "t.csv", None, None, None)
+        tracking.write(drop / "drop.mp4", tmp_path / "t.csv", broken)
     assert not list(tmp_path.iterdir())
 
 

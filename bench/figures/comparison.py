@@ -1,0 +1,115 @@
+"""The figures of one comparison, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+from bench.analysis.statistics import Statistics
+from bench.figures import errors, identifiability, runtimes
+from bench.figures.style import Styles
+from bench.problem.experiment import Experiment
+from bench.problem.problem import Problem
+from bench.store.folder import Stored
+from sims.base import unknown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FILES: Mapping[str, str] = {
+    "error": "error-vs-simulations",
+    "misfit": "misfit-vs-simulations",
+    "distance": "error-vs-distance",
+    "runtime": "runtime-distribution",
+    "cost": "who-wins-at-which-cost",
+    "amortisation": "amortisation",
+    "spectra": "identifiability",
+    "directions": "stiff-sloppy-prediction",
+}
+"""Every figure's name, in the order in which they are written, and that of its files."""
+
+
+class Labels(NamedTuple):
+    """What axes are called: the error channel, ``q [rad]``, and the parameter where there is one,
+    ``restitution``; empty for several.
+    """
+
+    channel: str
+    parameter: str
+
+
+def labels_of(problem: Problem) -> Labels:
+    """The labels of a comparison's problem."""
+    channel = problem.channels[problem.error_channel]
+    parameters = problem.cube.parameters
+    parameter = ""
+    if len(parameters) == 1:
+        unit = parameters[0].unit
+        parameter = parameters[0].name + (f" [{unit}]" if unit != "1" else "")
+    return Labels(f"{channel.name} [{channel.unit}]", parameter)
+
+
+def statistics_of(stored: Stored) -> Statistics:
+    """What the tables and some of the figures are made from; at least one run is there."""
+    return Statistics(stored.experiment, stored.runs, stored.statuses, stored.costs)
+
+
+def names(stored: Stored) -> list[str]:
+    """Names of the figures that a comparison allows; none without a run."""
+    experiment, runs = stored.experiment, stored.runs
+    if runs.empty:
+        return []
+    wide = "wide" in experiment.ranges
+    allowed = {
+        "error": True,
+        # Without another world the least misfit is the sensor's noise, which shows nothing.
+        "misfit": bool(experiment.world),
+        "distance": wide and bool(runs.loc[runs["range"] == "wide", "outside"].gt(0).any()),
+        "runtime": True,
+        "cost": True,
+        "amortisation": any(simulations for simulations, _ in stored.costs.values()),
+        "spectra": stored.spectra is not None,
+        "directions": bool(identifiability.directional(experiment, runs)),
+    }
+    return [name for name in FILES if allowed[name]]
+
+
+def figure(
+    stored: Stored, labels: Labels, name: str, statistics: Statistics | None = None
+) -> Figure:
+    """One figure of a comparison.
+
+    Args:
+        stored: the comparison as `bench.store.folder.read` gives it.
+        labels: of its axes, see `labels_of`.
+        name: one of `names(stored)`.
+        statistics: of `statistics_of(stored)`, for who makes several figures.
+
+    Raises:
+        InputError: the comparison has no figure of that name.
+    """
+    if name not in (known := names(stored)):
+        raise unknown("figure", name, known)
+    experiment, runs = stored.experiment, stored.runs
+    if name == "error":
+        return errors.error_figure(experiment, runs, labels.channel, labels.parameter)
+    if name == "misfit":
+        return errors.misfit_figure(experiment, runs, labels.channel)
+    if name == "distance":
+        return errors.distance_figure(experiment, runs, labels.parameter)
+    if name == "directions":
+        return identifiability.directions_figure(experiment, runs, labels.channel)
+    if name == "spectra":
+        assert stored.spectra is not None
+        return identifiability.spectra_figure(experiment, stored.spectra)
+    return _of_statistics(experiment, name, statistics or statistics_of(stored))
+
+
+def _of_statistics(experiment: Experiment, name: str, statistics: Statistics) -> Figure:
+    style = Styles(experiment, statistics.runs, statistics.metric)
+    if name == "runtime":
+        return runtimes.runtime_figure(experiment, style, statistics.curves, statistics.spread)
+    # Tables have every level; a figure has the one at which there is most to see.
+    level = statistics.level
+    draw = runtimes.cost_figure if name == "cost" else runtimes.amortisation_figure
+    return draw(experiment, style, statistics.prices[level], level)

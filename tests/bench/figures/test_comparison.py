@@ -1,0 +1,103 @@
+"""Every figure of a comparison by name, and the tables beside them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+from bench.analysis.table import table
+from bench.figures import comparison
+from bench.figures.comparison import FILES, figure, names, statistics_of
+from bench.report import tables
+from sims.base import InputError
+from tests.bench.figures.made import LABELS, stored
+
+ALL = list(FILES)
+
+
+def words(drawn):
+    texts = [axis.get_title() for axis in drawn.axes]
+    texts += [axis.get_ylabel() for axis in drawn.axes]
+    return " | ".join([*texts, drawn.get_suptitle()])
+
+
+def test_a_comparison_that_has_everything_allows_every_figure():
+    assert names(stored()) == ALL
+    assert len(set(FILES.values())) == len(FILES)
+
+
+@pytest.mark.parametrize(
+    ("missing", "changes"),
+    [
+        ({"misfit"}, {"experiment": replace(stored().experiment, world={})}),
+        ({"distance"}, {"runs": stored().runs.assign(outside=0.0)}),
+        ({"amortisation"}, {"costs": {"tunenet": (0.0, 0.0)}}),
+        ({"spectra"}, {"spectra": None}),
+        (
+            {"directions"},
+            {"runs": stored().runs.drop(columns=["stiff_error", "sloppy_error", "heldout_error"])},
+        ),
+        (set(ALL), {"runs": pd.DataFrame()}),
+    ],
+)
+def test_what_a_comparison_lacks_is_not_drawn(missing, changes):
+    lacking = stored(**changes)
+    assert names(lacking) == [name for name in ALL if name not in missing]
+    with pytest.raises(InputError, match=f"unknown figure '{next(iter(missing))}'; there are: "):
+        figure(lacking, LABELS, next(iter(missing)))
+
+
+@pytest.mark.parametrize(
+    ("name", "axes", "says"),
+    [
+        ("error", 2, "absolute error of restitution, median"),
+        ("misfit", 2, "RMSE of z [m], median"),
+        ("distance", 3, "After 12 simulations"),
+        ("runtime", 2, "share of (run, threshold) pairs reached for good"),
+        ("cost", 2, "seconds for one target"),
+        ("amortisation", 2, "simulations in total, training included"),
+        ("spectra", 2, "what the data can know"),
+        ("directions", 6, "of prediction,\nRMSE of z [m]"),
+    ],
+)
+def test_each_figure_can_be_had_without_a_file(name, axes, says):
+    drawn = figure(stored(), LABELS, name)
+    assert isinstance(drawn, Figure)
+    assert len(drawn.axes) == axes
+    assert says in words(drawn)
+
+
+def test_a_figure_draws_the_numbers_of_the_runs():
+    whole = stored()
+    axis = figure(whole, LABELS, "error").axes[0]
+    lines = {line.get_label(): line for line in axis.lines}
+    part = whole.runs[(whole.runs["range"] == "in") & (whole.runs["k"] == 12)]
+    for tuner, values in part.groupby("tuner")["param_abs_error"]:
+        assert lines[tuner].get_ydata()[-1] == pytest.approx(np.median(values), rel=1e-12)
+
+
+def test_statistics_are_computed_once_for_several_figures(monkeypatch):
+    whole = stored()
+    statistics = statistics_of(whole)
+
+    def again(_):
+        raise AssertionError("computed again")
+
+    monkeypatch.setattr(comparison, "statistics_of", again)
+    for name in ("runtime", "cost", "amortisation"):
+        figure(whole, LABELS, name, statistics)
+
+
+def test_tables_can_be_had_without_a_file():
+    whole = stored()
+    made = tables(whole)
+    assert list(made) == ["table", "ert", "pairs", "break_even", "who_wins"]
+    expected = table(whole.runs, whole.statuses, 12, whole.costs)
+    pd.testing.assert_frame_equal(made["table"], expected)
+    assert set(made["ert"]["tuner"]) == {"random", "tunenet"}
+    assert set(made["pairs"]["range"]) == {"in", "wide"}
+    assert set(made["break_even"]["learned"]) == {"tunenet"}
+    assert len(made["who_wins"]) > 0
+    assert tables(stored(runs=pd.DataFrame())) == {}

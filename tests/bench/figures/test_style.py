@@ -1,0 +1,133 @@
+"""Drawing leaves a notebook as it was; one palette, one way to write files."""
+
+import re
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib import pyplot
+from matplotlib.figure import Figure
+
+import bench
+from bench.analysis.paired import nemenyi
+from bench.figures import style, training
+from bench.figures.comparison import figure, names
+from bench.figures.recording import recording_figure
+from bench.figures.runtimes import rank_figure
+from bench.figures.style import blank, png, save
+from bench.figures.track import track_figure
+from bench.gap.report import pictures
+from bench.recordings.inspection import load
+from bench.recordings.metres import Heights
+from sims.base import InputError
+from sims.camera.track import Track
+from tests.bench.figures.made import LABELS, stored
+from tests.bench.gap.stories import story
+from tests.bench.gap.tables import swing, table
+
+ROOT = Path(bench.__file__).parents[1]
+SOURCES = [path for room in ("bench", "methods", "sims") for path in (ROOT / room).rglob("*.py")]
+
+
+def swinging(folder):
+    return table(folder, [swing(np.arange(90) / 60) for _ in range(3)])
+
+
+def ranks():
+    rng = np.random.default_rng(0)
+    scores = pd.DataFrame(rng.uniform(size=(6, 4)), columns=list("abcd"))
+    return scores.rank(axis=1)
+
+
+def rank():
+    friedman, p_values = nemenyi(ranks())
+    return rank_figure(ranks(), p_values, friedman)
+
+
+def loss():
+    return training.loss_figure("t", [(0, "clean", e, 1.0 / e, 2.0 / e) for e in range(1, 9)])
+
+
+def tracked():
+    t = np.arange(30) / 30
+    ball = np.full(30, 5.0)
+    scene = np.zeros((60, 40, 3), dtype=np.uint8)
+    track = Track(t, 20.0 + 0 * t, 10 + 30 * t**2, ball, 0.1, (40, 60), (), scene, {3: scene})
+    return track_figure(track, Heights(1 - t**2, 0.03, "somehow"), slice(2, 28), "film.mp4")
+
+
+@pytest.fixture
+def notebook(monkeypatch):
+    """A user's own backend, setting and open figure; gives what must be the same afterwards."""
+    before = matplotlib.get_backend()
+    pyplot.switch_backend("svg")
+    matplotlib.rcParams["lines.linewidth"] = 3.25
+    pyplot.figure(num=7)
+
+    def state():
+        return matplotlib.get_backend(), dict(matplotlib.rcParams), pyplot.get_fignums()
+
+    yield state
+    pyplot.close("all")
+    matplotlib.rcdefaults()
+    pyplot.switch_backend(before)
+
+
+def test_drawing_leaves_backend_settings_and_open_figures_alone(notebook, tmp_path):
+    before = notebook()
+    assert before[2] == [7]
+    drawn = [figure(stored(), LABELS, name) for name in names(stored())]
+    drawn += [pictures.figure(story(), name) for name in pictures.names(story())]
+    drawn += [rank(), loss(), tracked(), recording_figure(*load(swinging(tmp_path)))]
+    for i, one in enumerate(drawn):
+        assert isinstance(one, Figure)
+        save(one, tmp_path / str(i), dpi=40)
+    pictures.draw(story(), tmp_path)
+    assert notebook() == before
+
+
+def test_no_source_chooses_a_backend_or_leaves_figures_with_pyplot():
+    for path in SOURCES:
+        text = path.read_text(encoding="utf-8")
+        assert not re.search(r"matplotlib\.use\(|import pyplot|switch_backend", text), path
+
+
+def test_colours_are_named_in_one_place():
+    for path in SOURCES:
+        if path != Path(style.__file__):
+            assert not re.search(r"[\"']#[0-9A-Fa-f]{6}[\"']", path.read_text()), path
+
+
+def test_a_notebook_can_show_a_figure_that_pyplot_does_not_know():
+    drawn, _ = blank(1, 2, (4, 3))
+    assert drawn._repr_png_().startswith(b"\x89PNG")
+
+
+def test_files_are_whole_and_the_same_whenever_they_are_made(tmp_path):
+    paths = save(loss(), tmp_path / "new" / "figures" / "loss")
+    assert [path.name for path in paths] == ["loss.png", "loss.pdf"]
+    assert sorted((tmp_path / "new" / "figures").iterdir()) == sorted(paths)
+    again = save(loss(), tmp_path / "loss")
+    assert [p.read_bytes() for p in again] == [p.read_bytes() for p in paths]
+    assert paths[0].read_bytes() == png(loss())
+
+
+def test_of_png_and_pdf_neither_is_left_without_the_other(tmp_path, monkeypatch):
+    def full(self, content):
+        if ".pdf" in self.name:
+            raise OSError(28, "No space left on device")
+        return original(self, content)
+
+    original = Path.write_bytes
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(InputError, match=r"cannot be written \(No space left on device\)"):
+        save(loss(), tmp_path / "loss")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file: cannot be written"):
+        save(loss(), tmp_path / "file" / "loss")
