@@ -23,8 +23,8 @@ from bench.figures.style import Styles, save
 from bench.problem.experiment import Entry, Experiment
 from bench.report import NEEDED
 from bench.store.folder import read
-from bench.store.journal import replace_text
 from sims.base import Array, InputError
+from sims.files import write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,7 +43,7 @@ def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> No
     together = read_together(folders)
     out.mkdir(parents=True, exist_ok=True)
     for name, text in together.tables().items():
-        replace_text(out / f"{name}.csv", text)
+        write(out / f"{name}.csv", text)
     means = together.ranked.mean().sort_values().round(2)
     count = len(together.ranked)
     say(f"mean rank over {count} problems (1 is best)\n{means.to_string()}")

@@ -18,7 +18,7 @@ from bench.figures.comparison import Labels, labels_of, statistics_of
 from bench.figures.style import save
 from bench.problem.problem import Problem
 from bench.store.folder import Stored, read
-from bench.store.journal import replace_text
+from sims.files import write
 
 NEEDED = (
     "run",
@@ -61,7 +61,7 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     labels, statistics = labels_of(problem), statistics_of(stored)
     made = tables(stored, statistics)
     for name, frame in made.items():
-        replace_text(folder / f"{name}.csv", frame.to_csv(index=False))
+        write(folder / f"{name}.csv", frame.to_csv(index=False))
     figures = _drawn(folder, stored, labels, statistics)
 
     lines = made["table"]

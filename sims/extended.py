@@ -107,10 +107,10 @@ class Extended:
 
 def write(extended: Extended, path: Path) -> None:
     """Write the file."""
-    files.write(path, _written(extended))
+    files.write(path, written(extended))
 
 
-def _written(extended: Extended) -> str:
+def written(extended: Extended) -> str:
     """The content of the file."""
     import tomli_w
 
@@ -250,7 +250,7 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
         "extends": extended.system,
         # All such classes come from this one text and may have one name: their numbers tell them
         # apart, or a tuner trained in the one would be taken for trained in the other.
-        "source_digest": hashlib.sha256(_written(extended).encode()).hexdigest(),
+        "source_digest": hashlib.sha256(written(extended).encode()).hexdigest(),
         "made_of": tuple(library.get(name) for name in effects),
     }
     simulator: type[Simulated] = type(re.sub(r"\W", "_", extended.name), (kind,), body)

@@ -25,6 +25,14 @@ def write(path: Path, content: Content) -> None:
         partial.write_bytes(_bytes(content))
 
 
+def write_all(contents: Mapping[Path, Content]) -> None:
+    """Write whole files, all or none, in place of what is there."""
+    with ExitStack() as places:
+        # None takes its place before all are complete.
+        for path, content in contents.items():
+            places.enter_context(replacing(path)).write_bytes(_bytes(content))
+
+
 @contextmanager
 def replacing(path: Path, *, keep_ending: bool = False) -> Iterator[Path]:
     """The place where a library may write what becomes `path` when the block ends well.

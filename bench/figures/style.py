@@ -7,10 +7,8 @@ they are.
 
 from __future__ import annotations
 
-import os
 import textwrap
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +18,7 @@ import pandas as pd
 
 from bench.problem.experiment import Experiment
 from sims.base import InputError
+from sims.files import write_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -236,21 +235,13 @@ def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
     Raises:
         InputError: the folder cannot be made or written to.
     """
-    contents = {f"{path.name}.png": png(figure, dpi), f"{path.name}.pdf": pdf(figure)}
-    drafts = {name: path.with_name(f".{name}.{os.getpid()}.partial") for name in contents}
+    contents = {
+        path.with_name(f"{path.name}.png"): png(figure, dpi),
+        path.with_name(f"{path.name}.pdf"): pdf(figure),
+    }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for name, content in contents.items():
-            drafts[name].write_bytes(content)
-        # Both are on the disk by now: a full one has shown itself before anything is replaced.
-        return [draft.replace(path.with_name(name)) for name, draft in drafts.items()]
+        write_all(contents)
     except OSError as error:
-        _discard(drafts.values())
         raise InputError(f"{path.parent}: cannot be written ({error.strerror})") from None
-
-
-def _discard(drafts: Iterable[Path]) -> None:
-    """Delete what was begun, as far as the folder lets us."""
-    for draft in drafts:
-        with suppress(OSError):
-            draft.unlink(missing_ok=True)
+    return list(contents)

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from bench.gap.causes.rules import VerdictName
 from bench.gap.report import pictures
 from bench.gap.report.account import closes, interval
-from bench.gap.report.page import framed, page, write_report
+from bench.gap.report.page import framed, page
+from bench.gap.report.pictures import Printed
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, estimate, joined, percent, with_unit
 from bench.gap.verdict import Cause, Verdict
 from sims import extended as extending
 from sims.base import InputError
 from sims.extended import Extended
+from sims.files import Content, write_all
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -75,22 +77,28 @@ class Explanation:
             InputError: the folder cannot be made or written to.
         """
         folder = Path(folder)
+        figures = pictures.printed(self.story)
+        contents: dict[Path, Content] = {
+            folder / "verdict.json": self._json(),
+            folder / "extended.toml": extending.written(self.extended),
+        }
+        for name, figure in figures.items():
+            contents[folder / f"{name}.png"] = figure.png
+            contents[folder / f"{name}.pdf"] = figure.pdf
+        contents[folder / "report.html"] = self._page(figures, for_print=True)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            # Drawn first and moved last: what fails on the way leaves no half of an answer.
-            with TemporaryDirectory(prefix=".unfinished-", dir=folder) as drafts:
-                paths = self._write_each(Path(drafts))
-                return [path.replace(folder / path.name) for path in paths]
+            write_all(contents)
         except OSError as error:
             raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
+        return list(contents)
 
-    def _write_each(self, folder: Path) -> list[Path]:
-        verdict, extended = folder / "verdict.json", folder / "extended.toml"
-        text = json.dumps(self.answer.document(), indent=1, allow_nan=False)
-        verdict.write_text(text + "\n", encoding="utf-8")
-        extending.write(self.extended, extended)
-        figures = pictures.draw(self.story, folder)
-        return [verdict, extended, *figures, write_report(self.story, folder, figures)]
+    def _json(self) -> str:
+        return json.dumps(self.answer.document(), indent=1, allow_nan=False) + "\n"
+
+    def _page(self, figures: Mapping[str, Printed], for_print: bool) -> str:
+        drawn = {name: figure.png for name, figure in figures.items()}
+        return page(self.story, drawn, for_print)
 
     def __repr__(self) -> str:
         lines = [f"{self.verdict}: {self.story.title}", self._causes_in_words(), self._gain()]
@@ -109,8 +117,8 @@ class Explanation:
 
     def _repr_html_(self) -> str:
         """The report for a cell of a notebook, in a frame of its own so that its styles stay there."""
-        drawn = {name: pictures.png(self.story, name) for name in self.figures}
-        return framed(page(self.story, drawn, for_print=False))
+        # Nothing lies beside a cell: no file is named for print.
+        return framed(self._page(pictures.printed(self.story), for_print=False))
 
 
 def _in_words(cause: Cause) -> str:

@@ -8,7 +8,7 @@ plugin passes `safe`.
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from html import escape
 from math import isfinite
 from pathlib import Path
@@ -26,7 +26,6 @@ from bench.gap.report.sections import (
 )
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, joined, name_of, number, percent, pretty, with_unit
-from sims.base import InputError
 
 _KINDS = {
     "adequate": "adequate: no gap found",
@@ -44,23 +43,6 @@ _CAPTIONS = {
     "candidates": "Left: evidence for each candidate, with the probability p of as much by chance. Right: what each "
     "gains on held-out runs.",
 }
-
-
-def write_report(story: Story, folder: Path, figures: Sequence[Path]) -> Path:
-    """Write ``report.html`` into `folder`, the PNG files among `figures` within it; returns its
-    path.
-
-    Raises:
-        InputError: the folder cannot be made or written to.
-    """
-    path = folder / "report.html"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        drawn = {p.stem: p.read_bytes() for p in figures if p.suffix == ".png"}
-        path.write_text(page(story, drawn), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
-    return path
 
 
 def framed(html: str) -> str:

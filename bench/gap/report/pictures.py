@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -90,24 +89,18 @@ def figure(story: Story, name: str) -> Figure:
     return drawn
 
 
-def png(story: Story, name: str) -> bytes:
-    """One figure as the bytes of a PNG file."""
+class Printed(NamedTuple):
+    """One figure as the bytes of its two files."""
+
+    png: bytes
+    pdf: bytes
+
+
+def printed(story: Story) -> dict[str, Printed]:
+    """Every figure that there is, by name."""
     with _styled():
-        return style.png(figure(story, name), DPI)
-
-
-def draw(story: Story, folder: Path) -> list[Path]:
-    """Draw what there is to see into `folder`, each figure as PNG and PDF; returns the files, PNG
-    before PDF.
-
-    Raises:
-        InputError: the folder cannot be made or written to.
-    """
-    paths = []
-    with _styled():
-        for name in names(story):
-            paths += style.save(figure(story, name), folder / name, DPI)
-    return paths
+        figures = {name: figure(story, name) for name in names(story)}
+        return {n: Printed(style.png(f, DPI), style.pdf(f)) for n, f in figures.items()}
 
 
 @contextmanager

@@ -84,7 +84,7 @@ def test_drawing_leaves_backend_settings_and_open_figures_alone(notebook, tmp_pa
     for i, one in enumerate(drawn):
         assert isinstance(one, Figure)
         save(one, tmp_path / str(i), dpi=40)
-    pictures.draw(story(), tmp_path)
+    pictures.printed(story())
     assert notebook() == before
 
 

@@ -4,14 +4,15 @@ import json
 import re
 from base64 import b64decode
 from html import unescape
+from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from bench.gap import explanation
 from bench.gap.explanation import Explanation
+from bench.gap.report.pictures import DPI
 from bench.gap.verdict import Verdict
 from sims.base import InputError
 from sims.extended import Extended, Number
@@ -109,7 +110,7 @@ def test_a_figure_looks_alike_shown_and_written(named, tmp_path):
     named.write(tmp_path)
     for name in named.figures:
         shown = named.figure(name)
-        shown.savefig(tmp_path / "shown.png", dpi=explanation.pictures.DPI)
+        shown.savefig(tmp_path / "shown.png", dpi=DPI)
         pixels = [matplotlib.image.imread(tmp_path / f"{n}.png") for n in (name, "shown")]
         np.testing.assert_array_equal(*pixels)
 
@@ -118,6 +119,7 @@ def test_it_is_written_into_a_folder_that_is_made(named, tmp_path):
     folder = tmp_path / "new" / "one"
     paths = named.write(str(folder))
     names = [f"{n}{e}" for n in named.figures for e in (".png", ".pdf")]
+    assert paths[-1].read_bytes().decode("utf-8").startswith("<!DOCTYPE html>")
     assert [p.name for p in paths] == ["verdict.json", "extended.toml", *names, "report.html"]
     assert sorted(folder.iterdir()) == sorted(paths), "nothing else is left there"
     assert json.loads(paths[0].read_text()) == named.answer.document()
@@ -126,10 +128,13 @@ def test_it_is_written_into_a_folder_that_is_made(named, tmp_path):
 
 
 def test_all_is_written_or_nothing(named, tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
+    def full(path, content):
+        if "report" in path.name:
+            raise OSError(28, "No space left on device")
+        return write_bytes(path, content)
 
-    monkeypatch.setattr(explanation, "write_report", full)
+    write_bytes = Path.write_bytes
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(InputError, match=r"cannot be written \(No space left on device\)"):
         named.write(tmp_path / "out")
     assert not any((tmp_path / "out").iterdir())

@@ -7,9 +7,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from bench.gap.report.page import framed, page, write_report
+from bench.gap.report.page import framed, page
 from bench.gap.report.sections import errors_of
-from sims.base import InputError
 from tests.bench.gap.report.test_account import VERDICTS
 from tests.bench.gap.stories import DRAG, EVIL, HELD_OUT, TILT, evil, story
 
@@ -233,20 +232,6 @@ def test_many_runs_are_cut_to_the_worst():
     assert "The 40 worst of 499." in html
     assert cells(html, "run r499")[2] == "499.00"
     assert "run r459<" not in html
-
-
-def test_it_is_written_as_utf_8_or_refused_in_one_line(tmp_path, figures):
-    paths = [tmp_path / f"{name}{ending}" for name in figures for ending in (".png", ".pdf")]
-    for path in paths:
-        path.write_bytes(figures[path.stem])
-    path = write_report(story(), tmp_path / "new", paths)
-    assert path == tmp_path / "new" / "report.html"
-    assert path.read_text(encoding="utf-8") == page(story(), figures)
-    assert "kg·m²" in path.read_bytes().decode("utf-8")
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
-        write_report(story(), blocked, paths)
 
 
 def test_a_pdf_is_named_only_where_one_lies_beside_the_page(figures):
