@@ -36,6 +36,8 @@ from sims.simulated import Simulated
 
 LEAST = 2.0
 """Samples for each unknown without which nothing can be said."""
+SPARE = 4
+"""Samples that there must be besides."""
 HUGE = 1e9
 """Values so many times a channel's typical size are none."""
 Say = Callable[[str], None]
@@ -93,6 +95,7 @@ class _Explainer:
             kind, self.recording, self.recording.training(), self.engine, [Hat], free
         )
         held_out = self.recording.held_out()
+        # The same effects in the same places, so that a fitted vector means the same there.
         self.measuring = (
             World(kind, self.recording, held_out, self.engine, [Hat], free) if held_out else None
         )
@@ -107,19 +110,20 @@ class _Explainer:
         world = self.fitting
         samples = int(np.isfinite(world.observed).sum())
         unknowns = world.base.size + int((~world.known).sum())
-        if samples < LEAST * unknowns + 4:
+        if samples < LEAST * unknowns + SPARE:
+            least = int(LEAST * unknowns) + SPARE
             raise InputError(
-                f"{self.path}: too short: {samples} samples for fitting, expected at least {int(LEAST * unknowns) + 4} "
-                f"for {unknowns} parameters and initial states"
+                f"{self.path}: too short: {samples} samples for fitting, "
+                f"expected at least {least} for {unknowns} parameters and initial states"
             )
-
+        # What is larger by so many orders is of a wrong unit, and nothing that a fit could follow.
         parts = [part.observed for part in (world, self.measuring) if part is not None]
         for c, channel in enumerate(world.simulator.channels):
             largest = max(float(np.nanmax(np.abs(part[..., c]), initial=0.0)) for part in parts)
             if largest >= HUGE * channel.scale:
-                expected = f"expected values of about {channel.scale:g} {channel.unit}, found {largest:.3g}"
                 raise InputError(
-                    f"{self.path}: column {channel.name}: {expected}; is the unit right?"
+                    f"{self.path}: column {channel.name}: expected values of about "
+                    f"{channel.scale:g} {channel.unit}, found {largest:.3g}; is the unit right?"
                 )
 
     def run(self) -> Explanation:
@@ -160,11 +164,9 @@ class _Explainer:
         ):
             first, last = (finding.measured[names].simulated for names in ((), finding.model.names))
             held_out = show.side(self.measuring, first, last)
-            places += [
-                p
-                for p in show.places(self.measuring, first, last, sigma, " (held out)")
-                if p.kind == "run"
-            ]
+            there = show.places(self.measuring, first, last, sigma, " (held out)")
+            # Channels and phases are told of the fitted runs alone; of these, which run is worst.
+            places += [place for place in there if place.kind == "run"]
         channels = tuple(
             Shown(
                 c.name,
@@ -226,24 +228,27 @@ class _Explainer:
             )
         if finding.verdict in ("partial", "unknown") and finding.remains.structure:
             chance = finding.remains.p_value
-            told = f"structure is left over (chance {chance:.2g}) that the sensor's noise does not have"
-            lines.append(
-                told
-                if chance < CHANCE
-                else "what is left over exceeds the stated noise of the sensors"
-            )
+            left = "what is left over exceeds the stated noise of the sensors"
+            if chance < CHANCE:
+                left = (
+                    f"structure is left over (chance {chance:.2g}) "
+                    "that the sensor's noise does not have"
+                )
+            lines.append(left)
         for cause in finding.causes:
             if cause.alternatives:
                 others = ", ".join(cause.alternatives)
                 lines.append(
-                    f"{cause.effect} and {others} make the same difference in these runs, once parameters and initial "
-                    "states are fitted with each: their likelihoods differ by odds of less than 33 to 1"
+                    f"{cause.effect} and {others} make the same difference in these runs, "
+                    "once parameters and initial states are fitted with each: "
+                    "their likelihoods differ by odds of less than 33 to 1"
                 )
         return lines
 
     def _extended(self, search: Search, finding: Finding) -> Extended:
         world, numbers = self.fitting, self.assessor.numbers(search, finding.model)
         own = {world.parameters[i].name: numbers[i] for i in range(world.own)}
+        # A freed constant is a constant of the extended simulator, with the value that was fitted.
         freed = {p.name: numbers[world.own + i].value for i, p in enumerate(world.freed)}
         added = {}
         for effect in (n for n in world.slots if n in finding.model.names):

@@ -76,10 +76,12 @@ class HeldOutRuns:
         would then decide between them: every model is fitted again from the states of the nearest
         one, and the better fit counts.
         """
-        fits = self._fitted([Start((), theta, self.world.guess) for theta in thetas], STAGES)
+        guess = self.world.guess
+        fits = self._fitted([Start((), theta, guess) for theta in thetas], STAGES)
         nearest = min(fits, key=lambda fit: fit.cost)
         # Asked this way round, since a fit that failed has a cost that is no number.
-        apart = [i for i, fit in enumerate(fits) if not fit.cost < TWICE * nearest.cost]
+        limit = TWICE * nearest.cost
+        apart = [i for i, fit in enumerate(fits) if not fit.cost < limit]
         starts = [replace(fits[i].start(), states=nearest.states) for i in apart]
         # These states are good over the first share of the runs already.
         again = self._fitted(starts, STAGES[1:])
@@ -123,19 +125,25 @@ def central(world: World, fit: Fit, noise: Noise) -> Fit:
     states = np.tile(fit.states, (2, q + size, 1, 1))
     for side, sign in enumerate((-1.0, 1.0)):
         for j, place in enumerate(fit.free):
+            moved = theta[side, j, place] + sign * steps[j]
             # At a bound the step is one-sided; what it comes to is divided by below.
-            theta[side, j, place] = np.clip(theta[side, j, place] + sign * steps[j], *bounds[j])
+            theta[side, j, place] = np.clip(moved, *bounds[j])
         for j in range(size):
             states[side, q + j, :, j] += sign * steps[q + j]
+    # One call for both sides and all runs: the engine steps its lanes at once.
     rows = np.repeat(theta.reshape(-1, theta.shape[2]), runs, axis=0)
     lanes = np.tile(np.arange(runs), 2 * (q + size))
     simulated = world.simulate(rows, lanes, states.reshape(-1, size))
     simulated = simulated.reshape(2, q + size, *fit.simulated.shape)
-    moved = np.diagonal(theta[1][:q][:, fit.free] - theta[0][:q][:, fit.free])
+    below, above = theta[0][:q], theta[1][:q]
+    # Row j has moved parameter j, so its widths stand on the diagonal.
+    moved = np.diagonal(above[:, fit.free] - below[:, fit.free])
     widths = np.concatenate([moved, 2.0 * steps[q:]])
-    jacobian = np.moveaxis(simulated[1] - simulated[0], 0, -1) / widths
+    change = simulated[1] - simulated[0]
+    jacobian = np.moveaxis(change, 0, -1) / widths
     # A simulation that failed on one side tells nothing of the slope.
-    return replace(fit, jacobian=np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0))
+    jacobian = np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
+    return replace(fit, jacobian=jacobian)
 
 
 def _bounds_around(world: World, fit: Fit) -> Array:
@@ -143,16 +151,23 @@ def _bounds_around(world: World, fit: Fit) -> Array:
     their plausible range.
     """
     values = fit.theta[fit.free]
-    bounds = np.array([world.parameters[i].bounds for i in fit.free]).reshape(-1, 2)
-    return np.stack([np.minimum(bounds[:, 0], values), np.maximum(bounds[:, 1], values)], 1)
+    bounds = [world.parameters[i].bounds for i in fit.free]
+    # Shaped by hand, since there may be no parameter at all.
+    low, high = np.array(bounds).reshape(-1, 2).T
+    lowest, highest = np.minimum(low, values), np.maximum(high, values)
+    return np.stack([lowest, highest], 1)
 
 
 def _steps(fit: Fit, noise: Noise, bounds: Array) -> Array:
     """(q + s,) steps that move the runs by as much as the fit's own differences do."""
     size = fit.states.shape[1]
-    moved = np.sqrt(np.mean(np.square(fit.jacobian / noise.sigma[:, None]), axis=(0, 1, 2)))
-    largest = np.concatenate([1e-2 * (bounds[:, 1] - bounds[:, 0]), np.full(size, 1e-2)])
-    steps: Array = np.clip(RESPONSE / np.maximum(moved, 1e-300), 1e-5 * largest, largest)
+    in_sigmas = fit.jacobian / noise.sigma[:, None]
+    moved = np.sqrt(np.mean(np.square(in_sigmas), axis=(0, 1, 2)))
+    widths = bounds[:, 1] - bounds[:, 0]
+    largest = np.concatenate([1e-2 * widths, np.full(size, 1e-2)])
+    wanted = RESPONSE / np.maximum(moved, 1e-300)
+    # Below the least step rounding would be the difference, above the largest one curvature.
+    steps: Array = np.clip(wanted, 1e-5 * largest, largest)
     return steps
 
 
@@ -160,15 +175,19 @@ def covariance(models: Models, model: Model) -> Array:
     """(q, q) of the fitted parameters, from the curvature, with the noise's own correlation."""
     world, q = models.world, model.fit.free.size
     fit = central(world, model.fit, models.noise)
-    noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), model.likelihood.phi)
-    jacobian = whitened(np.where(models.seen[..., None], fit.jacobian, 0.0), models.seen, noise)
+    # What the model leaves is the noise, whatever the recording states of it.
+    sigma = np.maximum(model.likelihood.sigma, 1e-300)
+    noise = Noise(sigma, model.likelihood.phi)
+    jacobian = np.where(models.seen[..., None], fit.jacobian, 0.0)
+    jacobian = whitened(jacobian, models.seen, noise)
     j = jacobian.reshape(len(jacobian), -1, jacobian.shape[3])
     normal = np.matmul(j.transpose(0, 2, 1), j)
     inner = normal[:, q:, q:] + np.diag(1.0 / prior_of(world) ** 2)
     # An initial state that is known is not fitted, so it takes nothing away.
     cross = np.where(world.known[:, None, :], 0.0, normal[:, :q, q:])
     own = normal[:, :q, :q].sum(axis=0)
-    absorbed = np.matmul(cross, np.linalg.solve(inner, cross.transpose(0, 2, 1))).sum(0)
+    solved = np.linalg.solve(inner, cross.transpose(0, 2, 1))
+    absorbed = np.matmul(cross, solved).sum(0)
     schur = own - absorbed  # what eq. (2) inverts
     # Parameters of any unit on one scale, so that the cut-off below means the same for each.
     scale = np.sqrt(np.maximum(np.diagonal(own), 1e-300))
@@ -178,7 +197,8 @@ def covariance(models: Models, model: Model) -> Array:
     lost = values < 1e-12
     # A direction that the data do not fix at all has no pseudo-inverse that says so.
     if lost.any():
-        inverse = inverse + (vectors[:, lost] * 1e12) @ vectors[:, lost].T
+        free = vectors[:, lost]
+        inverse = inverse + (free * 1e12) @ free.T
     result: Array = inverse / np.outer(scale, scale)
     return result
 
@@ -187,12 +207,15 @@ def intervals(models: Models, model: Model) -> dict[int, tuple[float, float, flo
     """Value, low and high (95 %) of each fitted parameter by its place; NaN where the data do not
     bound it.
     """
-    spread = np.sqrt(np.maximum(np.diagonal(covariance(models, model)), 0.0))
+    variances = np.diagonal(covariance(models, model))
+    # Rounding may leave a variance below zero.
+    spread = np.sqrt(np.maximum(variances, 0.0))
     result = {}
     for place, sd in zip(model.fit.free.tolist(), spread.tolist(), strict=True):
         value = float(model.fit.theta[place])
         low, high = models.world.parameters[place].bounds
-        known = np.isfinite(sd) and 2.0 * Z95 * sd < UNBOUNDED * max(high - low, abs(value))
+        widest = UNBOUNDED * max(high - low, abs(value))
+        known = np.isfinite(sd) and 2.0 * Z95 * sd < widest
         reach = Z95 * sd if known else np.nan
         result[place] = (value, value - reach, value + reach)
     return result
@@ -235,14 +258,17 @@ def gain(
     """
     sums = _sums(world, before, after, channels)
     whole = sums.sum(axis=0)
-    base, extended = float(np.sqrt(whole[0] / whole[2])), float(np.sqrt(whole[1] / whole[2]))
+    base = float(np.sqrt(whole[0] / whole[2]))
+    extended = float(np.sqrt(whole[1] / whole[2]))
+    # Runs are drawn whole: samples of one run depend on each other.
     rows = rng.integers(len(sums), size=(RESAMPLES, len(sums)))
     shares = _closed(sums[rows].sum(axis=1), floor)
     low, high = np.nan, np.nan
     # Of one stretch every resample is the same, and would look certain.
     if len(sums) > 1:
         low, high = (float(v) for v in np.quantile(shares, [0.025, 0.975]))
-    return Gain(base, extended, floor, float(_closed(whole[None], floor)[0]), low, high)
+    closed = float(_closed(whole[None], floor)[0])
+    return Gain(base, extended, floor, closed, low, high)
 
 
 def _sums(world: World, before: Array, after: Array, channels: Sequence[int]) -> Array:
@@ -251,8 +277,8 @@ def _sums(world: World, before: Array, after: Array, channels: Sequence[int]) ->
     """
     parts: list[tuple[int, slice]] = [(r, slice(None)) for r in range(len(world.tracks))]
     if len(parts) == 1:
-        edges = np.linspace(0, world.lengths[0], STRETCHES + 1).astype(int)
-        parts = [(0, slice(int(a), int(b))) for a, b in pairwise(edges) if b > a]
+        edges = np.linspace(0, world.lengths[0], STRETCHES + 1).astype(int).tolist()
+        parts = [(0, slice(a, b)) for a, b in pairwise(edges) if b > a]
     rows = []
     for run, part in parts:
         observed = world.observed[run, part][:, channels]
@@ -269,7 +295,8 @@ def _sums(world: World, before: Array, after: Array, channels: Sequence[int]) ->
 
 def _closed(sums: Array, floor: float) -> Array:
     """Shares of the gap closed of rows (n, 3); 0 where there is no gap above the floor."""
-    base, extended = np.sqrt(sums[:, 0] / sums[:, 2]), np.sqrt(sums[:, 1] / sums[:, 2])
+    before, after, counts = sums.T
+    base, extended = np.sqrt(before / counts), np.sqrt(after / counts)
     gap = base - floor
     with np.errstate(all="ignore"):
         share = (base - np.maximum(extended, floor)) / gap  # (1)

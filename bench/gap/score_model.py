@@ -15,8 +15,8 @@ from bench.gap.model.floor import noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
 from bench.registry import simulators
-from sims.base import InputError, unknown
-from sims.extended import opened
+from sims.base import Array, InputError, unknown
+from sims.extended import Extended, opened
 from sims.own import OwnSimulator
 from sims.recording.recording import read_recording, system_of
 
@@ -34,12 +34,15 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
         InputError: a file cannot be read, or the recording is of another system.
     """
     extended, kind, _ = opened(model, simulators.get)
-    if (other := system_of(recording)) not in (extended.system, extended.name):
+    other = system_of(recording)
+    if other not in (extended.system, extended.name):
         raise InputError(
             f"{recording}: expected a recording of {extended.system}, as {model} is; "
             f"found one of {other}"
         )
+    # Every run counts, unless asked otherwise: nothing is fitted here but initial states.
     data = read_recording(recording, kind, whole=True)
+    # What the recording states of itself stands above what the model was fitted with.
     data = replace(data, constants={**extended.constants, **data.constants})
     runs = data.held_out() if held_out else data.runs
     if not runs:
@@ -49,32 +52,50 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
             raise unknown(f"channel of {recording}", channel, list(runs[0].channels))
     engine = None if issubclass(kind, OwnSimulator) else extended.engine
     world = World(kind, data, runs, engine, candidates=list(extended.effects))
+    floor = noise_floor(world, data)
+    noise = Noise(floor.sigma, np.zeros(len(floor.sigma)))
+    measured = HeldOutRuns(world, noise).measure([_theta(world, extended)])[0]
+    world.close()
+    squares = _squares(world, measured.simulated)
+    if not np.isfinite(squares).all():
+        raise InputError(f"{recording}: the simulation failed with the parameters of {model}")
+    return _errors(world, squares, floor.sigma)
+
+
+def _theta(world: World, extended: Extended) -> Array:
+    """(P,) the numbers of an extended simulator, nominal where it has none."""
     theta = world.nominal()
     for place, parameter in enumerate(world.parameters[: world.own]):
         if parameter.name in extended.parameters:
             theta[place] = extended.parameters[parameter.name].value
     for name, numbers in extended.effects.items():
-        there = [c.name for c in world.effects[name].on(world.simulator.system)]
-        theta[world.slots[name]] = [numbers[c].value if c in numbers else 0.0 for c in there]
-    floor = noise_floor(world, data)
-    measured = HeldOutRuns(world, Noise(floor.sigma, np.zeros(len(floor.sigma)))).measure([theta])[
-        0
-    ]
-    world.close()
+        coefficients = world.effects[name].on(world.simulator.system)
+        values = [numbers[c.name].value if c.name in numbers else 0.0 for c in coefficients]
+        theta[world.slots[name]] = values
+    return theta
+
+
+def _squares(world: World, simulated: Array) -> Array:
+    """(R, T, C) squared errors; zero where nothing was seen."""
     seen = np.isfinite(world.observed)
-    squares = np.where(seen, np.square(world.observed - measured.simulated), 0.0)
+    squares: Array = np.where(seen, np.square(world.observed - simulated), 0.0)
+    return squares
+
+
+def _errors(world: World, squares: Array, sigma: Array) -> dict[str, Any]:
+    """RMSE by channel, and over all of them in units of the noise."""
+    seen = np.isfinite(world.observed)
     counts = seen.sum(axis=(0, 1))
-    if not np.isfinite(squares).all():
-        raise InputError(f"{recording}: the simulation failed with the parameters of {model}")
-    rmse = {
-        name: float(np.sqrt(squares[:, :, c].sum() / counts[c]))
-        for c, name in enumerate(world.channels)
-        if counts[c]
-    }
+    rmse = {}
+    for c, name in enumerate(world.channels):
+        # A channel without samples here has no error.
+        if counts[c]:
+            rmse[name] = float(np.sqrt(squares[:, :, c].sum() / counts[c]))
+    normalised = np.sqrt((squares / np.square(sigma)).sum() / counts.sum())
     return {
         "rmse": rmse,
-        "normalised_rmse": float(np.sqrt((squares / np.square(floor.sigma)).sum() / counts.sum())),
-        "runs": len(runs),
+        "normalised_rmse": float(normalised),
+        "runs": len(world.runs),
         "samples": int(seen.any(axis=2).sum()),
-        "units": {c.name: c.unit for c in world.simulator.channels},
+        "units": {channel.name: channel.unit for channel in world.simulator.channels},
     }

@@ -78,9 +78,11 @@ class Alternatives:
         search, key = self.search, frozenset(rest.names)
         known = search.scanned.get(key)
         scores = search.scan(rest) if known is None else known.scores
-        chance = dict(zip(scores.effects, scores.chance.tolist(), strict=True)).get(effect, 0.0)
-        by_refit = tail(scores.by_chance, np.array([gain - chance]))
-        return min(search.tests.get(key, 1.0), by_refit)
+        chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
+        # The score is linear and the gain of a fit is not; either may see more.
+        by_refit = tail(scores.by_chance, np.array([gain - chances.get(effect, 0.0)]))
+        by_score = search.tests.get(key, 1.0)
+        return min(by_score, by_refit)
 
     def _rivals(self, model: Model, rest: Model, effect: str) -> list[tuple[float, str]]:
         """How far behind, and the name, of each effect that does as well in place of this one."""
@@ -91,6 +93,7 @@ class Alternatives:
             if len(names) != len(model.names) or not shared < names:
                 continue
             (added,) = names - shared
+            # The model itself, and other fits of its effects.
             if added == effect:
                 continue
             behind = self._behind(model, other)
@@ -112,6 +115,7 @@ class Alternatives:
                 ratios.append(ratio_of(trial.excess(other.names), trial.excess(model.names)))
             return behind_in_excess(ratios)
         behind = model.merit - other.merit
+        # Held-out runs are further data, so their likelihoods multiply.
         if both and trial is not None:
             behind += trial.measured[model.names].merit - trial.measured[other.names].merit
         return behind

@@ -105,6 +105,7 @@ def _first(world: World, name: str) -> Iterator[Probe]:
     scaling = [i for i in range(len(parameters)) if i not in shaping]
     grids = [_grid(world, parameters[i]) for i in shaping]
     group = 0
+    # Coefficients that scale at one point of the grid act together: a sine with its cosine.
     for point in product(*grids):
         for place in scaling:
             low, high = parameters[place].bounds
@@ -124,7 +125,8 @@ def _limits(world: World, name: str, group: int) -> Iterator[Probe]:
     if not largest > 0:
         return
     for number, level in enumerate(LEVELS, start=group):
-        yield Probe(name, number, 0, np.array([level * largest]), False, True)
+        c = np.array([level * largest])
+        yield Probe(name, number, 0, c, signed=False, fixed=True)
 
 
 def _largest_input(world: World) -> Iterator[float]:
@@ -161,8 +163,10 @@ def neighbours(world: World, fit: Fit) -> Iterator[Start]:
     nearest such minimum.
     """
     for name in fit.effects:
-        for place in range(*world.slots[name].indices(len(world.parameters))):
-            parameter, value = world.parameters[place], float(fit.theta[place])
+        places = range(*world.slots[name].indices(len(world.parameters)))
+        for place in places:
+            parameter = world.parameters[place]
+            value = float(fit.theta[place])
             for moved in _shifted(world, parameter, value):
                 theta = fit.theta.copy()
                 theta[place] = np.clip(moved, *parameter.bounds)
@@ -175,14 +179,17 @@ def _shifted(world: World, parameter: Parameter, value: float) -> Iterator[float
         if parameter.unit == "Hz":
             yield value + cycles / world.longest
         elif _is_period(world, parameter) and value > 0:
-            # A shift beyond the longest period would turn its sign.
-            yield 1.0 / max(1.0 / value + cycles / world.travel, 1.0 / parameter.bounds[1])
+            frequency = 1.0 / value + cycles / world.travel
+            # Slower than the longest period it might turn its sign.
+            yield 1.0 / max(frequency, 1.0 / parameter.bounds[1])
 
 
 def _frequencies(low: float, high: float, extent: float) -> Array:
     """Frequencies from low to high, half a cycle over the extent apart where they lie closest."""
     count = int(np.clip(2.0 * (high - low) * extent, 4, FREQUENCIES))
-    frequencies: Array = low + (high - low) * np.linspace(0.0, 1.0, count) ** SPREAD
+    # Slow ones lie closer: as periods they would else be far apart.
+    shares = np.linspace(0.0, 1.0, count) ** SPREAD
+    frequencies: Array = low + (high - low) * shares
     return frequencies
 
 
@@ -190,7 +197,9 @@ def _acting(world: World, probes: Sequence[Probe], values: Array) -> Mask:
     """(K,) which probes change more than rounding does."""
     largest = np.abs(values).max(axis=(0, 1), initial=0.0)
     changes = largest * np.abs(_sizes(probes))
-    rounding = NOTHING * np.nanmax(np.abs(world.observed), axis=(0, 1))
+    sizes = np.nanmax(np.abs(world.observed), axis=(0, 1))
+    rounding = NOTHING * sizes
+    # One channel that moves is enough: a sensor's effects show in no other.
     acting: Mask = (changes > rounding[:, None]).any(axis=0)
     return acting
 
@@ -228,8 +237,11 @@ def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
     """(R, T, C, K): the change that each probe makes, per unit of its coefficient, or as it is
     where that is fixed.
     """
-    changed = simulate_with(world, at, [(p.effect, p.c) for p in probes])
-    values = np.nan_to_num(np.moveaxis(changed - at.simulated, 0, -1))
+    added = [(probe.effect, probe.c) for probe in probes]
+    changed = simulate_with(world, at, added)
+    change = np.moveaxis(changed - at.simulated, 0, -1)
+    # A probe that the simulator cannot follow is a direction that changes nothing.
+    values = np.nan_to_num(change)
     result: Array = values / _sizes(probes)  # (1)
     return result
 

@@ -89,7 +89,9 @@ def name(search: Search, held_out: HeldOutRuns | None) -> Finding:
 def shows_nothing(search: Search) -> bool:
     """Whether nothing moves in the recording, and nothing should."""
     observed = search.world.observed
-    ranges = np.nanmax(observed, axis=(0, 1)) - np.nanmin(observed, axis=(0, 1))
+    largest, smallest = np.nanmax(observed, axis=(0, 1)), np.nanmin(observed, axis=(0, 1))
+    ranges = largest - smallest
+    # Parameters that the simulated runs do not show were frozen by the base fit.
     touched = len(search.frozen) != search.world.base.size
     left = search.base.likelihood.sigma
     return rules.shows_nothing(ranges, left, search.noise.sigma, touched)
@@ -97,8 +99,10 @@ def shows_nothing(search: Search) -> bool:
 
 def _without_motion(search: Search) -> Finding:
     base, world = search.base, search.world
+    # Nothing can be known of any of them, and no test of what is left would mean anything.
     vague = tuple(world.parameters[i].name for i in world.base)
-    nothing = Remains(1.0, "", base.likelihood.sigma / search.noise.sigma, ())
+    excess = base.likelihood.sigma / search.noise.sigma
+    nothing = Remains(1.0, "", excess, ())
     return Finding(verdict_of(State(fixed=False)), base, base, (), nothing, vague)
 
 
@@ -121,10 +125,13 @@ def _trial(search: Search, model: Model, held_out: HeldOutRuns | None) -> Trial 
     if held_out is None:
         return None
     models = search.models.values()
+    # Parts of the model, since an effect without which held-out runs are as good will go.
     parts = [m for m in models if set(m.names) < set(model.names)]
     singles = sorted((m for m in models if len(m.names) == 1), key=lambda m: -m.merit)
+    near = rivals(search, model)
     trial = Trial(held_out)
-    trial.measure([search.base, model, *rivals(search, model), *parts, *singles[:SHOWN]])
+    # All at once: initial states are begun again from those of the nearest model.
+    trial.measure([search.base, model, *near, *parts, *singles[:SHOWN]])
     return trial
 
 
@@ -154,10 +161,15 @@ def closed(search: Search, model: Model, left: Remains) -> float:
     """
     own = model.likelihood.sigma
     # What is left without structure is noise, and may be more than an estimated floor.
-    floor = np.where(np.isfinite(own) & ~left.structure, own, search.noise.sigma)
+    usable = np.isfinite(own) & ~left.structure
+    floor = np.where(usable, own, search.noise.sigma)
     noise = np.maximum(floor, search.noise.sigma)
-    before, after = (_loudness(search, m, noise) for m in (search.base, model))
-    return (before - max(after, 1.0)) / (before - 1.0) if before > 1.0 + 1e-9 else 0.0
+    before = _loudness(search, search.base, noise)
+    after = _loudness(search, model, noise)
+    # At the noise there is no gap, and a share of it would be a quotient of rounding.
+    if not before > 1.0 + 1e-9:
+        return 0.0
+    return (before - max(after, 1.0)) / (before - 1.0)
 
 
 def _loudness(search: Search, model: Model, noise: Array) -> float:

@@ -114,6 +114,7 @@ class Search(Moves):
         cut = pieces(self.world)
         if cut is None:
             return
+        # One search over pieces serves every size; it decides nothing, and finds where to begin.
         if self._sketch is None:
             self._sketch = Search(cut, self.noise, self.frozen, self.rng, self.stated)
             self._sketch.refit([Start((), self.base.fit.theta, cut.guess)])
@@ -160,6 +161,7 @@ def beam(search: Search, size: int) -> list[Model]:
 
 def is_hopeless(search: Search, larger: Model) -> bool:
     """Whether a model of several effects is too far from the data for one more to be tried."""
+    # Two effects that leave as much as the best single one are no way to a third.
     singles = [search.excess(m) for m in search.models.values() if len(m.names) == 1]
     of_base = HOPELESS * search.excess(search.base)
     of_single = IDLE * min(singles, default=np.inf)

@@ -40,7 +40,9 @@ def settle(search: Search, model: Model) -> Model:
     # Where structure is left merits only compare how each model mimics it, so none takes its place.
     if noise is not None:
         judged = [m for m in near if abs(model.merit - m.merit) < NEAR] or [model]
-    search.refit([*(m.fit.start() for m in (*near, *parts)), *around], noise)
+    starts = [m.fit.start() for m in (*near, *parts)]
+    search.refit([*starts, *around], noise)
+    # A refit that ends worse than before is not kept, so the table holds the best of each.
     refitted = [search.models[frozenset(m.names)] for m in judged]
     return max(refitted, key=lambda m: m.merit)
 
@@ -50,14 +52,18 @@ def _among_all(search: Search, model: Model) -> Model:
     size, known = len(model.names), set(search.models)
     smaller = [search.without(model, name) for name in model.names]
     search.extend(smaller, len(search.world.library))
-    asked = [m for key, m in search.models.items() if key not in known and len(key) == size]
+    asked = [other for key, other in search.models.items() if key not in known and len(key) == size]
     return max([model, *asked], key=lambda m: m.merit)
 
 
 def rivals(search: Search, model: Model) -> list[Model]:
     """Models of as many effects that explain nearly as much, the model itself among them."""
-    same = [m for m in search.models.values() if len(m.names) == len(model.names)]
-    return [m for m in same if _is_near(search, m, model)]
+    size = len(model.names)
+    return [
+        other
+        for other in search.models.values()
+        if len(other.names) == size and _is_near(search, other, model)
+    ]
 
 
 def _is_near(search: Search, other: Model, model: Model) -> bool:
@@ -70,7 +76,11 @@ def _is_near(search: Search, other: Model, model: Model) -> bool:
 def _smaller(search: Search, model: Model) -> list[Model]:
     """The models without one of the effects: the gain of each is measured against them."""
     size, names = len(model.names) - 1, set(model.names)
-    return [m for m in search.models.values() if len(m.names) == size and set(m.names) < names]
+    return [
+        other
+        for other in search.models.values()
+        if len(other.names) == size and set(other.names) < names
+    ]
 
 
 def _noise_of(search: Search, model: Model) -> Noise | None:

@@ -46,17 +46,20 @@ class Trial:
         """
         runs = self.runs
         noise = runs.noise.sigma if sigma is None else sigma
-        left = (runs.world.observed - self.measured[names].simulated) / noise
-        return float(np.sqrt(np.square(left[runs.seen]).mean())) - 1.0
+        residual = runs.world.observed - self.measured[names].simulated
+        left = (residual / noise)[runs.seen]
+        return float(np.sqrt(np.square(left).mean())) - 1.0
 
     def without_idle(self, search: Search, model: Model) -> Model:
         """The model without effects that make held-out runs worse, or hardly better while much is
         left of the gap.
         """
         while model.names and model.names in self.measured:
-            idle = [m for m in self._smaller(search, model) if not self._helps(m, model)]
+            smaller = self._smaller(search, model)
+            idle = [m for m in smaller if not self._helps(m, model)]
             if not idle:
                 return model
+            # Of several that could go, the one goes without which held-out runs are best.
             model = max(idle, key=lambda m: self.measured[m.names].merit)
         return model
 
@@ -71,9 +74,10 @@ class Trial:
 
     def _helps(self, without: Model, having: Model) -> bool:
         """Whether the effect by which two models differ makes held-out runs better."""
-        names = without.names, having.names
-        merits = self.measured[names[0]].merit, self.measured[names[1]].merit
-        return helps(merits, (self.excess(names[0]), self.excess(names[1])))
+        pair = without.names, having.names
+        before, after = (self.measured[names].merit for names in pair)
+        excess, rest = (self.excess(names) for names in pair)
+        return helps((before, after), (excess, rest))
 
     def misses(self, model: Model, left: Remains) -> bool:
         """Whether held-out runs show a gap that the model does not close: something acts there that
@@ -81,5 +85,8 @@ class Trial:
         """
         own = np.nan_to_num(model.likelihood.sigma)
         # What is left of fitted runs is noise where it has no structure; else only the floor is.
-        noise = np.maximum(self.runs.noise.sigma, np.where(left.structure, 0.0, own))
-        return is_missed(self.excess((), noise), self.excess(model.names, noise))
+        known = np.where(left.structure, 0.0, own)
+        noise = np.maximum(self.runs.noise.sigma, known)
+        before = self.excess((), noise)
+        after = self.excess(model.names, noise)
+        return is_missed(before, after)
