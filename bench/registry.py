@@ -48,7 +48,8 @@ def load_plugins(paths: Iterable[str | Path]) -> None:
         InputError: a file is missing, does not run, or defines none of them; of this file nothing
             is registered then.
     """
-    for path in sorted((Path(p).resolve() for p in paths), key=lambda p: p.suffix == ".toml"):
+    files = [Path(path).resolve() for path in paths]
+    for path in sorted(files, key=lambda file: file.suffix == ".toml"):
         if any(path in registry.paths() for registry in REGISTRIES):
             continue
         before = [registry.snapshot() for registry in REGISTRIES]

@@ -225,13 +225,25 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
     known(f"parameter of system {extended.system}", extended.parameters, _names(kind))
     fitted = extended.parameters
     own = [_at(p, fitted[p.name]) if p.name in fitted else p for p in kind.parameters]
-    effects, observed = list(extended.effects), list(extended.observe)
-    engine_of: dict[str, Any] = {"engine": extended.engine} if extended.engine else {}
     values = _coefficients(extended, kind)
     # Made once, so that whatever it refuses is refused here; it knows the coefficients' bounds.
-    fresh = kind(extended.constants, observed, effects=effects, **engine_of)
+    effects, observed = list(extended.effects), list(extended.observe)
+    fresh = kind(extended.constants, observed, effects=effects, **_engine(extended))
     added = [_at(p, n) for p, n in zip(fresh.parameters[len(own) :], values, strict=True)]
     fresh.close()
+    return _class_of(extended, kind, (*own, *added))
+
+
+def _engine(extended: Extended) -> dict[str, Any]:
+    """The setting that chooses the engine; a simulator that steps itself has no such setting."""
+    return {"engine": extended.engine} if extended.engine else {}
+
+
+def _class_of(
+    extended: Extended, kind: type[Simulated], parameters: tuple[Parameter, ...]
+) -> type[Simulated]:
+    """A class of `kind` with everything that was fitted for its defaults."""
+    effects, observed = list(extended.effects), list(extended.observe)
 
     def __init__(  # noqa: N807
         self: Simulated,
@@ -239,10 +251,11 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
         observe: Sequence[str] | None = None,
         **settings: Any,
     ) -> None:
+        # Engine, sensors and constants may be chosen anew; the effects are what was found.
         stated = {**extended.constants, **(constants or {})}
-        chosen = {**engine_of, **settings}
+        chosen = {**_engine(extended), **settings}
         kind.__init__(self, stated, observe or observed, effects=effects, **chosen)
-        self.parameters = (*own, *added)
+        self.parameters = parameters
 
     body = {
         "__init__": __init__,
@@ -254,11 +267,11 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
         "made_of": tuple(library.get(name) for name in effects),
     }
     simulator: type[Simulated] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
-    # A class of a system takes these from the system when it is made.
+    # A class of a system takes these from the system when it is made; they are its own.
     simulator.name = extended.name
-    what = ", ".join(effects) or "nothing added"
+    what = ", ".join(extended.effects) or "nothing added"
     simulator.says = f"{extended.system} with {what}, fitted to: {extended.title}"
-    simulator.parameters = (*own, *added)
+    simulator.parameters = parameters
     return simulator
 
 

@@ -40,6 +40,9 @@ _WORDS: Mapping[type, str] = {
 }
 """What a message calls a value of each type."""
 
+_WIDER: Mapping[type, tuple[type, ...]] = {float: (int, float), list: (list, tuple)}
+"""Types that pass for another: a TOML number may have no point, a list from Python may be fixed."""
+
 
 def read_toml(path: Path) -> dict[str, Any]:
     """The tables of a TOML file.
@@ -50,6 +53,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
     try:
+        # Editors on Windows begin a file with a byte order mark.
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         what = f"{error.reason} at byte {error.start}"
@@ -80,7 +84,7 @@ def known(kind: str, given: Iterable[str], allowed: Iterable[str]) -> None:
     """Refuse names that are not among the allowed ones.
 
     Args:
-        kind: what a message calls one of them, and where, e.g. ``entry of [held_out] in mine.toml``.
+        kind: what a message calls one of them, and where, e.g. ``entry of [noise] in mine.toml``.
         given: what the user wrote.
         allowed: what there is.
     """
@@ -96,9 +100,10 @@ def checked(source: Source, where: str, value: Any, wanted: type, words: str = "
     Raises:
         InputError: it is not; `words` stand for what was expected, in place of the usual ones.
     """
-    kinds: tuple[type, ...] = {float: (int, float), list: (list, tuple)}.get(wanted, (wanted,))
+    kinds = _WIDER.get(wanted, (wanted,))
     # Python counts true and false among the whole numbers.
-    if not isinstance(value, kinds) or (isinstance(value, bool) and wanted is not bool):
+    mistaken = isinstance(value, bool) and wanted is not bool
+    if mistaken or not isinstance(value, kinds):
         raise fault(source, where, words or _WORDS[wanted], value)
     return value
 
@@ -176,17 +181,16 @@ def as_declared(source: Source, where: str, value: Any, declared: Any) -> Any:
     """
     origin, inner = get_origin(declared), get_args(declared)
     if declared is Any:
-        return value
+        return value  # whoever uses it checks it, as a simulator its settings
     if origin in (Union, UnionType):
         return as_declared(source, where, value, _chosen(value, inner))
-    if declared == Pair:
+    if declared == Pair:  # before other tuples: those may be of any length
         return pair(source, where, value)
     if origin is tuple:
         items = checked(source, where, value, list)
         return tuple(as_declared(source, where, item, inner[0]) for item in items)
-    if origin is not None:  # a mapping
-        items = table(source, where, value).items()
-        return {key: as_declared(source, f"{where}.{key}", v, inner[1]) for key, v in items}
+    if origin is not None:
+        return _mapping(source, where, value, inner[1])
     if isinstance(declared, type) and is_dataclass(declared):
         return declared(**entries(source, where, value, hints_of(declared)))
     if is_typeddict(declared):
@@ -194,6 +198,14 @@ def as_declared(source: Source, where: str, value: Any, declared: Any) -> Any:
     if declared is float:
         return number(source, where, value)
     return checked(source, where, value, declared)
+
+
+def _mapping(source: Source, where: str, value: Any, declared: Any) -> dict[str, Any]:
+    """A table whose entries have any names and are all of one type."""
+    result = {}
+    for key, item in table(source, where, value).items():
+        result[key] = as_declared(source, f"{where}.{key}", item, declared)
+    return result
 
 
 def entries(
@@ -227,6 +239,7 @@ def hints_of(kind: type) -> dict[str, Any]:
 
 def _chosen(value: Any, among: Sequence[Any]) -> Any:
     """Which type of a union the value is checked against: a list against a pair, else the first."""
+    # TOML has no null: what may be None is left out.
     kinds = [kind for kind in among if kind is not NoneType]
     lists = [kind for kind in kinds if get_origin(kind) is tuple]
     return lists[0] if lists and isinstance(value, list | tuple) else kinds[0]

@@ -42,15 +42,19 @@ def entries_of(path: Path, value: Any) -> tuple[Entry, ...]:
         InputError: a fault in it, in one line.
     """
     if isinstance(value, dict):
-        return tuple(_entry(path, f"tuners.{label}", label, own) for label, own in value.items())
+        tables = value.items()
+        return tuple(_entry(path, f"tuners.{label}", label, own) for label, own in tables)
     if not isinstance(value, list):
         raise fault(path, "tuners", "a list of names or a table for each tuner", value)
-    listed = tuple(_listed(path, f"tuners[{place}]", item) for place, item in enumerate(value))
-    labels = [entry.label for entry in listed]
-    for label in labels:
-        if labels.count(label) > 1:  # tables and figures tell tuners apart by it
-            raise InputError(f"{path}: tuners: {label} stands twice; give one of them a label")
-    return listed
+    listed: list[Entry] = []
+    for place, item in enumerate(value):
+        entry = _listed(path, f"tuners[{place}]", item)
+        # Tables and figures tell tuners apart by their labels; TOML's own keys cannot be twice.
+        if entry.label in [other.label for other in listed]:
+            twice = f"{entry.label} stands twice; give one of them a label"
+            raise InputError(f"{path}: tuners: {twice}")
+        listed.append(entry)
+    return tuple(listed)
 
 
 def _listed(path: Path, where: str, item: Any) -> Entry:
@@ -58,7 +62,7 @@ def _listed(path: Path, where: str, item: Any) -> Entry:
         return Entry(item, item)
     if not isinstance(item, dict):
         raise fault(path, where, "a name or a table", item)
-    own = dict(item)
+    own = dict(item)  # what was read stays as it is
     label = own.pop("label", own.get("tuner"))
     if not isinstance(label, str):
         raise fault(path, where, 'a table with tuner = "NAME"', item)

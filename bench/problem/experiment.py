@@ -158,7 +158,7 @@ class Experiment:
             count = getattr(self, what)
             if count < 1:
                 raise InputError(f"{who}: {what} must be at least 1, found {count}")
-        if self.memory < 0 or not self.timeout > 0:
+        if self.memory < 0 or not self.timeout > 0:  # so that NaN is refused too
             raise InputError(f"{who}: expected timeout > 0 and memory >= 0")
         known("range", self.ranges, RANGES)
         # A recording has no range to draw from, and ranges have no recording.
@@ -181,38 +181,37 @@ class Experiment:
     @property
     def fixed(self) -> dict[str, float]:
         """The constants that are the same in every scenario."""
-        return {
-            name: value for name, value in self.constants.items() if not isinstance(value, tuple)
-        }
+        constants = self.constants.items()
+        return {name: value for name, value in constants if not isinstance(value, tuple)}
 
     def chosen(self, **changes: Any) -> Experiment:
         """This experiment with the given fields replaced where they are not None."""
+        # None is what a command line leaves out.
         return replace(self, **{k: v for k, v in changes.items() if v is not None})
 
     def with_seeds(self, seeds: int) -> Experiment:
         """The same number of seeds for every tuner whose entry does not ask for fewer."""
-        entries = tuple(
-            replace(e, seeds=min(e.seeds, seeds) if e.seeds else None) for e in self.tuners
-        )
-        return replace(self, seeds=seeds, tuners=entries)
+        entries = []
+        for entry in self.tuners:
+            # An entry without a number takes the experiment's, and must go on doing so.
+            fewer = min(entry.seeds, seeds) if entry.seeds else None
+            entries.append(replace(entry, seeds=fewer))
+        return replace(self, seeds=seeds, tuners=tuple(entries))
 
     def with_tuners(self, labels: Sequence[str]) -> Experiment:
         """Only the tuners of these labels, in this order; a registered name that has no entry gets
         one.
         """
         entries = {entry.label: entry for entry in self.tuners}
-        return replace(
-            self, tuners=tuple(entries.get(label, Entry(label, label)) for label in labels)
-        )
+        chosen = tuple(entries.get(label, Entry(label, label)) for label in labels)
+        return replace(self, tuners=chosen)
 
 
 def names() -> list[str]:
     """The experiments that come with the project."""
-    return sorted(
-        f.name[:-5]
-        for f in resources.files("bench.experiments").iterdir()
-        if f.name.endswith(".toml")
-    )
+    folder = resources.files("bench.experiments")
+    files = [file.name for file in folder.iterdir() if file.name.endswith(".toml")]
+    return sorted(name.removesuffix(".toml") for name in files)
 
 
 def load(name_or_path: str) -> Experiment:
@@ -226,9 +225,8 @@ def load(name_or_path: str) -> Experiment:
     elif name_or_path.endswith(".toml"):
         path = Path(name_or_path)
     else:
-        raise InputError(
-            f"{unknown('experiment', name_or_path, names())} (or give the path of a .toml file)"
-        )
+        error = unknown("experiment", name_or_path, names())
+        raise InputError(f"{error} (or give the path of a .toml file)")
     return parse(path.stem, read_toml(path), path)
 
 
@@ -250,6 +248,7 @@ def parse(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
     fields = entries(path, "", given, hints)
     if not fields.get("simulator"):
         raise InputError(f'{path}: expected simulator = "NAME", found none')
+    # Known here only: neither a worker nor a folder of results knows where this file lay.
     if "recording" in fields:
         fields["recording"] = Source(beside(fields["recording"].path, path))
     try:
@@ -274,6 +273,7 @@ def _expanded(experiment: Experiment, path: Path) -> list[Experiment]:
         return [experiment]
     document = experiment.document()
     del document["sweep"]
+    # A difference between two of them is then one of what is swept over, not of the draw.
     document["same_targets_as"] = experiment.same_targets_as or experiment.name
     expanded = []
     for label, changed in sweep.documents(path, document, experiment.sweep):

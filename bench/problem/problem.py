@@ -1,9 +1,9 @@
 """An experiment's problem: its simulator, the unit cube of its parameters, the channels observed
 and their scale.
 
-`Problem` is rebuilt from the experiment in every process. Targets (`bench.problem.targets`) are made
-in the parent process alone, which keeps their true parameters; learned tuners meet the simulator in
-`bench.problem.practice`.
+`Problem` is rebuilt from the experiment in every process. Targets (`bench.problem.targets`) are
+made in the parent process alone, which keeps their true parameters; learned tuners meet the
+simulator in `bench.problem.practice`.
 """
 
 from __future__ import annotations
@@ -48,15 +48,18 @@ class Problem:
             raise InputError(f"experiment {experiment.name}: sweeps over {swept}; {remedy}")
         self.experiment = experiment
         self.simulated = 0
+
         kind = simulators.get(experiment.simulator)
         observe = experiment.observe or tuple(c.name for c in kind.channels)
         self.simulator = self._simulator(kind, observe, experiment.settings)
         self.world = self.simulator
         if experiment.world:
             self.world = self._simulator(kind, observe, experiment.world)
+
         self.cube = UnitCube(adjusted(self.simulator.parameters, experiment.parameters))
         self.channels = self.simulator.channels
         self.error_channel = self._channel(experiment.error_channel or self.channels[0].name)
+
         self.recording: Measured | None = None
         noise = dict(experiment.noise)
         for name in noise:
@@ -66,7 +69,9 @@ class Problem:
             # What the experiment says stands above what the recording does.
             noise = {**self.recording.noise, **noise}
         self.noise: Array = np.array([noise.get(c.name, 0.0) for c in self.channels])
-        self.scale: Array = np.where(self.noise > 0, self.noise, [c.scale for c in self.channels])
+        # Channels of different units weigh alike: by their noise, else by their usual size.
+        typical = [c.scale for c in self.channels]
+        self.scale: Array = np.where(self.noise > 0, self.noise, typical)
 
     def _simulator(
         self, kind: type[Simulator], observe: Sequence[str], settings: Mapping[str, Any]
@@ -165,6 +170,7 @@ class Problem:
         training-range widths.
         """
         ranges = np.array([p.training_range for p in self.cube.parameters])
+        # One of the two is positive outside, both are negative inside.
         beyond = np.maximum(ranges[:, 0] - truth, truth - ranges[:, 1])
         return float(max(0.0, (beyond / self.cube.training_widths()).max()))
 

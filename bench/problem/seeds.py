@@ -13,5 +13,8 @@ def rng_for(*names: str | int) -> np.random.Generator:
     A caller names what its stream depends on and nothing else: a target's stream has no tuner in
     it, so all tuners meet the same target.
     """
-    digest = hashlib.sha256("\x1f".join(str(name) for name in names).encode()).digest()
+    # A separator that no name has: ("a", "bc") and ("ab", "c") are different streams.
+    text = "\x1f".join(str(name) for name in names)
+    # Python's own hash differs from process to process.
+    digest = hashlib.sha256(text.encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))

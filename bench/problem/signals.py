@@ -9,32 +9,57 @@ import numpy as np
 from sims.base import Array, InputError, unknown
 
 _TAU = 2 * np.pi
+"""Radians of one period."""
+
+_EDGE = 1e-9
+"""Share of a step by which a sample may come early and still belong to the new level: times are
+rounded."""
+
+
+# Every form takes the generator, whether it draws from it or not: one call serves all.
 
 
 def _constant(t: Array, rng: np.random.Generator, value: float) -> Array:  # noqa: ARG001
     return np.full(t.size, value)
 
 
-def _sine(t: Array, rng: np.random.Generator, amplitude: float, frequency: float) -> Array:  # noqa: ARG001
+def _sine(
+    t: Array,
+    rng: np.random.Generator,  # noqa: ARG001
+    amplitude: float,
+    frequency: float,
+) -> Array:
     signal: Array = amplitude * np.sin(_TAU * frequency * t)
     return signal
 
 
-def _square(t: Array, rng: np.random.Generator, amplitude: float, frequency: float) -> Array:  # noqa: ARG001
-    return np.where(np.floor(2 * frequency * t) % 2 == 0, amplitude, -amplitude)
+def _square(
+    t: Array,
+    rng: np.random.Generator,  # noqa: ARG001
+    amplitude: float,
+    frequency: float,
+) -> Array:
+    half_periods = np.floor(2 * frequency * t)
+    return np.where(half_periods % 2 == 0, amplitude, -amplitude)
 
 
 def _steps(t: Array, rng: np.random.Generator, amplitude: float, seconds: float) -> Array:
-    place = np.floor(t / seconds + 1e-9).astype(
-        int
-    )  # a sample at the edge belongs to the new level
+    place = np.floor(t / seconds + _EDGE).astype(int)
     levels: Array = rng.uniform(-amplitude, amplitude, size=place[-1] + 1)
     held: Array = levels[place]
     return held
 
 
-def _chirp(t: Array, rng: np.random.Generator, amplitude: float, low: float, high: float) -> Array:  # noqa: ARG001
-    signal: Array = amplitude * np.sin(_TAU * (low * t + (high - low) * t * t / (2 * t[-1])))
+def _chirp(
+    t: Array,
+    rng: np.random.Generator,  # noqa: ARG001
+    amplitude: float,
+    low: float,
+    high: float,
+) -> Array:
+    # The phase is the integral of a frequency that grows in proportion to time.
+    periods = low * t + (high - low) * t * t / (2 * t[-1])
+    signal: Array = amplitude * np.sin(_TAU * periods)
     return signal
 
 
@@ -45,6 +70,8 @@ _FORMS: dict[str, tuple[Callable[..., Array], str]] = {
     "steps": (_steps, "AMPLITUDE:SECONDS"),
     "chirp": (_chirp, "AMPLITUDE:HERTZ:HERTZ"),
 }
+"""Each form by name: what computes it, and the numbers that it takes."""
+
 HELP = ", ".join(f"{name}:{form}" for name, (_, form) in _FORMS.items())
 """The forms there are, for a help text."""
 
@@ -69,13 +96,9 @@ def signal(text: str, times: Array, rng: np.random.Generator) -> Array:
         numbers = [float(number) for number in given]
     except ValueError:
         numbers = []
+    complete = len(numbers) == len(form.split(":")) and np.isfinite(numbers).all()
     # All behind the first are frequencies or durations.
-    if (
-        len(numbers) != len(form.split(":"))
-        or not np.isfinite(numbers).all()
-        or min([1.0, *numbers[1:]]) <= 0
-    ):
-        raise InputError(
-            f"signal '{text}': expected {name}:{form} with numbers, all but the first > 0"
-        )
+    if not complete or min([1.0, *numbers[1:]]) <= 0:
+        wanted = f"{name}:{form} with numbers, all but the first > 0"
+        raise InputError(f"signal '{text}': expected {wanted}")
     return make(times, rng, *numbers)

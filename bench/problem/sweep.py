@@ -33,20 +33,24 @@ def documents(
         InputError: a key without values, or values that one label would stand for.
     """
     for key, values in swept.items():
-        if not values:
-            raise fault(path, f"sweep.{key}", "at least one value", values)
-        texts = [_text(path, f"sweep.{key}", value) for value in values]
-        for text in texts:
-            if texts.count(text) > 1:  # two experiments would share one folder
-                raise InputError(f"{path}: sweep.{key}: {text} stands twice")
+        _check(path, f"sweep.{key}", values)
     for values in product(*swept.values()):
+        # Tables within the document are changed, and every combination begins with the file's.
         changed = deepcopy(dict(document))
+        parts = []
         for key, value in zip(swept, values, strict=True):
             _put(path, changed, key, value)
-        label = ",".join(
-            f"{key}={_text(path, key, value)}" for key, value in zip(swept, values, strict=True)
-        )
-        yield label, changed
+            parts.append(f"{key}={_text(path, key, value)}")
+        yield ",".join(parts), changed
+
+
+def _check(path: Path, where: str, values: Sequence[Any]) -> None:
+    if not values:
+        raise fault(path, where, "at least one value", values)
+    texts = [_text(path, where, value) for value in values]
+    for text in texts:
+        if texts.count(text) > 1:  # two experiments would share one folder
+            raise InputError(f"{path}: {where}: {text} stands twice")
 
 
 def _text(path: Path, where: str, value: Any) -> str:
@@ -55,7 +59,9 @@ def _text(path: Path, where: str, value: Any) -> str:
         raise fault(path, where, "texts, numbers, bools or lists of them", value)
     if isinstance(value, list | tuple):
         return "_".join(_text(path, where, item) for item in value)
-    return _UNFIT.sub("-", str(value).lower() if isinstance(value, bool) else str(value))
+    if isinstance(value, bool):  # as TOML writes it
+        return str(value).lower()
+    return _UNFIT.sub("-", str(value))
 
 
 def _put(path: Path, document: dict[str, Any], key: str, value: Any) -> None:
@@ -69,6 +75,7 @@ def _put(path: Path, document: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _first(table: Mapping[str, Any], key: str) -> str:
-    """The part of a key that names an entry of the table: names of effects have dots of their own."""
+    """The part of a key that names an entry of the table; effects have names with dots in them."""
     there = [name for name in table if key == name or key.startswith(f"{name}.")]
+    # What is not there is a table to be made, or a key that the checks will refuse.
     return max(there, key=len, default=key.partition(".")[0])

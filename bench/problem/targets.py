@@ -58,6 +58,7 @@ def draw(problem: Problem, kind: str, index: int) -> Target:
     """Target `index` of range `kind`; it depends on the experiment's name, not on tuners, seeds or
     budgets.
     """
+    # No tuner, seed or budget in the stream's name: all tuners meet the same target.
     met = problem.experiment.same_targets_as or problem.experiment.name
     rng = rng_for(met, "target", kind, index)
     box = _CUBE if kind == "wide" else problem.cube.training
@@ -66,11 +67,11 @@ def draw(problem: Problem, kind: str, index: int) -> Target:
     recording = problem.recording
     if recording:
         return Target(SealedTarget(name, kind, start, recording.fitting, recording.held_out), None)
-    scenarios = problem.scenarios(rng)
+    scenarios = problem.scenarios(rng)  # a single one: several runs come from recordings
     # The world's own parameters are the first of those that are tuned.
     theta = problem.cube.physical(truth[None])[:, : len(problem.world.parameters)]
-    observed = problem.world.simulate(theta, scenarios[0])[0]
-    observed = observed + problem.noise * rng.standard_normal(observed.shape)
+    clean = problem.world.simulate(theta, scenarios[0])[0]
+    observed = clean + problem.noise * rng.standard_normal(clean.shape)
     fitting = Side(scenarios, observed)
     held_out = _held_out(problem, theta, (met, kind, index))
     sealed = SealedTarget(name, kind, start, fitting, held_out)

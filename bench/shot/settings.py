@@ -1,4 +1,6 @@
-"""The [shot] table of an experiment: what is shot, at what, and what the planner takes for known."""
+"""The [shot] table of an experiment: what is shot, at what, and what the planner takes for
+known.
+"""
 
 from __future__ import annotations
 
@@ -65,16 +67,17 @@ def settings_of(experiment: Experiment) -> Settings:
     if not settings.balls:
         raise InputError(f"{source}: shot.balls: expected at least one ball")
     for ball in settings.balls:
-        ball_named(ball)
+        ball_named(ball)  # refuses one that there is not
     if settings.rows and not settings.filmed:
         raise InputError(f"{source}: shot.rows: only a film has pixel rows; set shot.filmed too")
+    # A registered tuner need not be one of the experiment's: the command line may add it.
     there = {*(entry.label for entry in experiment.tuners), *tuners.names()}
     known(f"tuner in shot.rows of {source}", settings.rows, there)
     return settings
 
 
 def _value(source: str, where: str, value: Any, declared: Any) -> Any:
-    """A value as the field of its name is declared; every number here is a size or a place ahead."""
+    """A value as the field of its name is declared; every number here is a size or lies ahead."""
     if declared == tuple[str, ...]:
         return names(source, where, value)
     if declared == Pair:

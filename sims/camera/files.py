@@ -52,6 +52,7 @@ def read_filmed(path: Path) -> Filmed:
         InputError: anything malformed, in one line.
     """
     meta = read_toml(path)
+    # All of it is stated: a camera that is half a default would give wrong metres without a word.
     camera = _values(path, "camera", meta, _CAMERA)
     ball = _values(path, "ball", meta, _BALL)
     if ball["radius"] <= 0:

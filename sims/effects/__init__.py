@@ -19,7 +19,7 @@ def library(system: type[System]) -> dict[str, type[Effect]]:
     for name in registry.names():
         try:
             effect = registry.get(name)
-        except SkippedError:
+        except SkippedError:  # whoever lists effects says why; explain does without
             continue
         if effect.fits(system):
             usable[name] = effect

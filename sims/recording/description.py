@@ -4,18 +4,28 @@ known of each run.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
-from sims.base import InputError, Simulator
+from sims.base import Channel, InputError, Simulator
 from sims.recording.units import Scale, scale
 from sims.system import System
 from sims.user_toml import checked, fault, finite, known, read_toml, table, text
 
 Declared: TypeAlias = type[Simulator] | type[System]
 """What a recording is checked against: channels, inputs, constants and states of a system."""
+
+_KEYS = ("system", "title", "channels", "inputs", "constants", "runs", "extra")
+"""What may stand in the file."""
+
+
+class _Column(NamedTuple):
+    """How a column becomes SI, and the table that says so."""
+
+    scale: Scale
+    table: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -83,26 +93,26 @@ def read_description(path: Path, declared: Declared) -> Description:
         InputError: anything malformed, in one line.
     """
     meta = read_toml(path)
-    _known(path, "", meta, ("system", "title", "channels", "inputs", "constants", "runs", "extra"))
+    _known(path, "", meta, _KEYS)
     title = text(path, "title", meta.get("title", path.stem))
-    channels = _columns(path, "channel", meta, {c.name: c.unit for c in declared.channels})
-    inputs = _columns(path, "input", meta, {c.name: c.unit for c in declared.inputs})
+    channels = _columns(path, "channel", meta, declared.channels)
+    inputs = _columns(path, "input", meta, declared.inputs)
     if not channels:
         raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
     constants = _constants(path, "constants", meta.get("constants", {}), declared)
     _positive(path, "constants", constants, declared)
+    # Whether the table has these runs is known only when it has been read (`check_names`).
     marks = table(path, "runs", meta.get("runs", {}))
     runs = {name: _run(path, name, own, declared) for name, own in marks.items()}
-    taken = ["run", "t", *(c.name for c in (*declared.channels, *declared.inputs))]
     return Description(
         system=_system(path, meta),
         title=title,
-        channels={name: column for name, (column, _) in channels.items()},
-        inputs={name: column for name, (column, _) in inputs.items()},
+        channels={name: column.scale for name, column in channels.items()},
+        inputs={name: column.scale for name, column in inputs.items()},
         noise=_noises(path, channels),
         constants=constants,
         runs=runs,
-        extra=_extra(path, meta, taken),
+        extra=_extra(path, meta, declared),
     )
 
 
@@ -127,35 +137,36 @@ def _system(path: Path, meta: Mapping[str, Any]) -> str:
 
 
 def _columns(
-    path: Path, kind: str, meta: Mapping[str, Any], units: Mapping[str, str]
-) -> dict[str, tuple[Scale, dict[str, Any]]]:
-    """Each column's scale and table; `units` are the system's."""
-    columns = {}
+    path: Path, kind: str, meta: Mapping[str, Any], declared: Sequence[Channel]
+) -> dict[str, _Column]:
+    """The columns of one kind, channel or input, each with its scale."""
+    units = {signal.name: signal.unit for signal in declared}
     given = table(path, f"{kind}s", meta.get(f"{kind}s", {}))
     known(f"{kind} in {path}", given, units)
-    for name, entry in given.items():
-        where, usual = f"{kind} {name}", f'unit = "{units[name]}"'
-        own = table(path, where, entry, f"a table with {usual}")
-        # The noise of a signal that is put in is nothing that a simulation could use.
-        allowed = ("unit", "noise") if kind == "channel" else ("unit",)
-        _known(path, f"{kind}s.{name}", own, allowed)
-        unit = text(path, where, own.get("unit"), f"{usual} or one that converts to it")
-        try:
-            columns[name] = scale(unit, units[name]), own
-        except InputError as error:
-            raise InputError(f"{path}: {where}: {error}") from None
-    return columns
+    return {name: _column(path, kind, name, own, units[name]) for name, own in given.items()}
 
 
-def _noises(
-    path: Path, channels: Mapping[str, tuple[Scale, Mapping[str, Any]]]
-) -> dict[str, float]:
+def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
+    where, usual = f"{kind} {name}", f'unit = "{unit}"'
+    own = table(path, where, value, f"a table with {usual}")
+    # The noise of a signal that is put in is nothing that a simulation could use.
+    allowed = ("unit", "noise") if kind == "channel" else ("unit",)
+    _known(path, f"{kind}s.{name}", own, allowed)
+    # No unit is no SI unit: a log in degrees without a word of it would be read as radians.
+    stated = text(path, where, own.get("unit"), f"{usual} or one that converts to it")
+    try:
+        return _Column(scale(stated, unit), own)
+    except InputError as error:
+        raise InputError(f"{path}: {where}: {error}") from None
+
+
+def _noises(path: Path, channels: Mapping[str, _Column]) -> dict[str, float]:
     """Each channel's noise where stated, SI units."""
     noises = {}
-    for name, (column, entry) in channels.items():
-        if "noise" in entry:
+    for name, column in channels.items():
+        if "noise" in column.table:
             # A spread knows no offset, and no sign.
-            noises[name] = abs(column.gain) * _noise(path, name, entry["noise"])
+            noises[name] = abs(column.scale.gain) * _noise(path, name, column.table["noise"])
     return noises
 
 
@@ -167,8 +178,10 @@ def _noise(path: Path, name: str, value: Any) -> float:
     return noise
 
 
-def _extra(path: Path, meta: Mapping[str, Any], taken: Collection[str]) -> dict[str, str]:
-    """Units of the columns that are no channel or input; `taken` are names that they cannot have."""
+def _extra(path: Path, meta: Mapping[str, Any], declared: Declared) -> dict[str, str]:
+    """Units of the columns that are no channel or input."""
+    # A channel left out by mistake must not pass for a column that nobody uses.
+    taken = ["run", "t", *(signal.name for signal in (*declared.channels, *declared.inputs))]
     units = {}
     for name, entry in table(path, "extra", meta.get("extra", {})).items():
         if name in taken:
