@@ -1,14 +1,27 @@
 """Impacts with level ground: what becomes of the velocity, and when bouncing has died out.
 
-The last coordinate strikes the ground at its `floor`; the others run along it. Restitution is the
-system's, changed by the contact effects in their order. The ground takes tangential speed mu (1 +
-e) |vn|, never more than there is (R. M. Brach, J. Appl. Mech. 56(1), 133, 1989,
-doi:10.1115/1.3176033), or less where the system says at which share of it a body that spins up
-grips. A ball that rests on the ground has no impacts and is not slowed by it.
+The last coordinate strikes the ground at its `floor`; the others run along it. Restitution e is the
+system's, changed by the contact effects in their order. With the speed n against the ground and the
+velocity u along it,
 
-Bounces of a ball with e < 1 die out in finite time after infinitely many. They are taken as over
-once a flight would last less than `SHORTEST`, or after `PATIENCE` flights below `SHORT` in a row;
-what the bounces left out would have taken from the tangential speed is taken at once.
+    n' = e n                                                               (1)
+    u' = u max(1 - mu (1 + e) n / |u|, 1 - g)                              (2)
+
+so the ground takes tangential speed mu (1 + e) n, never more than there is (R. M. Brach, J. Appl.
+Mech. 56(1), 133, 1989, doi:10.1115/1.3176033): g is 1, or less where the system says at which share
+of it a body that spins up grips. A ball that rests on the ground has no impacts and is not slowed
+by it.
+
+Bounces of a ball with e < 1 die out in finite time after infinitely many. A flight that leaves with
+speed n' under a downward acceleration f lasts
+
+    2 n' / f                                                               (3)
+
+and bouncing is taken as over once that is less than `SHORTEST`, or after `PATIENCE` flights below
+`SHORT` in a row. The bounces left out strike with n', e n', e^2 n' ..., and what they would have
+taken from the tangential speed is taken at once:
+
+    mu (1 + e) (n' + e n' + e^2 n' + ...) = mu (1 + e) n' / (1 - e)        (4)
 """
 
 from __future__ import annotations
@@ -24,8 +37,12 @@ from sims.system import Contact, Lanes
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-SHORTEST = 5e-5  # seconds: a flight of that length rises 3 nm
-SHORT, PATIENCE = 2e-3, 64  # seconds and flights
+SHORTEST = 5e-5
+"""Seconds that a flight lasts at least; one of that length rises 3 nm."""
+SHORT = 2e-3
+"""Seconds below which a flight counts against `PATIENCE`."""
+PATIENCE = 64
+"""Short flights in a row after which bouncing is over."""
 
 
 @dataclass
@@ -67,28 +84,29 @@ class Ground:
         for effect, c in self._effects:
             own = c[:, lanes]
             on = (own != 0).any(axis=0)
+            # Only where it acts: an effect that is off changes nothing, not even by rounding.
             e = np.where(on, effect.restitution(own, e, speed), e)
             mu = mu + np.where(on, effect.friction(own), 0.0)
-        up, down = e * speed, -a[:, -1:]
+        up, down = e * speed, -a[:, -1:]  # (1)
         rests = self._over(lanes, up, down)
         lost = mu * (1.0 + e) * speed
         if rests.any():
-            left = np.where(e < 1.0, mu * (1.0 + e) * up / np.where(e < 1.0, 1.0 - e, 1.0), 0.0)
+            yields = np.where(e < 1.0, 1.0 - e, 1.0)
+            left = np.where(e < 1.0, mu * (1.0 + e) * up / yields, 0.0)  # (4)
             lost = np.where(rests, lost + left, lost)
             up = np.where(rests, 0.0, up)
         if mu.any():
             along = _size(v[:, :-1])
             least = 0.0 if self._grip is None else 1.0 - self._grip[lanes]
-            kept = np.where(
-                mu > 0, np.maximum(1.0 - lost / np.where(along > 0, along, 1.0), least), 1.0
-            )
+            share = 1.0 - lost / np.where(along > 0, along, 1.0)
+            kept = np.where(mu > 0, np.maximum(share, least), 1.0)  # (2)
             return Outcome(np.concatenate([v[:, :-1] * kept, up], axis=1), rests[:, 0])
         return Outcome(np.concatenate([v[:, :-1], up], axis=1), rests[:, 0])
 
     def _over(self, lanes: Indices, up: Array, down: Array) -> Mask:
         """(n, 1) whether bouncing is over, after an impact that would be left with speed `up`."""
-        flight = 2.0 * up / np.where(down > 0, down, 1.0)
-        falls = down > 0
+        flight = 2.0 * up / np.where(down > 0, down, 1.0)  # (3)
+        falls = down > 0  # what is not drawn to the ground flies away, however slowly
         short = np.where((falls & (flight < SHORT))[:, 0], self._shorts[lanes] + 1, 0)
         self._shorts[lanes] = short
         over: Mask = falls & ((flight < SHORTEST) | (short > PATIENCE)[:, None])

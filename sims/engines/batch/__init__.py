@@ -21,6 +21,7 @@ from sims.system import Force, Friction, Lanes, Motion, System
 
 REQUIRES: tuple[str, ...] = ()
 TIME_STEP = 5e-3
+"""Longest step in seconds where the user sets none."""
 FEW = 3
 """Lanes whose steps are divided into more parts are stepped apart from the others."""
 
@@ -53,11 +54,9 @@ class Batch:
         for name, value in (("turn", turn), ("patience", patience)):
             if not value > 0:
                 raise InputError(f"engine batch: {name} must be a positive number, found {value}")
-        self.largest_step, self._turn, self._patience = (
-            float(time_step),
-            float(turn),
-            float(patience),
-        )
+        self.largest_step = float(time_step)
+        self._turn = float(turn)
+        self._patience = float(patience)
 
     def integrate(self, lanes: Lanes) -> Motion:
         """Integrate every lane over its steps; a lane whose numbers overflow is NaN throughout."""
@@ -66,10 +65,12 @@ class Batch:
             if not moved.any():
                 motion = self._moved(lanes)
             else:
+                # Lanes in free flight apart from the others: in closed form they take no steps.
                 parts = [order[moved[order] == kind] for kind in (False, True)]
                 motion = _joined(
                     [(part, self._moved(_take(lanes, part))) for part in parts if part.size], lanes
                 )
+        # What is not finite stays so, so the last state tells of the whole run.
         lost = ~(np.isfinite(motion.x[:, -1]) & np.isfinite(motion.v[:, -1])).all(axis=1)
         if lost.any():
             for values in (motion.x, motion.v, motion.a):
@@ -86,14 +87,10 @@ class Batch:
         spans = np.max(lanes.steps, axis=1, keepdims=True, initial=0.0)
         parts = divisions(lanes, field, spans, self._turn)
         slow = (parts > FEW)[:, 0]
-        if (
-            slow.any() and not slow.all()
-        ):  # few lanes in many short steps would keep the others waiting in every one
-            apart = [
-                (part, self._moved(_take(lanes, part)))
-                for part in map(np.flatnonzero, (~slow, slow))
-            ]
-            return _joined(apart, lanes)
+        # Few lanes in many short steps would keep the others waiting in every one.
+        if slow.any() and not slow.all():
+            groups = np.flatnonzero(~slow), np.flatnonzero(slow)
+            return _joined([(i, self._moved(_take(lanes, i))) for i in groups], lanes)
         return Stepping(lanes, field, ground, spans, parts).run(self._patience)
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
@@ -123,6 +120,7 @@ def _sorted(lanes: Lanes) -> tuple[Mask, Indices]:
     steps = not lanes.system.uniform
     if not forces:
         return np.full(len(lanes.x), steps), np.arange(len(lanes.x))
+    # Lanes with the same effects lie together, so that each effect is asked for a short span.
     moved: Mask = np.any(forces, axis=0) | steps
     return moved, np.lexsort(forces)
 
@@ -131,16 +129,17 @@ def _take(lanes: Lanes, i: Indices) -> Lanes:
     """Some lanes, i (n,)."""
     if i.size == len(lanes.x) and (i[1:] > i[:-1]).all():
         return lanes
-    shared = lanes.steps.strides[0] == 0
+    if lanes.steps.strides[0] == 0:  # shared by all lanes, and shared it stays
+        steps = np.broadcast_to(lanes.steps[0], (i.size, lanes.steps.shape[1]))
+    else:
+        steps = lanes.steps[i]
     return replace(
         lanes,
         theta=lanes.theta[i],
         constants={name: values[i] for name, values in lanes.constants.items()},
         x=lanes.x[i],
         v=lanes.v[i],
-        steps=np.broadcast_to(lanes.steps[0], (i.size, lanes.steps.shape[1]))
-        if shared
-        else lanes.steps[i],
+        steps=steps,
         inputs={name: values[i] for name, values in lanes.inputs.items()},
         effects=tuple((effect, c[:, i]) for effect, c in lanes.effects),
     )

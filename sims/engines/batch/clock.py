@@ -23,8 +23,11 @@ class Clock:
 
     def __init__(self, lanes: Lanes) -> None:
         count, self._end = lanes.steps.shape
+        # Lanes that share their steps share the row: a stride of zero says that it is one row.
         steps = lanes.steps[:1] if lanes.steps.strides[0] == 0 else lanes.steps
-        none = np.zeros((1, len(steps)))  # rows must lie together: they are looked up by place
+        none = np.zeros((1, len(steps)))
+        # One row a step, and one of zeros behind the last, in which finished lanes wait. Rows must
+        # lie together: they are looked up by place.
         self._steps = np.ascontiguousarray(np.concatenate([steps.T, none]))
         self._starts = np.ascontiguousarray(np.concatenate([none, np.cumsum(steps, axis=1).T]))
         self._inputs = {
@@ -54,6 +57,7 @@ class Clock:
         """Keep the state (3 D, L) of lanes that begin a step behind a sample."""
         if self._common is not None:
             if self._common % self._every == 0:
+                # Whole rows, without looking for lanes: most calls never leave this branch.
                 self._kept[self._common // self._every] = state.T
             return
         lanes = np.flatnonzero(self._begins & (self._step % self._every == 0))
@@ -70,6 +74,7 @@ class Clock:
             self.left[:, 0], self.t[:, 0] = self._steps[self._common], self._starts[self._common]
             return
         assert ended is not None
+        # A lane that has made all its steps goes on to no other: it would run off the table.
         ended = ended & (self._step < self._end)
         self._begins = ended
         if ended.any():
@@ -82,6 +87,7 @@ class Clock:
     def spend(self, h: Array) -> None:
         """Let h (L, 1) seconds pass, at most what is left."""
         self.t += h
+        # Steps add up to a little more than what was left; a rest below zero would run backwards.
         self.left = np.maximum(self.left - h, 0.0)
 
     def _part(self) -> None:
@@ -96,6 +102,7 @@ class Clock:
         """
         self._part()
         self._step[lanes] = self._end
+        # The engine tells lost lanes by the last state that was kept.
         self._kept[-1, lanes] = state[:, lanes].T
         self.left[lanes], self.t[lanes] = 0.0, 0.0
         self._begins &= ~lanes

@@ -2,7 +2,15 @@
 
 Dry friction opposes motion with all of its limit. Its direction is held during a step, so that the
 step is smooth. A lane that is still sticks while what pulls is within the limit, else it slips
-where it is pulled.
+where it is pulled. With generalised inertia M, pull F (all forces but friction), limit L and the
+unit vector d of the motion,
+
+    M a = F - L d          while it moves, d = v / |v|                     (1)
+    a = 0                  at rest, as long as |F| <= L                    (2)
+    M a = F - L F / |F|    at rest, where |F| > L                          (3)
+
+(C. Coulomb's law; see E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations
+I, 1993, section II.6, on such discontinuities: a step must not reach across one).
 """
 
 from __future__ import annotations
@@ -46,8 +54,11 @@ class Dynamics:
         limit, size, speed = self.field.limit(t, x, v), length(pull), length(v)
         still = speed == 0
         self.excess, self.rubs = (size - limit,) * 2, []
-        self.sticks = still & (size <= limit) & self.field.rubs
-        self.way = np.where(still, pull, v) / np.where(still, np.where(size > 0, size, 1.0), speed)
+        self.sticks = still & (size <= limit) & self.field.rubs  # (2)
+        # (1) and (3): along the motion, or where there is none along what pulls; a lane without
+        # either has no direction, and must not divide by zero.
+        pulled = np.where(size > 0, size, 1.0)
+        self.way = np.where(still, pull, v) / np.where(still, pulled, speed)
         return self._rubbed(pull, limit, self.way)
 
     def during(self, t: Array, x: Array, v: Array) -> Array:
@@ -74,7 +85,8 @@ class Dynamics:
         """Forces but for dry friction, without what the ground takes."""
         pull = self.field.force(t, x, v)
         if self._any_rests:
-            pull = pull + 0.0
+            pull = pull + 0.0  # a copy: a constant force is the same array at every instant
+            # The ground pushes and does not pull: what lifts the lane is left to it.
             pull[:, -1:] = np.where(self.rests, np.maximum(pull[:, -1:], 0.0), pull[:, -1:])
         return pull
 
@@ -82,13 +94,15 @@ class Dynamics:
         """Directions of v, turned to the side of the direction at the beginning."""
         if v.shape[1] == 1:
             return self.way
+        # In a plane the direction may turn within the step, but not over to the other side: that
+        # is a reversal, which the step is cut for.
         speed = length(v)
         unit = np.where(speed > 0, v / np.where(speed > 0, speed, 1.0), self.way)
         turned: Array = unit * np.where(dot(unit, self.way) < 0, -1.0, 1.0)
         return turned
 
     def _rubbed(self, pull: Array, limit: Array, way: Array) -> Array:
-        self.rubs.append(limit * way)
+        self.rubs.append(limit * way)  # four a step, from which it is told how friction bends
         result: Array = np.where(self.sticks, 0.0, (pull - self.rubs[-1]) / self.field.mass)
         return result
 

@@ -52,6 +52,7 @@ class Share:
             values = np.where(self.on, values, 0.0)
         if self.whole:
             return total + values
+        # A copy, since `total` may be the constant force itself; in its own order of storage.
         total = np.copy(total, order="K")
         total[self.span] += values
         return total
@@ -80,10 +81,10 @@ class Field:
         self._frictions = [
             (share, share.effect) for share in shares if isinstance(share.effect, Friction)
         ]
-        self.pushed, self.rubs = (
-            _where(found, len(lanes.x)) for found in (self._forces, self._frictions)
-        )
+        self.pushed = _where(self._forces, len(lanes.x))
+        self.rubs = _where(self._frictions, len(lanes.x))
         self.feel({name: values[:, :1] for name, values in lanes.inputs.items()})
+        # What is the same everywhere and always is asked for once and not at every instant.
         start = self._at(self._moment.t, lanes.x, lanes.v)
         self._constant = _by_coordinate(lanes.system.force(start)) if lanes.system.uniform else None
 
@@ -120,6 +121,7 @@ class Field:
         return total
 
     def _at(self, t: Array, x: Array, v: Array) -> Moment:
+        # One moment for the whole run: making one anew costs as much as a small system's force.
         self._moment.t, self._moment.x, self._moment.v = t, x, v
         return self._moment
 
@@ -149,6 +151,7 @@ def _shares(lanes: Lanes) -> list[Share]:
         on = acts(c)
         if not isinstance(effect, (Force, Friction)) or not on.any():
             continue
+        # From the first lane to the last: a slice is a view, a choice of lanes would be a copy.
         there = np.flatnonzero(on)
         span = slice(int(there[0]), int(there[-1]) + 1)
         constants = {name: values[span] for name, values in lanes.constants.items()}
@@ -157,9 +160,7 @@ def _shares(lanes: Lanes) -> list[Share]:
             lanes.system, lanes.theta[span], constants, start, lanes.x[span], lanes.v[span]
         )
         everywhere = bool(on[span].all())
-        mask, whole = (
-            None if everywhere else on[span, None],
-            there[0] == 0 and there[-1] == len(on) - 1,
-        )
+        mask = None if everywhere else on[span, None]
+        whole = bool(there[0] == 0 and there[-1] == len(on) - 1)
         result.append(Share(effect, c[:, span], span, mask, moment, whole))
     return result

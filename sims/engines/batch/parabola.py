@@ -1,7 +1,17 @@
 """Motion under a constant force, with bounces, in closed form: no steps at all.
 
 From impact to impact every coordinate is a parabola, so the engine goes from impact to impact, and
-then reads all samples off the parabolas at once.
+then reads all samples off the parabolas at once. s seconds after x and v,
+
+    x(s) = x + v s + a s^2 / 2                                             (1)
+    v(s) = v + a s                                                         (2)
+
+and a ball at height H with upward speed u and downward acceleration g meets the ground after
+
+    s = (u + w) / g = 2 H / (w - u),    w = sqrt(u^2 + 2 g H)              (3)
+
+of which the first form loses digits where u < 0 and the second where u > 0 (W. H. Press et al.,
+Numerical Recipes, 3rd edition, 2007, section 5.6).
 """
 
 from __future__ import annotations
@@ -49,10 +59,11 @@ def fly(lanes: Lanes, a: Array, ground: Ground | None) -> Motion:
     first = Arcs(np.arange(len(a)), np.zeros((len(a), 1)), lanes.x, lanes.v, a)
     if ground is None:
         return _sampled(first, times)
-    first.x = first.x.copy()
+    first.x = first.x.copy()  # the caller's, which what begins in the ground must not change
     first.x[:, -1:] = np.maximum(first.x[:, -1:], ground.floor)
     arcs: list[Arcs] = []
     first = _begun(first, ground)
+    # What rests already has no impacts; the others lose one by one whose next impact is too late.
     now = first.take((first.a[:, -1] != 0) | (first.v[:, -1] != 0))
     while now.lanes.size:
         s = _fall(now, ground.floor)
@@ -90,26 +101,29 @@ def _fall(arcs: Arcs, floor: Array) -> Array:
     high, up, down = arcs.x[:, -1:] - floor[arcs.lanes], arcs.v[:, -1:], -arcs.a[:, -1:]
     root = np.sqrt(up * up + 2.0 * down * high)  # not a number if it turns back before
     rising = np.where(down > 0, (up + root) / down, np.inf)
-    seconds = np.where(up < 0, 2.0 * high / (root - up), rising)
+    seconds = np.where(up < 0, 2.0 * high / (root - up), rising)  # (3)
     result: Array = np.where(np.isnan(seconds), np.inf, seconds)
     return result
 
 
 def _bounced(arcs: Arcs, s: Array, ground: Ground, a: Array) -> tuple[Arcs, Mask]:
     """The arcs after the impact s (n, 1) seconds on, and which of them fly again."""
-    x = arcs.x + s * (arcs.v + s * (0.5 * arcs.a))
-    outcome = ground.strike(arcs.lanes, arcs.v + s * arcs.a, arcs.a)
-    x[:, -1:] = ground.floor[arcs.lanes]
+    x = arcs.x + s * (arcs.v + s * (0.5 * arcs.a))  # (1)
+    outcome = ground.strike(arcs.lanes, arcs.v + s * arcs.a, arcs.a)  # (2)
+    x[:, -1:] = ground.floor[arcs.lanes]  # without the rounding of (1) and (3)
     after = a[arcs.lanes]
-    after[outcome.rests, -1] = 0.0
+    after[outcome.rests, -1] = 0.0  # the ground bears what rests on it
     return Arcs(arcs.lanes, arcs.t + s, x, outcome.v, after), ~outcome.rests
 
 
 def _sampled(arcs: Arcs, times: Array) -> Motion:
     """States at the instants times (L or 1, R), of arcs that are sorted by lane."""
     lanes, instants = int(arcs.lanes[-1]) + 1, times.shape[1]
+    # Each arc has the instants from its beginning to that of the next arc of its lane, or to the
+    # last one.
     begins = _places(times, arcs)
-    ends = np.append(np.where(arcs.lanes[1:] == arcs.lanes[:-1], begins[1:], instants), instants)
+    same_lane = arcs.lanes[1:] == arcs.lanes[:-1]
+    ends = np.append(np.where(same_lane, begins[1:], instants), instants)
     counts = ends - begins
 
     def spread(values: Array) -> Array:
@@ -119,9 +133,9 @@ def _sampled(arcs: Arcs, times: Array) -> Motion:
     result = np.empty((3, arcs.x.shape[1], lanes, instants))
     for d in range(arcs.x.shape[1]):
         x, v, a = result[:, d]
-        x[...], v[...], a[...] = (spread(column[:, d]) for column in (arcs.x, arcs.v, arcs.a))
-        x += s * (v + s * (0.5 * a))
-        v += s * a
+        x[...], v[...], a[...] = spread(arcs.x[:, d]), spread(arcs.v[:, d]), spread(arcs.a[:, d])
+        x += s * (v + s * (0.5 * a))  # (1), before v is overwritten
+        v += s * a  # (2)
     x, v, a = np.moveaxis(result, 1, 3)
     return Motion(x, v, a)
 
@@ -131,6 +145,8 @@ def _places(times: Array, arcs: Arcs) -> Indices:
     begins = arcs.t[:, 0]
     if len(times) == 1:
         return np.searchsorted(times[0], begins)
+    # Bisection of all arcs at once: `searchsorted` takes one row of instants, here each lane has
+    # its own.
     size = times.shape[1]
     low, high = np.zeros(begins.size, dtype=np.intp), np.full(begins.size, size, dtype=np.intp)
     for _ in range(size.bit_length()):

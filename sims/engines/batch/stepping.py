@@ -1,11 +1,30 @@
 """Fixed steps of fourth order, with what happens within them: impacts, standstill, breaking loose.
 
-The method is the classical one of Runge and Kutta, written for x'' = a(t, x, v) (Hairer, Norsett,
-Wanner, Solving Ordinary Differential Equations I, section II.1, doi:10.1007/978-3-540-78862-1).
+The method is the classical one of Runge and Kutta, written for x'' = a(t, x, v) (E. Hairer, S. P.
+Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sections II.1 and, for second
+order, II.14, doi:10.1007/978-3-540-78862-1). With step h,
+
+    k1 = a(t, x, v)                                                        (1)
+    k2 = a(t + h/2, x + h/2 v, v + h/2 k1)                                 (2)
+    k3 = a(t + h/2, x + h/2 v + h^2/4 k1, v + h/2 k2)                      (3)
+    k4 = a(t + h, x + h v + h^2/2 k2, v + h k3)                            (4)
+    x' = x + h v + h^2/6 (k1 + k2 + k3)                                    (5)
+    v' = v + h/6 (k1 + 2 k2 + 2 k3 + k4)                                   (6)
+
+How far the acceleration bends within the step is told by (6) less the midpoint rule, v + h/2 (k2 +
+k3), a second:
+
+    b = (k1 - k2 - k3 + k4) / 6                                            (7)
+
 Steps are those of the plan, divided where a lane's motion is too fast for them. Every lane has its
 own clock: a step in which something happens is taken back and taken again up to that instant,
 estimated by interpolation and corrected to second order by what is then left; the state is changed
-there, and the rest of the step follows. No lane waits for another, nor knows of it.
+there, and the rest of the step follows. No lane waits for another, nor knows of it. With distance d
+to the event after the second attempt, its rate r and its acceleration a, the event is
+
+    s = -d / r (1 + d a / (2 r^2))                                         (8)
+
+seconds away, which solves d + r s + a s^2 / 2 = 0 but for terms of third order in d.
 
 A lane with dry friction whose velocity would turn round is stopped where it is zero. Steps in which
 friction or the forces of effects bend sharply (Stribeck's peak, the ripples of a fast motor) are
@@ -24,18 +43,31 @@ from sims.engines.batch.roots import root
 from sims.engines.ground import Ground, Indices, Mask
 from sims.system import Lanes, Motion
 
-EVENTS = 256  # in one step of one lane; what else happens in that step is passed over
-FRICTION_BEND, FORCE_BEND = (
-    0.05,
-    0.005,
-)  # by which they may bend within a step, each of its largest so far
-FAINT = 1e-5  # share of all acceleration below which friction may bend as it likes
-SHORTENED, FINEST = (
-    0.25,
-    1.0 / 256.0,
-)  # a step that bends is shortened to this share, and to this of the full one
-PUNCTUAL = 1e-4  # share of a step by which breaking loose may be late
-NOTHING, IMPACT, STANDSTILL, LOOSE = range(4)
+EVENTS = 256
+"""Events in one step of one lane; what else happens in that step is passed over."""
+FRICTION_BEND = 0.05
+"""Share of its largest value so far by which dry friction may bend within a step, eq. (7)."""
+FORCE_BEND = 0.005
+"""Share of the largest acceleration so far by which the acceleration may bend within a step."""
+FAINT = 1e-5
+"""Share of the largest acceleration so far below which friction may bend as it likes."""
+SHORTENED = 0.25
+"""A step in which forces bend too much is taken again with this share of its length."""
+FINEST = 1.0 / 256.0
+"""Share of a full step below which none is shortened."""
+PUNCTUAL = 1e-4
+"""Share of a step by which breaking loose may be late."""
+STILL = 1e-9
+"""Share of what a full step's acceleration makes of speed below which a stopped lane is at rest."""
+
+NOTHING = 0
+"""A lane's steps lead to no event."""
+IMPACT = 1
+"""A lane's next step ends where it meets the ground."""
+STANDSTILL = 2
+"""A lane's next step ends where dry friction has stopped it."""
+LOOSE = 3
+"""A lane's next step ends where what pulls exceeds dry friction."""
 
 
 class Stepping:
@@ -62,7 +94,9 @@ class Stepping:
         shared = lanes.steps.strides[0] == 0
         self._planned = np.count_nonzero(lanes.steps[:1] if shared else lanes.steps, axis=1)
         self._taken = np.zeros(count)
+        # A hair longer than the part, so that rounding does not leave a crumb behind the last one.
         self._longest = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
+        # Lanes without any of these take the plan's steps as they are, which is much cheaper.
         self._bends = field.dry or bool(field.pushed.any())
         self._eventful = ground is not None or self._bends or bool((parts > 1).any())
         self._clock, self._dynamics = Clock(lanes), Dynamics(field, (count, dim))
@@ -72,9 +106,8 @@ class Stepping:
         self._try = np.full((count, 1), np.inf)  # seconds to an event
         self._goal = np.full(count, NOTHING, dtype=np.int8)
         self._events = np.zeros(count, dtype=np.intp)
-        self._open = np.ones(
-            count, dtype=bool
-        )  # to events: under way to none, and not after too many
+        # Open to events: under way to none, and not after too many.
+        self._open = np.ones(count, dtype=bool)
         self._awaits = self._shortened = False
         if ground is not None:
             self._start_on(ground)
@@ -87,13 +120,15 @@ class Stepping:
         hurries = self._eventful and np.isfinite(patience)
         while True:
             self._field.feel(clock.inputs())
-            k1 = dynamics.begin(clock.t, self._x, self._v)
+            k1 = dynamics.begin(clock.t, self._x, self._v)  # (1)
             self._a[...] = k1
+            # Kept before the step and not after it: k1 is the acceleration that belongs to it.
             clock.keep(self._rows)
             if clock.over or (hurries and self._overdue(patience)):
                 return clock.motion()
             if self._eventful:
                 h = np.minimum(clock.left, self._limit)
+                # A step that an event has cut short is taken again just up to that event.
                 if self._awaits:
                     h = np.minimum(h, self._try)
                 self._settle(h, k1)
@@ -110,6 +145,7 @@ class Stepping:
         if not late.any():
             return False
         self._rows[:, late] = np.nan
+        # Whatever a lost lane was waiting for must not hold up the clock of the others.
         self._limit = np.where(late[:, None], self._longest, self._limit)
         self._try[late], self._goal[late], self._taken[late] = np.inf, NOTHING, 0.0
         self._clock.give_up(late, self._rows)
@@ -123,32 +159,30 @@ class Stepping:
         half = 0.5 * h
         middle, sixth = t + half, h / 6.0
         x2 = x + half * v
-        k2 = during(middle, x2, v + half * k1)
+        k2 = during(middle, x2, v + half * k1)  # (2)
         v3 = v + half * k2
-        k3 = during(middle, x2 + (half * half) * k1, v3)
-        k4 = during(t + h, x + h * v3, v + h * k3)
+        k3 = during(middle, x2 + (half * half) * k1, v3)  # (3)
+        k4 = during(t + h, x + h * v3, v + h * k3)  # (4)
         inner = k2 + k3
         outer = k1 + k4
-        return (
-            x + h * (v + sixth * (k1 + inner)),
-            v + sixth * (outer + 2.0 * inner),
-            k4,
-            outer - inner,
-        )
+        after_x = x + h * (v + sixth * (k1 + inner))  # (5)
+        after_v = v + sixth * (outer + 2.0 * inner)  # (6)
+        return after_x, after_v, k4, outer - inner  # six times (7)
 
     def _settle(self, h: Array, k1: Array) -> None:
         """Make steps of h (L, 1) where nothing happens in them; prepare to make the others again."""
         x, v, k4, bend = self._stepped(h, k1)
+        # Bends first: events are looked for in steps that are worth believing.
         refused = self._bent(h, k1, bend) if self._bends else None
-        found = self._found(h, (self._x, self._v, k1), (x, v, k4), refused)
-        if found is not None:
-            refused = found if refused is None else refused | found
+        cut = self._interrupted(h, (self._x, self._v, k1), (x, v, k4), refused)
+        if cut is not None:
+            refused = cut if refused is None else refused | cut
         if refused is None:
             self._x[...], self._v[...] = x, v
         else:
             np.copyto(self._x, x, where=~refused[:, None])
             np.copyto(self._v, v, where=~refused[:, None])
-            h = np.where(refused[:, None], 0.0, h)
+            h = np.where(refused[:, None], 0.0, h)  # no time has passed where no step was made
         self._clock.spend(h)
         if self._awaits:
             self._reach(refused, k4)
@@ -164,26 +198,30 @@ class Stepping:
         none.
         """
         field = self._field
+        # Squares are compared, which saves a root for each lane; `bend` is six times (7).
         self._peak = np.maximum(self._peak, dot(k1, k1))
-        sharp = field.pushed & (dot(bend, bend) > (6.0 * FORCE_BEND) ** 2 * self._peak)
+        most_bent = (6.0 * FORCE_BEND) ** 2 * self._peak
+        sharp = field.pushed & (dot(bend, bend) > most_bent)
         if field.dry:
-            first, second, third, fourth = self._dynamics.rubs
+            first, second, third, fourth = self._dynamics.rubs  # at the instants of (1) to (4)
             # Against the largest so far: a Stribeck peak's tail, all but nothing at speed, bends
             # sharply in proportion.
             self._rubbed = np.maximum(self._rubbed, np.maximum(length(first), length(fourth)))
             most = np.maximum(self._rubbed, FAINT * np.sqrt(self._peak) * field.mass)
-            bends = length(first - second - third + fourth) > 6.0 * FRICTION_BEND * most
+            bends = length(first - second - third + fourth) > 6.0 * FRICTION_BEND * most  # (7)
             sharp |= bends & field.rubs & ~self._dynamics.sticks
         any_sharp = sharp.any()
         if any_sharp:
+            # A step that leads to an event keeps its length, or the event would not be met.
             sharp &= (h > FINEST * self._longest) & self._open[:, None]
         if any_sharp or self._shortened:
+            # The limit doubles with each step that is made at it: what bent may still be near.
             grown = np.where(h >= self._limit, 2.0 * self._limit, self._limit)
             self._limit = np.where(sharp, SHORTENED * h, np.minimum(grown, self._longest))
             self._shortened = bool((self._limit < self._longest).any())
         return sharp[:, 0] if any_sharp else None
 
-    def _found(
+    def _interrupted(
         self,
         h: Array,
         now: tuple[Array, Array, Array],
@@ -211,10 +249,11 @@ class Stepping:
             moves = (watched[:, None] & self._field.rubs & ~dynamics.sticks)[:, 0]
             turned = moves & (dot(then[1], dynamics.way) < 0)[:, 0]
             if turned.any():
-                self._await(
-                    turned, h, self._standstills(np.flatnonzero(turned), h, now, then), STANDSTILL
-                )
+                seconds = self._standstills(np.flatnonzero(turned), h, now, then)
+                self._await(turned, h, seconds, STANDSTILL)
                 result = turned if result is None else result | turned
+            # A lane on its way to breaking loose is asked again, a little late being good enough:
+            # the excess bends within the step, and its root is that of a straight line.
             before, after = dynamics.excess
             late = np.where(self._goal == LOOSE, PUNCTUAL, 0.0)[:, None] * (after - before)
             under_way = watched | (self._goal == LOOSE)
@@ -244,14 +283,15 @@ class Stepping:
         it surely does.
         """
         before, after = (excess[i, 0] for excess in self._dynamics.excess)
+        # The root of the straight line, and a tenth of the tolerance beyond it.
         result: Array = h[i, 0] * (before / (before - after) + 0.1 * PUNCTUAL)
         return result
 
-    def _await(self, found: Mask, h: Array, seconds: Array, goal: int) -> None:
-        """Note to what and when the next steps of lanes `found` (L,) lead; of two events the first
+    def _await(self, lanes: Mask, h: Array, seconds: Array, goal: int) -> None:
+        """Note to what and when the next steps of `lanes` (L,) lead; of two events the first
         counts.
         """
-        i = np.flatnonzero(found)
+        i = np.flatnonzero(lanes)
         first = seconds < self._try[i, 0]
         i, seconds = i[first], seconds[first]
         self._try[i, 0] = np.clip(seconds, 0.0, h[i, 0])
@@ -267,9 +307,9 @@ class Stepping:
             there &= ~refused
         if not there.any():
             return
-        struck, stopped = (
-            np.flatnonzero(there & (self._goal == goal)) for goal in (IMPACT, STANDSTILL)
-        )
+        # Breaking loose needs nothing done: the next `begin` finds that the lane slips.
+        struck = np.flatnonzero(there & (self._goal == IMPACT))
+        stopped = np.flatnonzero(there & (self._goal == STANDSTILL))
         if struck.size:
             self._strike(struck, k4[struck])
         if stopped.size:
@@ -283,10 +323,11 @@ class Stepping:
         x, v, floor = self._x[i], self._v[i], self._ground.floor[i]
         rate = v[:, -1:]
         late = np.where(rate < 0, (floor - x[:, -1:]) / rate, 0.0)
-        late *= 1.0 - 0.5 * late * a[:, -1:] / np.where(rate < 0, rate, 1.0)
+        late *= 1.0 - 0.5 * late * a[:, -1:] / np.where(rate < 0, rate, 1.0)  # (8)
         late = self._rounding(i, late)
         x, v = x + late * (v + 0.5 * late * a), v + late * a
         self._clock.correct(i, late)
+        # On the ground to the last bit and not moving up, or the next step would strike it again.
         x[:, -1:], v[:, -1:] = floor, np.minimum(v[:, -1:], 0.0)
         outcome = self._ground.strike(i, v, a)
         self._x[i], self._v[i] = x, outcome.v
@@ -309,7 +350,9 @@ class Stepping:
         self._clock.correct(i, late)
         v = v + late * a
         v = v - way * dot(v, way)
-        self._v[i] = np.where(length(v) <= 1e-9 * length(a) * self._longest[i], 0.0, v)
+        # Exactly zero, not nearly: only a lane of no speed at all can stick.
+        faint = STILL * length(a) * self._longest[i]
+        self._v[i] = np.where(length(v) <= faint, 0.0, v)
 
     def _start_on(self, ground: Ground) -> None:
         """Lift lanes that start in the ground onto it; throw back or lay to rest those that do not
@@ -319,10 +362,9 @@ class Stepping:
         down = (self._x[:, -1] <= ground.floor[:, 0]) & (self._v[:, -1] <= 0)
         if down.any():
             a = self._dynamics.begin(self._clock.t, self._x, self._v)
-            struck, lying = (
-                np.flatnonzero(down & (self._v[:, -1] < 0)),
-                np.flatnonzero(down & (self._v[:, -1] == 0)),
-            )
+            # Told apart before the impacts, after which a struck lane may have no speed either.
+            struck = np.flatnonzero(down & (self._v[:, -1] < 0))
+            lying = np.flatnonzero(down & (self._v[:, -1] == 0))
             if struck.size:
                 self._strike(struck, a[struck])
             self._dynamics.lay(lying)
