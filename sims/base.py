@@ -65,6 +65,7 @@ class Parameter:
     says: str = ""
 
     def __post_init__(self) -> None:
+        # In this order: each check may take the ones before it for granted.
         low, high = self.bounds
         if not (np.isfinite([low, high]).all() and low < high):
             raise InputError(
@@ -72,16 +73,19 @@ class Parameter:
             )
         if self.log and low <= 0:
             raise InputError(
-                f"parameter {self.name}: a log-scaled parameter needs positive bounds, found {self.bounds}"
+                f"parameter {self.name}: a log-scaled parameter needs positive bounds, found"
+                f" {self.bounds}"
             )
         if not low <= self.nominal <= high:
             raise InputError(
-                f"parameter {self.name}: nominal {self.nominal} lies outside its bounds {self.bounds}"
+                f"parameter {self.name}: nominal {self.nominal} lies outside its bounds"
+                f" {self.bounds}"
             )
         inner_low, inner_high = self.training_range
         if not low <= inner_low < inner_high <= high:
             raise InputError(
-                f"parameter {self.name}: training range {self.training_range} must increase inside {self.bounds}"
+                f"parameter {self.name}: training range {self.training_range} must increase inside"
+                f" {self.bounds}"
             )
 
     @property
@@ -139,13 +143,10 @@ class Scenario:
     constants: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        # Copies that nobody can write to: scenarios are shared by lanes and by methods.
         times = frozen(self.times)
-        if (
-            times.ndim != 1
-            or times.size == 0
-            or not np.isfinite(times).all()
-            or (np.diff(times) <= 0).any()
-        ):
+        row = times.ndim == 1 and times.size > 0
+        if not row or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise InputError(
                 "a scenario's times must be finite and increasing, at least one sample"
             )
@@ -153,8 +154,10 @@ class Scenario:
         for name, signal in inputs.items():
             if signal.shape != times.shape:
                 raise InputError(
-                    f"input '{name}' has shape {signal.shape}, the scenario has {times.size} samples"
+                    f"input '{name}' has shape {signal.shape}, the scenario has {times.size}"
+                    " samples"
                 )
+        # The class is frozen; this is how it sets its own fields.
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "inputs", inputs)
         object.__setattr__(self, "initial", {k: float(v) for k, v in self.initial.items()})
@@ -165,6 +168,10 @@ class UnitCube:
     """The map between physical parameters and the unit cube in which every tuner works.
 
     0..1 spans each parameter's `bounds`, linearly, or logarithmically for log-scaled parameters.
+    With bounds a and b, a parameter p and its place u in the cube,
+
+        p = a + u (b - a),    or    p = exp(log a + u (log b - log a))     (1)
+
     This is the only place where that map is made.
     """
 
@@ -187,12 +194,13 @@ class UnitCube:
     def _scaled(self, theta: Array) -> Array:
         if not self._any_log:
             return theta
+        # The logarithm of 1 where none is asked for: that of a negative number warns.
         scaled: Array = np.where(self._log, np.log(np.where(self._log, theta, 1.0)), theta)
         return scaled
 
     def physical(self, points: Array) -> Array:
         """Unit-cube points (..., dim) as physical parameter vectors."""
-        scaled: Array = self._low + points * self._span
+        scaled: Array = self._low + points * self._span  # (1)
         if not self._any_log:
             return scaled
         mixed: Array = np.where(self._log, np.exp(np.where(self._log, scaled, 0.0)), scaled)
@@ -248,9 +256,8 @@ class Simulator(ABC):
             InputError: for a constant or channel the simulator does not have, or an impossible
                 value.
         """
-        self.constant_values = self._constants(
-            {c.name: c.value for c in self.constants}, constants or {}
-        )
+        defaults = {c.name: c.value for c in self.constants}
+        self.constant_values = self._constants(defaults, constants or {})
         names = [c.name for c in self.channels]
         chosen = names if observe is None else list(observe)
         for name in chosen:
@@ -258,7 +265,8 @@ class Simulator(ABC):
                 raise unknown(f"channel of simulator {self.name}", name, names)
         if not chosen or len(set(chosen)) < len(chosen):
             raise InputError(
-                f"simulator {self.name}: observe needs one or more different channels, found {chosen}"
+                f"simulator {self.name}: observe needs one or more different channels, found"
+                f" {chosen}"
             )
         self.columns = [names.index(name) for name in chosen]
         self.channels = tuple(self.channels[i] for i in self.columns)
@@ -299,7 +307,8 @@ class Simulator(ABC):
         for c in self.constants:
             if c.positive and values[c.name] <= 0:
                 raise InputError(
-                    f"constant '{c.name}' of simulator {self.name} must be > 0, found {values[c.name]}"
+                    f"constant '{c.name}' of simulator {self.name} must be > 0, found"
+                    f" {values[c.name]}"
                 )
         return values
 
@@ -333,11 +342,10 @@ def adjusted(
         for attribute in change:
             if attribute not in allowed:
                 raise unknown(f"attribute of parameter {name}", attribute, allowed)
-    pairs = ("bounds", "training")
+    pairs = ("bounds", "training")  # lists in an experiment's file
     result = []
     for p in parameters:
-        new: dict[str, Any] = {
-            k: tuple(v) if k in pairs else v for k, v in changes.get(p.name, {}).items()
-        }
-        result.append(replace(p, **new))
+        change = changes.get(p.name, {})
+        new: dict[str, Any] = {k: tuple(v) if k in pairs else v for k, v in change.items()}
+        result.append(replace(p, **new))  # which checks the parameter anew
     return tuple(result)

@@ -13,8 +13,8 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-# Bullet clips speeds, by default at 100 in SI units.
 NO_LIMIT = 1e100
+"""m/s or rad/s: Bullet clips speeds, by default at 100."""
 
 
 @functools.cache
@@ -32,6 +32,7 @@ def _output_discarded() -> Iterator[None]:
     """Discard what C code prints (PyBullet says when it was built), so that the output is ours
     alone.
     """
+    # PyBullet prints from C, past Python's `sys.stdout`: the file descriptors themselves are turned.
     flush = ctypes.CDLL(None).fflush if os.name == "posix" else lambda _: None
     flush(None)  # what others printed before is theirs to keep
     with contextlib.ExitStack() as undo:
@@ -75,6 +76,7 @@ class World:
             self._client = engine().connect(engine().DIRECT)
             self._disconnect = weakref.finalize(self, engine().disconnect, self._client)
         if self._built_for != constants:
+            # Before the building, which may fail half way.
             self.discard()
             engine().resetSimulation(physicsClientId=self._client)
             self._body = self._build(self._client, constants)
@@ -137,5 +139,6 @@ def joint(
         maxJointVelocity=NO_LIMIT,
         physicsClientId=client,
     )
+    # A motor without force in place of the one that every joint begins with.
     p.setJointMotorControl2(body, 0, p.VELOCITY_CONTROL, force=0.0, physicsClientId=client)
     return body

@@ -5,6 +5,19 @@ Effects that shift time (a sensor's delay, a skewed clock) move the instants at 
 sampled; effects on the input change the signal before the integration starts, since it does not
 depend on the plant. So every engine has them. What a lane gets does not depend on the others, but
 for steps of no length in which it waits for them.
+
+A command u holds its value from one sample to the next. Over a step from a to b the plant feels its
+mean, of which the integral A is piecewise linear:
+
+    (A(b) - A(a)) / (b - a),    A(t) = sum of u_i (t_{i+1} - t_i) up to t  (1)
+
+An effect that shifts time feels at t what was commanded at s(t); the change commanded at t is then
+felt at
+
+    t + (t - s(t))                                                         (2)
+
+which is right where the shift is the same at both instants, as it is for a delay, and all but
+right for one that hardly changes.
 """
 
 from __future__ import annotations
@@ -18,6 +31,9 @@ from numpy.typing import NDArray
 
 from sims.base import Array, Scenario
 from sims.system import Acting, Effect, Input, Sensor, Signal
+
+_ROUNDING = 1e-6
+"""Share of a step by which an interval may exceed a whole number of steps."""
 
 Indices = NDArray[np.intp]
 Number = TypeVar("Number", np.float64, np.intp)
@@ -63,6 +79,7 @@ class Runs:
 
 def make_runs(scenarios: Sequence[Scenario]) -> Runs:
     """Group scenarios (one a lane) with the same times and inputs."""
+    # Told apart by object first: comparing contents costs more than most lanes' share of a step.
     by_object: dict[int, int] = {}
     by_content: dict[object, int] = {}
     distinct: list[Scenario] = []
@@ -70,10 +87,8 @@ def make_runs(scenarios: Sequence[Scenario]) -> Runs:
     for lane, scenario in enumerate(scenarios):
         group = by_object.get(id(scenario))
         if group is None:
-            content = (
-                scenario.times.tobytes(),
-                *((name, u.tobytes()) for name, u in sorted(scenario.inputs.items())),
-            )
+            signals = sorted(scenario.inputs.items())
+            content = scenario.times.tobytes(), *((name, u.tobytes()) for name, u in signals)
             group = by_content.setdefault(content, len(distinct))
             if group == len(distinct):
                 distinct.append(scenario)
@@ -102,6 +117,7 @@ def make_plan(runs: Runs, commands: Commands, acting: Acting, largest_step: floa
     instants = np.stack([_padded(s.times - s.times[0], samples) for s in runs.distinct])
     shifting = [(e, c) for e, c in acting if c.any() and _shifts(e)]
     if not shifting:
+        # Runs with the same instants share one row, and all that is computed from it.
         if (instants == instants[:1]).all():
             instants = instants[:1]
         steps, ends, every, rows = _divided(instants, largest_step)
@@ -110,11 +126,13 @@ def make_plan(runs: Runs, commands: Commands, acting: Acting, largest_step: floa
     for effect, c in shifting:
         if isinstance(effect, Sensor):
             instants = np.where(acts(c), effect.times(c, instants), instants)
+    # Time never runs backwards, whatever an effect makes of it, and begins with the run.
     instants = np.maximum.accumulate(np.maximum(instants, 0.0), axis=1)
     marks = np.concatenate([instants, _changes(runs, commands, shifting)], axis=1)
     marks = np.clip(marks, 0.0, instants[:, -1:])
     order = np.argsort(marks, axis=1, kind="stable")
     steps, ends, every, rows = _divided(np.take_along_axis(marks, order, axis=1), largest_step)
+    # The rows of the sorted marks back in the order of the marks, of which the first are samples.
     back = np.empty_like(rows)
     np.put_along_axis(back, order, rows, axis=1)
     return Plan(steps, ends, every, back[:, :samples])
@@ -124,20 +142,17 @@ def _changes(runs: Runs, commands: Commands, shifting: Sequence[tuple[Effect, Ar
     """Instants (L, K) at which a changed command is felt; zero where a lane has fewer."""
     columns = []
     for place, name in enumerate(commands[0]):
-        rows = [
-            (s.times - s.times[0])[1:][np.diff(u[name]) != 0]
-            for s, u in zip(runs.distinct, commands, strict=True)
-        ]
+        rows = []
+        for s, u in zip(runs.distinct, commands, strict=True):
+            changed = np.diff(u[name]) != 0
+            rows.append((s.times - s.times[0])[1:][changed])
         size = max(row.size for row in rows)
-        given = np.stack([np.concatenate([row, np.zeros(size - row.size)]) for row in rows])[
-            runs.of
-        ]
-        felt = given
+        padded = [np.concatenate([row, np.zeros(size - row.size)]) for row in rows]
+        felt = np.stack(padded)[runs.of]
+        # Effects act on the first input.
         for effect, c in shifting if place == 0 else ():
-            if isinstance(
-                effect, Input
-            ):  # the inverse of a map of time that is a shift, or close to one
-                felt = np.where(acts(c), felt + (felt - effect.times(c, felt)), felt)
+            if isinstance(effect, Input):
+                felt = np.where(acts(c), felt + (felt - effect.times(c, felt)), felt)  # (2)
         columns.append(felt)
     return np.concatenate(columns, axis=1) if columns else np.zeros((runs.of.size, 0))
 
@@ -153,7 +168,8 @@ def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, I
     lanes, samples = instants.shape
     before = np.concatenate([np.zeros((lanes, 1)), instants[:, :-1]], axis=1)
     intervals = instants - before
-    parts = np.ceil(intervals / largest_step - 1e-6).astype(np.intp)
+    # An interval of a whole number of steps has that number, whatever its rounding.
+    parts = np.ceil(intervals / largest_step - _ROUNDING).astype(np.intp)
     parts = np.where(intervals > 0, np.maximum(parts, 1), 0)
     every = int(np.bincount(parts[parts > 0]).argmax()) if parts.any() else 1
     blocks = -(-parts // every)
@@ -167,11 +183,10 @@ def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, I
     number = (block - (rows - blocks).ravel()[interval])[:, None] * every + np.arange(every)
     count = parts.ravel()[interval, None]
     length = intervals.ravel()[interval, None] / count
-    steps, ends = (
-        np.zeros((lanes, size, every)),
-        np.repeat(instants[:, -1], size * every).reshape(lanes, size, every),
-    )
+    steps = np.zeros((lanes, size, every))
+    ends = np.repeat(instants[:, -1], size * every).reshape(lanes, size, every)
     steps[lane, block] = np.where(number < count, length, 0.0)
+    # The last step of an interval ends at the instant itself and not near it.
     inside = before.ravel()[interval, None] + (number + 1) * length
     ends[lane, block] = np.where(number + 1 < count, inside, instants.ravel()[interval, None])
     return steps.reshape(lanes, -1), ends.reshape(lanes, -1), every, rows
@@ -203,26 +218,24 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
     }
     if not effects:
         return felt
+    # Back from the plant to the command: the last effect asks the one before it for its instants.
     end = plan.ends
     for effect, c, on in reversed(effects):
         assert isinstance(effect, Input)
-        begin, end = (
-            np.where(on, effect.times(c, begin), begin),
-            np.where(on, effect.times(c, end), end),
-        )
+        begin = np.where(on, effect.times(c, begin), begin)
+        end = np.where(on, effect.times(c, end), end)
     lasting = _lasting(plan.steps)
-    values = np.take_along_axis(
-        _felt(runs, [u[names[0]] for u in commands], begin, end), lasting, axis=1
-    )
+    means = _felt(runs, [u[names[0]] for u in commands], begin, end)
+    values = np.take_along_axis(means, lasting, axis=1)
+    # And forward with the values. What was before the run is a signal that has always been there.
     start = np.array([u[names[0]][0] for u in commands])[runs.of, None]
+    nothing = np.zeros_like(start)
     for effect, c, on in effects:
         assert isinstance(effect, Input)
-        begun = effect.feel(c, Signal(start, np.zeros_like(start), start, np.zeros_like(start)))
+        begun = effect.feel(c, Signal(start, nothing, start, nothing))
         passed = effect.feel(c, Signal(values, plan.steps, start, plan.ends))
-        values, start = (
-            np.where(on, np.take_along_axis(passed, lasting, axis=1), values),
-            np.where(on, begun, start),
-        )
+        values = np.where(on, np.take_along_axis(passed, lasting, axis=1), values)
+        start = np.where(on, begun, start)
     return {names[0]: values, **felt}
 
 
@@ -246,6 +259,7 @@ def _felt(runs: Runs, signals: Sequence[Array], begin: Array, end: Array) -> Arr
     """Means (L, S) of each lane's signal from `begin` to `end` (L, S)."""
     alike = begin.strides[0] == 0 and end.strides[0] == 0  # all lanes make the same steps
     result = np.empty((len(signals) if alike else len(begin), begin.shape[1]))
+    # All lanes of a run in one call, and of lanes that step alike only the first.
     by_run = np.argsort(runs.of, kind="stable")
     for lanes in np.split(by_run, np.flatnonzero(np.diff(runs.of[by_run])) + 1):
         run = runs.of[lanes[0]]
@@ -262,11 +276,13 @@ def _means(times: Array, values: Array, begin: Array, end: Array) -> Array:
     place = np.clip(np.searchsorted(times, begin, side="right") - 1, 0, times.size - 1)
     value: Array = values[place]
     last = np.clip(np.searchsorted(times, end, side="left") - 1, 0, times.size - 1)
+    # (1) only where the command changes within: elsewhere its value is exact, a quotient is not.
     crossing = last > place
     if crossing.any():
         area = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(times))])
         a, b = begin[crossing], end[crossing]
-        value[crossing] = (_area(times, values, area, b) - _area(times, values, area, a)) / (b - a)
+        over = _area(times, values, area, b) - _area(times, values, area, a)
+        value[crossing] = over / (b - a)  # (1)
     return value
 
 

@@ -70,26 +70,25 @@ class Simulated(Simulator):
         if doubled:
             raise InputError(f"effect {doubled[0]} is named twice")
         for effect, values in self.fixed:
-            there = [c.name for c in effect.on(self.system)]
-            if not 1 <= len(values) <= len(there):
+            names = [c.name for c in effect.on(self.system)]
+            if not 1 <= len(values) <= len(names):
                 raise InputError(
-                    f"effect {effect.name}: expected up to {len(there)} values ({', '.join(there)}), found {values}"
+                    f"effect {effect.name}: expected up to {len(names)} values"
+                    f" ({', '.join(names)}), found {values}"
                 )
         observed = [c.name for c in self.channels]
-        extra = tuple(
-            p for effect in self.effects for p in effect_parameters(effect, self.system, observed)
-        )
+        extra: list[Parameter] = []
+        for effect in self.effects:
+            extra += effect_parameters(effect, self.system, observed)
         self.parameters = (*self.system.parameters, *extra)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        # A simulator says what its system says: it is declared once.
         system = cls.system
         cls.name, cls.says = system.name, system.says
-        cls.parameters, cls.channels, cls.constants = (
-            system.parameters,
-            system.channels,
-            system.constants,
-        )
+        cls.parameters, cls.channels = system.parameters, system.channels
+        cls.constants = system.constants
         cls.inputs, cls.states = system.inputs, system.states
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
@@ -144,16 +143,15 @@ class Simulated(Simulator):
             plan = make_plan(runs, commands, _of(acting, (Input, Sensor)), self.engine.largest_step)
             inputs = felt_inputs(plan, runs, commands, _of(acting, Input)) if self.inputs else {}
             sensors = tuple((effect, c) for effect, c in _of(acting, Sensor) if c.any())
-            every = (
-                1
-                if any(isinstance(effect, Sensor) and effect.filters for effect, _ in sensors)
-                else plan.every
-            )
+            # A filter in a sensor sees every step; the others see the samples alone.
+            filtered = any(isinstance(effect, Sensor) and effect.filters for effect, _ in sensors)
+            every = 1 if filtered else plan.every
             own = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
             constants, x, v = self._known(scenarios, initial or {})
             forces = _of(acting, (Force, Friction, Contact))
             lanes = Lanes(self._declared, own, constants, x, v, plan.steps, inputs, forces, every)
             observations = self._read(self.engine.integrate(lanes), lanes, plan, sensors)
+        # A shorter run has waited at its end; what it showed there was no sample.
         sizes = np.array([s.times.size for s in runs.distinct])
         if sizes.min() < sizes.max():
             observations[np.arange(sizes.max()) >= sizes[runs.of, None]] = np.nan
@@ -175,37 +173,28 @@ class Simulated(Simulator):
             acting.append((effect, _coefficients(effect, theta[:, place : place + count].T)))
             place += count
         for effect, values in self.fixed:
-            acting.append(
-                (
-                    effect,
-                    _coefficients(effect, np.repeat(np.array(values)[:, None], len(theta), axis=1)),
-                )
-            )
+            rows = np.repeat(np.array(values)[:, None], len(theta), axis=1)
+            acting.append((effect, _coefficients(effect, rows)))
         return tuple(acting)
 
     def _known(
         self, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> tuple[dict[str, Array], Array, Array]:
         """Constants (L, 1) by name, initial positions and velocities (L, D)."""
+        # Checked once for each scenario object and not for each lane: there are hundreds of lanes.
         place: dict[int, int] = {}
         distinct: list[Scenario] = []
         for scenario in scenarios:
             if place.setdefault(id(scenario), len(distinct)) == len(distinct):
                 distinct.append(scenario)
         of = np.array([place[id(scenario)] for scenario in scenarios])
-        known, began = (
-            [self.run_constants(s) for s in distinct],
-            [self.run_initial(s) for s in distinct],
-        )
+        known = [self.run_constants(s) for s in distinct]
+        began = [self.run_initial(s) for s in distinct]
         constants = {name: np.array([row[name] for row in known])[of, None] for name in known[0]}
         states = {name: np.array([row[name] for row in began])[of] for name in began[0]}
         states = self._checked("initial state", states, initial)
-        x, v = (
-            np.stack([np.broadcast_to(states[name], of.shape) for name in names], axis=1)
-            if names
-            else np.empty((len(of), 0))
-            for names in (self.system.coordinates, self.system.rates)
-        )
+        x = _stacked(states, self.system.coordinates, of.size)
+        v = _stacked(states, self.system.rates, of.size)
         return constants, x, v
 
     def _read(self, motion: Motion, lanes: Lanes, plan: Plan, sensors: Acting) -> Array:
@@ -214,20 +203,21 @@ class Simulated(Simulator):
         names = [c.name for c in self.channels]
         valued = self.system.reading(names)
         times = _kept(plan, lanes.every)
+        steps = np.diff(times, axis=1, prepend=0.0)
+        # The plan's rows count samples; more states than that are kept where a sensor filters.
         rows = plan.rows * (plan.every // lanes.every)
         observations = np.empty((*rows.shape, len(names)))
         for place, name in enumerate(names):
             values, start = channels[name], channels[name][:, :1]
             for effect, c in sensors:
                 assert isinstance(effect, Sensor)
+                # Sensors in a row: each reads what the one before gives, also at the start, in
+                # which the next begins. A gain or bias is that of one channel.
                 if effect.filters or name == valued:
-                    begun = effect.read(
-                        c, Signal(start, np.zeros_like(start), start, np.zeros_like(start))
-                    )
-                    read = effect.read(
-                        c, Signal(values, np.diff(times, axis=1, prepend=0.0), start, times)
-                    )
-                    values, start = np.where(acts(c), read, values), np.where(acts(c), begun, start)
+                    on, nothing = acts(c), np.zeros_like(start)
+                    begun = effect.read(c, Signal(start, nothing, start, nothing))
+                    read = effect.read(c, Signal(values, steps, start, times))
+                    values, start = np.where(on, read, values), np.where(on, begun, start)
             observations[:, :, place] = _chosen(values, rows)
         observations += 0.0  # no zero is negative: whatever made it, it is the same zero
         return observations
@@ -240,9 +230,8 @@ def _kept(plan: Plan, every: int) -> Array:
 
 def _chosen(values: Array, rows: NDArray[np.intp]) -> Array:
     """values[l, rows[l, t]], without a copy where all of the first values are chosen."""
-    if (rows[:1] == np.arange(rows.shape[1])).all() and (
-        rows.strides[0] == 0 or (rows == rows[:1]).all()
-    ):
+    in_order = (rows[:1] == np.arange(rows.shape[1])).all()
+    if in_order and (rows.strides[0] == 0 or (rows == rows[:1]).all()):
         return values[:, : rows.shape[1]]
     chosen: Array = np.take_along_axis(values, rows, axis=1)
     return chosen
@@ -259,10 +248,18 @@ def effect_parameters(
         name = effect.name if len(there) == 1 else f"{effect.name}.{c.name}"
         low, high = c.range(system.kind)
         unit = c.unit_on(system, observed) or ""
-        result.append(
-            Parameter(name, unit, min(max(0.0, low), high), (low, high), says=effect.says)
-        )
+        off = min(max(0.0, low), high)  # nominally it is not there, if that is in its range
+        result.append(Parameter(name, unit, off, (low, high), says=effect.says))
     return tuple(result)
+
+
+def _stacked(states: Mapping[str, Array], names: Sequence[str], count: int) -> Array:
+    """The states of these names as columns (L, D)."""
+    if not names:
+        return np.empty((count, 0))
+    columns = [np.broadcast_to(states[name], (count,)) for name in names]
+    result: Array = np.stack(columns, axis=1)
+    return result
 
 
 def _row(name: str, value: float | Sequence[float]) -> tuple[float, ...]:

@@ -7,7 +7,12 @@ contribution through one hook. None of them knows the others' insides: they meet
 instant at which forces are asked for, and in `Lanes`, the work for an engine.
 
 Shapes: L lanes (a parameter vector in a run), D coordinates, S steps, K coefficients. Per-lane
-numbers are (L, 1), so that they multiply generalised vectors (L, D) as they stand.
+numbers are (L, 1), so that they multiply generalised vectors (L, D) as they stand. With the mass M,
+the drive U and what it works against, P (gravity alone in most systems: `passive`),
+
+    M x'' = U(x, v, u) - P(x, v) + forces of effects                       (1)
+
+less dry friction, which is added up over its effects and opposes the motion as one force.
 """
 
 from __future__ import annotations
@@ -26,7 +31,9 @@ from sims.base import Array, Channel, Constant, Parameter
 Kind = Literal["point", "linear", "rotary"]
 """How a system counts force: `point` per unit mass (m/s^2), `linear` in N, `rotary` in N*m."""
 KINDS: tuple[Kind, ...] = ("point", "linear", "rotary")
+"""All kinds, in the order of a coefficient's units and ranges."""
 STANDARD_GRAVITY = 9.80665
+"""m/s^2 (3rd General Conference on Weights and Measures, 1901)."""
 
 
 @dataclass
@@ -54,6 +61,7 @@ class Moment:
     @property
     def speed(self) -> Array:
         """(L, 1) magnitude of the velocity."""
+        # Exact in one dimension, where the root of a square would round and underflow.
         if self.v.shape[1] == 1:
             return np.abs(self.v)
         speed: Array = np.sqrt((self.v * self.v).sum(axis=1, keepdims=True))
@@ -80,9 +88,8 @@ class Moment:
         """(L, 1) what a transmission carries: the drive from one side plus what it works against
         from the other.
         """
-        load: Array = np.abs(self.system.drive(self) + self.system.passive(self)).sum(
-            axis=1, keepdims=True
-        )
+        carried = self.system.drive(self) + self.system.passive(self)
+        load: Array = np.abs(carried).sum(axis=1, keepdims=True)
         return load
 
     @property
@@ -190,7 +197,7 @@ class System(ABC):
 
     def force(self, moment: Moment) -> Array:
         """(L, D) generalised force of the system itself, without effects: what engines integrate."""
-        return self.drive(moment) - self.passive(moment)
+        return self.drive(moment) - self.passive(moment)  # (1)
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
         """(L, D) generalised force of one m/s^2 of horizontal acceleration along `axis`; zero where
@@ -302,18 +309,18 @@ class Effect(ABC):
     def misses(cls, system: System | type[System]) -> str:
         """What keeps the system from having this effect; empty if it can have it."""
         declared = system if isinstance(system, type) else type(system)
+        heavy = any(c.name == "gravity" for c in system.constants)
+        says_push = declared.push is not System.push
+        in_space = len(system.coordinates) == 3
         lacks = {
             "": "",
             "input": "" if system.inputs else "it has no input",
             "ground": "" if system.bounces else "it meets no ground",
+            # What bounces flies freely: dry friction and springs have nothing to hold on to.
             "guide": "it flies freely" if system.bounces else "",
-            "gravity": ""
-            if any(c.name == "gravity" for c in system.constants)
-            else "it states no gravity",
-            "push": "it does not say what horizontal acceleration does"
-            if declared.push is System.push
-            else "",
-            "space": "" if len(system.coordinates) == 3 else "it does not move in three dimensions",
+            "gravity": "" if heavy else "it states no gravity",
+            "push": "" if says_push else "it does not say what horizontal acceleration does",
+            "space": "" if in_space else "it does not move in three dimensions",
         }[cls.needs]
         undefined = "" if cls.on(system) else f"it is not defined for a {system.kind} system"
         return lacks or undefined or system.refuses(cls)
@@ -321,6 +328,7 @@ class Effect(ABC):
     @classmethod
     def on(cls, system: System | type[System]) -> tuple[Coefficient, ...]:
         """The coefficients that the effect has on this system."""
+        # Those that the kind does not have come last, so the others are the first ones.
         return tuple(takewhile(lambda c: c.unit(system.kind) is not None, cls.coefficients))
 
 

@@ -16,6 +16,7 @@ NAMES = {
     "mujoco": "sims.engines.mujoco",
     "pybullet": "sims.engines.bullet",
 }
+"""Modules of the engines; one is imported when it is asked for, and says what it requires."""
 
 
 def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -> Engine:
@@ -33,11 +34,9 @@ def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -
         raise InputError(
             f"engine {name} needs {', '.join(missing)}, not installed (pip install {' '.join(missing)})"
         )
-    known = [
-        key
-        for key, p in inspect.signature(module.engine).parameters.items()
-        if p.kind is p.KEYWORD_ONLY
-    ]
+    # An engine's settings are the keyword arguments of what makes it: they are declared once.
+    parameters = inspect.signature(module.engine).parameters
+    known = [key for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY]
     for setting in settings:
         if setting not in known:
             raise unknown(f"setting of engine {name}", setting, known)

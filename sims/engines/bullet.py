@@ -28,10 +28,15 @@ from sims.system import Engine, Lanes, Motion, System
 REQUIRES = ("pybullet",)
 
 _PUBLISHED = {"linear_damping": 0.04, "lateral_friction": 0.2, "plane_restitution": 1.0}
+"""Settings of the published scene (TuneNet, arXiv 1907.11200): 1/s, and pure numbers."""
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+"""A body that is not turned, as a quaternion x, y, z, w."""
 _NOWHERE = (0.0, 0.0, 0.0)
-_IMPACT = 1e-4  # seconds: step of an impact
-_REACH = 0.02 * math.sqrt(3)  # Bullet's contact begins this many radii above the ground
+"""The origin, or no velocity at all."""
+_IMPACT = 1e-4
+"""Seconds that the step of an impact lasts."""
+_REACH = 0.02 * math.sqrt(3)
+"""Radii above the ground at which Bullet's contact begins."""
 
 
 def engine(
@@ -158,20 +163,18 @@ class Joint:
 
     def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
         """Steps with a force or torque at the joint."""
-        p, client, body, found = bullet.engine(), self._client, self._body, []
-        step, push, torque, read = (
-            p.stepSimulation,
-            p.setJointMotorControl2,
-            p.TORQUE_CONTROL,
-            p.getJointState,
-        )
+        p, client, body = bullet.engine(), self._client, self._body
+        # Looked up once: a rollout has thousands of each.
+        step, push, torque = p.stepSimulation, p.setJointMotorControl2, p.TORQUE_CONTROL
+        read = p.getJointState
+        states = []
         for count in counts:
             for _ in range(count):
                 if force:  # Bullet forgets applied torques after each step
                     push(body, 0, torque, force=force, physicsClientId=client)
                 step(client)
-            found.append(read(body, 0, client)[:2])
-        return found
+            states.append(read(body, 0, client)[:2])
+        return states
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity", "open_loop")}
@@ -192,8 +195,9 @@ class _Mover:
         p = bullet.engine()
         self._mass, self._contact = constants["mass"], (math.nan, math.nan)
         self._client, self._body = self._world.body(constants)
-        # Contact points outlive a reset and would be taken for old: they are dropped where the ball
-        # touches nothing.
+        # The world is reset in place: building one is half the cost of a rollout. But contact points
+        # outlive a reset and would be taken for old, which changes what follows by rounding. They
+        # are dropped where the ball touches nothing.
         far = 0.0, 0.0, 2.0 * constants["radius"] + 1.0
         p.resetBasePositionAndOrientation(self._body, far, _UPRIGHT, self._client)
         p.performCollisionDetection(self._client)
@@ -210,6 +214,7 @@ class _Mover:
 
     def advance(self, force: Vector) -> State:
         """One step with a force at the centre, which is where it was last placed or read."""
+        # Forces come per unit mass, Bullet wants newtons and where they attack.
         p, mass = bullet.engine(), self._mass
         newtons = mass * force[0], mass * force[1], mass * force[2]
         p.applyExternalForce(self._body, -1, newtons, self._x, p.WORLD_FRAME, self._client)
@@ -219,13 +224,13 @@ class _Mover:
         """Steps under gravity."""
         p, client, body = bullet.engine(), self._client, self._body
         step, at, moving = p.stepSimulation, p.getBasePositionAndOrientation, p.getBaseVelocity
-        found: list[State] = []
+        states: list[State] = []
         for count in counts:
             for _ in range(count):
                 step(client)
-            found.append((at(body, client)[0], moving(body, client)[0]))
-        self._x = found[-1][0]
-        return found
+            states.append((at(body, client)[0], moving(body, client)[0]))
+        self._x = states[-1][0]
+        return states
 
     def touch(self, restitution: float, friction: float) -> None:
         """The ball's restitution and friction."""
@@ -253,18 +258,19 @@ class Ball(_Mover):
 
     def _meets(self, ground: bool) -> None:
         """Let contact act or not."""
+        # In flight contact is off: where the ground is met is found by the flight itself.
         p = bullet.engine()
-        p.setCollisionFilterPair(
-            p.getBodyUniqueId(0, self._client), self._body, -1, -1, ground, self._client
-        )
+        floor = p.getBodyUniqueId(0, self._client)
+        p.setCollisionFilterPair(floor, self._body, -1, -1, ground, self._client)
 
     def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
         """Bullet's contact solver on one short step, gravity made up for."""
         self.touch(restitution, friction)
         self.pace(_IMPACT)
-        self.place(
-            (x[0], x[1], self._floor - flight.INSIDE), (v[0], v[1], v[2] + self._gravity * _IMPACT)
-        )
+        # Bullet adds gravity's share of the step before it solves the contact: what it then finds
+        # is v.
+        inside = x[0], x[1], self._floor - flight.INSIDE
+        self.place(inside, (v[0], v[1], v[2] + self._gravity * _IMPACT))
         self._meets(True)
         _, after = self.glide((1,))[0]
         self._meets(False)
@@ -296,6 +302,8 @@ class NativeBall(_Mover):
         """
         if (restitution, friction) == self._contact:
             return
+        # The contact has the product of both bodies' frictions: with the ground's 1, the ball's own
+        # is the sum of what the settings' product was and what the effect adds.
         own, ground = self._rough, self._rough
         if friction:
             own, ground = self._rough**2 + friction, 1.0

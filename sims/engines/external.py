@@ -3,13 +3,23 @@ engine's interface.
 
 Bullet and MuJoCo (with its Euler integrator) step alike, by semi-implicit Euler: with step h,
 
-    w' = w + h (G(x) + F) / M,    x' = x + h w'
+    w' = w + h (G(x) + F) / M                                              (1)
+    x' = x + h w'                                                          (2)
 
 where G is the gravity that the engine itself applies and F is what is put in from outside. That is
 of first order if w is read as the velocity at the time of x, and of second if it is read as the one
 half a step before (leapfrog; Hairer, Lubich, Wanner, Acta Numerica 12, 2003,
-doi:10.1017/S0962492902000144). `sims.engines.joint` and `sims.engines.flight` read it so: they
-choose F such that the engine's velocity ends where half a step's force takes the velocity at x.
+doi:10.1017/S0962492902000144), with a(x) the acceleration there:
+
+    w = v - h/2 a(x)                                                       (3)
+
+`sims.engines.joint` and `sims.engines.flight` read it so: they choose F such that the engine's
+velocity ends where half a step's force takes the velocity at x.
+
+Dry friction of limit L leaves of a force F, at velocity v,
+
+    F - L sign(v)                      where v is not 0                    (4)
+    F - L sign(F), or 0 if |F| <= L    where v is 0                        (5)
 """
 
 from __future__ import annotations
@@ -24,9 +34,9 @@ from numpy.typing import NDArray
 from sims.base import Array, InputError
 from sims.system import Acting, Contact, Force, Friction, Lanes, Moment, Motion, System
 
-# Sample times may miss the engine's steps by this share of an interval: recordings round their time
-# stamps.
 TIME_TOLERANCE = 1e-6
+"""Share of an interval by which sample times may miss the engine's steps: recordings round their
+time stamps."""
 
 DEFAULT_STEPS = {"point": 1 / 120, "linear": 2.5e-3, "rotary": 2.5e-3}
 """Longest step in seconds where the user sets none, by the system's kind."""
@@ -93,6 +103,7 @@ class Forces:
         inputs = {name: np.full((rows, 1), signal[0]) for name, signal in lane.inputs.items()}
         self.moment = lane.moment(np.zeros((rows, 1)), np.zeros(shape), np.zeros(shape), inputs)
         self._system, self._inputs = lane.system, inputs
+        # Most systems have no passive force but gravity, which the engine applies by itself.
         self._more = type(lane.system).passive is not System.passive
         self._driven = bool(inputs) or self._more
         acting = [(effect, np.repeat(c, rows, axis=1)) for effect, c in lane.effects]
@@ -110,6 +121,7 @@ class Forces:
         """(rows, D) generalised force at `moment`, friction apart."""
         total = self._system.drive(self.moment) if self._driven else self._nothing
         if self._more:
+            # What the drive works against, less the gravity that is the engine's own.
             total = total - self._system.passive(self.moment) - self._system.weight(self.moment)
         for effect, c in self._forces:
             total = total + effect.force(c, self.moment)
@@ -125,8 +137,8 @@ def rate(velocity: float, force: float, limit: float) -> float:
     if not limit:
         return force
     if velocity:
-        return force - math.copysign(limit, velocity)
-    return force - math.copysign(limit, force) if abs(force) > limit else 0.0
+        return force - math.copysign(limit, velocity)  # (4)
+    return force - math.copysign(limit, force) if abs(force) > limit else 0.0  # (5)
 
 
 def kick(velocity: float, force: float, limit: float, inverse: float, duration: float) -> float:
@@ -146,6 +158,7 @@ def kick(velocity: float, force: float, limit: float, inverse: float, duration: 
         after = velocity + slope * duration
         if after * velocity >= 0:
             return after
+        # It came to rest on the way, -v / slope after the beginning; the time left begins there.
         duration += velocity / slope
         velocity = 0.0
     return velocity + rate(velocity, force, limit) * inverse * duration
@@ -167,9 +180,11 @@ def integrate(lanes: Lanes, rollout: Callable[[Lane], Path], discard: Callable[[
     shape = (len(lanes.theta), count, lanes.x.shape[1])
     motion = Motion(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan))
     for i in range(len(lanes.theta)):
+        # Lanes of one run follow each other and make the same steps.
         if i == 0 or not np.array_equal(lanes.steps[i], lanes.steps[i - 1]):
             timing = _timing(lanes.steps[i], lanes.every)
         lane = _lane(lanes, i, *timing[:3])
+        # A rollout that must fail would cost the engine its world.
         if not all(np.isfinite(values).all() for values in _given(lane)):
             continue
         try:
@@ -189,6 +204,7 @@ def _timing(steps: Array, every: int) -> tuple[Places, Array, Places, Places]:
     """Which steps are taken, their lengths, how many precede the states to keep, and which of these
     each record is.
     """
+    # A state behind a step of no length is the one before it: records share their rows.
     moving = np.flatnonzero(steps > 0)
     taken = np.concatenate([[0], np.cumsum(steps > 0)])[::every]
     kept, rows = np.unique(taken, return_inverse=True)
@@ -236,6 +252,8 @@ def evened(steps: Array, every: int) -> Array:
     """
     if not steps.size:
         return steps
+    # By how much the sample times are missed counts, and not by how much each step differs: errors
+    # of rounded time stamps do not add up.
     even = math.fsum(steps) / steps.size
     missed = np.abs(np.cumsum(steps) - even * np.arange(1, steps.size + 1)).max()
     return np.full(steps.size, even) if missed <= TIME_TOLERANCE * even * every else steps
@@ -253,6 +271,7 @@ def legs(lane: Lane, *signals: Array) -> list[tuple[int, list[int]]]:
     new[:1] = True
     for values in (lane.steps, *signals):
         new[1:] |= values[1:size] != values[: size - 1]
+    # The engine is stopped where a leg begins and where a state is to be kept.
     stops = new.copy()
     stops[lane.kept[lane.kept < size]] = True
     begins = np.flatnonzero(stops)

@@ -2,11 +2,24 @@
 where they happen.
 
 In flight the engine's velocity w is the one half a step before the position (see
-`sims.engines.external`): with acceleration a, a step of length h goes w = v + h a / 2, x' = x + h
-w, v' = w + h a' / 2. Under gravity alone that is the exact parabola. A step in which x + h v + h^2
-a / 2 would pass the ground is cut where it meets it; there the engine solves the contact in a step
-of its own, of which only the change of velocity counts, and the rest of the step follows. The error
-of an impact is thus that of the flight, of second order in h, and none under gravity alone.
+`sims.engines.external`): with acceleration a, a step of length h is
+
+    w' = v + h/2 a                                                         (1)
+    x' = x + h w'                                                          (2)
+    v' = w' + h/2 a'                                                       (3)
+
+where the engine adds gravity g by itself and is given, beside it, what takes its velocity to (1):
+
+    f = (v + h/2 a - w) / h - g                                            (4)
+
+Under gravity alone that is the exact parabola. A step that would pass the ground is cut where it
+meets it: from height H above it, with upward speed u and upward acceleration l,
+
+    s = (u + r) / -l = 2 H / (r - u),    r = sqrt(u^2 - 2 l H)             (5)
+
+seconds away. There the engine solves the contact in a step of its own, of which only the change of
+velocity counts, and the rest of the step follows. The error of an impact is thus that of the
+flight, of second order in h, and none under gravity alone.
 
 When bouncing is over is agreed with the batch engine (`sims.engines.ground`).
 """
@@ -20,8 +33,10 @@ from typing import Protocol
 from sims.engines.external import Lane, Path, legs
 from sims.engines.point import Impact, Pull, State, Vector, gravity, path_of
 
-_NO_TIME = 1e-12  # seconds that are not worth a step
-INSIDE = 1e-9  # metres inside the ground: where contact is beyond rounding
+_NO_TIME = 1e-12
+"""Seconds that are not worth a step."""
+INSIDE = 1e-9
+"""Metres inside the ground at which a ball is placed where contact must act beyond rounding."""
 
 
 class Mover(Protocol):
@@ -71,8 +86,9 @@ def rollout(ball: Ball, lane: Lane) -> Path:
     kept, steps = set(lane.kept.tolist()), lane.steps.tolist()
     rows = [flight.state]
     for begin, counts in legs(lane):
-        found = flight.leg(steps[begin], counts)
-        rows.extend(found if begin + sum(counts) in kept else found[:-1])
+        states = flight.leg(steps[begin], counts)
+        # A leg may end between two samples, where nothing is kept.
+        rows.extend(states if begin + sum(counts) in kept else states[:-1])
         if not math.isfinite(sum(flight.state)):
             break
     return path_of(lane, rows)
@@ -110,9 +126,10 @@ class _Flight:
         """So many steps, and so many again, and so on; the state reached each time."""
         if self._pull.any:
             return [self._stepwise(step, count) for count in counts]
-        found: list[tuple[float, ...]] = []
+        states: list[tuple[float, ...]] = []
         left = list(counts)
         while left:
+            # Steps until the impact: as many whole samples as fit go to the engine in one call.
             room = math.inf if self._rests else self._time_to_ground() / step
             whole = 0
             for count in left:
@@ -121,21 +138,23 @@ class _Flight:
                 room -= count
                 whole += 1
             if whole:
-                found.extend(self._glide(step, left[:whole]))
+                states.extend(self._glide(step, left[:whole]))
                 left = left[whole:]
                 continue
+            # Then the whole steps before the impact, and the one that it cuts.
             if room >= 1.0:
                 self._glide(step, (int(room),))
             self._meet(step)
             left[0] -= int(room) + 1
             if not left[0]:
-                found.append(self.state)
+                states.append(self.state)
                 left = left[1:]
-        return found
+        return states
 
     def _stepwise(self, step: float, count: int) -> tuple[float, ...]:
         """Steps that ask for the forces; the state they reach."""
         for _ in range(count):
+            # What lies on the ground and is pulled upward flies again.
             if self._rests and self._lift > 0.0:
                 self._rests, self._w = False, None
                 self._look()
@@ -162,10 +181,12 @@ class _Flight:
 
     def _ready(self, step: float) -> Vector:
         """Make the engine step so, placed if it must be; its velocity."""
+        # The velocity half a step before is another one for another step.
         if step != self._step:
             self._ball.pace(step)
             self._step, self._w = step, None
         if self._w is None:
+            # (1) backwards, from the step before.
             (x, y, z), (ax, ay, az), half = self._v, self._a, 0.5 * step
             self._w = x - half * ax, y - half * ay, z - half * az
             self._ball.place(self._x, self._w)
@@ -176,9 +197,9 @@ class _Flight:
         self._ready(step)
         ax, ay, az = self._a
         x, y, z = 0.5 * step * ax, 0.5 * step * ay, 0.5 * step * az
-        found = self._ball.glide(counts)
-        self._x, self._w = found[-1]
-        states = [(*at, w[0] + x, w[1] + y, w[2] + z, ax, ay, az) for at, w in found]
+        reached = self._ball.glide(counts)
+        self._x, self._w = reached[-1]
+        states = [(*at, w[0] + x, w[1] + y, w[2] + z, ax, ay, az) for at, w in reached]  # (3)
         self._v = states[-1][3:6]
         return states
 
@@ -187,11 +208,14 @@ class _Flight:
         half = 0.5 * step
         (wx, wy, wz), (x, y, z) = self._ready(step), self._v
         (ax, ay, az), (gx, gy, gz) = self._a, self._gravity
+        # (4); at rest the engine's contact bears whatever presses the ball on the ground.
         lift = self._lift - gz if self._rests else (z + half * az - wz) / step - gz
         force = (x + half * ax - wx) / step - gx, (y + half * ay - wy) / step - gy, lift
         self._x, self._w = self._ball.advance(force)
         self._time += step
         wx, wy, wz = self._w
+        # The acceleration at the end is asked for at the velocity that (3) gives with that at the
+        # beginning, and (3) is taken with what comes back.
         self._v = 2.0 * wx - x, 2.0 * wy - y, 0.0 if self._rests else 2.0 * wz - z
         self._look()
         ax, ay, az = self._a
@@ -212,6 +236,7 @@ class _Flight:
         """
         gap, rate, lift = max(self._x[2] - self._floor, 0.0), self._v[2], self._a[2]
         inside = rate * rate - 2.0 * lift * gap
+        # (5): of its two forms the one in which no digits are lost.
         if rate > 0.0 or (rate == 0.0 and lift < 0.0):
             return (rate + math.sqrt(inside)) / -lift if lift < 0.0 else math.inf
         if inside < 0.0 or (rate == 0.0 and lift >= 0.0):
@@ -220,17 +245,18 @@ class _Flight:
 
     def _strike(self) -> None:
         speed = -self._v[2]
-        self._w = None
+        self._w = None  # whatever contact makes of the velocity, the engine must be told
         restitution, friction, over = self._contact.law(max(speed, 0.0), -self._a[2])
         if speed > 0.0:
             self._v = self._ball.strike(self._x, self._v, restitution, friction)
-            self._step = math.nan
+            self._step = math.nan  # the engine's own step was that of the contact
         if over:
             self._rest()
         self._look()
 
     def _rest(self) -> None:
         self._rests = True
+        # A little inside, so that the engine's contact acts from the first step on.
         self._x = self._x[0], self._x[1], min(self._x[2], self._floor - INSIDE)
         self._v = self._v[0], self._v[1], 0.0
         self._ball.hold()

@@ -3,15 +3,33 @@
 The engine's velocity w is the one half a step before the position. With force f(t, x, v, u) beside
 the gravity G(x), each step of length h from (x, v) is
 
-    start:  w  = v + h/2 (G(x) + f(t, x, v, u)) / M          put in as one force over the step
-    engine: x' = x + h w
-    end:    v' = w + h/2 (G(x') + f(t', x', v', u)) / M      solved for v' by one Newton step
+    start:  w  = v + h/2 (G(x) + f(t, x, v, u)) / M                        (1)
+    engine: x' = x + h w                                                   (2)
+    end:    v' = w + h/2 (G(x') + f(t', x', v', u)) / M                    (3)
 
-so that damping, however strong, is stable (the two halves together are the trapezoidal rule in v),
-and dry friction is exact in each half (`external.kick`). Where nothing acts but inputs and viscous
-damping c, the engine's own joint damping carries it, explicit in w: w' = w + h (T - c w) / J with J
-= M + h c / 2 is w' - w = h (T - c (w + w') / 2) / M, damping at the midpoint, and the engine need
-not be interrupted.
+where (1) is put in as one force over the step,
+
+    F = (w - w_before) M / h - G(x)                                        (4)
+
+and (3) is solved for v' by one Newton step, so that damping, however strong, is stable (the two
+halves together are the trapezoidal rule in v), and dry friction is exact in each half
+(`external.kick`).
+
+Where nothing acts but inputs and viscous damping c, the engine's own joint damping carries it,
+explicit in w, and the engine need not be interrupted. With J = M + h c / 2 in place of M,
+
+    w' = w + h (T - c w) / J,  which is  w' - w = h (T - c (w + w') / 2) / M    (5)
+
+has its damping at the midpoint, so that v = (w + w') / 2 is the velocity at x. From the engine's
+velocity half a step before x, and back to it,
+
+    v = (w + h/2 (G + u) / M) / (1 + h/2 c / M)                            (6)
+    w = (1 + h/2 c / M) v - h/2 (G + u) / M                                (7)
+
+and where the input goes from u to u', the step has half a kick of each: w' - w = h (G + (u + u') /
+2 - c v) / M with v of (6) is (5) with T = G plus
+
+    u' + (1/2 - h c / (4 M)) (u - u')                                      (8)
 """
 
 from __future__ import annotations
@@ -27,7 +45,8 @@ from sims.base import Array
 from sims.engines.external import Forces, Lane, Path, kick, legs, rate
 from sims.engines.scalar import Resistance, is_library, resistance
 
-_NUDGE = 1e-3  # change of velocity over which the slope of the force is taken
+_NUDGE = 1e-3
+"""Change of velocity (m/s or rad/s) over which the slope of the force is taken."""
 
 
 class Joint(Protocol):
@@ -69,6 +88,8 @@ def rollout(joint: Joint, lane: Lane) -> Path:
     """Integrate one lane; NaN where the engine cannot represent it."""
     joint.start(lane.numbers)
     inertia = float(lane.system.mass(lane.theta, lane.constants)[0, 0])
+    # Three ways, the quickest that carries all that acts: asking the effects for their force takes
+    # longer than the engine's own step.
     opposing = resistance(lane) if joint.open_loop else None
     if opposing is None:
         return _driven(joint, lane, inertia, _Asked(joint, lane, inertia))
@@ -99,28 +120,32 @@ def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
     for begin, counts in legs(lane, drive):
         h, u, end = steps[begin], forces[begin], begin + sum(counts)
         if h != step:
+            # The velocity half a step before is another one for another step.
             if begin:
                 v = _whole(w, joint.gravity(x) + felt, inertia, damping, step)
-            if not joint.pace(h, inertia + 0.5 * h * damping, damping):
+            if not joint.pace(h, inertia + 0.5 * h * damping, damping):  # (5)
                 break
             half = 0.5 * h / inertia
-            joint.place(x, (1.0 + half * damping) * v - half * (joint.gravity(x) + u))
-        elif u != felt:  # this step has half a kick of each
-            joint.advance(u + (0.5 - 0.25 * h * damping / inertia) * (felt - u))
+            joint.place(x, (1.0 + half * damping) * v - half * (joint.gravity(x) + u))  # (7)
+        elif u != felt:
+            joint.advance(u + (0.5 - 0.25 * h * damping / inertia) * (felt - u))  # (8)
             counts[0] -= 1
-        found = joint.glide(u, counts)
-        x, w = found[-1]
+        states = joint.glide(u, counts)
+        x, w = states[-1]
         if not math.isfinite(x + w):
             break
         step, felt = h, u
-        rows.extend((*state, h, u) for state in (found if end in kept else found[:-1]))
+        # A leg may end between two samples, where the input changes and nothing is kept.
+        rows.extend((*state, h, u) for state in (states if end in kept else states[:-1]))
     if len(rows) < lane.kept.size:
         return _failed(lane)
+    # Velocities are read off at the end, all at once: the engine ran without interruption.
     positions, w_at, step_at, felt_at = np.array(rows).T
     force = _weights(lane, positions) + felt_at
     rates = _whole(w_at, force, inertia, damping, step_at)
     rates[0] = lane.v[0]
-    return positions[:, None], rates[:, None], ((force - damping * rates) / inertia)[:, None]
+    accelerations = (force - damping * rates) / inertia
+    return positions[:, None], rates[:, None], accelerations[:, None]
 
 
 def _whole(w: Any, force: Any, inertia: float, damping: float, step: Any) -> Any:
@@ -128,7 +153,7 @@ def _whole(w: Any, force: Any, inertia: float, damping: float, step: Any) -> Any
     on the position.
     """
     half = 0.5 * step / inertia
-    return (w + half * force) / (1.0 + half * damping)
+    return (w + half * force) / (1.0 + half * damping)  # (6)
 
 
 def _driven(joint: Joint, lane: Lane, inertia: float, forces: _Forces) -> Path:
@@ -142,19 +167,21 @@ def _driven(joint: Joint, lane: Lane, inertia: float, forces: _Forces) -> Path:
     for i, h in enumerate(lane.steps.tolist()):
         if forces.feel(i):
             forces.look(t, x, v)
-        start = kick(v, forces.force(v), forces.limit, inverse, 0.5 * h)
+        start = kick(v, forces.force(v), forces.limit, inverse, 0.5 * h)  # (1)
         if h != step:
             if not joint.pace(h, inertia, 0.0):
                 break
             w = 2.0 * v - start  # so that the force put in is the force there is
             joint.place(x, w)
             step = h
-        x, w = joint.advance((start - w) * inertia / h - forces.weight)
+        x, w = joint.advance((start - w) * inertia / h - forces.weight)  # (4), (2)
         if not math.isfinite(x + w):
             break
         t += h
+        # Forces are asked for where the velocity would be without a change of force: w lies in the
+        # middle between v and that.
         forces.look(t, x, 2.0 * w - v)
-        v = forces.end(w, h)
+        v = forces.end(w, h)  # (3)
         if i + 1 in kept:
             rows.append((x, v, forces.acceleration(v)))
     if len(rows) < lane.kept.size:
@@ -191,6 +218,8 @@ class _Forces(ABC):
         """The velocity half a step after `w`, the force being the one at its end; a growing force
         is taken as is.
         """
+        # (3) with f linear in v about the last look: its slope goes over to the side of the inertia.
+        # A growing force would make that side smaller, down to nothing.
         slope = min(self._slope, 0.0)
         force = self._force + slope * (w - self._at)
         return kick(w, force, self.limit, 1.0 / (self._inertia - 0.5 * step * slope), 0.5 * step)
@@ -210,6 +239,7 @@ class _Asked(_Forces):
 
     def feel(self, i: int) -> bool:
         """See `_Forces`."""
+        # The first step has none before it, not even an equal one.
         changed = i == 0 or any(values[i] != values[i - 1] for values in self._signals.values())
         if changed:
             self._ask.feel({name: values[i] for name, values in self._signals.items()})

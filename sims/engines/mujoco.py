@@ -21,8 +21,10 @@ from sims.system import Engine, Lanes, Motion, System
 
 REQUIRES = ("mujoco",)
 
-_STIFFNESS = 1e5  # 1/s^2
-_OWN_STEP = 2e-3  # seconds: the step MuJoCo takes by default
+_STIFFNESS = 1e5
+"""1/s^2, of `native_contact` where the user sets none: contacts then last 10 ms."""
+_OWN_STEP = 2e-3
+"""Seconds: the step that MuJoCo takes by default."""
 
 
 def engine(

@@ -1,16 +1,23 @@
 """Bodies in MuJoCo: on a joint, and a ball over level ground.
 
-MuJoCo's contact asks for an acceleration a_ref = -b v - k r along the normal, of which it gives the
-share d: with what would happen without contact a_0, a = (1 - d) a_0 + d a_ref, never pulling
+MuJoCo's contact asks for an acceleration along the normal, of which it gives the share d: with r
+the depth, v its rate, and a_0 what would happen without contact,
+
+    a_ref = -b v - k r                                                     (1)
+    a = (1 - d) a_0 + d a_ref, never pulling                               (2)
+
 ("Solver parameters", https://mujoco.readthedocs.io/en/stable/modeling.html#solver-parameters).
 Written as ``solref = (-stiffness, -damping)`` with constant impedance d and no stiffness, a_ref =
 -(damping / d) v, so that with
 
-    damping = (1 + e) / h
+    damping = (1 + e) / h                                                  (3)
 
 a single step of length h from the surface, other forces made up for (a_0 = 0), takes v to v - (1 +
-e) v = -e v: exactly the restitution e, for any h. A resting ball is held by damping 1 / h and
-stiffness 0.1 / h^2, which let it sink in by 10 (1 - d) g h^2. MuJoCo's friction is a convex
+e) v = -e v: exactly the restitution e, for any h. A resting ball is held by
+
+    damping = 1 / h,    stiffness = 0.1 / h^2                              (4)
+
+which let it sink in by 10 (1 - d) g h^2. MuJoCo's friction is a convex
 relaxation that turns slip into lift (Todorov, ICRA 2014, doi:10.1109/ICRA.2014.6907751), so contact
 is frictionless here and the tangential speed lost in an impact goes in as an impulse, through
 ``qfrc_applied`` in the step of the impact.
@@ -27,9 +34,12 @@ from sims.engines import flight
 from sims.engines.point import State, Vector
 from sims.engines.worlds import MujocoJointModule
 
-_IMPACT = 1e-4  # seconds: step of an impact; MuJoCo takes accelerations above 1e10 for a failure
-_IMPEDANCE = 0.9999  # the largest MuJoCo allows
-_MOST_DAMPED = 2.0  # damping ratio
+_IMPACT = 1e-4
+"""Seconds that the step of an impact lasts; MuJoCo takes accelerations above 1e10 for a failure."""
+_IMPEDANCE = 0.9999
+"""Share d of the acceleration asked for that contact gives: the largest MuJoCo allows."""
+_MOST_DAMPED = 2.0
+"""Largest damping ratio of a springy contact."""
 
 
 @functools.cache
@@ -65,10 +75,11 @@ class World:
         if self._built_for != constants:
             mujoco = library()
             self._model = mujoco.MjModel.from_xml_string(self._compile(constants))
-            self._model.opt.disableflags |= (
-                mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-            )  # joint damping is explicit
-            self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+            disabled = mujoco.mjtDisableBit
+            # Joint damping explicit, as in Bullet and as `sims.engines.joint` takes it to be.
+            self._model.opt.disableflags |= disabled.mjDSBL_EULERDAMP
+            # A lane that fails must be NaN: MuJoCo would start it again, and it would pass for done.
+            self._model.opt.disableflags |= disabled.mjDSBL_AUTORESET
             self._data = mujoco.MjData(self._model)
             self._built_for = dict(constants)
         else:
@@ -113,13 +124,14 @@ class Joint:
 
     def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
         """Steps with a force or torque at the joint."""
-        found = []
+        states = []
         self._force[0] = force
         for count in counts:
+            # None where `joint` has taken the step itself, with an input of its own.
             if count:
                 self._step(self._model, self._data, count)
-            found.append((self._x.item(), self._w.item()))
-        return found
+            states.append((self._x.item(), self._w.item()))
+        return states
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity", "open_loop")}
@@ -134,11 +146,8 @@ class _Mover:
     def start(self, constants: dict[str, float]) -> None:
         """A world for these constants, as newly made, without contact."""
         mujoco = library()
-        self._mass, self._floor, self._gravity = (
-            constants["mass"],
-            constants["radius"],
-            constants["gravity"],
-        )
+        self._mass, self._floor = constants["mass"], constants["radius"]
+        self._gravity = constants["gravity"]
         self._model, self._data = self._world.fresh(constants)
         self._x, self._w, self._force = self._data.qpos, self._data.qvel, self._data.qfrc_applied
         self._no_contact = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -177,11 +186,11 @@ class _Mover:
 
     def glide(self, counts: Sequence[int]) -> list[State]:
         """Steps under gravity."""
-        found: list[State] = []
+        states: list[State] = []
         for count in counts:
             self._step(self._model, self._data, count)
-            found.append((self._x.tolist(), self._w.tolist()))
-        return found
+            states.append((self._x.tolist(), self._w.tolist()))
+        return states
 
     def __getstate__(self) -> dict[str, Any]:
         return {
@@ -201,7 +210,7 @@ class Ball(_Mover):
         """Step in seconds."""
         super().pace(step)
         if self._held:
-            self._contact(0.1 * self._hertz**2, self._hertz)
+            self._contact(0.1 * self._hertz**2, self._hertz)  # (4)
 
     def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
         """MuJoCo's contact solver on one short step, gravity made up for, friction put in as an
@@ -210,11 +219,11 @@ class Ball(_Mover):
         self._held = False
         self.pace(_IMPACT)
         self.place((x[0], x[1], self._floor - flight.INSIDE), v)
-        self._contact(0.0, (1.0 + restitution) * self._hertz)
+        self._contact(0.0, (1.0 + restitution) * self._hertz)  # (3)
+        # Of the tangential speed mu (1 + e) |vn| goes (`sims.engines.ground`), in this one step.
         along = math.hypot(v[0], v[1])
-        lost = (
-            min(friction * (1.0 + restitution) * -v[2] / along, 1.0) * self._hertz if along else 0.0
-        )
+        share = min(friction * (1.0 + restitution) * -v[2] / along, 1.0) if along else 0.0
+        lost = share * self._hertz
         self._meets(True)
         _, after = self.advance((-lost * v[0], -lost * v[1], self._gravity))
         self._meets(False)
@@ -224,6 +233,7 @@ class Ball(_Mover):
         """Contact that damps and, very little, springs."""
         self._held = True
         self._meets(True)
+        # (4) depends on the step: where one is set already, contact is set for it.
         if not math.isnan(self._hertz):
             self.pace(1.0 / self._hertz)
 
@@ -250,9 +260,9 @@ class SoftBall(_Mover):
         """Damping that gives this restitution if the step is short; friction."""
         if (restitution, friction) != self._touched:
             self._touched = restitution, friction
-            self._contact(
-                self._stiffness, 2.0 * damping_ratio(restitution) * math.sqrt(self._stiffness)
-            )
+            # Of a spring of k and a damper of b per unit mass, the damping ratio is b / (2 sqrt k).
+            damping = 2.0 * damping_ratio(restitution) * math.sqrt(self._stiffness)
+            self._contact(self._stiffness, damping)
 
     def near(self, gap: float) -> bool:
         """Touching."""
@@ -264,11 +274,9 @@ class SoftBall(_Mover):
         if friction and self._data.nefc:
             vx, vy, _ = self._w.tolist()
             slip = math.hypot(vx, vy)
-            share = (
-                min(friction * float(self._data.efc_force[0]) / self._mass / slip, self._hertz)
-                if slip
-                else 0.0
-            )
+            normal = float(self._data.efc_force[0])
+            # No more than stops the slip within the step.
+            share = min(friction * normal / self._mass / slip, self._hertz) if slip else 0.0
             force = force[0] - share * vx, force[1] - share * vy, force[2]
         return super().advance(force)
 
@@ -280,6 +288,7 @@ def damping_ratio(restitution: float) -> float:
     T. Schwager, T. Poeschel, Granular Matter 9, 465 (2007), doi:10.1007/s10035-007-0065-z, equation
     20.
     """
+    # Restitution falls with damping; sixty halvings leave nothing but rounding.
     low, high = 0.0, _MOST_DAMPED
     for _ in range(60):
         middle = 0.5 * (low + high)

@@ -48,20 +48,17 @@ class Pull:
         """
         vx, vy, vz = v
         speed = math.sqrt(vx * vx + vy * vy + vz * vz)
+        # What opposes the motion is counted as a share of the velocity: force = -share v.
         if self._opposing:
-            share, limit, fx, fy, fz = (
-                self._opposing.at(speed)[0],
-                self._opposing.limit,
-                0.0,
-                0.0,
-                0.0,
-            )
+            share, limit = self._opposing.at(speed)[0], self._opposing.limit
+            fx = fy = fz = 0.0
         else:
             moment = self._ask.moment
             moment.t.fill(t)
             moment.x[0], moment.v[0] = x, v
             fx, fy, fz = self._ask.force()[0].tolist()
             share, limit = 0.0, self._ask.limit()
+        # Dry friction has no direction where there is no motion.
         if limit and speed:
             share += limit / speed
         return fx - share * vx, fy - share * vy, fz - share * vz
@@ -94,11 +91,15 @@ class Impact:
 
         The friction of the last impact includes that of all the bounces that are left out.
         """
+        # Equation numbers are those of `sims.engines.ground`.
         restitution, friction = self.at(speed)
-        up = restitution * speed
-        flight = 2.0 * up / down if down > 0.0 else math.inf
+        up = restitution * speed  # (1)
+        flight = 2.0 * up / down if down > 0.0 else math.inf  # (3)
         self._shorts = self._shorts + 1 if flight < SHORT else 0
         if flight >= SHORTEST and self._shorts <= PATIENCE:
             return restitution, friction, False
-        later = up / (1.0 - restitution) if restitution < 1.0 else 0.0
-        return 0.0, friction * (1.0 + restitution) * (1.0 + later / speed) if speed else 0.0, True
+        # Engines take mu (1 + e) |vn| with the e that is returned, which is 0: all of (4) and the
+        # factor 1 + e of this impact go into the friction.
+        later = up / (1.0 - restitution) if restitution < 1.0 else 0.0  # (4), over mu (1 + e)
+        total = friction * (1.0 + restitution) * (1.0 + later / speed) if speed else 0.0
+        return 0.0, total, True

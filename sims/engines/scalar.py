@@ -53,16 +53,17 @@ def resistance(lane: Lane) -> Resistance | None:
     for effect, c in lane.effects:
         number = float(c[0, 0, 0])
         if isinstance(effect, Contact):
-            continue
+            continue  # it acts at impacts alone, where it is asked by itself
         if is_library(effect, "friction.coulomb"):
-            limit += max(number, 0.0)
+            limit += max(number, 0.0)  # as in the effect: friction is never negative
         elif effect.name in _LAWS and is_library(effect, effect.name):
             laws.append((_LAWS[effect.name], number))
         else:
-            return None
+            return None  # where one must be asked, all are asked together
     return Resistance(tuple(laws), limit)
 
 
 def is_library(effect: Effect, name: str) -> bool:
     """Whether this is the library's own effect of this name."""
+    # A plugin may take over a name with a law of its own, which must be asked for.
     return effect.name == name and type(effect).__module__.startswith("sims.effects.")
