@@ -212,7 +212,9 @@ class UnitCube:
         return result
 
     def training_widths(self) -> Array:
-        """Widths (dim,) of the training ranges in the parameters' units: the unit of `param_error`."""
+        """Widths (dim,) of the training ranges, in the parameters' units; `param_error` counts in
+        them.
+        """
         ranges = np.array([p.training_range for p in self.parameters], dtype=np.float64)
         return ranges[:, 1] - ranges[:, 0]
 
@@ -285,7 +287,7 @@ class Simulator(ABC):
         """
 
     def close(self) -> None:
-        """Give back what the simulator holds (engine worlds). A closed simulator may be used again."""
+        """Give back what the simulator holds (engine worlds); it may be used again."""
 
     def run_constants(self, scenario: Scenario) -> dict[str, float]:
         """The constants of one run: the simulator's, overridden by the scenario's."""
@@ -296,7 +298,7 @@ class Simulator(ABC):
         return self._checked("initial state", self.states, scenario.initial)
 
     def run_inputs(self, scenario: Scenario) -> dict[str, Array]:
-        """The input signals of one run, each (T,); an input that the scenario leaves out is zero."""
+        """The input signals of one run, each (T,); what the scenario leaves out is zero."""
         known = {c.name: np.zeros(scenario.times.size) for c in self.inputs}
         return self._checked("input", known, scenario.inputs)
 

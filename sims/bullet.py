@@ -32,7 +32,7 @@ def _output_discarded() -> Iterator[None]:
     """Discard what C code prints (PyBullet says when it was built), so that the output is ours
     alone.
     """
-    # PyBullet prints from C, past Python's `sys.stdout`: the file descriptors themselves are turned.
+    # PyBullet prints from C, past Python's `sys.stdout`, so the file descriptors are turned.
     flush = ctypes.CDLL(None).fflush if os.name == "posix" else lambda _: None
     flush(None)  # what others printed before is theirs to keep
     with contextlib.ExitStack() as undo:

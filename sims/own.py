@@ -80,6 +80,7 @@ class _UnsaidError(InputError):
 
 def _ask(effect: type[Effect], system: type[OwnSystem]) -> None:
     """Let the effect ask the system once for all it needs."""
+    # With coefficients of zero at rest at zero: what it asks for counts, not what comes out.
     one, d = np.ones((1, 1)), len(system.coordinates)
     constants = {c.name: c.value * one for c in system.constants}
     inputs = {c.name: 0.0 * one for c in system.inputs}
@@ -118,30 +119,30 @@ class OwnSimulator(Simulated):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         _check(cls)
         forced = {*cls.coordinates, *cls.rates}
+        # Whatever else has a start travels with the rates, since an engine hands on two vectors.
+        others = [name for name in cls.states if name not in forced]
+        summary = " ".join((cls.__doc__ or cls.says).split("\n\n")[0].split())
+        shared = ("name", "parameters", "channels", "constants", "inputs", "states")
         declared = {
-            **{
-                name: getattr(cls, name)
-                for name in ("name", "parameters", "channels", "constants", "inputs", "states")
-            },
-            "says": cls.__dict__.get("says")
-            or " ".join((cls.__doc__ or cls.says).split("\n\n")[0].split()),
+            **{name: getattr(cls, name) for name in shared},
+            "says": cls.__dict__.get("says") or summary,
             "kind": cls.kind,
             "coordinates": cls.coordinates,
-            "rates": (
-                *cls.rates,
-                *(name for name in cls.states if name not in forced),
-            ),  # whatever else has a start
+            "rates": (*cls.rates, *others),
             "sensed": tuple(c.name for c in cls.channels),
             "simulator": cls,
         }
+        # A system for each simulator: effects ask the class, not an instance, what it can have.
         system: Any = type(f"{cls.__name__}System", (OwnSystem,), declared)
         cls.system = system
         super().__init_subclass__(**kwargs)
 
     def __setattr__(self, name: str, value: object) -> None:
+        # A user's `self.engine = ...` would otherwise break the base class far from its cause.
         if name in _TAKEN and name in self.__dict__:
             raise InputError(
-                f"simulator {self.name}: the attribute '{name}' is the base class's; name yours otherwise"
+                f"simulator {self.name}: the attribute '{name}' is the base class's; name yours"
+                " otherwise"
             )
         super().__setattr__(name, value)
 
@@ -185,6 +186,7 @@ class OwnSimulator(Simulated):
             raise InputError(
                 f"simulator {self.name} has no setting '{extra[0]}'; there is: time_step"
             )
+        # To Python, True is the number 1.
         if isinstance(step, bool) or not isinstance(step, int | float) or not 0 < step < np.inf:
             raise InputError(f"time_step must be a positive number of seconds, found {step}")
         return OwnEngine(self, step)
@@ -204,13 +206,13 @@ def _check(cls: type[OwnSimulator]) -> None:
         raise InputError(f"simulator {cls.name}: expected at least one parameter and one channel")
     if len(cls.coordinates) != len(cls.rates):
         raise InputError(
-            f"simulator {cls.name}: expected a rate for each of {cls.coordinates}, found {cls.rates}"
+            f"simulator {cls.name}: expected a rate for each of {cls.coordinates}, found"
+            f" {cls.rates}"
         )
     for name in (*cls.coordinates, *cls.rates):
         if name not in cls.states:
-            raise InputError(
-                f"simulator {cls.name}: {name} is not among its states {', '.join(cls.states) or '(none)'}"
-            )
+            known = ", ".join(cls.states) or "(none)"
+            raise InputError(f"simulator {cls.name}: {name} is not among its states {known}")
 
 
 class BulletWorld:
@@ -221,8 +223,9 @@ class BulletWorld:
     def __init__(self) -> None:
         self._engine = engine()
         self._client: int = self._engine.connect(self._engine.DIRECT)
+        # Not `__del__`, which may run when the interpreter has lost the module already.
         weakref.finalize(self, self._engine.disconnect, self._client)
 
     def __getattr__(self, name: str) -> Any:
-        found = getattr(self._engine, name)
-        return partial(found, physicsClientId=self._client) if callable(found) else found
+        member = getattr(self._engine, name)  # a function, or a constant such as JOINT_REVOLUTE
+        return partial(member, physicsClientId=self._client) if callable(member) else member

@@ -1,4 +1,13 @@
-"""Steps a user's own simulator, and puts effects that are forces into it."""
+"""Steps a user's own simulator, and puts effects that are forces into it.
+
+Dry friction is the force that would stop the motion within the coming step of length h, as far as
+its limit L allows. With inertia M, velocity v, the forces F of effects and the simulator's own pull
+P, which it does not say and which is taken from the step before,
+
+    P = M (v - v_before) / h_before - F_before                             (1)
+    S = -(M v / h + P + F)                                                 (2)
+    friction = S where |S| <= L, else L S / |S|                            (3)
+"""
 
 from __future__ import annotations
 
@@ -45,17 +54,17 @@ class OwnEngine:
 
     def _run(self, lanes: Lanes, lane: int) -> Array | None:
         system, world = lanes.system, self.world
-        theta = dict(
-            zip((p.name for p in system.parameters), lanes.theta[lane].tolist(), strict=True)
-        )
+        names = [p.name for p in system.parameters]
+        theta = dict(zip(names, lanes.theta[lane].tolist(), strict=True))
         constants = {name: float(value[lane, 0]) for name, value in lanes.constants.items()}
-        initial = dict(
-            zip((*system.coordinates, *system.rates), [*lanes.x[lane], *lanes.v[lane]], strict=True)
-        )
+        states = (*system.coordinates, *system.rates)
+        initial = dict(zip(states, [*lanes.x[lane], *lanes.v[lane]], strict=True))
+        # A user's model is never asked what it makes of NaN: it may hang, or never recover.
         if not np.isfinite([*theta.values(), *constants.values(), *initial.values()]).all():
             return None
         world.reset(theta, constants, {name: float(value) for name, value in initial.items()})
         forces, steps = _Forces(lanes, lane, world), lanes.steps[lane].copy()
+        # Steps of no length, in which the lane waits for others, are no steps of the simulator.
         steps[steps > 0] = evened(steps[steps > 0], lanes.every)
         row, t, moved = self._row(system), 0.0, False
         rows = [row]
@@ -66,6 +75,7 @@ class OwnEngine:
                     world.apply_force(forces.at(t, inputs, seconds))
                 world.step(inputs, seconds)
                 t, moved = t + seconds, True
+            # Nothing has changed where nothing has moved: the row before is the row now.
             if (i + 1) % lanes.every == 0:
                 row, moved = self._row(system) if moved else row, False
                 rows.append(row)
@@ -121,11 +131,11 @@ class _Forces:
         own = np.zeros_like(force)
         if self._last is not None:
             before, applied, took = self._last
-            own = inertia * (v - before) / took - applied
+            own = inertia * (v - before) / took - applied  # (1)
         limit = sum(float(effect.limit(c, moment)[0, 0]) for effect, c in self.frictions)
-        stop = -(inertia * v / seconds + own + force)
+        stop = -(inertia * v / seconds + own + force)  # (2)
         size = float(np.linalg.norm(stop))
-        friction: Array = stop if size <= limit else stop * (limit / size)
+        friction: Array = stop if size <= limit else stop * (limit / size)  # (3)
         self._last = v, force + friction, seconds
         return friction
 

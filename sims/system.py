@@ -196,7 +196,7 @@ class System(ABC):
         return -self.weight(moment)
 
     def force(self, moment: Moment) -> Array:
-        """(L, D) generalised force of the system itself, without effects: what engines integrate."""
+        """(L, D) generalised force of the system itself, without effects."""
         return self.drive(moment) - self.passive(moment)  # (1)
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:

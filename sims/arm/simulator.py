@@ -1,12 +1,22 @@
 """A two-link arm in a vertical plane, on PyBullet.
 
-With both angles measured from the vertical of the link before (0 hanging straight), M(q) q'' + c(q,
-q') + g(q) = u - damping q' - friction sign(q'); the equations are those of M. W. Spong, S.
-Hutchinson, M. Vidyasagar, Robot Modeling and Control (2006), section 7.4, with gravity along the
-arm at rest. Bullet's articulated-body algorithm solves them.
+With both angles measured from the vertical of the link before (0 hanging straight),
 
-Bullet steps by semi-implicit Euler, which is of first order. Here each step is two of Bullet's,
-whose mean is taken as in Heun's method: that makes it of second order. Dry friction is Bullet's
+    M(q) q'' + c(q, q') + g(q) = u - damping q' - friction sign(q')        (1)
+
+the equations are those of M. W. Spong, S. Hutchinson, M. Vidyasagar, Robot Modeling and Control
+(2006), section 7.4, with gravity along the arm at rest. Bullet's articulated-body algorithm solves
+them.
+
+Bullet steps by semi-implicit Euler, which is of first order. Here each step of length h is two of
+Bullet's, from v to v1 and from v1 to v2, whose mean is taken as in Heun's method, which makes it of
+second order (E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993,
+section II.1):
+
+    q' = q + h (v + v1) / 2                                                (2)
+    v' = (v + v2) / 2                                                      (3)
+
+Dry friction is Bullet's
 joint motor with the friction as its limit and standstill as its goal: a constraint of both joints
 at once, which holds what pulls less. It cannot change sides within a step, so a step in which a
 joint that rubs comes to rest or turns round is taken again in small parts.
@@ -23,10 +33,17 @@ from sims.bullet import NO_LIMIT
 from sims.own import BulletWorld, OwnSimulator
 
 _HERE = (0.0, 0.0, 0.0, 1.0)
+"""Not turned, as a quaternion x, y, z, w."""
 _AXIS = (0.0, 1.0, 0.0)
-_PARTS = 16  # of a step in which dry friction changes sides
+"""Of both joints: the arm swings in the plane of x and z."""
+_PARTS = 16
+"""Parts of a step in which dry friction changes sides."""
+_SOLVER_ROUNDS = 200
+"""Rounds of Bullet's constraint solver, in which both joints' frictions are settled together."""
 _OF_THE_WORLD = ("_world", "_place", "_push", "_state", "_go")
-_STILL = 1e-6  # rad/s: a joint that is slower is at rest
+"""Attributes that belong to a world in this process and cannot be copied."""
+_STILL = 1e-6
+"""rad/s: a joint that is slower is at rest."""
 
 
 def _of_link(
@@ -37,10 +54,12 @@ def _of_link(
     training: tuple[float, float],
     says: str,
 ) -> tuple[Parameter, Parameter]:
-    first, second = (
-        Parameter(f"{name}{i}", unit, nominal, bounds, training, says=f"{says} {i}") for i in (1, 2)
-    )
-    return first, second
+    """The same number of both links, told apart by its name."""
+
+    def of(link: int) -> Parameter:
+        return Parameter(f"{name}{link}", unit, nominal, bounds, training, says=f"{says} {link}")
+
+    return of(1), of(2)
 
 
 class Arm(OwnSimulator):
@@ -100,7 +119,8 @@ class Arm(OwnSimulator):
         p = self._world
         p.resetSimulation()
         p.setGravity(0.0, 0.0, -constants["gravity"])
-        p.setPhysicsEngineParameter(numSolverIterations=200, solverResidualThreshold=0.0)
+        # All rounds, whatever the residual: what friction holds must stand still.
+        p.setPhysicsEngineParameter(numSolverIterations=_SOLVER_ROUNDS, solverResidualThreshold=0.0)
         self._arm = p.createMultiBody(
             linkMasses=[theta["mass1"], theta["mass2"]],
             linkCollisionShapeIndices=[-1, -1],
@@ -128,20 +148,17 @@ class Arm(OwnSimulator):
             )
         self._friction = [theta["friction1"], theta["friction2"]]
         self._step = 0.0
-        self._place, self._push, self._state = (
-            p.resetJointState,
-            p.setJointMotorControl2,
-            p.getJointState,
-        )
-        self._go, self._torque = (
-            p.stepSimulation,
-            p.TORQUE_CONTROL,
-        )  # looked up once: a run has thousands of each
-        self._q, self._v = [initial["q1"], initial["q2"]], [initial["qd1"], initial["qd2"]]
+        # Looked up once: a run has thousands of each.
+        self._place, self._push = p.resetJointState, p.setJointMotorControl2
+        self._state, self._go = p.getJointState, p.stepSimulation
+        self._torque = p.TORQUE_CONTROL
+        self._q = [initial["q1"], initial["q2"]]
+        self._v = [initial["qd1"], initial["qd2"]]
 
     def step(self, inputs: Mapping[str, float], seconds: float) -> None:
         """One step of Heun's method, or several short ones where dry friction changes sides."""
         torques, before = (inputs["u1"], inputs["u2"]), (self._q, self._v)
+        # Friction's side is fixed within a step of Bullet's; where it changes, steps must be short.
         if self._heun(torques, seconds):
             self._q, self._v = before
             for _ in range(_PARTS):
@@ -156,14 +173,9 @@ class Arm(OwnSimulator):
         for joint in (0, 1):
             self._place(self._arm, joint, q[joint], v[joint])
         v1, v2 = self._advance(torques), self._advance(torques)
-        self._q = [q[i] + seconds * (v[i] + v1[i]) / 2 for i in (0, 1)]
-        self._v = [(v[i] + v2[i]) / 2 for i in (0, 1)]
-        return any(
-            self._friction[i] > 0
-            and abs(v[i]) > _STILL
-            and min(v1[i] * v[i], v2[i] * v[i]) < _STILL * abs(v[i])
-            for i in (0, 1)
-        )
+        self._q = [q[i] + seconds * (v[i] + v1[i]) / 2 for i in (0, 1)]  # (2)
+        self._v = [(v[i] + v2[i]) / 2 for i in (0, 1)]  # (3)
+        return any(_turns(v[i], v1[i], v2[i]) for i in (0, 1) if self._friction[i] > 0)
 
     def observe(self) -> Mapping[str, float]:
         """Angles and rates."""
@@ -178,9 +190,9 @@ class Arm(OwnSimulator):
         return {name: value for name, value in self.__dict__.items() if name not in _OF_THE_WORLD}
 
     def _pace(self, seconds: float) -> None:
-        if (
-            seconds != self._step
-        ):  # Bullet turns a motor's force into an impulse when the motor is set
+        # Bullet turns a motor's force into an impulse when the motor is set, so a motor holds for
+        # one length of step.
+        if seconds != self._step:
             p = self._world
             p.setTimeStep(seconds)
             for joint, friction in enumerate(self._friction):
@@ -196,3 +208,10 @@ class Arm(OwnSimulator):
                 self._push(self._arm, joint, self._torque, force=torques[joint])
         self._go()
         return self._state(self._arm, 0)[1], self._state(self._arm, 1)[1]
+
+
+def _turns(before: float, middle: float, after: float) -> bool:
+    """Whether a joint that moved has come to rest or turned round, from its rates in rad/s."""
+    if abs(before) <= _STILL:
+        return False
+    return min(middle * before, after * before) < _STILL * abs(before)

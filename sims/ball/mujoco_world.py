@@ -9,6 +9,7 @@ def model(constants: Mapping[str, float]) -> str:
     """The world as MJCF; the joints are x, y, z, zero at the origin; the ball states what its
     contact is like.
     """
+    size, mass = constants["radius"], constants["mass"]
     return f"""
     <mujoco>
       <option gravity="0 0 {-constants["gravity"]!r}"/>
@@ -18,7 +19,7 @@ def model(constants: Mapping[str, float]) -> str:
           <joint type="slide" axis="1 0 0"/>
           <joint type="slide" axis="0 1 0"/>
           <joint type="slide" axis="0 0 1"/>
-          <geom type="sphere" size="{constants["radius"]!r}" mass="{constants["mass"]!r}" condim="1" priority="1"/>
+          <geom type="sphere" size="{size!r}" mass="{mass!r}" condim="1" priority="1"/>
         </body>
       </worldbody>
     </mujoco>"""

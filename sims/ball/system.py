@@ -1,4 +1,4 @@
-"""The ball: a sphere that falls freely and bounces on level ground, declared once for every engine."""
+"""The ball: a sphere that falls freely and bounces on level ground, declared for every engine."""
 
 from __future__ import annotations
 

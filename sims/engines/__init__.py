@@ -32,7 +32,8 @@ def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -
     missing = [package for package in module.REQUIRES if importlib.util.find_spec(package) is None]
     if missing:
         raise InputError(
-            f"engine {name} needs {', '.join(missing)}, not installed (pip install {' '.join(missing)})"
+            f"engine {name} needs {', '.join(missing)}, not installed"
+            f" (pip install {' '.join(missing)})"
         )
     # An engine's settings are the keyword arguments of what makes it: they are declared once.
     parameters = inspect.signature(module.engine).parameters

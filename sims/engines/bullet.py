@@ -75,7 +75,8 @@ def engine(
     if not native_contact:
         if given:
             raise InputError(
-                f"setting {next(iter(given))} belongs to Bullet's own contact: set native_contact = true"
+                f"setting {next(iter(given))} belongs to Bullet's own contact: set"
+                " native_contact = true"
             )
         return BulletEngine(system, checked_time_step(time_step, system))
     if not system.bounces:
@@ -195,9 +196,9 @@ class _Mover:
         p = bullet.engine()
         self._mass, self._contact = constants["mass"], (math.nan, math.nan)
         self._client, self._body = self._world.body(constants)
-        # The world is reset in place: building one is half the cost of a rollout. But contact points
-        # outlive a reset and would be taken for old, which changes what follows by rounding. They
-        # are dropped where the ball touches nothing.
+        # The world is reset in place: building one is half the cost of a rollout. But contact
+        # points outlive a reset and would be taken for old, which changes what follows by
+        # rounding. They are dropped where the ball touches nothing.
         far = 0.0, 0.0, 2.0 * constants["radius"] + 1.0
         p.resetBasePositionAndOrientation(self._body, far, _UPRIGHT, self._client)
         p.performCollisionDetection(self._client)

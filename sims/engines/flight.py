@@ -75,7 +75,7 @@ class Ball(Mover, Protocol):
         ...
 
     def hold(self) -> None:
-        """Let contact from now on do no more than hold the ball above the ground; `place` follows."""
+        """Let contact do no more from now on than hold the ball up; `place` follows."""
         ...
 
 

@@ -80,7 +80,7 @@ class Joint(Protocol):
         ...
 
     def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
-        """As `advance`, for so many steps, and so many again, and so on; what is reached each time."""
+        """As `advance`, for so many steps, and so many again, and so on; the states reached."""
         ...
 
 
@@ -218,8 +218,8 @@ class _Forces(ABC):
         """The velocity half a step after `w`, the force being the one at its end; a growing force
         is taken as is.
         """
-        # (3) with f linear in v about the last look: its slope goes over to the side of the inertia.
-        # A growing force would make that side smaller, down to nothing.
+        # (3) with f linear in v about the last look: its slope goes over to the inertia's side,
+        # which a growing force would make smaller, down to nothing.
         slope = min(self._slope, 0.0)
         force = self._force + slope * (w - self._at)
         return kick(w, force, self.limit, 1.0 / (self._inertia - 0.5 * step * slope), 0.5 * step)

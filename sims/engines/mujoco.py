@@ -54,7 +54,8 @@ def engine(
     if not native_contact:
         if stiffness is not None:
             raise InputError(
-                "setting stiffness belongs to MuJoCo's contact as it comes: set native_contact = true"
+                "setting stiffness belongs to MuJoCo's contact as it comes: set"
+                " native_contact = true"
             )
         return MujocoEngine(system, step)
     if not system.bounces:

@@ -78,7 +78,7 @@ class World:
             disabled = mujoco.mjtDisableBit
             # Joint damping explicit, as in Bullet and as `sims.engines.joint` takes it to be.
             self._model.opt.disableflags |= disabled.mjDSBL_EULERDAMP
-            # A lane that fails must be NaN: MuJoCo would start it again, and it would pass for done.
+            # A lane that fails must be NaN: MuJoCo would reset it, and it would pass for done.
             self._model.opt.disableflags |= disabled.mjDSBL_AUTORESET
             self._data = mujoco.MjData(self._model)
             self._built_for = dict(constants)

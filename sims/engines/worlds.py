@@ -105,7 +105,7 @@ def lacking(module: ModuleType, asked: type) -> str:
 
     A type checker sees the modules of this project; this sees everybody's, when they are loaded.
     """
-    # From the most general protocol to the module's own, so that what all worlds need is named first.
+    # From the most general protocol to the module's own: what all worlds need is named first.
     for part in reversed(asked.__mro__):
         if part in (object, Generic, Protocol):
             continue

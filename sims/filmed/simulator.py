@@ -17,6 +17,7 @@ from sims.camera import packages
 from sims.camera.camera import Camera
 
 FILMS = ("projected", "tracked")
+"""How a film is made: computed through the camera, or rendered and tracked."""
 
 
 class FilmedBall(Simulator):
@@ -71,27 +72,29 @@ class FilmedBall(Simulator):
         super().__init__(constants, observe)
         if film not in FILMS:
             raise InputError(
-                f"simulator {self.name}: expected film to be one of {', '.join(FILMS)}, found {film!r}"
+                f"simulator {self.name}: expected film to be one of {', '.join(FILMS)}, found"
+                f" {film!r}"
             )
         if film == "tracked":
-            packages.require()
+            packages.require()  # now, with one message, and not in the middle of a training
         self._tracked = film == "tracked"
         self._ball = Ball(self._of_ball(self.constant_values), ["x", "y", "z"], **settings)
 
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
         """Simulate each row of `theta` (n, 1); returns (n, T, C). See `Simulator.simulate`."""
         constants = self.run_constants(scenario)
-        self.run_inputs(scenario)
+        self.run_inputs(scenario)  # which refuses any: the ball does not know of these names
         fall = Scenario(scenario.times, scenario.initial, {}, self._of_ball(constants))
         places = self._ball.simulate(theta, fall)
         camera, radius = _camera(constants), constants["radius"]
         if self._tracked:
-            rows = np.array(
-                [_tracked(camera, radius, way, scenario.times) for way in places]
-            ).reshape(places.shape[:2])
-            seen = np.stack([np.full_like(rows, np.nan), rows], axis=2)
+            tracks = [_tracked(camera, radius, way, scenario.times) for way in places]
+            rows = np.array(tracks).reshape(places.shape[:2])  # also where there are no lanes
+            heights = np.full_like(rows, np.nan)
         else:
-            seen = np.stack([places[..., 2], camera.outline(places, radius)[0][..., 1]], axis=2)
+            middles, _ = camera.outline(places, radius)
+            heights, rows = places[..., 2], middles[..., 1]
+        seen = np.stack([heights, rows], axis=2)
         result: Array = seen[:, :, self.columns]
         return result
 
@@ -122,6 +125,8 @@ def _tracked(camera: Camera, radius: float, places: Array, times: Array) -> Arra
     rows: Array = np.full(times.size, np.nan)
     if not np.isfinite(places).all():
         return rows
+    # Light, colours and compression are drawn from what the film shows: the same parameters and
+    # scenario give the same film, whatever was filmed before.
     numbers = [
         camera.azimuth,
         camera.distance,
@@ -138,11 +143,12 @@ def _tracked(camera: Camera, radius: float, places: Array, times: Array) -> Arra
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
             write_video(path, stage.film(places), times, look.crf)
-            found = track(Video(path))
+            measured = track(Video(path))
     except InputError:  # no ball to be seen: nothing was measured
         return rows
     finally:
         stage.close()
-    at = np.rint(np.interp(found.times, times - times[0], np.arange(times.size))).astype(int)
-    rows[at] = found.v
+    # Frames without a ball are left out of a track: each place is found by its time.
+    frames = np.interp(measured.times, times - times[0], np.arange(times.size))
+    rows[np.rint(frames).astype(int)] = measured.v
     return rows

@@ -11,7 +11,12 @@ from sims.base import Array, InputError, Scenario
 from sims.shot.scene import Scene, margins
 from sims.shot.simulator import BounceShot
 
-_GRID, _ROUNDS, _ZOOM = 48, 4, 9
+_GRID = 48
+"""Heights of the first grid, over the whole range."""
+_ROUNDS = 4
+"""Grids, each around the best height of the one before."""
+_ZOOM = 9
+"""Heights of each later grid, over two spaces of the one before."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,7 @@ def plan(
         if not np.isfinite(room).any():
             break
         best, reach = float(grid[np.nanargmax(room)]), float(grid[1] - grid[0])
+        # As far as the neighbours of the best: the maximum lies between them.
         grid = np.linspace(max(low, best - reach), min(high, best + reach), _ZOOM)
     if not np.isfinite(best):
         return Plan(best, float("nan"), times, np.full((times.size, 3), np.nan))
@@ -90,9 +96,8 @@ def flights(
 ) -> Array:
     """Simulated paths (n, T, 3) from drop heights (n,)."""
     known = {**constants, "incline_angle": scene.angle}
-    scenarios = [
-        Scenario(times, constants={**known, "drop_height": float(height)}) for height in heights
-    ]
-    return simulator.simulate_lanes(
-        np.repeat(np.atleast_2d(theta), len(heights), axis=0), scenarios
-    )
+    scenarios = []
+    for height in heights:
+        scenarios.append(Scenario(times, constants={**known, "drop_height": float(height)}))
+    rows = np.repeat(np.atleast_2d(theta), len(heights), axis=0)
+    return simulator.simulate_lanes(rows, scenarios)

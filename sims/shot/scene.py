@@ -30,7 +30,8 @@ class Scene:
     def __post_init__(self) -> None:
         if not (0 < self.angle < math.pi / 2 and self.hoop_x > 0 and self.hoop_radius > 0):
             raise InputError(
-                f"expected an incline between 0 and a right angle and a hoop in front of it, found {self}"
+                "expected an incline between 0 and a right angle and a hoop in front of it,"
+                f" found {self}"
             )
         if self.hoop_z <= -self.hoop_x * math.tan(self.angle):
             raise InputError(f"expected a hoop above the incline, found {self}")
@@ -46,24 +47,29 @@ def crossings(path: Array, scene: Scene) -> Array:
     """Where paths (n, T, 3) of centres x, y, z come down through the hoop's plane: (n, 2), NaN for
     never.
 
-    The flight after the first bounce counts: from where z first rises to where it rises again.
+    The flight after the first bounce counts: from where z first rises to where it rises again. With
+    the sample before the plane at height z1 and the one behind it at z2, the hoop's plane at height
+    h is met on the chord between them, at the share
+
+        (z1 - h) / (z1 - z2)                                               (1)
     """
     x, y, z = np.moveaxis(np.asarray(path, dtype=np.float64), -1, 0)
     with np.errstate(invalid="ignore"):
         rises, falls = z[:, 1:] > z[:, :-1], z[:, 1:] < z[:, :-1]
         risen = np.logical_or.accumulate(rises, axis=1)
-        again = np.logical_or.accumulate(
-            np.logical_or.accumulate(risen & falls, axis=1) & rises, axis=1
-        )
+        fallen = np.logical_or.accumulate(risen & falls, axis=1)
+        again = np.logical_or.accumulate(fallen & rises, axis=1)
+        # Downward only: a ball that comes up through the hoop has not scored.
         down = risen & ~again & (z[:, :-1] > scene.hoop_z) & (z[:, 1:] <= scene.hoop_z)
     first = np.argmax(down, axis=1)
     rows = np.arange(len(z))
     high, low = z[rows, first], z[rows, first + 1]
-    share = (high - scene.hoop_z) / np.where(down.any(axis=1), high - low, 1.0)
-    place = np.stack(
-        [c[rows, first] + share * (c[rows, first + 1] - c[rows, first]) for c in (x, y)], axis=1
-    )
-    result: Array = np.where(down.any(axis=1)[:, None], place, np.nan)
+    comes = down.any(axis=1)  # where none does, `first` is 0 and means nothing
+    share = (high - scene.hoop_z) / np.where(comes, high - low, 1.0)  # (1)
+    at_x = x[rows, first] + share * (x[rows, first + 1] - x[rows, first])
+    at_y = y[rows, first] + share * (y[rows, first + 1] - y[rows, first])
+    place = np.stack([at_x, at_y], axis=1)
+    result: Array = np.where(comes[:, None], place, np.nan)
     return result
 
 

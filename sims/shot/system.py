@@ -4,7 +4,12 @@ The coordinates are the centre's displacement from where it is let go: down the 
 and away from it. In that frame gravity is as uniform as ever, only tilted, so every engine, force
 and contact effect works as for a ball on level ground. The channels turn the motion back: x is
 horizontal and points the way the incline falls, z is up, both from the point of the incline below
-the ball.
+the ball. With the incline's angle a, the ball's radius r and the height H through which it falls,
+
+    gravity = g (sin a, 0, -cos a)                                         (1)
+    floor = -H cos a                                                       (2)
+    x = along cos a + away sin a                                           (3)
+    z = r / cos a + H - along sin a + away cos a                           (4)
 """
 
 from __future__ import annotations
@@ -19,6 +24,7 @@ from sims.base import Array, Channel, Constant, Parameter
 from sims.system import Effect, Kind, Moment, System
 
 _LEVEL_ONLY = ("force.bias", "force.periodic", "lift.magnus")
+"""Effects that act along the last coordinate, taken for the vertical."""
 
 
 class ShotSystem(System):
@@ -89,11 +95,8 @@ class ShotSystem(System):
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:
         """Effects that act along the vertical coordinate, which this frame does not have."""
-        return (
-            "it acts along the vertical, and the incline is tilted"
-            if effect.name in _LEVEL_ONLY
-            else ""
-        )
+        tilted = "it acts along the vertical, and the incline is tilted"
+        return tilted if effect.name in _LEVEL_ONLY else ""
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """One: force is counted per unit mass."""
@@ -103,7 +106,7 @@ class ShotSystem(System):
         """Gravity, m/s^2, in the incline's frame."""
         angle = moment.constants["incline_angle"]
         down: Array = np.concatenate([np.sin(angle), np.zeros_like(angle), -np.cos(angle)], axis=1)
-        return moment.gravity * down
+        return moment.gravity * down  # (1)
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
         """A horizontal unit vector."""
@@ -121,14 +124,14 @@ class ShotSystem(System):
         along, away = x[:, :, 0], x[:, :, 2]
         height = constants["radius"] / cos + constants["drop_height"]
         return {
-            "x": along * cos + away * sin,
+            "x": along * cos + away * sin,  # (3)
             "y": x[:, :, 1],
-            "z": height - along * sin + away * cos,
+            "z": height - along * sin + away * cos,  # (4)
         }
 
     def floor(self, constants: Mapping[str, Array]) -> Array:
         """Where the ball touches, measured from its release along the normal."""
-        return -constants["drop_height"] * np.cos(constants["incline_angle"])
+        return -constants["drop_height"] * np.cos(constants["incline_angle"])  # (2)
 
     def restitution(self, theta: Array) -> Array:
         """The parameter."""

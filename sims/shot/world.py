@@ -1,14 +1,26 @@
 """The world in which shots are made: MuJoCo, with physics that the planning simulator lacks.
 
-A free rigid sphere flies through still air with quadratic drag, 1/2 rho Cd A v^2, and the lift of
-its spin, 1/2 rho A r omega x v (C_L = r omega / v; G. Robinson, I. Robinson, Physica Scripta 88,
-018101, 2013, doi:10.1088/0031-8949/88/01/018101), by MuJoCo's fourth-order integrator. Contact
-takes time: MuJoCo's spring and damper between ball and ground act for about `CONTACT` seconds,
-damped for the restitution at that impact's speed (T. Schwager, T. Poeschel, Phys. Rev. E 78,
-051304, 2008, doi:10.1103/PhysRevE.78.051304: contact ends when the force does). MuJoCo's friction
-is a convex relaxation that turns slip into lift, so contact is frictionless there, and Coulomb's
-friction acts from step to step with the normal force that MuJoCo reports: the ball slides until it
-grips, and spins.
+A free rigid sphere flies through still air with quadratic drag and the lift of its spin,
+
+    drag = -1/2 rho Cd A |v| v                                             (1)
+    lift = 1/2 rho A r omega x v                                           (2)
+
+(C_L = r omega / v; G. Robinson, I. Robinson, Physica Scripta 88, 018101, 2013,
+doi:10.1088/0031-8949/88/01/018101), by MuJoCo's fourth-order integrator. Contact takes time:
+MuJoCo's spring and damper between ball and ground act for about `CONTACT` seconds, damped for the
+restitution at that impact's speed: with damping ratio D, contact that ends when the force does
+gives
+
+    e = exp(-D / w atan2(2 D w, 2 D^2 - 1)),        w = sqrt(1 - D^2)      for D < 1    (3)
+    e = exp(-D / s log((D + s) / (D - s))),         s = sqrt(D^2 - 1)      for D > 1    (4)
+
+(T. Schwager, T. Poeschel, Phys. Rev. E 78, 051304, 2008, doi:10.1103/PhysRevE.78.051304, equation
+12). MuJoCo's friction is a convex relaxation that turns slip into lift, so contact is frictionless
+there, and Coulomb's friction acts from step to step with the normal force N that MuJoCo reports:
+the ball slides until it grips, and spins. A force f at its surface changes the slip of a sphere of
+moment of inertia k m r^2 by f (1 + 1 / k) / m a second, so that within a step h
+
+    |f| = min(mu N, k / (1 + k) m |slip| / h)                              (5)
 """
 
 from __future__ import annotations
@@ -23,20 +35,27 @@ import numpy as np
 from sims.base import Array, InputError
 from sims.shot.balls import Ball
 
-AIR = 1.2  # kg/m^3
+AIR = 1.2
+"""kg/m^3: density of air."""
 GRAVITY = 9.81
-CONTACT = 3e-3  # seconds: tennis balls stay for 5 ms, golf balls for 0.5 ms
-_FLIGHT, _IMPACT = 1e-3, 3e-5  # seconds: steps
-_IMPEDANCE = 0.9999  # the largest MuJoCo allows
+"""m/s^2, downward."""
+CONTACT = 3e-3
+"""Seconds that an impact lasts: tennis balls stay for 5 ms, golf balls for 0.5 ms."""
+_FLIGHT = 1e-3
+"""Seconds of a step in flight."""
+_IMPACT = 3e-5
+"""Seconds of a step in contact: a hundred of them to an impact."""
+_IMPEDANCE = 0.9999
+"""Share of the acceleration asked for that contact gives: the largest MuJoCo allows."""
+_MOST_DAMPED = 60.0
+"""Damping ratio at which a ball is all but dead."""
 
 
 def missing() -> str:
     """Why this world cannot be had here; empty if it can."""
-    return (
-        ""
-        if importlib.util.find_spec("mujoco")
-        else "the world needs mujoco, not installed (pip install mujoco)"
-    )
+    if importlib.util.find_spec("mujoco"):
+        return ""
+    return "the world needs mujoco, not installed (pip install mujoco)"
 
 
 @dataclass(frozen=True)
@@ -80,7 +99,8 @@ def damping_ratio(restitution: float) -> float:
     """Damping ratio of a spring and damper that end their contact with this restitution, 0 < e <=
     1.
     """
-    low, high = 0.0, 60.0
+    # Restitution falls with damping; eighty halvings leave nothing but rounding.
+    low, high = 0.0, _MOST_DAMPED
     for _ in range(80):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if _restitution(middle) > restitution else (low, middle)
@@ -89,13 +109,14 @@ def damping_ratio(restitution: float) -> float:
 
 def _restitution(ratio: float) -> float:
     """Schwager and Poeschel's Eq. (12), for contact that ends when the force does."""
+    # Both forms are 0 / 0 at a damping ratio of 1, where their limit is exp(-2).
     if ratio == 0.0 or abs(ratio - 1.0) < 1e-9:
         return 1.0 if ratio == 0.0 else math.exp(-2.0)
     if ratio < 1.0:
         w = math.sqrt(1.0 - ratio * ratio)
-        return math.exp(-ratio / w * math.atan2(2.0 * ratio * w, 2.0 * ratio * ratio - 1.0))
+        return math.exp(-ratio / w * math.atan2(2.0 * ratio * w, 2.0 * ratio * ratio - 1.0))  # (3)
     s = math.sqrt(ratio * ratio - 1.0)
-    return math.exp(-ratio / s * math.log((ratio + s) / (ratio - s)))
+    return math.exp(-ratio / s * math.log((ratio + s) / (ratio - s)))  # (4)
 
 
 class _Flight:
@@ -129,14 +150,14 @@ class _Flight:
         """One step, short where the ball touches or soon will."""
         data = self._data
         position, velocity = data.qpos[:3].tolist(), data.qvel.tolist()
-        gap, rate = (
-            self.gap(*position),
-            velocity[0] * self._normal[0] + velocity[2] * self._normal[1],
-        )
+        gap = self.gap(*position)
+        rate = velocity[0] * self._normal[0] + velocity[2] * self._normal[1]
+        # Two steps ahead: one of flight must not reach into the ground.
         near = gap <= 0.0 or (rate < 0.0 and gap < -2.0 * _FLIGHT * rate)
         self._model.opt.timestep = _IMPACT if near else _FLIGHT
         if gap > 0.0:
             self._touches = False
+        # Once an impact, at the speed that it begins with: restitution is that of the whole impact.
         if not self._touches and rate < 0.0 and gap + rate * _IMPACT <= 0.0:
             self._prepare(-rate)
         self._push(velocity)
@@ -145,20 +166,20 @@ class _Flight:
     def _prepare(self, speed: float) -> None:
         """The damping of an impact at this speed."""
         self._touches = True
+        # Rounded, so that impacts that are all but alike share what was computed.
         ratio = damping_ratio(round(self._ball.restitution_at(speed), 9))
+        # A spring's contact is half of a period.
         frequency = math.pi / CONTACT
         self._model.geom_solref[1] = -(frequency**2), -2.0 * ratio * frequency
 
     def _push(self, velocity: list[float]) -> None:
         """Drag, lift and friction as the force and torque of the coming step."""
-        vx, vy, vz, wx, wy, wz = (
-            velocity  # spin in the ball's frame, which does not matter for a spin about y
-        )
-        vz -= (
-            0.5 * GRAVITY * self._model.opt.timestep
-        )  # held through the step, so taken from its middle
+        # Spin is in the ball's frame, which does not matter for a spin about y.
+        vx, vy, vz, wx, wy, wz = velocity
+        # Forces are held through the step, so they are those of its middle.
+        vz -= 0.5 * GRAVITY * self._model.opt.timestep
         pull = -self._drag * math.sqrt(vx * vx + vy * vy + vz * vz)
-        force = [
+        force = [  # (1) and (2)
             pull * vx + self._lift * (wy * vz - wz * vy),
             pull * vy + self._lift * (wz * vx - wx * vz),
             pull * vz + self._lift * (wx * vy - wy * vx),
@@ -177,11 +198,12 @@ class _Flight:
         k = self._ball.inertia_ratio
         stops = self._ball.mass * k / (1.0 + k) * abs(slip) / self._model.opt.timestep
         held = self._friction * float(self._data.efc_force[0])
-        return -math.copysign(min(stops, held), slip)
+        return -math.copysign(min(stops, held), slip)  # (5)
 
 
 def _mjcf(ball: Ball, ground: Ground) -> str:
     inertia = ball.inertia_ratio * ball.mass * ball.radius**2
+    moments = f"{inertia!r} {inertia!r} {inertia!r}"
     return f"""
     <mujoco>
       <compiler angle="radian"/>
@@ -190,7 +212,7 @@ def _mjcf(ball: Ball, ground: Ground) -> str:
         <geom type="plane" size="0 0 1" euler="0 {ground.angle!r} 0" condim="1"/>
         <body>
           <freejoint/>
-          <inertial pos="0 0 0" mass="{ball.mass!r}" diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>
+          <inertial pos="0 0 0" mass="{ball.mass!r}" diaginertia="{moments}"/>
           <geom type="sphere" size="{ball.radius!r}" condim="1" priority="1"
             solimp="{_IMPEDANCE} {_IMPEDANCE} 0.001 0.5 2"/>
         </body>

@@ -1,4 +1,4 @@
-"""The modules that build systems' worlds fulfil what the engines ask of them, and others are refused."""
+"""Modules that build systems' worlds fulfil what the engines ask of them; others are refused."""
 
 import inspect
 import sys

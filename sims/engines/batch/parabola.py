@@ -54,7 +54,7 @@ class Arcs:
 
 
 def fly(lanes: Lanes, a: Array, ground: Ground | None) -> Motion:
-    """The motion of lanes whose acceleration `a` (L, D) is constant, over `ground` if there is any."""
+    """The motion of lanes of constant acceleration `a` (L, D), over `ground` if there is any."""
     times = _kept_times(lanes)
     first = Arcs(np.arange(len(a)), np.zeros((len(a), 1)), lanes.x, lanes.v, a)
     if ground is None:

@@ -170,7 +170,7 @@ class Stepping:
         return after_x, after_v, k4, outer - inner  # six times (7)
 
     def _settle(self, h: Array, k1: Array) -> None:
-        """Make steps of h (L, 1) where nothing happens in them; prepare to make the others again."""
+        """Make steps of h (L, 1) where nothing happens in them; prepare to repeat the others."""
         x, v, k4, bend = self._stepped(h, k1)
         # Bends first: events are looked for in steps that are worth believing.
         refused = self._bent(h, k1, bend) if self._bends else None
@@ -318,7 +318,7 @@ class Stepping:
         self._awaits = bool(np.isfinite(self._try).any())
 
     def _strike(self, i: Indices, a: Array) -> None:
-        """Impacts of lanes i (n,), to which their steps have led but for rounding; a (n, D) before."""
+        """Impacts of lanes i (n,), to which their steps led but for rounding; a (n, D) before."""
         assert self._ground is not None
         x, v, floor = self._x[i], self._v[i], self._ground.floor[i]
         rate = v[:, -1:]
