@@ -26,7 +26,8 @@ class InputError(ValueError):
     def __init__(self, message: str) -> None:
         # Names and cells from a user's file may hold anything; what would break the line or a
         # terminal is escaped.
-        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in message))
+        escaped = [c if c.isprintable() else ascii(c)[1:-1] for c in message]
+        super().__init__("".join(escaped))
 
 
 def unknown(kind: str, name: str, known: Sequence[str]) -> InputError:
@@ -179,7 +180,8 @@ class UnitCube:
         self.parameters = tuple(parameters)
         self._log = np.array([p.log for p in self.parameters])
         self._any_log = bool(self._log.any())
-        bounds = np.array([p.bounds for p in self.parameters], dtype=np.float64).reshape(-1, 2)
+        pairs = [p.bounds for p in self.parameters]
+        bounds = np.array(pairs, dtype=np.float64).reshape(-1, 2)  # also where there are none
         self._low, self._high = self._scaled(bounds.T)
         self._span = self._high - self._low
         self.training: Array = frozen(
@@ -195,7 +197,8 @@ class UnitCube:
         if not self._any_log:
             return theta
         # The logarithm of 1 where none is asked for: that of a negative number warns.
-        scaled: Array = np.where(self._log, np.log(np.where(self._log, theta, 1.0)), theta)
+        positive = np.where(self._log, theta, 1.0)
+        scaled: Array = np.where(self._log, np.log(positive), theta)
         return scaled
 
     def physical(self, points: Array) -> Array:
@@ -203,7 +206,8 @@ class UnitCube:
         scaled: Array = self._low + points * self._span  # (1)
         if not self._any_log:
             return scaled
-        mixed: Array = np.where(self._log, np.exp(np.where(self._log, scaled, 0.0)), scaled)
+        logarithm = np.where(self._log, scaled, 0.0)
+        mixed: Array = np.where(self._log, np.exp(logarithm), scaled)  # (1)
         return mixed
 
     def inverse(self, theta: Array) -> Array:

@@ -26,7 +26,8 @@ from sims.system import Contact, Effect, Engine, Force, Friction, Kind, Moment, 
 class OwnSystem(System):
     """The declaration behind an own simulator, made from its class attributes."""
 
-    name, says = "own", "a user's own simulator"
+    name = "own"
+    says = "a user's own simulator"
     kind: ClassVar[Kind] = "linear"
     parameters: ClassVar[tuple[Parameter, ...]] = ()
     channels: ClassVar[tuple[Channel, ...]] = ()
@@ -81,11 +82,13 @@ class _UnsaidError(InputError):
 def _ask(effect: type[Effect], system: type[OwnSystem]) -> None:
     """Let the effect ask the system once for all it needs."""
     # With coefficients of zero at rest at zero: what it asks for counts, not what comes out.
-    one, d = np.ones((1, 1)), len(system.coordinates)
+    one = np.ones((1, 1))
+    d = len(system.coordinates)
     constants = {c.name: c.value * one for c in system.constants}
     inputs = {c.name: 0.0 * one for c in system.inputs}
     theta = np.array([[p.nominal for p in system.parameters]])
-    moment = Moment(system(), theta, constants, 0 * one, np.zeros((1, d)), np.zeros((1, d)), inputs)
+    nothing = np.zeros((1, d))
+    moment = Moment(system(), theta, constants, 0 * one, nothing, nothing, inputs)
     c = np.zeros((len(effect.coefficients), 1, 1))
     if issubclass(effect, Force):
         effect().force(c, moment)

@@ -31,7 +31,8 @@ class OwnEngine:
     requires: tuple[str, ...] = ()
 
     def __init__(self, world: OwnSimulator, step: float) -> None:
-        self.world, self.largest_step = world, float(step)
+        self.world = world
+        self.largest_step = float(step)
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
         """Nothing."""
@@ -44,8 +45,10 @@ class OwnEngine:
         """Readings (L, R, C) in place of positions, a row after every `lanes.every` steps and one
         before the first.
         """
-        count, width = lanes.steps.shape[1] // lanes.every + 1, len(lanes.system.channels)
-        result = np.full((len(lanes.theta), count, width), np.nan)
+        count = lanes.steps.shape[1] // lanes.every + 1
+        width = len(lanes.system.channels)
+        shape = len(lanes.theta), count, width
+        result = np.full(shape, np.nan)
         for lane in range(len(lanes.theta)):
             rows = self._run(lanes, lane)
             if rows is not None and np.isfinite(rows).all():
@@ -53,31 +56,40 @@ class OwnEngine:
         return Motion(result, result, result)
 
     def _run(self, lanes: Lanes, lane: int) -> Array | None:
-        system, world = lanes.system, self.world
+        system = lanes.system
+        world = self.world
         names = [p.name for p in system.parameters]
         theta = dict(zip(names, lanes.theta[lane].tolist(), strict=True))
         constants = {name: float(value[lane, 0]) for name, value in lanes.constants.items()}
         states = (*system.coordinates, *system.rates)
-        initial = dict(zip(states, [*lanes.x[lane], *lanes.v[lane]], strict=True))
+        start = [*lanes.x[lane].tolist(), *lanes.v[lane].tolist()]
+        initial = dict(zip(states, start, strict=True))
         # A user's model is never asked what it makes of NaN: it may hang, or never recover.
-        if not np.isfinite([*theta.values(), *constants.values(), *initial.values()]).all():
+        given = [*theta.values(), *constants.values(), *initial.values()]
+        if not np.isfinite(given).all():
             return None
-        world.reset(theta, constants, {name: float(value) for name, value in initial.items()})
-        forces, steps = _Forces(lanes, lane, world), lanes.steps[lane].copy()
+        world.reset(theta, constants, initial)
+        forces = _Forces(lanes, lane, world)
+        steps = lanes.steps[lane].copy()
         # Steps of no length, in which the lane waits for others, are no steps of the simulator.
-        steps[steps > 0] = evened(steps[steps > 0], lanes.every)
-        row, t, moved = self._row(system), 0.0, False
+        moving = steps > 0
+        steps[moving] = evened(steps[moving], lanes.every)
+        row = self._row(system)
+        t = 0.0
+        moved = False
         rows = [row]
         for i, seconds in enumerate(steps.tolist()):
             if seconds > 0:
-                inputs = {name: float(signal[lane, i]) for name, signal in lanes.inputs.items()}
+                inputs = {name: float(u[lane, i]) for name, u in lanes.inputs.items()}
                 if forces.any:
                     world.apply_force(forces.at(t, inputs, seconds))
                 world.step(inputs, seconds)
-                t, moved = t + seconds, True
+                t = t + seconds
+                moved = True
             # Nothing has changed where nothing has moved: the row before is the row now.
             if (i + 1) % lanes.every == 0:
-                row, moved = self._row(system) if moved else row, False
+                row = self._row(system) if moved else row
+                moved = False
                 rows.append(row)
         return np.array(rows)
 
@@ -98,13 +110,13 @@ class _Forces:
     """The effects' forces on one lane."""
 
     def __init__(self, lanes: Lanes, lane: int, world: OwnSimulator) -> None:
-        acting = [
-            (effect, c[:, lane : lane + 1]) for effect, c in lanes.effects if c[:, lane].any()
-        ]
+        here = [(effect, c[:, lane : lane + 1]) for effect, c in lanes.effects]
+        acting = [(effect, c) for effect, c in here if c.any()]
         self.forces = [(effect, c) for effect, c in acting if isinstance(effect, Force)]
         self.frictions = [(effect, c) for effect, c in acting if isinstance(effect, Friction)]
         self.any = bool(acting)
-        self.world, self.system = world, lanes.system
+        self.world = world
+        self.system = lanes.system
         self.theta = lanes.theta[lane : lane + 1]
         self.constants = {name: value[lane : lane + 1] for name, value in lanes.constants.items()}
         self._last: tuple[Array, Array, float] | None = None
@@ -112,9 +124,11 @@ class _Forces:
     def at(self, t: float, inputs: Mapping[str, float], seconds: float) -> Array:
         """(D,) the sum over the coming step."""
         seen = self.world.observe()
-        x, v = (self._state(seen, names) for names in (self.world.coordinates, self.world.rates))
+        x = self._state(seen, self.world.coordinates)
+        v = self._state(seen, self.world.rates)
         felt = {name: np.array([[value]]) for name, value in inputs.items()}
-        moment = Moment(self.system, self.theta, self.constants, np.array([[t]]), x, v, felt)
+        now = np.array([[t]])
+        moment = Moment(self.system, self.theta, self.constants, now, x, v, felt)
         force = np.zeros(x.shape[1])
         for effect, c in self.forces:
             force = force + effect.force(c, moment)[0]
@@ -127,7 +141,8 @@ class _Forces:
 
         What the simulator itself pulls with is taken from the last step.
         """
-        inertia, v = self.world.inertia(), moment.v[0]
+        inertia = self.world.inertia()
+        v = moment.v[0]
         own = np.zeros_like(force)
         if self._last is not None:
             before, applied, took = self._last
@@ -140,6 +155,6 @@ class _Forces:
         return friction
 
     def _state(self, seen: Mapping[str, float], names: Sequence[str]) -> Array:
-        values = [[_seen(self.world, seen, name) for name in names]]
-        state: Array = np.array(values)
+        values = [_seen(self.world, seen, name) for name in names]
+        state: Array = np.array([values])
         return state

@@ -114,7 +114,7 @@ def make_plan(runs: Runs, commands: Commands, acting: Acting, largest_step: floa
         largest_step: no step is longer, in seconds.
     """
     samples = max(s.times.size for s in runs.distinct)
-    instants = np.stack([_padded(s.times - s.times[0], samples) for s in runs.distinct])
+    instants = np.stack([_padded(_since_start(s), samples) for s in runs.distinct])
     shifting = [(e, c) for e, c in acting if c.any() and _shifts(e)]
     if not shifting:
         # Runs with the same instants share one row, and all that is computed from it.
@@ -127,11 +127,14 @@ def make_plan(runs: Runs, commands: Commands, acting: Acting, largest_step: floa
         if isinstance(effect, Sensor):
             instants = np.where(acts(c), effect.times(c, instants), instants)
     # Time never runs backwards, whatever an effect makes of it, and begins with the run.
-    instants = np.maximum.accumulate(np.maximum(instants, 0.0), axis=1)
-    marks = np.concatenate([instants, _changes(runs, commands, shifting)], axis=1)
+    instants = np.maximum(instants, 0.0)
+    instants = np.maximum.accumulate(instants, axis=1)
+    changes = _changes(runs, commands, shifting)
+    marks = np.concatenate([instants, changes], axis=1)
     marks = np.clip(marks, 0.0, instants[:, -1:])
     order = np.argsort(marks, axis=1, kind="stable")
-    steps, ends, every, rows = _divided(np.take_along_axis(marks, order, axis=1), largest_step)
+    marks = np.take_along_axis(marks, order, axis=1)
+    steps, ends, every, rows = _divided(marks, largest_step)
     # The rows of the sorted marks back in the order of the marks, of which the first are samples.
     back = np.empty_like(rows)
     np.put_along_axis(back, order, rows, axis=1)
@@ -145,16 +148,20 @@ def _changes(runs: Runs, commands: Commands, shifting: Sequence[tuple[Effect, Ar
         rows = []
         for s, u in zip(runs.distinct, commands, strict=True):
             changed = np.diff(u[name]) != 0
-            rows.append((s.times - s.times[0])[1:][changed])
+            later = _since_start(s)[1:]
+            rows.append(later[changed])
         size = max(row.size for row in rows)
         padded = [np.concatenate([row, np.zeros(size - row.size)]) for row in rows]
         felt = np.stack(padded)[runs.of]
         # Effects act on the first input.
         for effect, c in shifting if place == 0 else ():
             if isinstance(effect, Input):
-                felt = np.where(acts(c), felt + (felt - effect.times(c, felt)), felt)  # (2)
+                commanded = effect.times(c, felt)
+                felt = np.where(acts(c), felt + (felt - commanded), felt)  # (2)
         columns.append(felt)
-    return np.concatenate(columns, axis=1) if columns else np.zeros((runs.of.size, 0))
+    if not columns:
+        return np.zeros((runs.of.size, 0))
+    return np.concatenate(columns, axis=1)
 
 
 def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, Indices]:
@@ -166,7 +173,8 @@ def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, I
     interval.
     """
     lanes, samples = instants.shape
-    before = np.concatenate([np.zeros((lanes, 1)), instants[:, :-1]], axis=1)
+    start = np.zeros((lanes, 1))
+    before = np.concatenate([start, instants[:, :-1]], axis=1)
     intervals = instants - before
     # An interval of a whole number of steps has that number, whatever its rounding.
     parts = np.ceil(intervals / largest_step - _ROUNDING).astype(np.intp)
@@ -179,8 +187,12 @@ def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, I
     # in the interval.
     interval = np.repeat(np.arange(lanes * samples), blocks.ravel())
     lane = interval // samples
-    block = np.arange(interval.size) - (np.cumsum(rows[:, -1]) - rows[:, -1])[lane]
-    number = (block - (rows - blocks).ravel()[interval])[:, None] * every + np.arange(every)
+    in_lane = rows[:, -1]
+    in_lanes_before = np.cumsum(in_lane) - in_lane
+    block = np.arange(interval.size) - in_lanes_before[lane]
+    blocks_before = (rows - blocks).ravel()[interval]
+    in_interval = (block - blocks_before)[:, None]
+    number = in_interval * every + np.arange(every)
     count = parts.ravel()[interval, None]
     length = intervals.ravel()[interval, None] / count
     steps = np.zeros((lanes, size, every))
@@ -188,12 +200,21 @@ def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, I
     steps[lane, block] = np.where(number < count, length, 0.0)
     # The last step of an interval ends at the instant itself and not near it.
     inside = before.ravel()[interval, None] + (number + 1) * length
-    ends[lane, block] = np.where(number + 1 < count, inside, instants.ravel()[interval, None])
+    instant = instants.ravel()[interval, None]
+    ends[lane, block] = np.where(number + 1 < count, inside, instant)
     return steps.reshape(lanes, -1), ends.reshape(lanes, -1), every, rows
 
 
+def _since_start(scenario: Scenario) -> Array:
+    """(T,) seconds since the first sample."""
+    seconds: Array = scenario.times - scenario.times[0]
+    return seconds
+
+
 def _padded(values: Array, size: int) -> Array:
-    return np.concatenate([values, np.full(size - values.size, values[-1])])
+    """`values` and their last one, over and over, up to this size."""
+    more = np.full(size - values.size, values[-1])
+    return np.concatenate([values, more])
 
 
 def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> dict[str, Array]:
@@ -209,13 +230,13 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
         commands: inputs of each distinct scenario.
         acting: input effects in the order in which the signal passes them.
     """
-    names = list(commands[0])
     effects = tuple((effect, c, acts(c)) for effect, c in acting if c.any())
     begin = _before(plan.ends)
-    felt = {
-        name: _felt(runs, [u[name] for u in commands], begin, plan.ends)
-        for name in names[1 if effects else 0 :]
-    }
+    first, *others = commands[0]
+    felt = {}
+    for name in others if effects else (first, *others):
+        signals = [u[name] for u in commands]
+        felt[name] = _felt(runs, signals, begin, plan.ends)
     if not effects:
         return felt
     # Back from the plant to the command: the last effect asks the one before it for its instants.
@@ -225,24 +246,28 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
         begin = np.where(on, effect.times(c, begin), begin)
         end = np.where(on, effect.times(c, end), end)
     lasting = _lasting(plan.steps)
-    means = _felt(runs, [u[names[0]] for u in commands], begin, end)
+    signals = [u[first] for u in commands]
+    means = _felt(runs, signals, begin, end)
     values = np.take_along_axis(means, lasting, axis=1)
     # And forward with the values. What was before the run is a signal that has always been there.
-    start = np.array([u[names[0]][0] for u in commands])[runs.of, None]
+    beginnings = np.array([signal[0] for signal in signals])
+    start = beginnings[runs.of, None]
     nothing = np.zeros_like(start)
     for effect, c, on in effects:
         assert isinstance(effect, Input)
         begun = effect.feel(c, Signal(start, nothing, start, nothing))
         passed = effect.feel(c, Signal(values, plan.steps, start, plan.ends))
-        values = np.where(on, np.take_along_axis(passed, lasting, axis=1), values)
+        passed = np.take_along_axis(passed, lasting, axis=1)
+        values = np.where(on, passed, values)
         start = np.where(on, begun, start)
-    return {names[0]: values, **felt}
+    return {first: values, **felt}
 
 
 def _before(ends: Array) -> Array:
     """(L, S) the beginnings of steps, from their ends; shares memory as they do."""
     own = ends[:1] if ends.strides[0] == 0 else ends
-    begin = np.concatenate([np.zeros((len(own), 1)), own[:, :-1]], axis=1)
+    start = np.zeros((len(own), 1))
+    begin = np.concatenate([start, own[:, :-1]], axis=1)
     return np.broadcast_to(begin, ends.shape)
 
 
@@ -251,21 +276,24 @@ def _lasting(steps: Array) -> Indices:
     feels nothing new.
     """
     own = np.arange(steps.shape[1])
-    last: Indices = np.maximum.accumulate(np.where(steps > 0, own, 0), axis=1)
+    lasting = np.where(steps > 0, own, 0)
+    last: Indices = np.maximum.accumulate(lasting, axis=1)
     return last
 
 
 def _felt(runs: Runs, signals: Sequence[Array], begin: Array, end: Array) -> Array:
     """Means (L, S) of each lane's signal from `begin` to `end` (L, S)."""
     alike = begin.strides[0] == 0 and end.strides[0] == 0  # all lanes make the same steps
-    result = np.empty((len(signals) if alike else len(begin), begin.shape[1]))
+    count = len(signals) if alike else len(begin)
+    result = np.empty((count, begin.shape[1]))
     # All lanes of a run in one call, and of lanes that step alike only the first.
     by_run = np.argsort(runs.of, kind="stable")
-    for lanes in np.split(by_run, np.flatnonzero(np.diff(runs.of[by_run])) + 1):
+    borders = np.flatnonzero(np.diff(runs.of[by_run])) + 1
+    for lanes in np.split(by_run, borders):
         run = runs.of[lanes[0]]
-        times = runs.distinct[run].times
+        times = _since_start(runs.distinct[run])
         to, of = (slice(run, run + 1), slice(1)) if alike else (lanes, lanes)
-        result[to] = _means(times - times[0], signals[run], begin[of], end[of])
+        result[to] = _means(times, signals[run], begin[of], end[of])
     return runs.spread(result) if alike else result
 
 
@@ -273,30 +301,36 @@ def _means(times: Array, values: Array, begin: Array, end: Array) -> Array:
     """Means over [begin, end] of the signal that holds values[i] from times[i] on; its value where
     begin = end.
     """
-    place = np.clip(np.searchsorted(times, begin, side="right") - 1, 0, times.size - 1)
+    place = np.searchsorted(times, begin, side="right") - 1
+    place = np.clip(place, 0, times.size - 1)
     value: Array = values[place]
-    last = np.clip(np.searchsorted(times, end, side="left") - 1, 0, times.size - 1)
+    last = np.searchsorted(times, end, side="left") - 1
+    last = np.clip(last, 0, times.size - 1)
     # (1) only where the command changes within: elsewhere its value is exact, a quotient is not.
     crossing = last > place
     if crossing.any():
-        area = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(times))])
-        a, b = begin[crossing], end[crossing]
+        held = values[:-1] * np.diff(times)
+        area = np.concatenate([[0.0], np.cumsum(held)])
+        a = begin[crossing]
+        b = end[crossing]
         over = _area(times, values, area, b) - _area(times, values, area, a)
         value[crossing] = over / (b - a)  # (1)
     return value
 
 
 def _area(times: Array, values: Array, area: Array, t: Array) -> Array:
-    place = np.clip(np.searchsorted(times, t, side="right") - 1, 0, times.size - 1)
+    """A(t) of (1), with `area` (T,) that up to each of `times` (T,)."""
+    place = np.searchsorted(times, t, side="right") - 1
+    place = np.clip(place, 0, times.size - 1)
     result: Array = area[place] + values[place] * (t - times[place])
     return result
 
 
 def _shifts(effect: Effect) -> bool:
-    return isinstance(effect, (Input, Sensor)) and type(effect).times not in (
-        Input.times,
-        Sensor.times,
-    )
+    """Whether it moves instants: whether it has a `times` of its own."""
+    if not isinstance(effect, (Input, Sensor)):
+        return False
+    return type(effect).times not in (Input.times, Sensor.times)
 
 
 def acts(c: Array) -> NDArray[np.bool_]:

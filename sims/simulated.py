@@ -86,10 +86,13 @@ class Simulated(Simulator):
         super().__init_subclass__(**kwargs)
         # A simulator says what its system says: it is declared once.
         system = cls.system
-        cls.name, cls.says = system.name, system.says
-        cls.parameters, cls.channels = system.parameters, system.channels
+        cls.name = system.name
+        cls.says = system.says
+        cls.parameters = system.parameters
+        cls.channels = system.channels
         cls.constants = system.constants
-        cls.inputs, cls.states = system.inputs, system.states
+        cls.inputs = system.inputs
+        cls.states = system.states
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
         return engine_named(name or self.default_engine, self.system, settings)
@@ -137,7 +140,8 @@ class Simulated(Simulator):
             raise InputError(f"theta must have shape {expected}, found {theta.shape}")
         if not len(theta):
             return np.empty((0, 0, len(self.channels)))
-        acting, runs = self._acting(theta), make_runs(scenarios)
+        acting = self._acting(theta)
+        runs = make_runs(scenarios)
         commands = [self.run_inputs(s) for s in runs.distinct]
         with np.errstate(all="ignore"):  # a lane whose numbers overflow is NaN in the end
             plan = make_plan(runs, commands, _of(acting, (Input, Sensor)), self.engine.largest_step)
@@ -167,13 +171,16 @@ class Simulated(Simulator):
 
         Those that the system does not have, or that were not given, are zero.
         """
-        acting, place = [], len(self.system.parameters)
+        acting = []
+        place = len(self.system.parameters)
         for effect in self.effects:
             count = len(effect.on(self.system))
-            acting.append((effect, _coefficients(effect, theta[:, place : place + count].T)))
+            rows = theta[:, place : place + count].T
+            acting.append((effect, _coefficients(effect, rows)))
             place += count
         for effect, values in self.fixed:
-            rows = np.repeat(np.array(values)[:, None], len(theta), axis=1)
+            column = np.array(values)[:, None]
+            rows = np.repeat(column, len(theta), axis=1)
             acting.append((effect, _coefficients(effect, rows)))
         return tuple(acting)
 
@@ -190,8 +197,8 @@ class Simulated(Simulator):
         of = np.array([place[id(scenario)] for scenario in scenarios])
         known = [self.run_constants(s) for s in distinct]
         began = [self.run_initial(s) for s in distinct]
-        constants = {name: np.array([row[name] for row in known])[of, None] for name in known[0]}
-        states = {name: np.array([row[name] for row in began])[of] for name in began[0]}
+        constants = {name: values[of, None] for name, values in _columns(known).items()}
+        states = {name: values[of] for name, values in _columns(began).items()}
         states = self._checked("initial state", states, initial)
         x = _stacked(states, self.system.coordinates, of.size)
         v = _stacked(states, self.system.rates, of.size)
@@ -208,16 +215,19 @@ class Simulated(Simulator):
         rows = plan.rows * (plan.every // lanes.every)
         observations = np.empty((*rows.shape, len(names)))
         for place, name in enumerate(names):
-            values, start = channels[name], channels[name][:, :1]
+            values = channels[name]
+            start = channels[name][:, :1]
             for effect, c in sensors:
                 assert isinstance(effect, Sensor)
                 # Sensors in a row: each reads what the one before gives, also at the start, in
                 # which the next begins. A gain or bias is that of one channel.
                 if effect.filters or name == valued:
-                    on, nothing = acts(c), np.zeros_like(start)
+                    on = acts(c)
+                    nothing = np.zeros_like(start)
                     begun = effect.read(c, Signal(start, nothing, start, nothing))
                     read = effect.read(c, Signal(values, steps, start, times))
-                    values, start = np.where(on, read, values), np.where(on, begun, start)
+                    values = np.where(on, read, values)
+                    start = np.where(on, begun, start)
             observations[:, :, place] = _chosen(values, rows)
         observations += 0.0  # no zero is negative: whatever made it, it is the same zero
         return observations
@@ -225,7 +235,8 @@ class Simulated(Simulator):
 
 def _kept(plan: Plan, every: int) -> Array:
     """(L, R) instants of the states that an engine keeps, in seconds since the start."""
-    return np.concatenate([np.zeros((len(plan.ends), 1)), plan.ends[:, every - 1 :: every]], axis=1)
+    start = np.zeros((len(plan.ends), 1))
+    return np.concatenate([start, plan.ends[:, every - 1 :: every]], axis=1)
 
 
 def _chosen(values: Array, rows: NDArray[np.intp]) -> Array:
@@ -243,7 +254,8 @@ def effect_parameters(
     """The coefficients of an effect as parameters, named for the effect and searched in their
     plausible range.
     """
-    result, there = [], effect.on(system)
+    result = []
+    there = effect.on(system)
     for c in there:
         name = effect.name if len(there) == 1 else f"{effect.name}.{c.name}"
         low, high = c.range(system.kind)
@@ -251,6 +263,11 @@ def effect_parameters(
         off = min(max(0.0, low), high)  # nominally it is not there, if that is in its range
         result.append(Parameter(name, unit, off, (low, high), says=effect.says))
     return tuple(result)
+
+
+def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, Array]:
+    """Rows of numbers by name as one array (N,) a name."""
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 def _stacked(states: Mapping[str, Array], names: Sequence[str], count: int) -> Array:

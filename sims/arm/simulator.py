@@ -65,7 +65,8 @@ def _of_link(
 class Arm(OwnSimulator):
     """A two-link arm that swings in a vertical plane, driven at both joints."""
 
-    name, requires = "arm", ("pybullet",)
+    name = "arm"
+    requires = ("pybullet",)
     says = "a two-link arm in a vertical plane, driven at both joints"
     kind = "rotary"
     time_step = 1 / 250
@@ -100,7 +101,8 @@ class Arm(OwnSimulator):
         Channel("qd1", "rad/s", 10.0, "rate of joint 1"),
         Channel("qd2", "rad/s", 10.0, "rate of joint 2"),
     )
-    coordinates, rates = ("q1", "q2"), ("qd1", "qd2")
+    coordinates = ("q1", "q2")
+    rates = ("qd1", "qd2")
     states = MappingProxyType({"q1": 0.5, "q2": 0.5, "qd1": 0.0, "qd2": 0.0})
 
     _world: BulletWorld
@@ -142,22 +144,26 @@ class Arm(OwnSimulator):
         )
         p.changeDynamics(self._arm, -1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING)
         for joint in (0, 1):
-            inertia, damping = constants[f"inertia{joint + 1}"], theta[f"damping{joint + 1}"]
+            inertia = constants[f"inertia{joint + 1}"]
+            damping = theta[f"damping{joint + 1}"]
             p.changeDynamics(
                 self._arm, joint, localInertiaDiagonal=(inertia,) * 3, jointDamping=damping
             )
         self._friction = [theta["friction1"], theta["friction2"]]
         self._step = 0.0
         # Looked up once: a run has thousands of each.
-        self._place, self._push = p.resetJointState, p.setJointMotorControl2
-        self._state, self._go = p.getJointState, p.stepSimulation
+        self._place = p.resetJointState
+        self._push = p.setJointMotorControl2
+        self._state = p.getJointState
+        self._go = p.stepSimulation
         self._torque = p.TORQUE_CONTROL
         self._q = [initial["q1"], initial["q2"]]
         self._v = [initial["qd1"], initial["qd2"]]
 
     def step(self, inputs: Mapping[str, float], seconds: float) -> None:
         """One step of Heun's method, or several short ones where dry friction changes sides."""
-        torques, before = (inputs["u1"], inputs["u2"]), (self._q, self._v)
+        torques = (inputs["u1"], inputs["u2"])
+        before = (self._q, self._v)
         # Friction's side is fixed within a step of Bullet's; where it changes, steps must be short.
         if self._heun(torques, seconds):
             self._q, self._v = before
@@ -169,17 +175,21 @@ class Arm(OwnSimulator):
         turned round.
         """
         self._pace(seconds)
-        q, v = self._q, self._v
+        q = self._q
+        v = self._v
         for joint in (0, 1):
             self._place(self._arm, joint, q[joint], v[joint])
-        v1, v2 = self._advance(torques), self._advance(torques)
+        v1 = self._advance(torques)
+        v2 = self._advance(torques)
         self._q = [q[i] + seconds * (v[i] + v1[i]) / 2 for i in (0, 1)]  # (2)
         self._v = [(v[i] + v2[i]) / 2 for i in (0, 1)]  # (3)
         return any(_turns(v[i], v1[i], v2[i]) for i in (0, 1) if self._friction[i] > 0)
 
     def observe(self) -> Mapping[str, float]:
         """Angles and rates."""
-        return {"q1": self._q[0], "q2": self._q[1], "qd1": self._v[0], "qd2": self._v[1]}
+        q1, q2 = self._q
+        qd1, qd2 = self._v
+        return {"q1": q1, "q2": q2, "qd1": qd1, "qd2": qd2}
 
     def close(self) -> None:
         """Leave Bullet; the next run starts it again."""

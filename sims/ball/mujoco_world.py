@@ -9,7 +9,8 @@ def model(constants: Mapping[str, float]) -> str:
     """The world as MJCF; the joints are x, y, z, zero at the origin; the ball states what its
     contact is like.
     """
-    size, mass = constants["radius"], constants["mass"]
+    size = constants["radius"]
+    mass = constants["mass"]
     return f"""
     <mujoco>
       <option gravity="0 0 {-constants["gravity"]!r}"/>

@@ -137,7 +137,8 @@ class Joint:
 
     def __init__(self, world: bullet.World, module: BulletJointModule) -> None:
         self._world = world
-        self._load, self._gravity = module.load, module.gravity
+        self._load = module.load
+        self._gravity = module.gravity
         self.open_loop: bool = module.OPEN_LOOP
 
     def start(self, constants: dict[str, float]) -> None:
@@ -164,9 +165,13 @@ class Joint:
 
     def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
         """Steps with a force or torque at the joint."""
-        p, client, body = bullet.engine(), self._client, self._body
+        p = bullet.engine()
+        client = self._client
+        body = self._body
         # Looked up once: a rollout has thousands of each.
-        step, push, torque = p.stepSimulation, p.setJointMotorControl2, p.TORQUE_CONTROL
+        step = p.stepSimulation
+        push = p.setJointMotorControl2
+        torque = p.TORQUE_CONTROL
         read = p.getJointState
         states = []
         for count in counts:
@@ -194,7 +199,8 @@ class _Mover:
     def start(self, constants: dict[str, float]) -> None:
         """A world for these constants, without the contact points of the rollout before."""
         p = bullet.engine()
-        self._mass, self._contact = constants["mass"], (math.nan, math.nan)
+        self._mass = constants["mass"]
+        self._contact = (math.nan, math.nan)
         self._client, self._body = self._world.body(constants)
         # The world is reset in place: building one is half the cost of a rollout. But contact
         # points outlive a reset and would be taken for old, which changes what follows by
@@ -216,15 +222,20 @@ class _Mover:
     def advance(self, force: Vector) -> State:
         """One step with a force at the centre, which is where it was last placed or read."""
         # Forces come per unit mass, Bullet wants newtons and where they attack.
-        p, mass = bullet.engine(), self._mass
+        p = bullet.engine()
+        mass = self._mass
         newtons = mass * force[0], mass * force[1], mass * force[2]
         p.applyExternalForce(self._body, -1, newtons, self._x, p.WORLD_FRAME, self._client)
         return self.glide((1,))[0]
 
     def glide(self, counts: Sequence[int]) -> list[State]:
         """Steps under gravity."""
-        p, client, body = bullet.engine(), self._client, self._body
-        step, at, moving = p.stepSimulation, p.getBasePositionAndOrientation, p.getBaseVelocity
+        p = bullet.engine()
+        client = self._client
+        body = self._body
+        step = p.stepSimulation
+        at = p.getBasePositionAndOrientation
+        moving = p.getBaseVelocity
         states: list[State] = []
         for count in counts:
             for _ in range(count):
@@ -253,7 +264,8 @@ class Ball(_Mover):
 
     def start(self, constants: dict[str, float]) -> None:
         """As every ball's, without contact."""
-        self._floor, self._gravity = constants["radius"], constants["gravity"]
+        self._floor = constants["radius"]
+        self._gravity = constants["gravity"]
         super().start(constants)
         self._meets(False)
 
@@ -305,9 +317,11 @@ class NativeBall(_Mover):
             return
         # The contact has the product of both bodies' frictions: with the ground's 1, the ball's own
         # is the sum of what the settings' product was and what the effect adds.
-        own, ground = self._rough, self._rough
+        own = self._rough
+        ground = self._rough
         if friction:
-            own, ground = self._rough**2 + friction, 1.0
+            own = self._rough**2 + friction
+            ground = 1.0
         p = bullet.engine()
         if friction or self._contact[1]:
             floor = p.getBodyUniqueId(0, self._client)

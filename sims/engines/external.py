@@ -86,7 +86,8 @@ class Lane:
         """Instants of this lane: t (n, 1), x and v (n, D), inputs (n, 1)."""
         n = len(x)
         known = {name: np.repeat(value, n, axis=0) for name, value in self.constants.items()}
-        return Moment(self.system, np.repeat(self.theta, n, axis=0), known, t, x, v, inputs)
+        theta = np.repeat(self.theta, n, axis=0)
+        return Moment(self.system, theta, known, t, x, v, inputs)
 
 
 class Forces:
@@ -101,11 +102,14 @@ class Forces:
     def __init__(self, lane: Lane, rows: int) -> None:
         shape = (rows, lane.x.size)
         inputs = {name: np.full((rows, 1), signal[0]) for name, signal in lane.inputs.items()}
-        self.moment = lane.moment(np.zeros((rows, 1)), np.zeros(shape), np.zeros(shape), inputs)
-        self._system, self._inputs = lane.system, inputs
+        t = np.zeros((rows, 1))
+        self.moment = lane.moment(t, np.zeros(shape), np.zeros(shape), inputs)
+        self._system = lane.system
+        self._inputs = inputs
         # Most systems have no passive force but gravity, which the engine applies by itself.
         self._more = type(lane.system).passive is not System.passive
         self._driven = bool(inputs) or self._more
+        # Every velocity is asked for at once, a row each: a call costs more than its rows.
         acting = [(effect, np.repeat(c, rows, axis=1)) for effect, c in lane.effects]
         self._forces = [(effect, c) for effect, c in acting if isinstance(effect, Force)]
         self._frictions = [(effect, c) for effect, c in acting if isinstance(effect, Friction)]
@@ -129,7 +133,8 @@ class Forces:
 
     def limit(self) -> float:
         """Largest friction at the first row of `moment`."""
-        return sum(float(effect.limit(c, self.moment)[0, 0]) for effect, c in self._frictions)
+        limits = [effect.limit(c, self.moment) for effect, c in self._frictions]
+        return sum(float(limit[0, 0]) for limit in limits)
 
 
 def rate(velocity: float, force: float, limit: float) -> float:
@@ -178,7 +183,8 @@ def integrate(lanes: Lanes, rollout: Callable[[Lane], Path], discard: Callable[[
     """
     count = lanes.steps.shape[1] // lanes.every + 1
     shape = (len(lanes.theta), count, lanes.x.shape[1])
-    motion = Motion(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan))
+    x = np.full(shape, np.nan)
+    motion = Motion(x, x.copy(), x.copy())
     for i in range(len(lanes.theta)):
         # Lanes of one run follow each other and make the same steps.
         if i == 0 or not np.array_equal(lanes.steps[i], lanes.steps[i - 1]):
@@ -205,19 +211,20 @@ def _timing(steps: Array, every: int) -> tuple[Places, Array, Places, Places]:
     each record is.
     """
     # A state behind a step of no length is the one before it: records share their rows.
-    moving = np.flatnonzero(steps > 0)
-    taken = np.concatenate([[0], np.cumsum(steps > 0)])[::every]
+    moves = steps > 0
+    moving = np.flatnonzero(moves)
+    taken = np.concatenate([[0], np.cumsum(moves)])[::every]
     kept, rows = np.unique(taken, return_inverse=True)
     return moving, evened(steps[moving], every), kept, rows
 
 
 def _lane(lanes: Lanes, i: int, moving: Places, steps: Array, kept: Places) -> Lane:
-    effects = tuple((effect, c[:, i : i + 1]) for effect, c in lanes.effects if c[:, i].any())
+    acting = [(effect, c[:, i : i + 1]) for effect, c in lanes.effects]
+    effects = tuple((effect, c) for effect, c in acting if c.any())
     constants = {name: value[i : i + 1] for name, value in lanes.constants.items()}
-    inputs = {
-        name: value[i, moving] if moving.size else value[i, :1]
-        for name, value in lanes.inputs.items()
-    }
+    # A lane that never moves has an input still, at its one instant.
+    felt = moving if moving.size else slice(1)
+    inputs = {name: value[i, felt] for name, value in lanes.inputs.items()}
     return Lane(
         lanes.system,
         lanes.theta[i : i + 1],
@@ -255,8 +262,10 @@ def evened(steps: Array, every: int) -> Array:
     # By how much the sample times are missed counts, and not by how much each step differs: errors
     # of rounded time stamps do not add up.
     even = math.fsum(steps) / steps.size
-    missed = np.abs(np.cumsum(steps) - even * np.arange(1, steps.size + 1)).max()
-    return np.full(steps.size, even) if missed <= TIME_TOLERANCE * even * every else steps
+    ends = even * np.arange(1, steps.size + 1)
+    missed = np.abs(np.cumsum(steps) - ends).max()
+    alike = missed <= TIME_TOLERANCE * even * every
+    return np.full(steps.size, even) if alike else steps
 
 
 def legs(lane: Lane, *signals: Array) -> list[tuple[int, list[int]]]:
@@ -276,8 +285,9 @@ def legs(lane: Lane, *signals: Array) -> list[tuple[int, list[int]]]:
     stops[lane.kept[lane.kept < size]] = True
     begins = np.flatnonzero(stops)
     counts = np.diff(begins, append=size).tolist()
+    firsts = new[begins].tolist()
     result: list[tuple[int, list[int]]] = []
-    for begin, count, first in zip(begins.tolist(), counts, new[begins].tolist(), strict=True):
+    for begin, count, first in zip(begins.tolist(), counts, firsts, strict=True):
         if first:
             result.append((begin, []))
         result[-1][1].append(count)

@@ -83,7 +83,8 @@ def rollout(ball: Ball, lane: Lane) -> Path:
     """Integrate one lane."""
     ball.start(lane.numbers)
     flight = _Flight(ball, lane)
-    kept, steps = set(lane.kept.tolist()), lane.steps.tolist()
+    kept = set(lane.kept.tolist())
+    steps = lane.steps.tolist()
     rows = [flight.state]
     for begin, counts in legs(lane):
         states = flight.leg(steps[begin], counts)
@@ -156,7 +157,8 @@ class _Flight:
         for _ in range(count):
             # What lies on the ground and is pulled upward flies again.
             if self._rests and self._lift > 0.0:
-                self._rests, self._w = False, None
+                self._rests = False
+                self._w = None
                 self._look()
             if self._rests or self._time_to_ground() >= step:
                 self._forced(step)
@@ -184,10 +186,13 @@ class _Flight:
         # The velocity half a step before is another one for another step.
         if step != self._step:
             self._ball.pace(step)
-            self._step, self._w = step, None
+            self._step = step
+            self._w = None
         if self._w is None:
             # (1) backwards, from the step before.
-            (x, y, z), (ax, ay, az), half = self._v, self._a, 0.5 * step
+            half = 0.5 * step
+            x, y, z = self._v
+            ax, ay, az = self._a
             self._w = x - half * ax, y - half * ay, z - half * az
             self._ball.place(self._x, self._w)
         return self._w
@@ -196,22 +201,30 @@ class _Flight:
         """Steps under gravity alone, or at rest; the states they reach."""
         self._ready(step)
         ax, ay, az = self._a
-        x, y, z = 0.5 * step * ax, 0.5 * step * ay, 0.5 * step * az
+        x = 0.5 * step * ax
+        y = 0.5 * step * ay
+        z = 0.5 * step * az
         reached = self._ball.glide(counts)
         self._x, self._w = reached[-1]
-        states = [(*at, w[0] + x, w[1] + y, w[2] + z, ax, ay, az) for at, w in reached]  # (3)
+        states = []
+        for at, w in reached:
+            v = w[0] + x, w[1] + y, w[2] + z  # (3)
+            states.append((*at, *v, ax, ay, az))
         self._v = states[-1][3:6]
         return states
 
     def _forced(self, step: float) -> None:
         """One step, in flight or at rest, under all that acts."""
         half = 0.5 * step
-        (wx, wy, wz), (x, y, z) = self._ready(step), self._v
-        (ax, ay, az), (gx, gy, gz) = self._a, self._gravity
+        wx, wy, wz = self._ready(step)
+        x, y, z = self._v
+        ax, ay, az = self._a
+        gx, gy, gz = self._gravity
         # (4); at rest the engine's contact bears whatever presses the ball on the ground.
         lift = self._lift - gz if self._rests else (z + half * az - wz) / step - gz
-        force = (x + half * ax - wx) / step - gx, (y + half * ay - wy) / step - gy, lift
-        self._x, self._w = self._ball.advance(force)
+        along = (x + half * ax - wx) / step - gx
+        across = (y + half * ay - wy) / step - gy
+        self._x, self._w = self._ball.advance((along, across, lift))
         self._time += step
         wx, wy, wz = self._w
         # The acceleration at the end is asked for at the velocity that (3) gives with that at the
@@ -226,7 +239,9 @@ class _Flight:
         x, y, z = self._gravity
         if self._pull.any:
             felt = self._pull.at(self._time, self._x, self._v)
-            x, y, z = x + felt[0], y + felt[1], z + felt[2]
+            x = x + felt[0]
+            y = y + felt[1]
+            z = z + felt[2]
         self._lift = z
         self._a = x, y, 0.0 if self._rests else z
 
@@ -234,7 +249,9 @@ class _Flight:
         """Seconds until a flight with the present acceleration meets the ground; 0 on it, inf if
         never.
         """
-        gap, rate, lift = max(self._x[2] - self._floor, 0.0), self._v[2], self._a[2]
+        gap = max(self._x[2] - self._floor, 0.0)
+        rate = self._v[2]
+        lift = self._a[2]
         inside = rate * rate - 2.0 * lift * gap
         # (5): of its two forms the one in which no digits are lost.
         if rate > 0.0 or (rate == 0.0 and lift < 0.0):
@@ -257,6 +274,7 @@ class _Flight:
     def _rest(self) -> None:
         self._rests = True
         # A little inside, so that the engine's contact acts from the first step on.
-        self._x = self._x[0], self._x[1], min(self._x[2], self._floor - INSIDE)
+        x, y, z = self._x
+        self._x = x, y, min(z, self._floor - INSIDE)
         self._v = self._v[0], self._v[1], 0.0
         self._ball.hold()

@@ -85,14 +85,17 @@ class Ground:
             own = c[:, lanes]
             on = (own != 0).any(axis=0)
             # Only where it acts: an effect that is off changes nothing, not even by rounding.
-            e = np.where(on, effect.restitution(own, e, speed), e)
+            changed = effect.restitution(own, e, speed)
+            e = np.where(on, changed, e)
             mu = mu + np.where(on, effect.friction(own), 0.0)
-        up, down = e * speed, -a[:, -1:]  # (1)
+        up = e * speed
+        down = -a[:, -1:]  # (1)
         rests = self._over(lanes, up, down)
         lost = mu * (1.0 + e) * speed
         if rests.any():
             yields = np.where(e < 1.0, 1.0 - e, 1.0)
-            left = np.where(e < 1.0, mu * (1.0 + e) * up / yields, 0.0)  # (4)
+            later = mu * (1.0 + e) * up / yields  # (4)
+            left = np.where(e < 1.0, later, 0.0)
             lost = np.where(rests, lost + left, lost)
             up = np.where(rests, 0.0, up)
         if mu.any():
@@ -100,16 +103,20 @@ class Ground:
             least = 0.0 if self._grip is None else 1.0 - self._grip[lanes]
             share = 1.0 - lost / np.where(along > 0, along, 1.0)
             kept = np.where(mu > 0, np.maximum(share, least), 1.0)  # (2)
-            return Outcome(np.concatenate([v[:, :-1] * kept, up], axis=1), rests[:, 0])
-        return Outcome(np.concatenate([v[:, :-1], up], axis=1), rests[:, 0])
+            after = np.concatenate([v[:, :-1] * kept, up], axis=1)
+            return Outcome(after, rests[:, 0])
+        after = np.concatenate([v[:, :-1], up], axis=1)
+        return Outcome(after, rests[:, 0])
 
     def _over(self, lanes: Indices, up: Array, down: Array) -> Mask:
         """(n, 1) whether bouncing is over, after an impact that would be left with speed `up`."""
         flight = 2.0 * up / np.where(down > 0, down, 1.0)  # (3)
         falls = down > 0  # what is not drawn to the ground flies away, however slowly
-        short = np.where((falls & (flight < SHORT))[:, 0], self._shorts[lanes] + 1, 0)
-        self._shorts[lanes] = short
-        over: Mask = falls & ((flight < SHORTEST) | (short > PATIENCE)[:, None])
+        is_short = (falls & (flight < SHORT))[:, 0]
+        shorts = np.where(is_short, self._shorts[lanes] + 1, 0)
+        self._shorts[lanes] = shorts
+        tired = (shorts > PATIENCE)[:, None]
+        over: Mask = falls & ((flight < SHORTEST) | tired)
         return over
 
 

@@ -105,7 +105,8 @@ def _carried(lane: Lane) -> float | None:
         return 0.0
     (effect, c), *others = lane.effects
     damping = float(c[0, 0, 0])
-    return damping if is_library(effect, "drag.linear") and damping > 0.0 and not others else None
+    alone = is_library(effect, "drag.linear") and not others
+    return damping if alone and damping > 0.0 else None
 
 
 def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
@@ -113,12 +114,19 @@ def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
     is constant.
     """
     drive = _drive(lane)
-    forces, steps, kept = drive.tolist(), lane.steps.tolist(), set(lane.kept.tolist())
-    x, w, v = float(lane.x[0]), math.nan, float(lane.v[0])
-    step, felt = math.nan, forces[0]
+    forces = drive.tolist()
+    steps = lane.steps.tolist()
+    kept = set(lane.kept.tolist())
+    x = float(lane.x[0])
+    w = math.nan
+    v = float(lane.v[0])
+    step = math.nan
+    felt = forces[0]
     rows = [(x, w, step, felt)]
     for begin, counts in legs(lane, drive):
-        h, u, end = steps[begin], forces[begin], begin + sum(counts)
+        h = steps[begin]
+        u = forces[begin]
+        end = begin + sum(counts)
         if h != step:
             # The velocity half a step before is another one for another step.
             if begin:
@@ -134,9 +142,12 @@ def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
         x, w = states[-1]
         if not math.isfinite(x + w):
             break
-        step, felt = h, u
+        step = h
+        felt = u
         # A leg may end between two samples, where the input changes and nothing is kept.
-        rows.extend((*state, h, u) for state in (states if end in kept else states[:-1]))
+        if end not in kept:
+            states.pop()
+        rows.extend((*state, h, u) for state in states)
     if len(rows) < lane.kept.size:
         return _failed(lane)
     # Velocities are read off at the end, all at once: the engine ran without interruption.
@@ -158,8 +169,12 @@ def _whole(w: Any, force: Any, inertia: float, damping: float, step: Any) -> Any
 
 def _driven(joint: Joint, lane: Lane, inertia: float, forces: _Forces) -> Path:
     """Whatever acts, asked for at each step."""
-    x, v = float(lane.x[0]), float(lane.v[0])
-    t, step, w, inverse = 0.0, math.nan, v, 1.0 / inertia
+    x = float(lane.x[0])
+    v = float(lane.v[0])
+    t = 0.0
+    step = math.nan
+    w = v
+    inverse = 1.0 / inertia
     forces.feel(0)
     forces.look(t, x, v)
     kept = set(lane.kept.tolist())
@@ -199,7 +214,8 @@ class _Forces(ABC):
     """
 
     def __init__(self, joint: Joint, inertia: float) -> None:
-        self._gravity, self._inertia = joint.gravity, inertia
+        self._gravity = joint.gravity
+        self._inertia = inertia
         self.weight = self.limit = self._at = self._force = self._slope = 0.0
 
     @abstractmethod
@@ -250,11 +266,14 @@ class _Asked(_Forces):
         moment = self._ask.moment
         moment.t.fill(t)
         moment.x.fill(x)
-        moment.v[0, 0], moment.v[1, 0] = v, v + _NUDGE
+        moment.v[0, 0] = v
+        moment.v[1, 0] = v + _NUDGE
         force, nudged = self._ask.force()[:, 0].tolist()
         self.weight = self._gravity(x)
         self.limit = self._ask.limit()
-        self._at, self._force, self._slope = v, self.weight + force, (nudged - force) / _NUDGE
+        self._at = v
+        self._force = self.weight + force
+        self._slope = (nudged - force) / _NUDGE
 
 
 class _Known(_Forces):
@@ -264,18 +283,22 @@ class _Known(_Forces):
         super().__init__(joint, inertia)
         self._drive: list[float] = _drive(lane).tolist()
         self._felt = self._drive[0]
-        self._resistance, self.limit = opposing.at, opposing.limit
+        self._resistance = opposing.at
+        self.limit = opposing.limit
 
     def feel(self, i: int) -> bool:
         """See `_Forces`."""
-        before, self._felt = self._felt, self._drive[i]
+        before = self._felt
+        self._felt = self._drive[i]
         return bool(self._felt != before)
 
     def look(self, t: float, x: float, v: float) -> None:  # noqa: ARG002
         """See `_Forces`."""
         opposed, slope = self._resistance(abs(v))
         self.weight = self._gravity(x)
-        self._at, self._force, self._slope = v, self.weight + self._felt - opposed * v, -slope
+        self._at = v
+        self._force = self.weight + self._felt - opposed * v
+        self._slope = -slope
 
 
 def _drive(lane: Lane) -> Array:
@@ -283,15 +306,18 @@ def _drive(lane: Lane) -> Array:
     if not lane.inputs:
         return np.zeros(max(lane.steps.size, 1))
     signals = {name: values[:, None] for name, values in lane.inputs.items()}
-    nothing = np.zeros((len(next(iter(signals.values()))), 1))
-    drive: Array = lane.system.drive(lane.moment(nothing, nothing, nothing, signals))[:, 0]
+    size = len(next(iter(signals.values())))
+    nothing = np.zeros((size, 1))
+    moment = lane.moment(nothing, nothing, nothing, signals)
+    drive: Array = lane.system.drive(moment)[:, 0]
     return drive
 
 
 def _weights(lane: Lane, x: Array) -> Array:
     """(n,) gravity's force at positions (n,)."""
     nothing = np.zeros((x.size, 1))
-    weights: Array = lane.system.weight(lane.moment(nothing, x[:, None], nothing, {}))[:, 0]
+    moment = lane.moment(nothing, x[:, None], nothing, {})
+    weights: Array = lane.system.weight(moment)[:, 0]
     return weights
 
 

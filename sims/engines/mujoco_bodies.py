@@ -96,14 +96,17 @@ class Joint:
 
     def __init__(self, world: World, module: MujocoJointModule) -> None:
         self._world = world
-        self._load, self._gravity = module.load, module.gravity
+        self._load = module.load
+        self._gravity = module.gravity
         self.open_loop: bool = module.OPEN_LOOP
 
     def start(self, constants: dict[str, float]) -> None:
         """A world for these constants, as newly made."""
         self._constants, self.gravity = constants, self._gravity(constants)
         self._model, self._data = self._world.fresh(constants)
-        self._x, self._w, self._force = self._data.qpos, self._data.qvel, self._data.qfrc_applied
+        self._x = self._data.qpos
+        self._w = self._data.qvel
+        self._force = self._data.qfrc_applied
         self._step = library().mj_step
 
     def pace(self, step: float, inertia: float, damping: float) -> bool:
@@ -114,7 +117,8 @@ class Joint:
 
     def place(self, x: float, w: float) -> None:
         """The joint's position and velocity."""
-        self._x[0], self._w[0] = x, w
+        self._x[0] = x
+        self._w[0] = w
 
     def advance(self, force: float) -> tuple[float, float]:
         """One step."""
@@ -146,10 +150,13 @@ class _Mover:
     def start(self, constants: dict[str, float]) -> None:
         """A world for these constants, as newly made, without contact."""
         mujoco = library()
-        self._mass, self._floor = constants["mass"], constants["radius"]
+        self._mass = constants["mass"]
+        self._floor = constants["radius"]
         self._gravity = constants["gravity"]
         self._model, self._data = self._world.fresh(constants)
-        self._x, self._w, self._force = self._data.qpos, self._data.qvel, self._data.qfrc_applied
+        self._x = self._data.qpos
+        self._w = self._data.qvel
+        self._force = self._data.qfrc_applied
         self._no_contact = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self._model.geom_solimp[:] = _IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0
         self._step = mujoco.mj_step
@@ -174,7 +181,8 @@ class _Mover:
 
     def place(self, x: Vector, w: Vector) -> None:
         """Position and velocity."""
-        self._x[:], self._w[:] = x, w
+        self._x[:] = x
+        self._w[:] = w
 
     def advance(self, force: Vector) -> State:
         """One step with a force at the centre."""
@@ -289,7 +297,8 @@ def damping_ratio(restitution: float) -> float:
     20.
     """
     # Restitution falls with damping; sixty halvings leave nothing but rounding.
-    low, high = 0.0, _MOST_DAMPED
+    low = 0.0
+    high = _MOST_DAMPED
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if _rebound(middle) > restitution else (low, middle)

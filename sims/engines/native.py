@@ -45,15 +45,18 @@ class Ball(Mover, Protocol):
 def rollout(ball: Ball, lane: Lane) -> Path:
     """Integrate one lane."""
     # Unlike in `flight`, the engine's velocity is read as it comes, and so is its contact.
-    contact, felt = Impact(lane), Pull(lane)
+    contact = Impact(lane)
+    felt = Pull(lane)
     floor = float(lane.system.floor(lane.constants)[0, 0])
     ball.start(lane.numbers)
     x: Vector = lane.x.tolist()
     w: Vector = lane.v.tolist()
     ball.touch(*contact.at(max(-w[2], 0.0)))
     ball.place(x, w)
-    kept, steps = set(lane.kept.tolist()), lane.steps.tolist()
-    t, step = 0.0, math.nan
+    kept = set(lane.kept.tolist())
+    steps = lane.steps.tolist()
+    t = 0.0
+    step = math.nan
     rows = [(*x, *w, *felt.at(t, x, w))]
     for begin, counts in legs(lane):
         if steps[begin] != step:

@@ -19,10 +19,10 @@ State = tuple[Vector, Vector]
 
 def gravity(lane: Lane) -> Vector:
     """The acceleration of gravity, the same everywhere."""
+    start = np.zeros((1, 1))
     nothing = np.zeros((1, 3))
-    weight: list[float] = lane.system.weight(lane.moment(np.zeros((1, 1)), nothing, nothing, {}))[
-        0
-    ].tolist()
+    moment = lane.moment(start, nothing, nothing, {})
+    weight: list[float] = lane.system.weight(moment)[0].tolist()
     return weight
 
 
@@ -50,14 +50,17 @@ class Pull:
         speed = math.sqrt(vx * vx + vy * vy + vz * vz)
         # What opposes the motion is counted as a share of the velocity: force = -share v.
         if self._opposing:
-            share, limit = self._opposing.at(speed)[0], self._opposing.limit
+            share = self._opposing.at(speed)[0]
+            limit = self._opposing.limit
             fx = fy = fz = 0.0
         else:
             moment = self._ask.moment
             moment.t.fill(t)
-            moment.x[0], moment.v[0] = x, v
+            moment.x[0] = x
+            moment.v[0] = v
             fx, fy, fz = self._ask.force()[0].tolist()
-            share, limit = 0.0, self._ask.limit()
+            share = 0.0
+            limit = self._ask.limit()
         # Dry friction has no direction where there is no motion.
         if limit and speed:
             share += limit / speed
@@ -79,7 +82,8 @@ class Impact:
 
     def at(self, speed: float) -> tuple[float, float]:
         """Restitution and friction of an impact at this speed."""
-        restitution, friction = self._restitution, 0.0
+        restitution = self._restitution
+        friction = 0.0
         for effect, c in self._effects:
             restitution = effect.restitution(c, restitution, np.array([[speed]]))
             friction += float(effect.friction(c)[0, 0])

@@ -86,14 +86,16 @@ class FilmedBall(Simulator):
         self.run_inputs(scenario)  # which refuses any: the ball does not know of these names
         fall = Scenario(scenario.times, scenario.initial, {}, self._of_ball(constants))
         places = self._ball.simulate(theta, fall)
-        camera, radius = _camera(constants), constants["radius"]
+        camera = _camera(constants)
+        radius = constants["radius"]
         if self._tracked:
             tracks = [_tracked(camera, radius, way, scenario.times) for way in places]
             rows = np.array(tracks).reshape(places.shape[:2])  # also where there are no lanes
             heights = np.full_like(rows, np.nan)
         else:
             middles, _ = camera.outline(places, radius)
-            heights, rows = places[..., 2], middles[..., 1]
+            heights = places[..., 2]
+            rows = middles[..., 1]
         seen = np.stack([heights, rows], axis=2)
         result: Array = seen[:, :, self.columns]
         return result

@@ -20,7 +20,8 @@ _TINY = 1e-14  # kg m^2: MuJoCo wants the body to have some inertia of its own
 
 def model(constants: Mapping[str, float]) -> str:
     """The world as MJCF."""
-    mass, arm = constants["mass"] * SHORTER, constants["length"] / SHORTER
+    mass = constants["mass"] * SHORTER
+    arm = constants["length"] / SHORTER
     return f"""
     <mujoco>
       <option gravity="0 0 {-constants["gravity"]!r}"/>

@@ -11,15 +11,22 @@ import numpy as np
 from sims.base import Array, Channel, Constant, Parameter
 from sims.system import Kind, Moment, System, UsualRecording
 
-_KT, _RESISTANCE, _ARMATURE = (slice(i, i + 1) for i in range(3))
+_KT = slice(0, 1)
+"""Column of the torque constant among the parameters."""
+_RESISTANCE = slice(1, 2)
+"""Column of the winding's resistance."""
+_ARMATURE = slice(2, 3)
+"""Column of the inertia of motor and gears."""
 
 
 class ServoSystem(System):
-    """(armature + mass length^2) q'' = torque - mass gravity length sin q, with a proportional
-    position controller.
+    """A pendulum on a motor with a proportional position controller.
 
-    duty = clip(kp error_gain (goal - q), -1, 1); torque = kt (duty voltage - kt q') / resistance
-    while enabled, else 0. States are the angle q [rad], 0 hanging, and its rate qd [rad/s].
+        (armature + mass length^2) q'' = torque - mass gravity length sin q    (1)
+        duty = clip(kp error_gain (goal - q), -1, 1)                           (2)
+        torque = kt (duty voltage - kt q') / resistance                        (3)
+
+    while enabled, else without torque. States are the angle q [rad], 0 hanging, and its rate qd [rad/s].
     """
 
     name = "servo"
@@ -75,7 +82,7 @@ class ServoSystem(System):
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """(L, 1) kg m^2 about the joint."""
-        return theta[:, _ARMATURE] + constants["mass"] * constants["length"] ** 2
+        return theta[:, _ARMATURE] + constants["mass"] * constants["length"] ** 2  # (1)
 
     def weight(self, moment: Moment) -> Array:
         """Gravity's torque."""
@@ -85,11 +92,13 @@ class ServoSystem(System):
 
     def drive(self, moment: Moment) -> Array:
         """The motor's torque, with its own back electromotive force."""
-        k, kt = moment.constants, moment.theta[:, _KT]
-        duty = np.minimum(
-            np.maximum(k["kp"] * k["error_gain"] * (moment.inputs["goal"] - moment.x), -1.0), 1.0
-        )
-        torque = kt * (duty * k["voltage"] - kt * moment.v) / moment.theta[:, _RESISTANCE]
+        k = moment.constants
+        kt = moment.theta[:, _KT]
+        error = moment.inputs["goal"] - moment.x
+        wanted = k["kp"] * k["error_gain"] * error
+        duty = np.minimum(np.maximum(wanted, -1.0), 1.0)  # (2)
+        voltage = duty * k["voltage"] - kt * moment.v
+        torque = kt * voltage / moment.theta[:, _RESISTANCE]  # (3)
         return np.where(moment.inputs["torque_enable"] > 0.5, torque, 0.0)
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:

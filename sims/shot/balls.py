@@ -26,7 +26,6 @@ import numpy as np
 
 from sims.base import unknown
 
-
 _SLOWEST = 1e-3
 """m/s: impacts slower than this bounce as this one does, since (2) grows without bound."""
 

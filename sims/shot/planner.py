@@ -77,7 +77,8 @@ def plan(
         room = margins(flights(simulator, theta, scene, constants, grid, times), scene)
         if not np.isfinite(room).any():
             break
-        best, reach = float(grid[np.nanargmax(room)]), float(grid[1] - grid[0])
+        best = float(grid[np.nanargmax(room)])
+        reach = float(grid[1] - grid[0])
         # As far as the neighbours of the best: the maximum lies between them.
         grid = np.linspace(max(low, best - reach), min(high, best + reach), _ZOOM)
     if not np.isfinite(best):

@@ -53,17 +53,22 @@ def crossings(path: Array, scene: Scene) -> Array:
 
         (z1 - h) / (z1 - z2)                                               (1)
     """
-    x, y, z = np.moveaxis(np.asarray(path, dtype=np.float64), -1, 0)
+    path = np.asarray(path, dtype=np.float64)
+    x, y, z = np.moveaxis(path, -1, 0)
     with np.errstate(invalid="ignore"):
-        rises, falls = z[:, 1:] > z[:, :-1], z[:, 1:] < z[:, :-1]
+        rises = z[:, 1:] > z[:, :-1]
+        falls = z[:, 1:] < z[:, :-1]
         risen = np.logical_or.accumulate(rises, axis=1)
         fallen = np.logical_or.accumulate(risen & falls, axis=1)
         again = np.logical_or.accumulate(fallen & rises, axis=1)
         # Downward only: a ball that comes up through the hoop has not scored.
-        down = risen & ~again & (z[:, :-1] > scene.hoop_z) & (z[:, 1:] <= scene.hoop_z)
+        above = z[:, :-1] > scene.hoop_z
+        below = z[:, 1:] <= scene.hoop_z
+        down = risen & ~again & above & below
     first = np.argmax(down, axis=1)
     rows = np.arange(len(z))
-    high, low = z[rows, first], z[rows, first + 1]
+    high = z[rows, first]
+    low = z[rows, first + 1]
     comes = down.any(axis=1)  # where none does, `first` is 0 and means nothing
     share = (high - scene.hoop_z) / np.where(comes, high - low, 1.0)  # (1)
     at_x = x[rows, first] + share * (x[rows, first + 1] - x[rows, first])

@@ -105,7 +105,8 @@ class ShotSystem(System):
     def weight(self, moment: Moment) -> Array:
         """Gravity, m/s^2, in the incline's frame."""
         angle = moment.constants["incline_angle"]
-        down: Array = np.concatenate([np.sin(angle), np.zeros_like(angle), -np.cos(angle)], axis=1)
+        across = np.zeros_like(angle)
+        down: Array = np.concatenate([np.sin(angle), across, -np.cos(angle)], axis=1)
         return moment.gravity * down  # (1)
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
@@ -120,8 +121,10 @@ class ShotSystem(System):
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
         """The centre in the room's frame."""
-        cos, sin = np.cos(constants["incline_angle"]), np.sin(constants["incline_angle"])
-        along, away = x[:, :, 0], x[:, :, 2]
+        cos = np.cos(constants["incline_angle"])
+        sin = np.sin(constants["incline_angle"])
+        along = x[:, :, 0]
+        away = x[:, :, 2]
         height = constants["radius"] / cos + constants["drop_height"]
         return {
             "x": along * cos + away * sin,  # (3)

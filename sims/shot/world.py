@@ -100,7 +100,8 @@ def damping_ratio(restitution: float) -> float:
     1.
     """
     # Restitution falls with damping; eighty halvings leave nothing but rounding.
-    low, high = 0.0, _MOST_DAMPED
+    low = 0.0
+    high = _MOST_DAMPED
     for _ in range(80):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if _restitution(middle) > restitution else (low, middle)
@@ -123,7 +124,8 @@ class _Flight:
     def __init__(self, ball: Ball, ground: Ground, air: float) -> None:
         import mujoco
 
-        self._ball, self._friction = ball, ground.friction
+        self._ball = ball
+        self._friction = ground.friction
         self._normal = math.sin(ground.angle), math.cos(ground.angle)
         area = math.pi * ball.radius**2
         self._drag = 0.5 * air * ball.drag * area
@@ -138,7 +140,8 @@ class _Flight:
         return x * self._normal[0] + z * self._normal[1] - self._ball.radius
 
     def run(self, start: tuple[float, float, float], times: Array) -> Array:
-        data, last = self._data, float(times[-1])
+        data = self._data
+        last = float(times[-1])
         data.qpos[:3] = start
         rows = [(0.0, *start, 0.0, 0.0, 0.0)]
         while data.time < last:
@@ -149,7 +152,8 @@ class _Flight:
     def _advance(self) -> None:
         """One step, short where the ball touches or soon will."""
         data = self._data
-        position, velocity = data.qpos[:3].tolist(), data.qvel.tolist()
+        position = data.qpos[:3].tolist()
+        velocity = data.qvel.tolist()
         gap = self.gap(*position)
         rate = velocity[0] * self._normal[0] + velocity[2] * self._normal[1]
         # Two steps ahead: one of flight must not reach into the ground.

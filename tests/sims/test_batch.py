@@ -359,8 +359,8 @@ def test_a_lane_that_needs_too_many_steps_is_given_up_and_no_other():
         "reversals forty times a second, in a friction that falls within 0.02 m/s"
     )
     np.testing.assert_array_equal(hasty.simulate(theta[1:2], scenario), found[1:2])
-    np.testing.assert_array_equal(Slider(engine="batch", effects=list(kinds), time_step=0.01, patience=50.0).simulate(
-        theta, scenario), expected)  # fmt: skip
+    patient = Slider(engine="batch", effects=list(kinds), time_step=0.01, patience=50.0)
+    np.testing.assert_array_equal(patient.simulate(theta, scenario), expected)
 
 
 @pytest.mark.parametrize(

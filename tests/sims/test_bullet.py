@@ -39,7 +39,8 @@ def python(code):
 
 def test_import_is_lazy_and_quiet():
     lazy = python(
-        "import sys\nfrom sims.ball.simulator import Ball\nfrom sims.pendulum.simulator import Pendulum\n"
+        "import sys\nfrom sims.ball.simulator import Ball\n"
+        "from sims.pendulum.simulator import Pendulum\n"
         "Ball(engine='pybullet'); Pendulum(engine='pybullet'); print('pybullet' in sys.modules)"
     )
     assert lazy.stdout == "False\n"
@@ -123,9 +124,13 @@ def growth(kind, count, samples, constants, engine="pybullet", **settings):
     as many.
     """
     values = {
-        "kind": kind.__name__, "engine": engine, "settings": settings, "theta": theta_for(kind).tolist(),
-        "initial": {"z": 0.51} if kind is Ball else {}, "constants": constants,
-    }  # fmt: skip
+        "kind": kind.__name__,
+        "engine": engine,
+        "settings": settings,
+        "theta": theta_for(kind).tolist(),
+        "initial": {"z": 0.51} if kind is Ball else {},
+        "constants": constants,
+    }
     return int(python(GROWTH.format(**values, count=count, samples=samples)).stdout)
 
 

@@ -401,7 +401,8 @@ import numpy as np
 for system, kind in SIMULATORS.items():
     for engine in ("pybullet", "mujoco"):
         for fixed in ({}, {"drag.quadratic": 1e-3}):
-            found = kind(engine=engine, fixed=fixed).simulate(np.array([THETA[system]]), scenario(system))
+            theta = np.array([THETA[system]])
+            found = kind(engine=engine, fixed=fixed).simulate(theta, scenario(system))
             print(hashlib.sha256(found.tobytes()).hexdigest())
 """
 

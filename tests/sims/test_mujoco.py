@@ -90,8 +90,9 @@ def test_soft_contact_has_the_restitution_and_friction_asked_for_as_the_step_shr
     start = Scenario(np.arange(40) / 100, {"z": 0.6, "vz": -2.0, "vx": 3.0})
     errors = []
     for step in (4e-4, 1e-4):
-        ball = Ball({"gravity": 0.0}, ["x", "z"], engine="mujoco", native_contact=True, time_step=step,
-                    fixed={"contact.friction": friction})  # fmt: skip
+        settings = {"engine": "mujoco", "native_contact": True, "time_step": step}
+        rough = {"contact.friction": friction}
+        ball = Ball({"gravity": 0.0}, ["x", "z"], **settings, fixed=rough)
         velocity = np.diff(ball.simulate(np.array([[restitution]]), start)[0], axis=0)[-1] * 100
         errors.append(
             np.abs(velocity - [3.0 - friction * (1 + restitution) * 2.0, 2.0 * restitution]).max()

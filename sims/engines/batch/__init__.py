@@ -66,12 +66,14 @@ class Batch:
                 motion = self._moved(lanes)
             else:
                 # Lanes in free flight apart from the others: in closed form they take no steps.
-                parts = [order[moved[order] == kind] for kind in (False, True)]
-                motion = _joined(
-                    [(part, self._moved(_take(lanes, part))) for part in parts if part.size], lanes
-                )
+                kinds = moved[order]
+                parts = [part for part in (order[~kinds], order[kinds]) if part.size]
+                motions = [(part, self._moved(_take(lanes, part))) for part in parts]
+                motion = _joined(motions, lanes)
         # What is not finite stays so, so the last state tells of the whole run.
-        lost = ~(np.isfinite(motion.x[:, -1]) & np.isfinite(motion.v[:, -1])).all(axis=1)
+        there = np.isfinite(motion.x[:, -1])
+        moving = np.isfinite(motion.v[:, -1])
+        lost = ~(there & moving).all(axis=1)
         if lost.any():
             for values in (motion.x, motion.v, motion.a):
                 values[lost] = np.nan
@@ -82,15 +84,17 @@ class Batch:
         field = Field(lanes)
         ground = Ground(lanes) if lanes.system.bounces else None
         if field.free:
-            still = np.zeros((len(lanes.x), 1))
-            return fly(lanes, field.force(still, lanes.x, lanes.v) / field.mass, ground)
+            start = np.zeros((len(lanes.x), 1))
+            a = field.force(start, lanes.x, lanes.v) / field.mass
+            return fly(lanes, a, ground)
         spans = np.max(lanes.steps, axis=1, keepdims=True, initial=0.0)
         parts = divisions(lanes, field, spans, self._turn)
         slow = (parts > FEW)[:, 0]
         # Few lanes in many short steps would keep the others waiting in every one.
         if slow.any() and not slow.all():
             groups = np.flatnonzero(~slow), np.flatnonzero(slow)
-            return _joined([(i, self._moved(_take(lanes, i))) for i in groups], lanes)
+            motions = [(group, self._moved(_take(lanes, group))) for group in groups]
+            return _joined(motions, lanes)
         return Stepping(lanes, field, ground, spans, parts).run(self._patience)
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
@@ -147,10 +151,12 @@ def _take(lanes: Lanes, i: Indices) -> Lanes:
 
 def _joined(parts: list[tuple[Indices, Motion]], lanes: Lanes) -> Motion:
     """Motions of parts of the lanes put together in the lanes' own order."""
-    if len(parts) == 1 and (parts[0][0] == np.arange(len(lanes.x))).all():
-        return parts[0][1]
+    first, motion = parts[0]
+    if len(parts) == 1 and (first == np.arange(len(lanes.x))).all():
+        return motion
     count, dim = lanes.x.shape
-    whole = np.empty((3, count, lanes.steps.shape[1] // lanes.every + 1, dim))
+    records = lanes.steps.shape[1] // lanes.every + 1
+    whole = np.empty((3, count, records, dim))
     for i, motion in parts:
         whole[:, i] = motion.x, motion.v, motion.a
     return Motion(*whole)

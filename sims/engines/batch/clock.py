@@ -26,15 +26,18 @@ class Clock:
         # Lanes that share their steps share the row: a stride of zero says that it is one row.
         steps = lanes.steps[:1] if lanes.steps.strides[0] == 0 else lanes.steps
         none = np.zeros((1, len(steps)))
+        ends = np.cumsum(steps, axis=1)
         # One row a step, and one of zeros behind the last, in which finished lanes wait. Rows must
         # lie together: they are looked up by place.
         self._steps = np.ascontiguousarray(np.concatenate([steps.T, none]))
-        self._starts = np.ascontiguousarray(np.concatenate([none, np.cumsum(steps, axis=1).T]))
-        self._inputs = {
-            name: np.ascontiguousarray(values.T) for name, values in lanes.inputs.items()
-        }
+        self._starts = np.ascontiguousarray(np.concatenate([none, ends.T]))
+        self._inputs = {}
+        for name, values in lanes.inputs.items():
+            self._inputs[name] = np.ascontiguousarray(values.T)
         self._every = lanes.every
-        self._kept = np.empty((self._end // lanes.every + 1, count, 3 * lanes.x.shape[1]))
+        records = self._end // lanes.every + 1
+        width = 3 * lanes.x.shape[1]
+        self._kept = np.empty((records, count, width))
         self._lane = np.arange(count)
         self._stride = self._steps.shape[1]
         self._column = self._lane if self._stride > 1 else np.zeros_like(self._lane)
@@ -42,7 +45,8 @@ class Clock:
         self._step = np.zeros(count, dtype=np.intp)
         self._begins = np.ones(count, dtype=bool)
         self.over = self._end == 0
-        self.t, self.left = np.zeros((count, 1)), np.empty((count, 1))
+        self.t = np.zeros((count, 1))
+        self.left = np.empty((count, 1))
         self.left[:, 0] = self._steps[0]
 
     def inputs(self) -> dict[str, Array]:
@@ -60,9 +64,11 @@ class Clock:
                 # Whole rows, without looking for lanes: most calls never leave this branch.
                 self._kept[self._common // self._every] = state.T
             return
-        lanes = np.flatnonzero(self._begins & (self._step % self._every == 0))
+        due = self._step % self._every == 0
+        lanes = np.flatnonzero(self._begins & due)
         if lanes.size:
-            self._kept[self._step[lanes] // self._every, lanes] = state[:, lanes].T
+            records = self._step[lanes] // self._every
+            self._kept[records, lanes] = state[:, lanes].T
 
     def finish(self, ended: Mask | None = None) -> None:
         """Lanes `ended` (L,), or all, go on to their next step."""
@@ -71,7 +77,8 @@ class Clock:
         if self._common is not None:
             self._common += 1
             self.over = self._common == self._end
-            self.left[:, 0], self.t[:, 0] = self._steps[self._common], self._starts[self._common]
+            self.left[:, 0] = self._steps[self._common]
+            self.t[:, 0] = self._starts[self._common]
             return
         assert ended is not None
         # A lane that has made all its steps goes on to no other: it would run off the table.
@@ -80,8 +87,10 @@ class Clock:
         if ended.any():
             self._step += ended.astype(np.intp)
             place = self._step * self._stride + self._column
-            np.copyto(self.left[:, 0], self._steps.take(place), where=ended)
-            np.copyto(self.t[:, 0], self._starts.take(place), where=ended)
+            lengths = self._steps.take(place)
+            starts = self._starts.take(place)
+            np.copyto(self.left[:, 0], lengths, where=ended)
+            np.copyto(self.t[:, 0], starts, where=ended)
             self.over = bool(self._step.min() == self._end)
 
     def spend(self, h: Array) -> None:
@@ -104,7 +113,8 @@ class Clock:
         self._step[lanes] = self._end
         # The engine tells lost lanes by the last state that was kept.
         self._kept[-1, lanes] = state[:, lanes].T
-        self.left[lanes], self.t[lanes] = 0.0, 0.0
+        self.left[lanes] = 0.0
+        self.t[lanes] = 0.0
         self._begins &= ~lanes
         self.over = bool(self._step.min() == self._end)
 

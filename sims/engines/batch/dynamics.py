@@ -51,9 +51,13 @@ class Dynamics:
         pull = self._borne(t, x, v)
         if not self.field.dry:
             return pull / self.field.mass
-        limit, size, speed = self.field.limit(t, x, v), length(pull), length(v)
+        limit = self.field.limit(t, x, v)
+        size = length(pull)
+        speed = length(v)
         still = speed == 0
-        self.excess, self.rubs = (size - limit,) * 2, []
+        excess = size - limit
+        self.excess = (excess, excess)
+        self.rubs = []
         self.sticks = still & (size <= limit) & self.field.rubs  # (2)
         # (1) and (3): along the motion, or where there is none along what pulls; a lane without
         # either has no direction, and must not divide by zero.
@@ -87,7 +91,8 @@ class Dynamics:
         if self._any_rests:
             pull = pull + 0.0  # a copy: a constant force is the same array at every instant
             # The ground pushes and does not pull: what lifts the lane is left to it.
-            pull[:, -1:] = np.where(self.rests, np.maximum(pull[:, -1:], 0.0), pull[:, -1:])
+            lift = pull[:, -1:]
+            pull[:, -1:] = np.where(self.rests, np.maximum(lift, 0.0), lift)
         return pull
 
     def _along(self, v: Array) -> Array:
@@ -97,13 +102,17 @@ class Dynamics:
         # In a plane the direction may turn within the step, but not over to the other side: that
         # is a reversal, which the step is cut for.
         speed = length(v)
-        unit = np.where(speed > 0, v / np.where(speed > 0, speed, 1.0), self.way)
-        turned: Array = unit * np.where(dot(unit, self.way) < 0, -1.0, 1.0)
+        divisor = np.where(speed > 0, speed, 1.0)
+        unit = np.where(speed > 0, v / divisor, self.way)
+        side = np.where(dot(unit, self.way) < 0, -1.0, 1.0)
+        turned: Array = unit * side
         return turned
 
     def _rubbed(self, pull: Array, limit: Array, way: Array) -> Array:
-        self.rubs.append(limit * way)  # four a step, from which it is told how friction bends
-        result: Array = np.where(self.sticks, 0.0, (pull - self.rubs[-1]) / self.field.mass)
+        friction = limit * way
+        self.rubs.append(friction)  # four a step, from which it is told how friction bends
+        slipping = (pull - friction) / self.field.mass
+        result: Array = np.where(self.sticks, 0.0, slipping)
         return result
 
 

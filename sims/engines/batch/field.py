@@ -39,11 +39,16 @@ class Share:
 
     def look(self, t: Array, x: Array, v: Array) -> Moment:
         """The span's part of an instant of all lanes."""
-        moment, span = self.moment, self.span
+        moment = self.moment
+        span = self.span
         if self.whole:
-            moment.t, moment.x, moment.v = t, x, v
+            moment.t = t
+            moment.x = x
+            moment.v = v
         else:
-            moment.t, moment.x, moment.v = t[span], x[span], v[span]
+            moment.t = t[span]
+            moment.x = x[span]
+            moment.v = v[span]
         return moment
 
     def added(self, total: Array, values: Array) -> Array:
@@ -69,18 +74,16 @@ class Field:
 
     def __init__(self, lanes: Lanes) -> None:
         self._system = lanes.system
+        start_time = np.zeros((1, 1))
         self._moment = Moment(
-            lanes.system, lanes.theta, lanes.constants, np.zeros((1, 1)), lanes.x, lanes.v
+            lanes.system, lanes.theta, lanes.constants, start_time, lanes.x, lanes.v
         )
         self.mass = lanes.system.mass(lanes.theta, lanes.constants)
         self._none = np.zeros_like(self.mass)
         shares = _shares(lanes)
-        self._forces = [
-            (share, share.effect) for share in shares if isinstance(share.effect, Force)
-        ]
-        self._frictions = [
-            (share, share.effect) for share in shares if isinstance(share.effect, Friction)
-        ]
+        # With the effect beside its share: so much is known of which hook it has.
+        self._forces = [(s, s.effect) for s in shares if isinstance(s.effect, Force)]
+        self._frictions = [(s, s.effect) for s in shares if isinstance(s.effect, Friction)]
         self.pushed = _where(self._forces, len(lanes.x))
         self.rubs = _where(self._frictions, len(lanes.x))
         self.feel({name: values[:, :1] for name, values in lanes.inputs.items()})
@@ -110,19 +113,23 @@ class Field:
         if total is None:
             total = _by_coordinate(self._system.force(self._at(t, x, v)))
         for share, effect in self._forces:
-            total = share.added(total, effect.force(share.c, share.look(t, x, v)))
+            force = effect.force(share.c, share.look(t, x, v))
+            total = share.added(total, force)
         return total
 
     def limit(self, t: Array, x: Array, v: Array) -> Array:
         """(L, 1) largest dry friction."""
         total = self._none
         for share, effect in self._frictions:
-            total = share.added(total, effect.limit(share.c, share.look(t, x, v)))
+            limit = effect.limit(share.c, share.look(t, x, v))
+            total = share.added(total, limit)
         return total
 
     def _at(self, t: Array, x: Array, v: Array) -> Moment:
         # One moment for the whole run: making one anew costs as much as a small system's force.
-        self._moment.t, self._moment.x, self._moment.v = t, x, v
+        self._moment.t = t
+        self._moment.x = x
+        self._moment.v = v
         return self._moment
 
 
@@ -153,7 +160,9 @@ def _shares(lanes: Lanes) -> list[Share]:
             continue
         # From the first lane to the last: a slice is a view, a choice of lanes would be a copy.
         there = np.flatnonzero(on)
-        span = slice(int(there[0]), int(there[-1]) + 1)
+        first = int(there[0])
+        last = int(there[-1])
+        span = slice(first, last + 1)
         constants = {name: values[span] for name, values in lanes.constants.items()}
         start = np.zeros((1, 1))
         moment = Moment(
@@ -161,6 +170,6 @@ def _shares(lanes: Lanes) -> list[Share]:
         )
         everywhere = bool(on[span].all())
         mask = None if everywhere else on[span, None]
-        whole = bool(there[0] == 0 and there[-1] == len(on) - 1)
+        whole = first == 0 and last == len(on) - 1
         result.append(Share(effect, c[:, span], span, mask, moment, whole))
     return result

@@ -61,8 +61,8 @@ def _instants(lanes: Lanes) -> Iterator[dict[str, Array]]:
     if not lanes.inputs or not lanes.steps.size:
         yield {name: np.zeros((len(lanes.x), 1)) for name in lanes.inputs}
         return
-    shared = lanes.steps.strides[0] == 0
-    done = np.cumsum((lanes.steps[:1] if shared else lanes.steps) > 0, axis=1)
+    steps = lanes.steps[:1] if lanes.steps.strides[0] == 0 else lanes.steps
+    done = np.cumsum(steps > 0, axis=1)
     lane = np.arange(len(lanes.x))
     for share in np.linspace(0.0, 1.0, INSTANTS):
         at = (done >= np.ceil(share * done[:, -1:])).argmax(axis=1)
@@ -73,12 +73,15 @@ def _rates(field: Field, x: Array, v: Array) -> tuple[Array, Array]:
     """(L, 1) largest change of acceleration with position, 1/s^2, and with velocity, 1/s."""
     t = np.zeros_like(field.mass)
     base = field.force(t, x, v)
-    turning, decaying = np.zeros_like(t), np.zeros_like(t)
+    turning = np.zeros_like(t)
+    decaying = np.zeros_like(t)
     for d in range(x.shape[1]):
         nudge = np.zeros_like(x)
         nudge[:, d] = NUDGE
-        moved, sped = field.force(t, x + nudge, v), field.force(t, x, v + nudge)
+        moved = field.force(t, x + nudge, v)
+        sped = field.force(t, x, v + nudge)
         for force, largest in ((moved, turning), (sped, decaying)):
-            slope = np.abs((force - base)[:, d : d + 1] / (NUDGE * field.mass))
+            change = (force - base)[:, d : d + 1]
+            slope = np.abs(change / (NUDGE * field.mass))
             np.fmax(largest, slope, out=largest)
     return turning, decaying

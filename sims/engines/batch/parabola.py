@@ -38,7 +38,11 @@ class Arcs:
     def take(self, chosen: Mask) -> Arcs:
         """Some of them."""
         return Arcs(
-            self.lanes[chosen], self.t[chosen], self.x[chosen], self.v[chosen], self.a[chosen]
+            lanes=self.lanes[chosen],
+            t=self.t[chosen],
+            x=self.x[chosen],
+            v=self.v[chosen],
+            a=self.a[chosen],
         )
 
     def joined(self, others: list[Arcs]) -> Arcs:
@@ -46,17 +50,19 @@ class Arcs:
         every = [self, *others]
         lanes = np.concatenate([arcs.lanes for arcs in every])
         order = np.argsort(lanes, kind="stable")
-        t, x, v, a = (
-            np.concatenate([getattr(arcs, name) for arcs in every])[order]
-            for name in ("t", "x", "v", "a")
-        )
-        return Arcs(lanes[order], t, x, v, a)
+
+        def joined(name: str) -> Array:
+            values: Array = np.concatenate([getattr(arcs, name) for arcs in every])
+            return values[order]
+
+        return Arcs(lanes[order], joined("t"), joined("x"), joined("v"), joined("a"))
 
 
 def fly(lanes: Lanes, a: Array, ground: Ground | None) -> Motion:
     """The motion of lanes of constant acceleration `a` (L, D), over `ground` if there is any."""
     times = _kept_times(lanes)
-    first = Arcs(np.arange(len(a)), np.zeros((len(a), 1)), lanes.x, lanes.v, a)
+    start = np.zeros((len(a), 1))
+    first = Arcs(np.arange(len(a)), start, lanes.x, lanes.v, a)
     if ground is None:
         return _sampled(first, times)
     first.x = first.x.copy()  # the caller's, which what begins in the ground must not change
@@ -64,10 +70,13 @@ def fly(lanes: Lanes, a: Array, ground: Ground | None) -> Motion:
     arcs: list[Arcs] = []
     first = _begun(first, ground)
     # What rests already has no impacts; the others lose one by one whose next impact is too late.
-    now = first.take((first.a[:, -1] != 0) | (first.v[:, -1] != 0))
+    moves = (first.a[:, -1] != 0) | (first.v[:, -1] != 0)
+    now = first.take(moves)
     while now.lanes.size:
         s = _fall(now, ground.floor)
-        goes = (now.t + s)[:, 0] <= times[now.lanes if len(times) > 1 else 0, -1]
+        impact = (now.t + s)[:, 0]
+        last = times[now.lanes if len(times) > 1 else 0, -1]
+        goes = impact <= last
         now, flies = _bounced(now.take(goes), s[goes], ground, a)
         arcs.append(now)
         now = now.take(flies)
@@ -77,20 +86,23 @@ def fly(lanes: Lanes, a: Array, ground: Ground | None) -> Motion:
 def _kept_times(lanes: Lanes) -> Array:
     """(L, R) instants of the states to be kept, or (1, R) if all lanes share them."""
     steps = lanes.steps[:1] if lanes.steps.strides[0] == 0 else lanes.steps
-    times = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
+    start = np.zeros((len(steps), 1))
+    times = np.concatenate([start, np.cumsum(steps, axis=1)], axis=1)
     return np.ascontiguousarray(times[:, :: lanes.every])
 
 
 def _begun(arcs: Arcs, ground: Ground) -> Arcs:
     """The first arcs, with those that start on the ground thrown back or laid to rest."""
-    down = (arcs.x[:, -1] <= ground.floor[:, 0]) & (arcs.v[:, -1] <= 0)
+    rate = arcs.v[:, -1]
+    down = (arcs.x[:, -1] <= ground.floor[:, 0]) & (rate <= 0)
     if not down.any():
         return arcs
-    struck = np.flatnonzero(down & (arcs.v[:, -1] < 0))
+    struck = np.flatnonzero(down & (rate < 0))
     outcome = ground.strike(struck, arcs.v[struck], arcs.a[struck])
     arcs.v = arcs.v.copy()
     arcs.v[struck] = outcome.v
-    rests = down & (arcs.v[:, -1] == 0) & (arcs.a[:, -1] <= 0)
+    still = arcs.v[:, -1] == 0
+    rests = down & still & (arcs.a[:, -1] <= 0)
     arcs.a = arcs.a.copy()
     arcs.a[rests, -1] = 0.0
     return arcs
@@ -98,10 +110,13 @@ def _begun(arcs: Arcs, ground: Ground) -> Arcs:
 
 def _fall(arcs: Arcs, floor: Array) -> Array:
     """(n, 1) seconds to the impact; infinite if there is none."""
-    high, up, down = arcs.x[:, -1:] - floor[arcs.lanes], arcs.v[:, -1:], -arcs.a[:, -1:]
+    high = arcs.x[:, -1:] - floor[arcs.lanes]
+    up = arcs.v[:, -1:]
+    down = -arcs.a[:, -1:]
     root = np.sqrt(up * up + 2.0 * down * high)  # not a number if it turns back before
     rising = np.where(down > 0, (up + root) / down, np.inf)
-    seconds = np.where(up < 0, 2.0 * high / (root - up), rising)  # (3)
+    falling = 2.0 * high / (root - up)
+    seconds = np.where(up < 0, falling, rising)  # (3)
     result: Array = np.where(np.isnan(seconds), np.inf, seconds)
     return result
 
@@ -118,7 +133,8 @@ def _bounced(arcs: Arcs, s: Array, ground: Ground, a: Array) -> tuple[Arcs, Mask
 
 def _sampled(arcs: Arcs, times: Array) -> Motion:
     """States at the instants times (L or 1, R), of arcs that are sorted by lane."""
-    lanes, instants = int(arcs.lanes[-1]) + 1, times.shape[1]
+    lanes = int(arcs.lanes[-1]) + 1
+    instants = times.shape[1]
     # Each arc has the instants from its beginning to that of the next arc of its lane, or to the
     # last one.
     begins = _places(times, arcs)
@@ -133,7 +149,9 @@ def _sampled(arcs: Arcs, times: Array) -> Motion:
     result = np.empty((3, arcs.x.shape[1], lanes, instants))
     for d in range(arcs.x.shape[1]):
         x, v, a = result[:, d]
-        x[...], v[...], a[...] = spread(arcs.x[:, d]), spread(arcs.v[:, d]), spread(arcs.a[:, d])
+        x[...] = spread(arcs.x[:, d])
+        v[...] = spread(arcs.v[:, d])
+        a[...] = spread(arcs.a[:, d])
         x += s * (v + s * (0.5 * a))  # (1), before v is overwritten
         v += s * a  # (2)
     x, v, a = np.moveaxis(result, 1, 3)
@@ -148,9 +166,12 @@ def _places(times: Array, arcs: Arcs) -> Indices:
     # Bisection of all arcs at once: `searchsorted` takes one row of instants, here each lane has
     # its own.
     size = times.shape[1]
-    low, high = np.zeros(begins.size, dtype=np.intp), np.full(begins.size, size, dtype=np.intp)
+    low = np.zeros(begins.size, dtype=np.intp)
+    high = np.full(begins.size, size, dtype=np.intp)
     for _ in range(size.bit_length()):
         middle = (low + high) // 2
-        before = (times[arcs.lanes, np.minimum(middle, size - 1)] < begins) & (low < high)
-        low, high = np.where(before, middle + 1, low), np.where(before, high, middle)
+        there = times[arcs.lanes, np.minimum(middle, size - 1)]
+        before = (there < begins) & (low < high)
+        low = np.where(before, middle + 1, low)
+        high = np.where(before, high, middle)
     return low

@@ -33,7 +33,8 @@ def root(value: Array, rate: Array, later: Array, h: Array) -> Array:
     bend = (value + h * rate - later) / (h * h)  # (1)
     turn = np.sqrt(rate * rate + 4.0 * bend * value)
     # (2): of its two forms the one that adds what has the same sign.
-    falling, rising = 2.0 * value / (turn - rate), (turn + rate) / (2.0 * bend)
+    falling = 2.0 * value / (turn - rate)
+    rising = (turn + rate) / (2.0 * bend)
     seconds = np.where(rate < 0, falling, rising)
     # A parabola without a root can only be rounding: the event is at the end of the step.
     result: Array = np.where(np.isfinite(seconds), seconds, h)

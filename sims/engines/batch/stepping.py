@@ -85,12 +85,14 @@ class Stepping:
         self, lanes: Lanes, field: Field, ground: Ground | None, spans: Array, parts: Array
     ) -> None:
         count, dim = lanes.x.shape
-        self._field, self._ground = field, ground
+        self._field = field
+        self._ground = ground
         # Stored coordinate by coordinate: what is per lane, (L, 1), multiplies whole rows.
         self._state = np.empty((3, dim, count))
         self._rows = self._state.reshape(3 * dim, count)
         self._x, self._v, self._a = (part.T for part in self._state)
-        self._x[...], self._v[...] = lanes.x, lanes.v
+        self._x[...] = lanes.x
+        self._v[...] = lanes.v
         shared = lanes.steps.strides[0] == 0
         self._planned = np.count_nonzero(lanes.steps[:1] if shared else lanes.steps, axis=1)
         self._taken = np.zeros(count)
@@ -99,7 +101,8 @@ class Stepping:
         # Lanes without any of these take the plan's steps as they are, which is much cheaper.
         self._bends = field.dry or bool(field.pushed.any())
         self._eventful = ground is not None or self._bends or bool((parts > 1).any())
-        self._clock, self._dynamics = Clock(lanes), Dynamics(field, (count, dim))
+        self._clock = Clock(lanes)
+        self._dynamics = Dynamics(field, (count, dim))
         self._limit = self._longest  # of steps, as forces bend
         self._peak = np.zeros((count, 1))  # square of the largest acceleration so far
         self._rubbed = np.zeros((count, 1))  # largest friction so far
@@ -116,7 +119,8 @@ class Stepping:
         """All steps; a lane that needs more than `patience` times the planned ones is NaN from
         there on.
         """
-        clock, dynamics = self._clock, self._dynamics
+        clock = self._clock
+        dynamics = self._dynamics
         hurries = self._eventful and np.isfinite(patience)
         while True:
             self._field.feel(clock.inputs())
@@ -147,7 +151,9 @@ class Stepping:
         self._rows[:, late] = np.nan
         # Whatever a lost lane was waiting for must not hold up the clock of the others.
         self._limit = np.where(late[:, None], self._longest, self._limit)
-        self._try[late], self._goal[late], self._taken[late] = np.inf, NOTHING, 0.0
+        self._try[late] = np.inf
+        self._goal[late] = NOTHING
+        self._taken[late] = 0.0
         self._clock.give_up(late, self._rows)
         return bool(self._clock.over)
 
@@ -155,9 +161,13 @@ class Stepping:
         """Position, velocity and (to third order) acceleration a step of h (L, 1) later; how the
         acceleration bent.
         """
-        t, x, v, during = self._clock.t, self._x, self._v, self._dynamics.during
+        t = self._clock.t
+        x = self._x
+        v = self._v
+        during = self._dynamics.during
         half = 0.5 * h
-        middle, sixth = t + half, h / 6.0
+        middle = t + half
+        sixth = h / 6.0
         x2 = x + half * v
         k2 = during(middle, x2, v + half * k1)  # (2)
         v3 = v + half * k2
@@ -174,11 +184,14 @@ class Stepping:
         x, v, k4, bend = self._stepped(h, k1)
         # Bends first: events are looked for in steps that are worth believing.
         refused = self._bent(h, k1, bend) if self._bends else None
-        cut = self._interrupted(h, (self._x, self._v, k1), (x, v, k4), refused)
+        now = self._x, self._v, k1
+        then = x, v, k4
+        cut = self._interrupted(h, now, then, refused)
         if cut is not None:
             refused = cut if refused is None else refused | cut
         if refused is None:
-            self._x[...], self._v[...] = x, v
+            self._x[...] = x
+            self._v[...] = v
         else:
             np.copyto(self._x, x, where=~refused[:, None])
             np.copyto(self._v, v, where=~refused[:, None])
@@ -206,9 +219,12 @@ class Stepping:
             first, second, third, fourth = self._dynamics.rubs  # at the instants of (1) to (4)
             # Against the largest so far: a Stribeck peak's tail, all but nothing at speed, bends
             # sharply in proportion.
-            self._rubbed = np.maximum(self._rubbed, np.maximum(length(first), length(fourth)))
-            most = np.maximum(self._rubbed, FAINT * np.sqrt(self._peak) * field.mass)
-            bends = length(first - second - third + fourth) > 6.0 * FRICTION_BEND * most  # (7)
+            rubbed = np.maximum(length(first), length(fourth))
+            self._rubbed = np.maximum(self._rubbed, rubbed)
+            faint = FAINT * np.sqrt(self._peak) * field.mass
+            most = np.maximum(self._rubbed, faint)
+            bent = length(first - second - third + fourth)
+            bends = bent > 6.0 * FRICTION_BEND * most  # (7)
             sharp |= bends & field.rubs & ~self._dynamics.sticks
         any_sharp = sharp.any()
         if any_sharp:
@@ -217,7 +233,8 @@ class Stepping:
         if any_sharp or self._shortened:
             # The limit doubles with each step that is made at it: what bent may still be near.
             grown = np.where(h >= self._limit, 2.0 * self._limit, self._limit)
-            self._limit = np.where(sharp, SHORTENED * h, np.minimum(grown, self._longest))
+            grown = np.minimum(grown, self._longest)
+            self._limit = np.where(sharp, SHORTENED * h, grown)
             self._shortened = bool((self._limit < self._longest).any())
         return sharp[:, 0] if any_sharp else None
 
@@ -242,7 +259,8 @@ class Stepping:
         if self._ground is not None:
             hit = (then[0][:, -1] < self._ground.floor[:, 0]) & watched
             if hit.any():
-                self._await(hit, h, self._impacts(np.flatnonzero(hit), h, now, then), IMPACT)
+                seconds = self._impacts(np.flatnonzero(hit), h, now, then)
+                self._await(hit, h, seconds, IMPACT)
                 result = hit
         if self._field.dry:
             dynamics = self._dynamics
@@ -255,11 +273,12 @@ class Stepping:
             # A lane on its way to breaking loose is asked again, a little late being good enough:
             # the excess bends within the step, and its root is that of a straight line.
             before, after = dynamics.excess
-            late = np.where(self._goal == LOOSE, PUNCTUAL, 0.0)[:, None] * (after - before)
-            under_way = watched | (self._goal == LOOSE)
-            loose = (dynamics.sticks & (after > late))[:, 0] & under_way
+            to_loose = self._goal == LOOSE
+            late = np.where(to_loose, PUNCTUAL, 0.0)[:, None] * (after - before)
+            loose = (dynamics.sticks & (after > late))[:, 0] & (watched | to_loose)
             if loose.any():
-                self._await(loose, h, self._loosenings(np.flatnonzero(loose), h), LOOSE)
+                seconds = self._loosenings(np.flatnonzero(loose), h)
+                self._await(loose, h, seconds, LOOSE)
                 result = loose if result is None else result | loose
         return result
 
@@ -267,15 +286,21 @@ class Stepping:
         self, i: Indices, h: Array, now: tuple[Array, ...], then: tuple[Array, ...]
     ) -> Array:
         """(n,) seconds to the impacts of lanes i (n,)."""
-        floor = self._ground.floor[i, 0] if self._ground is not None else np.zeros(i.size)
-        return root(now[0][i, -1] - floor, now[1][i, -1], then[0][i, -1] - floor, h[i, 0])
+        assert self._ground is not None
+        floor = self._ground.floor[i, 0]
+        height = now[0][i, -1] - floor
+        rate = now[1][i, -1]
+        later = then[0][i, -1] - floor
+        return root(height, rate, later, h[i, 0])
 
     def _standstills(
         self, i: Indices, h: Array, now: tuple[Array, ...], then: tuple[Array, ...]
     ) -> Array:
         """(n,) seconds until lanes i (n,) have lost their speed along their way."""
         way = self._dynamics.way[i]
-        speed, rate, later = (dot(part[i], way)[:, 0] for part in (now[1], now[2], then[1]))
+        speed = dot(now[1][i], way)[:, 0]
+        rate = dot(now[2][i], way)[:, 0]
+        later = dot(then[1][i], way)[:, 0]
         return root(speed, rate, later, h[i, 0])
 
     def _loosenings(self, i: Indices, h: Array) -> Array:
@@ -293,7 +318,8 @@ class Stepping:
         """
         i = np.flatnonzero(lanes)
         first = seconds < self._try[i, 0]
-        i, seconds = i[first], seconds[first]
+        i = i[first]
+        seconds = seconds[first]
         self._try[i, 0] = np.clip(seconds, 0.0, h[i, 0])
         self._goal[i] = goal
         self._events[i] += 1
@@ -314,23 +340,30 @@ class Stepping:
             self._strike(struck, k4[struck])
         if stopped.size:
             self._stop(stopped, k4[stopped])
-        self._try[there], self._goal[there] = np.inf, NOTHING
+        self._try[there] = np.inf
+        self._goal[there] = NOTHING
         self._awaits = bool(np.isfinite(self._try).any())
 
     def _strike(self, i: Indices, a: Array) -> None:
         """Impacts of lanes i (n,), to which their steps led but for rounding; a (n, D) before."""
         assert self._ground is not None
-        x, v, floor = self._x[i], self._v[i], self._ground.floor[i]
+        x = self._x[i]
+        v = self._v[i]
+        floor = self._ground.floor[i]
         rate = v[:, -1:]
         late = np.where(rate < 0, (floor - x[:, -1:]) / rate, 0.0)
-        late *= 1.0 - 0.5 * late * a[:, -1:] / np.where(rate < 0, rate, 1.0)  # (8)
+        falling = np.where(rate < 0, rate, 1.0)
+        late *= 1.0 - 0.5 * late * a[:, -1:] / falling  # (8)
         late = self._rounding(i, late)
-        x, v = x + late * (v + 0.5 * late * a), v + late * a
+        x = x + late * (v + 0.5 * late * a)
+        v = v + late * a
         self._clock.correct(i, late)
         # On the ground to the last bit and not moving up, or the next step would strike it again.
-        x[:, -1:], v[:, -1:] = floor, np.minimum(v[:, -1:], 0.0)
+        x[:, -1:] = floor
+        v[:, -1:] = np.minimum(v[:, -1:], 0.0)
         outcome = self._ground.strike(i, v, a)
-        self._x[i], self._v[i] = x, outcome.v
+        self._x[i] = x
+        self._v[i] = outcome.v
         if outcome.rests.any():
             self._dynamics.lay(i[outcome.rests])
 
@@ -338,14 +371,17 @@ class Stepping:
         """Corrections (n, 1) of lanes i (n,), none longer than a step: of a lane all but at rest
         they mean nothing.
         """
-        bounded: Array = np.clip(np.nan_to_num(seconds), -self._longest[i], self._longest[i])
+        step = self._longest[i]
+        bounded: Array = np.clip(np.nan_to_num(seconds), -step, step)
         return bounded
 
     def _stop(self, i: Indices, a: Array) -> None:
         """Lanes i (n,) have lost their speed along their way but for rounding; a (n, D) before."""
-        v, way = self._v[i], self._dynamics.way[i]
+        v = self._v[i]
+        way = self._dynamics.way[i]
         slows = dot(a, way)
-        late = self._rounding(i, np.where(slows < 0, -dot(v, way) / slows, 0.0))
+        late = np.where(slows < 0, -dot(v, way) / slows, 0.0)
+        late = self._rounding(i, late)
         self._x[i] += late * v
         self._clock.correct(i, late)
         v = v + late * a
@@ -359,12 +395,14 @@ class Stepping:
         move up.
         """
         self._x[:, -1:] = np.maximum(self._x[:, -1:], ground.floor)
-        down = (self._x[:, -1] <= ground.floor[:, 0]) & (self._v[:, -1] <= 0)
+        height = self._x[:, -1]
+        rate = self._v[:, -1]
+        down = (height <= ground.floor[:, 0]) & (rate <= 0)
         if down.any():
             a = self._dynamics.begin(self._clock.t, self._x, self._v)
             # Told apart before the impacts, after which a struck lane may have no speed either.
-            struck = np.flatnonzero(down & (self._v[:, -1] < 0))
-            lying = np.flatnonzero(down & (self._v[:, -1] == 0))
+            struck = np.flatnonzero(down & (rate < 0))
+            lying = np.flatnonzero(down & (rate == 0))
             if struck.size:
                 self._strike(struck, a[struck])
             self._dynamics.lay(lying)
