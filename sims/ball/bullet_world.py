@@ -4,14 +4,19 @@ What Bullet does to a free body of a multibody world (``btMultiBody``,
 ``btMultiBodyConstraintSolver``), measured to agree to rounding: with step h, gravity g, damping k
 and the gap d = z - radius before the step,
 
-    v' = v + h (-g ez - k v (1 + |v|)),    x' = x + h v'
+    v' = v + h (-g ez - k v (1 + |v|))                                     (1)
+    x' = x + h v'                                                          (2)
 
 so "linear damping" is a linear *and* a quadratic drag with one coefficient, and the method is
 semi-implicit Euler, of first order in h. Contact acts if d <= 0.02 sqrt(3) radius: then v'_z
 becomes at least
 
-    e |v'_z| - (d + s) / h    above the ground (d + s > 0): only what brings the ball to the ground
-    by the next step e |v'_z| - 0.08 (d + s) / h    below it: the ball is pushed out as well
+    e |v'_z| - (d + s) / h                                                 (3)
+
+above the ground (d + s > 0), which is only what brings the ball to the ground by the next step, and
+below it, where the ball is pushed out as well,
+
+    e |v'_z| - 0.08 (d + s) / h                                            (4)
 
 with e the product of both restitutions (0 for impacts below 0.2 m/s) and s = 1e-5 m. Rebounds
 therefore depend on where the last step before the impact happens to end, and the shorter the step,
@@ -35,9 +40,11 @@ def build(client: int, constants: Mapping[str, float]) -> int:
     """Ground of restitution and friction 1, and a ball; returns the ball's id."""
     p = bullet.engine()
     ground, ball = _ground_and_ball(client, constants)
+    # Nothing pushes out, s of (3) is nothing, and slow impacts bounce as well.
     p.setPhysicsEngineParameter(
         contactERP=0.0, contactSlop=0.0, restitutionVelocityThreshold=0.0, physicsClientId=client
     )
+    # The contact has the product of both bodies' numbers: with the ground's 1, the ball's own.
     p.changeDynamics(ground, -1, restitution=1.0, lateralFriction=1.0, physicsClientId=client)
     p.changeDynamics(
         ball,

@@ -13,9 +13,12 @@ from sims.pendulum.bullet_world import gravity  # the same torque
 
 __all__ = ["OPEN_LOOP", "gravity", "load", "model"]
 
-OPEN_LOOP = True  # the torque is the input, whatever the motion
+OPEN_LOOP = True
+"""The torque is the input, whatever the motion."""
 SHORTER = 1000.0
-_TINY = 1e-14  # kg m^2: MuJoCo wants the body to have some inertia of its own
+"""The body is so many times heavier, its arm so many times shorter."""
+_TINY = 1e-14
+"""kg m^2: MuJoCo wants the body to have some inertia of its own."""
 
 
 def model(constants: Mapping[str, float]) -> str:

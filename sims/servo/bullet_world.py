@@ -4,4 +4,5 @@ from sims.pendulum.bullet_world import build, gravity, load
 
 __all__ = ["OPEN_LOOP", "build", "gravity", "load"]
 
-OPEN_LOOP = False  # the motor's torque depends on angle and rate
+OPEN_LOOP = False
+"""The motor's torque depends on angle and rate."""

@@ -4,4 +4,5 @@ from sims.pendulum.mujoco_world import gravity, load, model
 
 __all__ = ["OPEN_LOOP", "gravity", "load", "model"]
 
-OPEN_LOOP = False  # the motor's torque depends on angle and rate
+OPEN_LOOP = False
+"""The motor's torque depends on angle and rate."""

@@ -26,7 +26,8 @@ class ServoSystem(System):
         duty = clip(kp error_gain (goal - q), -1, 1)                           (2)
         torque = kt (duty voltage - kt q') / resistance                        (3)
 
-    while enabled, else without torque. States are the angle q [rad], 0 hanging, and its rate qd [rad/s].
+    while enabled, else without torque. States are the angle q [rad], 0 hanging, and its rate qd
+    [rad/s].
     """
 
     name = "servo"

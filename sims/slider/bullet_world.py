@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping
 
 from sims import bullet
 
-OPEN_LOOP = True  # the force is the input, whatever the motion
+OPEN_LOOP = True
+"""The force is the input, whatever the motion."""
 
 
 def build(client: int, constants: Mapping[str, float]) -> int:  # noqa: ARG001

@@ -7,7 +7,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-OPEN_LOOP = True  # the force is the input, whatever the motion
+OPEN_LOOP = True
+"""The force is the input, whatever the motion."""
 
 
 def model(constants: Mapping[str, float]) -> str:  # noqa: ARG001

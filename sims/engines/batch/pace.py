@@ -49,7 +49,7 @@ def divisions(lanes: Lanes, field: Field, spans: Array, turn: float = TURN) -> A
             turned = np.sqrt(turning) * spans  # w h, radians
             decayed = decaying * spans * (TURN / DECAY)  # c h, in radians that count as much
             needed = np.maximum(turned, decayed) / turn
-            # `fmax` and not `maximum`: where forces overflow nothing is known, and one part will do.
+            # `fmax` and not `maximum`: what overflows tells nothing, and one part will do.
             parts = np.fmax(parts, np.ceil(needed))
     return np.minimum(parts, DIVISIONS)
 
