@@ -245,13 +245,29 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
         assert isinstance(effect, Input)
         begin = np.where(on, effect.times(c, begin), begin)
         end = np.where(on, effect.times(c, end), end)
-    lasting = _lasting(plan.steps)
+    # And forward with the values.
     signals = [u[first] for u in commands]
     means = _felt(runs, signals, begin, end)
-    values = np.take_along_axis(means, lasting, axis=1)
-    # And forward with the values. What was before the run is a signal that has always been there.
     beginnings = np.array([signal[0] for signal in signals])
-    start = beginnings[runs.of, None]
+    return {first: _passed(effects, plan, means, beginnings[runs.of, None]), **felt}
+
+
+def _passed(
+    effects: Sequence[tuple[Effect, Array, NDArray[np.bool_]]],
+    plan: Plan,
+    means: Array,
+    start: Array,
+) -> Array:
+    """(L, S) what becomes of `means` (L, S) on their way through effects on the input.
+
+    Args:
+        effects: with their coefficients, and where they act, (L, 1).
+        plan: the steps.
+        means: of the command over each step.
+        start: (L, 1) the command's first value, which has always been there before the run.
+    """
+    lasting = _lasting(plan.steps)
+    values = np.take_along_axis(means, lasting, axis=1)
     nothing = np.zeros_like(start)
     for effect, c, on in effects:
         assert isinstance(effect, Input)
@@ -260,7 +276,7 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
         passed = np.take_along_axis(passed, lasting, axis=1)
         values = np.where(on, passed, values)
         start = np.where(on, begun, start)
-    return {first: values, **felt}
+    return values
 
 
 def _before(ends: Array) -> Array:

@@ -123,26 +123,7 @@ class Arm(OwnSimulator):
         p.setGravity(0.0, 0.0, -constants["gravity"])
         # All rounds, whatever the residual: what friction holds must stand still.
         p.setPhysicsEngineParameter(numSolverIterations=_SOLVER_ROUNDS, solverResidualThreshold=0.0)
-        self._arm = p.createMultiBody(
-            linkMasses=[theta["mass1"], theta["mass2"]],
-            linkCollisionShapeIndices=[-1, -1],
-            linkVisualShapeIndices=[-1, -1],
-            linkPositions=[(0.0, 0.0, 0.0), (0.0, 0.0, -constants["length"])],
-            linkOrientations=[_HERE, _HERE],
-            linkInertialFramePositions=[
-                (0.0, 0.0, -theta["centre1"]),
-                (0.0, 0.0, -theta["centre2"]),
-            ],
-            linkInertialFrameOrientations=[_HERE, _HERE],
-            linkParentIndices=[0, 1],
-            linkJointTypes=[p.JOINT_REVOLUTE, p.JOINT_REVOLUTE],
-            linkJointAxis=[_AXIS, _AXIS],
-        )
-        # By default Bullet adds air resistance, sleep when nothing moves, and a speed limit.
-        p.changeDynamics(
-            self._arm, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=NO_LIMIT
-        )
-        p.changeDynamics(self._arm, -1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING)
+        self._arm = self._built(theta, constants)
         for joint in (0, 1):
             inertia = constants[f"inertia{joint + 1}"]
             damping = theta[f"damping{joint + 1}"]
@@ -159,6 +140,29 @@ class Arm(OwnSimulator):
         self._torque = p.TORQUE_CONTROL
         self._q = [initial["q1"], initial["q2"]]
         self._v = [initial["qd1"], initial["qd2"]]
+
+    def _built(self, theta: Mapping[str, float], constants: Mapping[str, float]) -> int:
+        """The two links in the empty world; the body's id."""
+        p = self._world
+        arm: int = p.createMultiBody(
+            linkMasses=[theta["mass1"], theta["mass2"]],
+            linkCollisionShapeIndices=[-1, -1],
+            linkVisualShapeIndices=[-1, -1],
+            linkPositions=[(0.0, 0.0, 0.0), (0.0, 0.0, -constants["length"])],
+            linkOrientations=[_HERE, _HERE],
+            linkInertialFramePositions=[
+                (0.0, 0.0, -theta["centre1"]),
+                (0.0, 0.0, -theta["centre2"]),
+            ],
+            linkInertialFrameOrientations=[_HERE, _HERE],
+            linkParentIndices=[0, 1],
+            linkJointTypes=[p.JOINT_REVOLUTE, p.JOINT_REVOLUTE],
+            linkJointAxis=[_AXIS, _AXIS],
+        )
+        # By default Bullet adds air resistance, sleep when nothing moves, and a speed limit.
+        p.changeDynamics(arm, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=NO_LIMIT)
+        p.changeDynamics(arm, -1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING)
+        return arm
 
     def step(self, inputs: Mapping[str, float], seconds: float) -> None:
         """One step of Heun's method, or several short ones where dry friction changes sides."""
