@@ -82,8 +82,10 @@ class Assessor:
         fitted = intervals(search, model)
         result = {}
         for place, parameter in enumerate(self.fitting.parameters):
+            # What the data do not touch stays nominal; effects that are off are zero.
             given = float(model.fit.theta[place]), np.nan, np.nan
             value, low, high = fitted.get(place, given)
+            # JSON has no number for what is not known.
             bounded = np.isfinite(low) and np.isfinite(high)
             interval = (low, high) if bounded else (None, None)
             result[place] = Number(value, parameter.unit, *interval)
@@ -98,6 +100,7 @@ class Assessor:
 
     def _cause(self, evidence: Evidence, numbers: dict[int, Number]) -> Cause:
         world = self.fitting
+        # An effect's coefficients lie side by side in the parameter vector, in its own order.
         effect = world.effects[evidence.effect]
         coefficients = effect.on(world.simulator.system)
         places = range(*world.slots[evidence.effect].indices(len(world.parameters)))
@@ -155,6 +158,7 @@ class Assessor:
             return None
         counted = self._counted()
         floor = self._floor_of(finding)
+        # As the gain of the whole model is counted: nothing below the floor is a gain.
         before = _rmse(runs, measured[()].simulated, counted)
         after = _rmse(runs, measured[names].simulated, counted)
         share = (before - max(after, floor)) / (before - floor) if before > floor * 1.001 else 0.0
@@ -164,6 +168,7 @@ class Assessor:
         """What to record next; None where nothing is open."""
         if finding.verdict == "unidentifiable":
             return _apart(finding.vague)
+        # The strongest cause that is open first, against its most plausible alternative.
         for cause in finding.causes:
             for other in cause.alternatives:
                 rest = {name for name in finding.model.names if name != cause.effect}

@@ -165,7 +165,7 @@ class _Explainer:
             first, last = (finding.measured[names].simulated for names in ((), finding.model.names))
             held_out = show.side(self.measuring, first, last)
             there = show.places(self.measuring, first, last, sigma, " (held out)")
-            # Channels and phases are told of the fitted runs alone; of these, which run is worst.
+            # Channels and phases are told of the fitted runs alone; of held-out ones, each run.
             places += [place for place in there if place.kind == "run"]
         channels = tuple(
             Shown(

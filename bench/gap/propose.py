@@ -81,6 +81,7 @@ def next_experiment(models: Models, model: Model, rival: Model) -> Experiment:
         # A run on which one of the simulations fails proposes nothing.
         if np.isfinite(apart) and apart > largest:
             says, change, largest = run.says, run.change, apart
+    # Effects that both have are no matter of dispute.
     mine = " and ".join(sorted({*model.names} - {*rival.names}))
     other = " and ".join(sorted({*rival.names} - {*model.names}))
     if largest < TELLING:
@@ -101,6 +102,7 @@ def _no_run(world: World, mine: str, other: str) -> str:
 
 def _runs(world: World) -> Iterator[_Run]:
     """Runs like the first one, with more or less of what an experimenter has in hand."""
+    # Of runs that tell as much the first one is proposed.
     track = world.tracks[0]
     yield _longer(track)
     yield from _elsewhere(world, track)
@@ -172,6 +174,7 @@ def _apart(world: World, run: _Run, model: Model, rival: Model, sigma: Array) ->
         name: np.full(2, value)
         for name, value in zip(world.states, run.states.tolist(), strict=True)
     }
+    # One lane of a call for each model.
     seen = world.simulator.simulate_lanes(theta, scenarios, initial)
     world.simulations += 2
     return float(np.sqrt(np.square((seen[0] - seen[1]) / sigma).mean()))  # (1)

@@ -64,6 +64,7 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
 
 def _theta(world: World, extended: Extended) -> Array:
     """(P,) the numbers of an extended simulator, nominal where it has none."""
+    # Parameters that the file does not state are nominal, coefficients that it does not are off.
     theta = world.nominal()
     for place, parameter in enumerate(world.parameters[: world.own]):
         if parameter.name in extended.parameters:

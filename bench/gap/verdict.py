@@ -164,6 +164,7 @@ class Verdict:
 
     def document(self) -> Document:
         """The content of verdict.json."""
+        # The order of the keys is that of the page that explains them, and of older files.
         proposed = self.next_experiment
         return {
             "verdict": self.verdict,
@@ -181,6 +182,7 @@ class Verdict:
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Verdict:
         """From the content of a verdict.json that explain has written."""
+        # Null stands for what there was nothing to say of.
         heldout, proposed = document["heldout"], document["next_experiment"]
         return cls(
             document["verdict"],

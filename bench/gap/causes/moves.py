@@ -39,6 +39,7 @@ class Moves(Scored):
         """Fit the model without each of these effects, from where it stands itself."""
         starts = []
         for name in names:
+            # Off is zero, and no parameter of the fit: everything else begins where it stands.
             theta = model.fit.theta.copy()
             theta[self.world.slots[name]] = 0.0
             rest = tuple(n for n in model.names if n != name)
@@ -63,6 +64,7 @@ class Moves(Scored):
     def swap(self, model: Model) -> Model:
         """The best model that has one effect replaced."""
         for _ in range(MOVES):
+            # Each smaller model is extended again: the effect taken away may not be the best.
             self.extend([self.without(model, name) for name in model.names], NOMINATED)
             better = self.best(len(model.names))
             if better is None or better.merit <= model.merit + BETTER:

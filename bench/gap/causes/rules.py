@@ -110,7 +110,7 @@ def has_structure(p_value: float, level: float, loud: Sequence[str]) -> bool:
     Either test is blind to something: what is no force need not look like one, and a small force is
     not loud.
     """
-    return p_value < level or bool(loud)
+    return p_value < level or len(loud) > 0
 
 
 def is_unexplained(structure: bool, chance: float) -> bool:
@@ -127,6 +127,7 @@ def helps(merits: tuple[float, float], excesses: tuple[float, float]) -> bool:
         merits: without the effect, and with it.
         excesses: the same.
     """
+    # Near the noise the merit alone decides: a tenth of next to nothing says nothing.
     before, after = excesses
     return merits[1] > merits[0] and (before < NOTICED or after < (1.0 - HELPS) * before)
 
@@ -153,6 +154,7 @@ def behind_in_excess(ratios: Sequence[float]) -> float:
 
 def ratio_of(excess: float, other: float) -> float:
     """One excess by another, neither of them taken for less than `AT_THE_NOISE`."""
+    # Of two models at the noise either may be nearer by chance, by any factor.
     return max(excess, AT_THE_NOISE) / max(other, AT_THE_NOISE)
 
 

@@ -157,6 +157,7 @@ class Products:
     ) -> None:
         self._own, self._states = at.free.size, at.jacobian.shape[3] - at.free.size
         self._runs: list[_Run] = []
+        # Behind a gap noise starts anew: what it remembers of before is not known.
         follows = np.zeros_like(seen)
         follows[:, 1:] = seen[:, 1:] & seen[:, :-1]
         for r in range(len(seen)):
@@ -174,9 +175,10 @@ class Products:
         total, cross, normal, whole = self._without_states(phi)
         # (2) once more, for the parameters that all runs share.
         inverse = _inverse(normal[:q, :q])
-        total = total - np.einsum("ks,kl,ls->s", cross[:q], inverse, cross[:q])
-        gram = normal[q:, q:] - normal[q:, :q] @ inverse @ normal[:q, q:]
-        both = cross[q:] - normal[q:, :q] @ (inverse @ cross[:q])
+        shared, mixed = cross[:q], normal[q:, :q]
+        total = total - np.einsum("ks,kl,ls->s", shared, inverse, shared)
+        gram = normal[q:, q:] - mixed @ inverse @ normal[:q, q:]
+        both = cross[q:] - mixed @ (inverse @ shared)
         # Of directions that are absorbed only rounding is left, which would explain at random.
         acting = np.diagonal(gram) > ABSORBED * whole
         gram = np.where(acting[:, None] & acting, (gram + gram.T) / 2.0, 0.0)
@@ -196,9 +198,10 @@ class Products:
             rest = np.r_[0:q, q + s : len(n)]
             # (2) with the initial states of this run for J.
             inverse = _inverse(n[own, own])
+            mixed = n[rest][:, own]
             total = total + t - np.einsum("ks,kl,ls->s", c[own], inverse, c[own])
-            cross = cross + c[rest] - n[rest][:, own] @ (inverse @ c[own])
-            normal = normal + n[np.ix_(rest, rest)] - n[rest][:, own] @ inverse @ n[own][:, rest]
+            cross = cross + c[rest] - mixed @ (inverse @ c[own])
+            normal = normal + n[np.ix_(rest, rest)] - mixed @ inverse @ n[own][:, rest]
         return total, cross, normal, whole
 
 
@@ -240,6 +243,7 @@ def _rows(values: Array, mask: Mask) -> Array:
 
 def _inverse(normal: Array) -> Array:
     """Of a positive semidefinite matrix; directions that hardly count are left out."""
+    # Columns of any unit on one scale, so that the cut-off means the same for each.
     scale = np.sqrt(np.maximum(np.diagonal(normal), 0.0))
     # A row of zeros stays one: divided by infinity it has no part in any direction.
     scale = np.where(scale > 0, scale, np.inf)
@@ -304,6 +308,7 @@ def _solved(gram: Array, cross: Array, columns: list[int]) -> tuple[Array, Array
     if not (scale > 0).all():
         return None
     normal = gram[np.ix_(columns, columns)] / np.outer(scale, scale)
+    # Columns that are alike share what they explain in any way: a choice with fewer has it.
     if np.linalg.eigvalsh(normal)[0] < RANK:
         return None
     right = cross[columns] / scale[:, None]
@@ -315,6 +320,7 @@ def _solved(gram: Array, cross: Array, columns: list[int]) -> tuple[Array, Array
 def _jointly(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
     """The same for a group of many columns, none of them held."""
     columns = list(group.columns)
+    # Of many columns some nearly repeat others, as hats that overlap do: what they add is rounding.
     scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 1e-300))
     scaled = gram[np.ix_(columns, columns)] / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(scaled)
@@ -347,35 +353,66 @@ def score(
     everything = residual[..., None]
     if surrogate is not None:
         everything = np.concatenate([everything, np.moveaxis(surrogate, 0, -1)], axis=3)
-    members = groups(directions)
-    names = list(dict.fromkeys(group.effect for group in members))
-    count, columns = int(seen.sum()), everything.shape[3]
-    without, white = np.full(columns, -np.inf), np.zeros(len(names))
-    best = np.full((len(names), columns), -np.inf)
-    hypotheses: dict[str, list[_Hypothesis]] = {name: [] for name in names}
-    for group in members:
-        hypotheses[group.effect].append(_Hypothesis(-np.inf, group, np.zeros(0), 0.0))
+    table = _Table(groups(directions), everything.shape[3], int(seen.sum()))
     products = Products(at, everything, directions.values, seen, noise.sigma)
+    # A grid: the products of one pass over the samples serve every correlation.
     for phi in GRID:
-        total, gram, cross = products.projected(phi)
         determinant = 2.0 * log_determinant(seen, np.full(seen.shape[2], phi))
+        table.enter(phi, determinant, *products.projected(phi))
+    return _ranked(table.names, table.best - table.without, table.hypotheses, table.white)  # (4)
+
+
+class _Table:
+    """The best of every effect so far, over the correlations that were entered.
+
+    Args:
+        members: the groups of all effects.
+        columns: residual and surrogates.
+        count: n of eq. (3).
+    """
+
+    def __init__(self, members: Sequence[Group], columns: int, count: int) -> None:
+        self._count = count
+        self.names = list(dict.fromkeys(group.effect for group in members))
+        self.best = np.full((len(self.names), columns), -np.inf)
+        self.without = np.full(columns, -np.inf)
+        self.white = np.zeros(len(self.names))
+        self.hypotheses: dict[str, list[_Hypothesis]] = {name: [] for name in self.names}
+        for group in members:
+            unknown = _Hypothesis(-np.inf, group, np.zeros(0), 0.0)
+            self.hypotheses[group.effect].append(unknown)
+
+    def enter(
+        self, phi: float, determinant: float, total: Array, gram: Array, cross: Array
+    ) -> None:
+        """Take a correlation into account.
+
+        Args:
+            phi: the correlation.
+            determinant: log det W'W of eq. (3).
+            total: <e, e> (S,).
+            gram: G (K, K).
+            cross: h (K, S).
+        """
         # What is explained whole leaves rounding, of which the logarithm has a bound.
         floor = 1e-12 * total + 1e-300
-        nothing = determinant - count * np.log(np.maximum(total, floor))  # (3), no directions
-        without = np.maximum(without, nothing)
-        for row, name in enumerate(names):
-            for i, hypothesis in enumerate(hypotheses[name]):
-                gain, c = explained(gram, cross, hypothesis.group)
+        left = np.maximum(total, floor)
+        nothing = determinant - self._count * np.log(left)  # (3) without directions
+        self.without = np.maximum(self.without, nothing)
+        for row, name in enumerate(self.names):
+            hypotheses = self.hypotheses[name]
+            for i, hypothesis in enumerate(hypotheses):
+                group = hypothesis.group
+                gain, c = explained(gram, cross, group)
                 left = np.maximum(total - gain, floor)
-                value = determinant - count * np.log(left)  # (3)
+                value = determinant - self._count * np.log(left)  # (3)
+                self.best[row] = np.maximum(self.best[row], value)
+                # The first column is the residual; only its coefficients begin fits.
                 if value[0] > hypothesis.value:
-                    group = hypothesis.group
-                    hypotheses[name][i] = _Hypothesis(float(value[0]), group, c[:, 0], phi)
-                best[row] = np.maximum(best[row], value)
+                    hypotheses[i] = _Hypothesis(float(value[0]), group, c[:, 0], phi)
                 if phi == 0:
-                    ratio = count * float(np.log(total[0] / max(total[0] - gain[0], floor[0])))
-                    white[row] = max(white[row], ratio)
-    return _ranked(names, best - without, hypotheses, white)  # (4)
+                    ratio = float(np.log(total[0] / max(total[0] - gain[0], floor[0])))
+                    self.white[row] = max(self.white[row], self._count * ratio)
 
 
 class _Hypothesis(NamedTuple):
@@ -449,6 +486,7 @@ def tail(by_chance: Array, observed: Array) -> float:
     largest, value = np.sort(by_chance.max(axis=0)), float(observed.max())
     count = largest.size
     above = int((largest >= value).sum())
+    # Counting ends at one in the number of surrogates; smaller chances are extrapolated.
     extreme = largest[int(EXTREME * count) :]
     begin = extreme[0]
     if value <= begin or count < FEWEST:

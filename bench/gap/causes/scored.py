@@ -75,6 +75,7 @@ class Scored(Models):
         # Directions cost a simulation of each candidate; other surrogates need no new ones.
         candidates = self._lacking(model) if known is None else known.directions
         residual = self.residual(model.fit)
+        # The colour of noise is best known from a model that leaves less structure.
         meaningless = residual if against is None else against
         surrogate = surrogates(meaningless, self.seen, SURROGATES, self.rng)
         scores = score(model.fit, residual, candidates, self.seen, self.weights(model), surrogate)
@@ -101,6 +102,7 @@ class Scored(Models):
         starts = []
         for model in beam:
             key = frozenset(model.names)
+            # A better fit since then has taken its scores away.
             if key not in self.scanned:
                 self.scan(model)
             candidates, scores = self.scanned[key]
@@ -124,6 +126,7 @@ class Scored(Models):
         gain = larger.likelihood.value - model.likelihood.value
         model = self.models[frozenset(model.names)]
         first = self._gained(self.scan(model), larger, gain)
+        # No colour of the surrogates makes such a gain a matter of chance.
         if first < CERTAIN:
             return first
         scores = self.scan(model, self.residual(larger.fit))
@@ -134,6 +137,7 @@ class Scored(Models):
         effects.
         """
         chance = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
+        # Of several effects the one that gains most by chance counts.
         lucky = max((chance.get(name, 0.0) for name in larger.names), default=0.0)
         return tail(scores.by_chance, np.array([gain - lucky]))
 

@@ -63,6 +63,7 @@ class Search(Moves):
         """
         best = self.base
         for size in range(1, MOST_EFFECTS + 1):
+            # A further effect is looked for on stronger evidence than the first.
             if self.plain(best, DOUBTFUL if best.names else UNLIKELY):
                 break
             larger = self._larger(best, size)
@@ -73,6 +74,7 @@ class Search(Moves):
             # Near the noise, or where all that is left may be noise, two steps at once find chance.
             elif self.excess(best) < FAR or self.quiet(best):
                 break
+            # What is missing then is nothing of the library, and triples would only mimic it.
             if size > 1 and is_hopeless(self, larger):
                 break
         return best
@@ -175,6 +177,7 @@ def conservative(search: Search, best: Model, larger: Model) -> Model:
     Two effects mimic many a third; where neither account reaches the noise, the shorter one is
     built upon.
     """
+    # A model that keeps the best one's effects puts none in their place.
     kept = set(best.names) <= set(larger.names)
     if kept or search.excess(larger) < CLEARLY * search.excess(best):
         return larger

@@ -33,6 +33,7 @@ class Trial:
 
     def measure(self, models: Iterable[Model]) -> None:
         """Try models, all at once: each is compared with the nearest of them."""
+        # By effects, so that a model that is asked for twice is simulated once.
         chosen = {model.names: model for model in models}
         results = self.runs.measure([model.fit.theta for model in chosen.values()])
         self.measured.update(zip(chosen, results, strict=True))
