@@ -12,7 +12,7 @@ TIMES = np.arange(60) / 60.0
 CONSTANTS = {"radius": 0.5, "gravity": 9.8}
 vision = pytest.mark.skipif(
     not all(map(importlib.util.find_spec, ("av", "cv2"))),
-    reason="PyAV and OpenCV are not installed: simgap[vision]",
+    reason="PyAV and OpenCV are not installed: .[vision]",
 )
 
 
@@ -74,5 +74,5 @@ def test_an_unknown_film_and_missing_packages_are_one_line(monkeypatch):
     with pytest.raises(InputError, match="projected, tracked, found 'seen'"):
         FilmedBall(film="seen")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"simgap\[vision\]"):
+    with pytest.raises(InputError, match=r'pip install -e "\.\[vision\]"'):
         FilmedBall(film="tracked")
