@@ -179,6 +179,7 @@ def _constants(path: Path, value: Any) -> dict[str, float]:
 
 def _effects(path: Path, value: Any) -> dict[str, dict[str, Number]]:
     coefficients = {}
+    # Their order is kept: a signal passes them one after another.
     for name, numbers in table(path, "effects", value).items():
         table(path, name, numbers)
         coefficients[name] = _numbers(path, f"effects.{name}", numbers)

@@ -64,7 +64,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(text)
     except ValueError as error:  # bad TOML, or a date or number that cannot be
         raise InputError(f"{path}: not valid TOML: {error}") from None
-    except RecursionError:
+    except RecursionError:  # a file may be nothing but brackets
         raise InputError(f"{path}: not valid TOML: nested too deeply") from None
 
 
@@ -76,7 +76,7 @@ def shown(value: object) -> str:
 
 def fault(source: Source, where: str, wanted: str, value: object) -> InputError:
     """The error for a value that is not what is wanted; `where` may be empty."""
-    place = f"{where}: " if where else ""
+    place = f"{where}: " if where else ""  # a whole file has no place in itself
     return InputError(f"{source}: {place}expected {wanted}, found {shown(value)}")
 
 
@@ -221,6 +221,7 @@ def entries(
         kind: what a message calls an entry of the table, and where.
     """
     given = table(source, where, value)
+    # Names first: the type of a key that does not exist would be a riddle.
     known(kind or f"entry of [{where}] in {source}", given, hints)
     result = {}
     for key, item in given.items():

@@ -254,6 +254,13 @@ def test_damaged_folder_is_one_line(damage, tmp_path, capsys):
     assert "not a complete comparison" in capsys.readouterr().err
 
 
+def test_list_shows_tags_of_experiments(capsys):
+    assert main(["list", "experiments"]) == 0
+    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+    assert lines["ball-drop-video"].endswith(" [published, video]")
+    assert lines["pendulum-real"].endswith(" [several-parameters, real]")
+
+
 def test_list_says_what_each_thing_is(capsys):
     for what, expected in [
         ("tuners", ["cma_es", "tunenet", "least_squares"]),
