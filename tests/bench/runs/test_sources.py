@@ -241,6 +241,25 @@ def test_class_of_a_script_or_a_notebook_takes_the_digest_of_its_text(monkeypatc
     assert digests[1] == source(cell(6, 2))
 
 
+def test_class_of_a_notebook_that_has_no_file_takes_the_text_of_its_cell(monkeypatch):
+    """As in Jupyter, where __main__ has no file, so that inspect finds functions and no classes."""
+    import linecache
+
+    main = sys.modules["__main__"]
+    monkeypatch.delattr(main, "__file__", raising=False)
+
+    def cell(number, step):
+        text = PLUGIN.format(step=step)
+        file = f"<cell {number}>"
+        linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
+        space = {"__name__": "__main__"}
+        exec(compile(text, file, "exec"), space)
+        monkeypatch.setattr(main, "Mine", space["Mine"], raising=False)
+        return source(space["Mine"])
+
+    assert cell(11, 1) == cell(12, 1) != cell(13, 2)
+
+
 def made(number):
     class Local(Tuner):
         step = number
