@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from bench.gap.causes.rules import VerdictName
 from bench.gap.report import pictures
 from bench.gap.report.account import closes, interval
-from bench.gap.report.page import framed, page
+from bench.gap.report.elements import framed
+from bench.gap.report.page import page
 from bench.gap.report.pictures import Printed
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, estimate, joined, percent, with_unit

@@ -27,11 +27,17 @@ from bench.gap.report.words import (
 from sims.base import Array
 
 WIDTH = 100
+"""Letters of a line on the terminal."""
 ESTIMATED = 1.2
 """An estimated noise is known to this over the root of the number of samples, as a share of it (see
 `floor`).
 """
 ONE_SIDED = 1.645
+"""Sigmas below which a normal variable lies with 95 %."""
+MOST_PHI = 0.98
+"""Correlation of neighbouring samples that is believed at most: at 1 no sample would count."""
+FAR = 10.0
+"""Shares of its value by which a parameter moves that are no longer said in percent."""
 PERFECT = "with a perfect model the sensor's noise would leave"
 MOVED = 0.05
 """Share by which a parameter moves that is called out where its interval is not known."""
@@ -51,27 +57,32 @@ def account(story: Story) -> list[str]:
 
 def details(story: Story) -> Iterator[str]:
     """Paragraphs below the headline, a sentence or a few each."""
-    told = story.verdict["verdict"] in ("named", "partial")
+    verdict = story.verdict["verdict"]
+    # What an effect does is said above the details already in these two.
+    explained = verdict in ("named", "partial")
     for cause in story.verdict["causes"]:
-        name = f"{sentence(noun(cause['effect']))[:-1]} ({clean(cause['effect'], 60)}): "
-        yield name + ("" if told else f"{clean(cause['says']).rstrip('.')}; ") + coefficients(cause)
+        name = f"{sentence(noun(cause['effect']))[:-1]} ({clean(cause['effect'], 60)})"
+        says = "" if explained else f"{_says(cause)}; "
+        yield f"{name}: {says}{coefficients(cause)}"
     if story.why:
         yield "Why: " + " ".join(sentence(text) for text in story.why[:2])
-    if story.verdict["verdict"] != "adequate" and (
-        places := [text for kind in ("run", "channel", "phase") if (text := largest(story, kind))]
-    ):
-        yield (
-            "Where the gap is largest, RMS in units of the noise (1 is the noise floor): "
-            + "; ".join(places)
-            + "."
-        )
-    if moved := [text for p in story.parameters if (text := moves(story, p))]:
-        yield "Parameters: " + " ".join(moved)
+    places = [text for kind in ("run", "channel", "phase") if (text := largest(story, kind))]
+    if places and verdict != "adequate":
+        unit = "RMS in units of the noise (1 is the noise floor)"
+        yield f"Where the gap is largest, {unit}: {'; '.join(places)}."
+    if story.parameters:
+        yield "Parameters: " + " ".join(moves(story, p) for p in story.parameters)
     if story.remains:
         yield "What remains: " + " ".join(sentence(text) for text in story.remains)
-    if story.verdict["verdict"] != "ambiguous" and (proposed := experiment(story)):
+    # Where causes cannot be told apart the experiment stands right below the headline.
+    if verdict != "ambiguous" and (proposed := experiment(story)):
         yield f"Next experiment: {proposed}"
     yield effort(story)
+
+
+def _says(cause: Mapping[str, Any]) -> str:
+    """What an effect does, to stand within a sentence."""
+    return clean(cause["says"]).rstrip(".")
 
 
 def headline(story: Story) -> str:
@@ -80,28 +91,33 @@ def headline(story: Story) -> str:
     if verdict == "adequate":
         return "Nothing is missing from the simulation that these data can show."
     if verdict == "unidentifiable":
-        return f"These data cannot fix {joined(unfixed(story))}: what the simulation lacks cannot be told from them."
+        unknown = "what the simulation lacks cannot be told from them"
+        return f"These data cannot fix {joined(unfixed(story))}: {unknown}."
     if verdict == "unknown" or not causes:
-        count = len(story.verdict["candidates"])
-        return f"Something is missing from the simulation, and none of the {count} known causes explains it."
+        none = f"none of the {len(story.verdict['candidates'])} known causes explains it"
+        return f"Something is missing from the simulation, and {none}."
     if verdict == "ambiguous":
         return f"The simulation lacks {_sets(causes)}: these data cannot tell which."
     if verdict == "partial":
-        return f"The simulation lacks {_sets(causes)}, and something else that no known cause explains."
-    names = [noun(cause["effect"]) for cause in causes]
-    says = f": {clean(causes[0]['says']).rstrip('.')}" if len(causes) == 1 else ""
-    return f"The simulation lacks {joined(names)}{says}."
+        more = "something else that no known cause explains"
+        return f"The simulation lacks {_sets(causes)}, and {more}."
+    names = joined([noun(cause["effect"]) for cause in causes])
+    # With several causes the sentence would not end: what they do follows it.
+    says = f": {_says(causes[0])}" if len(causes) == 1 else ""
+    return f"The simulation lacks {names}{says}."
 
 
 def _sets(causes: Sequence[Mapping[str, Any]]) -> str:
-    """The causes, those that have alternatives last: ``wind, and linear drag or Coulomb friction``."""
-    known = [noun(cause["effect"]) for cause in causes if not cause["alternatives"]]
-    open_sets = [
-        joined([noun(n) for n in (cause["effect"], *cause["alternatives"])], "or")
-        for cause in causes
-        if cause["alternatives"]
-    ]
-    return ", and ".join([*([joined(known)] if known else []), *open_sets])
+    """The causes, those that have alternatives last: ``wind, and linear drag or Coulomb
+    friction``.
+    """
+    sure = [noun(cause["effect"]) for cause in causes if not cause["alternatives"]]
+    parts = [joined(sure)] if sure else []
+    for cause in causes:
+        if cause["alternatives"]:
+            members = [noun(name) for name in (cause["effect"], *cause["alternatives"])]
+            parts.append(joined(members, "or"))
+    return ", and ".join(parts)
 
 
 def unfixed(story: Story) -> list[str]:
@@ -122,11 +138,8 @@ def following(story: Story) -> Iterator[str]:
         yield hiding(story)
     yield gain(story)
     if verdict == "partial" or (verdict == "named" and len(story.verdict["causes"]) > 1):
-        told = [
-            f"{noun(cause['effect'])}: {clean(cause['says']).rstrip('.')}"
-            for cause in story.verdict["causes"]
-        ]
-        yield sentence("; ".join(told))
+        causes = story.verdict["causes"]
+        yield sentence("; ".join(f"{noun(cause['effect'])}: {_says(cause)}" for cause in causes))
     if verdict == "ambiguous":
         yield "To tell them apart: " + (experiment(story) or "no experiment is proposed.")
 
@@ -135,21 +148,19 @@ def gain(story: Story) -> str:
     """The held-out error before and after against the floor; that it was not measured where no run
     is held out.
     """
-    found = story.verdict["heldout"]
-    if found is None:
+    held_out = story.verdict["heldout"]
+    if held_out is None:
         return _fitted_gain(story)
-    base, extended, floor = (
-        _error(story, found[k]) for k in ("rmse_base", "rmse_extended", "noise_floor")
-    )
+    base = _error(story, held_out["rmse_base"])
+    extended = _error(story, held_out["rmse_extended"])
+    perfect = f"{PERFECT} {_error(story, held_out['noise_floor'])}"
     if not story.verdict["causes"]:
-        return f"On held-out runs the tuned simulation errs by {base} (RMSE); {PERFECT} {floor}."
-    closed = (
-        f"{_closer(story)} {percent(found['gap_closed'])} of the gap{interval(found)}"
-        if closes(found)
-        else ""
-    )
-    errors = f"the error on held-out runs (RMSE) is {base} before and {extended} after; {PERFECT} {floor}."
-    return f"{closed}: {errors}" if closed else errors[0].upper() + errors[1:]
+        return f"On held-out runs the tuned simulation errs by {base} (RMSE); {perfect}."
+    errors = f"the error on held-out runs (RMSE) is {base} before and {extended} after; {perfect}."
+    if not closes(held_out):
+        return errors[0].upper() + errors[1:]
+    share = f"{percent(held_out['gap_closed'])} of the gap{interval(held_out)}"
+    return f"{_closer(story)} {share}: {errors}"
 
 
 def closes(found: Mapping[str, Any] | None) -> bool:
@@ -166,6 +177,7 @@ def interval(found: Mapping[str, Any]) -> str:
 
 
 def _closer(story: Story) -> str:
+    """The beginning of the sentence that says how much of the gap is closed."""
     causes = story.verdict["causes"]
     if story.verdict["verdict"] == "unknown":
         names = joined([noun(cause["effect"]) for cause in causes])
@@ -179,25 +191,27 @@ def _closer(story: Story) -> str:
 
 def _fitted_gain(story: Story) -> str:
     before, after = (rms(story, story.fitting, which) for which in ("before", "after"))
-    said = f"the tuned simulation's error is {number(before)} times the noise"
+    error = f"the tuned simulation's error is {number(before)} times the noise"
     if story.verdict["causes"]:
-        said += f" before and {number(after)} times after"
-    return (
-        f"No run is held out, so the gain is not measured independently; on the fitted runs {said}."
-    )
+        error += f" before and {number(after)} times after"
+    caution = "No run is held out, so the gain is not measured independently"
+    return f"{caution}; on the fitted runs {error}."
 
 
 def heldout_unit(story: Story) -> str:
     """The unit of the held-out errors: stated, or that of the channels whose noise together makes
     the floor.
     """
-    found = story.verdict["heldout"] or {}
-    if "unit" in found:
-        return str(found["unit"])
+    held_out = story.verdict["heldout"] or {}
+    if "unit" in held_out:
+        return str(held_out["unit"])
+    # Where it is not stated: the floor is the RMS of the noise of the channels of one unit.
+    floor = held_out.get("noise_floor") or 0.0
     units = list(dict.fromkeys(c.unit for c in story.channels))
     for unit in units:
-        together = float(np.sqrt(np.mean([c.sigma**2 for c in story.channels if c.unit == unit])))
-        if isclose(together, found.get("noise_floor") or 0.0, rel_tol=0.02):
+        noises = [c.sigma for c in story.channels if c.unit == unit]
+        together = float(np.sqrt(np.mean([sigma**2 for sigma in noises])))
+        if isclose(together, floor, rel_tol=0.02):
             return unit
     return units[0] if len(units) == 1 else "1"
 
@@ -212,61 +226,63 @@ def looked_for(story: Story) -> str:
     if not candidates:
         return "No candidate causes were at hand."
     best = candidates[0]
-    return (
-        f"{len(candidates)} possible causes were looked for and none stands out from chance; the most promising "
-        f"is {noun(best['effect'])} ({probability(best['p_value'])})."
-    )
+    none = f"{len(candidates)} possible causes were looked for and none stands out from chance"
+    promising = f"{noun(best['effect'])} ({probability(best['p_value'])})"
+    return f"{none}; the most promising is {promising}."
 
 
 def hiding(story: Story) -> str:
     """How large a gap the noise could hide, channel by channel."""
-    parts = [
-        f"{with_unit(number(size, 2), c.unit)} in {clean(c.name, 30)} ({number(size / c.sigma, 2)} of its noise)"
-        for c, size in zip(story.channels, hidden(story).tolist(), strict=True)
-        if isfinite(size)
-    ]
+    parts = []
+    for channel, size in zip(story.channels, hidden(story).tolist(), strict=True):
+        if isfinite(size):
+            amount = with_unit(number(size, 2), channel.unit)
+            share = f"{number(size / channel.sigma, 2)} of its noise"
+            parts.append(f"{amount} in {clean(channel.name, 30)} ({share})")
     return f"A gap of up to {joined(parts)} RMS could still hide in the noise." if parts else ""
 
 
 def hidden(story: Story) -> Array:
     """(C,) RMS in the channel's unit of the largest gap that a channel's noise could hide, at 95 %.
 
-    The mean square of the residual, less that of the noise, plus what the former is uncertain by:
-    fewer samples count where the noise remembers, and a noise that is estimated is itself
-    uncertain.
+    With r the residuals in units of the noise, n of them, and s = mean(r^2), which is 1 without a
+    gap:
+
+        phi = mean(r_t r_t+1) / s                                   (1)
+        n'  = n (1 - phi^2) / (1 + phi^2)                           (2)
+        gap^2 = max(0, s - 1) + 1.645 hypot(s sqrt(2 / n'), d)      (3)
+
+    Fewer samples count where the noise remembers: (2) is the number of independent ones whose mean
+    square is as uncertain as that of noise with the correlation phi^k over k samples. A noise that
+    is estimated is itself uncertain, by the share 1.2 / sqrt(n) and its square by d, twice as much.
     """
     sizes = []
     for c, channel in enumerate(story.channels):
-        rows = [
-            row
-            for side in sides(story)
-            for row in (side.observed - side.before)[:, :, c] / channel.sigma
-        ]
-        seen = np.concatenate([row[np.isfinite(row)] for row in rows])
-        if seen.size < 2:
+        rows = []
+        for side in sides(story):
+            rows += [*((side.observed - side.before)[:, :, c] / channel.sigma)]
+        residuals = np.concatenate([row[np.isfinite(row)] for row in rows])
+        if residuals.size < 2:
             sizes.append(np.nan)
             continue
-        square = float(np.mean(seen**2))
-        pairs = np.concatenate([row[1:] * row[:-1] for row in rows])
-        phi = (
-            float(np.clip(np.nanmean(pairs) / square, 0.0, 0.98))
-            if np.isfinite(pairs).any() and square
-            else 0.0
-        )
-        counted = seen.size * (1.0 - phi**2) / (1.0 + phi**2)
-        doubt = 0.0 if channel.stated else 2.0 * ESTIMATED / seen.size**0.5
-        excess = max(0.0, square - 1.0) + ONE_SIDED * float(
-            np.hypot(square * (2.0 / counted) ** 0.5, doubt)
-        )
+        square = float(np.mean(residuals**2))
+        # Neighbours within a run, and none across a missing sample: their product is NaN.
+        products = np.concatenate([row[1:] * row[:-1] for row in rows])
+        phi = 0.0
+        if np.isfinite(products).any() and square:
+            phi = float(np.clip(np.nanmean(products) / square, 0.0, MOST_PHI))  # (1)
+        counted = residuals.size * (1.0 - phi**2) / (1.0 + phi**2)  # (2)
+        doubt = 0.0 if channel.stated else 2.0 * ESTIMATED / residuals.size**0.5
+        chance = float(np.hypot(square * (2.0 / counted) ** 0.5, doubt))
+        excess = max(0.0, square - 1.0) + ONE_SIDED * chance  # (3)
         sizes.append(channel.sigma * excess**0.5)
     return np.array(sizes)
 
 
 def sides(story: Story) -> list[Side]:
     """Fitted and held-out runs, as far as there are any."""
-    return [
-        side for side in (story.fitting, story.held_out) if side is not None and len(side.names)
-    ]
+    both = (story.fitting, story.held_out)
+    return [side for side in both if side is not None and len(side.names)]
 
 
 def rms(story: Story, side: Side, which: str) -> float:
@@ -281,15 +297,14 @@ def coefficients(cause: Mapping[str, Any]) -> str:
     """A cause's coefficients with intervals, how unlikely it is by chance, and what would do as
     well.
     """
-    parts = [
-        f"{clean(name, 60)} {with_unit(estimate(c['value'], c['low'], c['high']), c['unit'])}"
-        for name, c in cause["coefficients"].items()
-    ]
-    others = (
-        f"; {joined([noun(n) for n in cause['alternatives']], 'or')} instead would do as well"
-        if cause["alternatives"]
-        else ""
-    )
+    parts = []
+    for name, c in cause["coefficients"].items():
+        value = estimate(c["value"], c["low"], c["high"])
+        parts.append(f"{clean(name, 60)} {with_unit(value, c['unit'])}")
+    others = ""
+    if cause["alternatives"]:
+        names = joined([noun(name) for name in cause["alternatives"]], "or")
+        others = f"; {names} instead would do as well"
     return f"{joined(parts)}; {probability(cause['p_value'])}{others}."
 
 
@@ -309,34 +324,32 @@ def moves(story: Story, p: Tuned) -> str:
     """
     unit, name = f" {pretty(p.unit)}" if pretty(p.unit) else "", clean(p.name, 60)
     if not p.touched:
-        return f"{name} is not touched by these data and stays at its nominal {number(p.before[0])}{unit}."
+        nominal = f"its nominal {number(p.before[0])}{unit}"
+        return f"{name} is not touched by these data and stays at {nominal}."
     if not story.verdict["causes"]:
         return f"{name} = {estimate(*p.before)}{unit}."
-    change = (
-        f"{name} {estimate(*p.before)}{unit} before, {estimate(*p.after)}{unit} after ({shift(p)})"
-    )
-    return change + (": it had absorbed part of the gap." if absorbed(p) else ".")
+    before, after = f"{estimate(*p.before)}{unit}", f"{estimate(*p.after)}{unit}"
+    end = ": it had absorbed part of the gap." if absorbed(p) else "."
+    return f"{name} {before} before, {after} after ({shift(p)}){end}"
 
 
 def shift(p: Tuned) -> str:
     """The move of a parameter as a signed percentage, or a number where it began at zero."""
     move = p.after[0] - p.before[0]
-    if not p.before[0] or abs(move / p.before[0]) > 10:
-        return ("+" if move > 0 else "") + with_unit(number(move, 2), p.unit)
-    return ("+" if move > 0 else "") + percent(move / abs(p.before[0]))
+    sign = "+" if move > 0 else ""
+    if not p.before[0] or abs(move / p.before[0]) > FAR:
+        return sign + with_unit(number(move, 2), p.unit)
+    return sign + percent(move / abs(p.before[0]))
 
 
 def absorbed(p: Tuned) -> bool:
     """Whether a parameter moves out of the interval that the base model gives, or that the extended
     one does.
     """
-    inside = [
-        low <= value <= high
-        for value, (_, low, high) in ((p.after[0], p.before), (p.before[0], p.after))
-    ]
     if not np.isfinite([*p.before, *p.after]).all():
         return abs(p.after[0] - p.before[0]) > MOVED * abs(p.before[0])
-    return not all(inside)
+    (before, low, high), (after, low_after, high_after) = p.before, p.after
+    return not (low <= after <= high and low_after <= before <= high_after)
 
 
 def experiment(story: Story) -> str:
@@ -348,7 +361,6 @@ def experiment(story: Story) -> str:
 def effort(story: Story) -> str:
     """What was simulated."""
     v = story.verdict
-    return (
-        f"{v['simulations']:,} simulations of system {clean(v['system'], 60)} on engine {clean(v['engine'], 60)}, "
-        f"{number(v['seconds'], 2)} s."
-    )
+    system, engine = clean(v["system"], 60), clean(v["engine"], 60)
+    simulations = f"{v['simulations']:,} simulations of system {system} on engine {engine}"
+    return f"{simulations}, {number(v['seconds'], 2)} s."

@@ -1,4 +1,4 @@
-"""Shows the gap: how far above the noise, in which runs, channels and phases, and what it follows."""
+"""Shows the gap: how far above the noise, in which runs, channels, phases, and what it follows."""
 
 from __future__ import annotations
 
@@ -11,10 +11,17 @@ from bench.gap.report.story import Place, Profile, Side
 from sims.base import Array
 
 BINS = 12
-SLOW, QUIET = 0.05, 0.01
-"""Shares of the largest speed: below the first a motion turns round, below the second, for a while,
-it is at rest.
-"""
+"""Of a profile."""
+TAILS = 0.005
+"""Share of the samples to either side that a profile's bins leave out: they would stretch it."""
+SLOW = 0.05
+"""Share of the largest speed below which a motion turns round."""
+QUIET = 0.01
+"""Share of the largest speed below which, for a while, it is at rest."""
+REST = 5
+"""Samples in a row for which something must hold to last."""
+EXTREME = 0.999
+"""Share of its largest value from which on an input is at its extreme."""
 NEAR_IMPACT = 2
 """Samples to either side of an impact that belong to it."""
 
@@ -29,25 +36,30 @@ def places(world: World, before: Array, after: Array, sigma: Array, mark: str = 
     """RMS of the residual in units of the noise, by run, channel and phase; `mark` is set behind
     names of runs.
     """
+    parts = _parts(world, after, mark)
     residuals = [(world.observed - simulated) / sigma for simulated in (before, after)]
+    shown = []
+    for kind, label, mask in parts:
+        # A run or phase without a sample has no RMS.
+        if mask.any():
+            sizes = [float(np.sqrt(np.square(r[mask]).mean())) for r in residuals]
+            shown.append(Place(kind, label, int(mask.sum()), *sizes))
+    return shown
+
+
+def _parts(world: World, simulated: Array, mark: str) -> list[tuple[str, str, Mask]]:
+    """Kind, label and (R, T, C) mask of what was observed in each run, channel and phase."""
     seen = np.isfinite(world.observed)
+    runs, _, channels = seen.shape
     parts: list[tuple[str, str, Mask]] = []
     for r, track in enumerate(world.tracks):
-        parts.append(("run", track.name + mark, seen & (np.arange(len(seen)) == r)[:, None, None]))
+        of_run = (np.arange(runs) == r)[:, None, None]
+        parts.append(("run", track.name + mark, seen & of_run))
     for c, name in enumerate(world.channels):
-        parts.append(("channel", name, seen & (np.arange(seen.shape[2]) == c)))
-    for phase, where in phases(world, after).items():
+        parts.append(("channel", name, seen & (np.arange(channels) == c)))
+    for phase, where in phases(world, simulated).items():
         parts.append(("phase", phase, seen & where[:, :, None]))
-    return [
-        Place(
-            kind,
-            label,
-            int(mask.sum()),
-            *(float(np.sqrt(np.square(r[mask]).mean())) for r in residuals),
-        )
-        for kind, label, mask in parts
-        if mask.any()
-    ]
+    return parts
 
 
 def phases(world: World, simulated: Array) -> dict[str, Mask]:
@@ -59,18 +71,19 @@ def phases(world: World, simulated: Array) -> dict[str, Mask]:
     if speed is None:
         return {}
     largest = max(float(np.nanmax(speed)), 1e-300)
+    # A reversal is slow for a moment too: only what lasts is rest.
     still = _lasting(speed < QUIET * largest)
-    found: dict[str, Mask] = {}
     if system.bounces:
         impact = _impacts(world, simulated) & ~still
-        found = {"flight": ~impact & ~still, "impact": impact, "at rest": still}
+        masks = {"flight": ~impact & ~still, "impact": impact, "at rest": still}
     else:
         reversal = (speed < SLOW * largest) & ~still
-        found = {"motion": ~reversal & ~still, "reversal": reversal, "at rest": still}
+        masks = {"motion": ~reversal & ~still, "reversal": reversal, "at rest": still}
+    # It lies across the others: an input may be at its limit in each of them.
     saturated = _saturated(world)
     if saturated.any():
-        found["saturated input"] = saturated
-    return found
+        masks["saturated input"] = saturated
+    return masks
 
 
 def speeds(world: World, simulated: Array) -> Array | None:
@@ -83,19 +96,23 @@ def speeds(world: World, simulated: Array) -> Array | None:
         values = simulated[:, :, world.channels.index(name)]
         for r, track in enumerate(world.tracks):
             size = len(track.observed)
+            # One sample has no slope.
             if size > 1:
-                squares[r, :size] += np.square(np.gradient(values[r, :size], track.scenario.times))
+                slope = np.gradient(values[r, :size], track.scenario.times)
+                squares[r, :size] += np.square(slope)
     return np.sqrt(np.nan_to_num(squares)) if shown else None
 
 
-def _lasting(mask: Mask, least: int = 5) -> Mask:
-    """Where a mask holds for at least so many samples in a row."""
-    result = np.zeros_like(mask)
-    for row, out in zip(mask, result, strict=True):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(np.int8), [0]])))
+def _lasting(mask: Mask) -> Mask:
+    """Where a mask holds for at least `REST` samples in a row."""
+    lasting = np.zeros_like(mask)
+    for row, out in zip(mask, lasting, strict=True):
+        # Framed by zeros, changes come in pairs: where a stretch begins, and one behind its end.
+        framed = np.concatenate([[0], row.astype(np.int8), [0]])
+        edges = np.flatnonzero(np.diff(framed))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
-            out[begin:end] = end - begin >= least
-    return result
+            out[begin:end] = end - begin >= REST
+    return lasting
 
 
 def _impacts(world: World, simulated: Array) -> Mask:
@@ -105,6 +122,7 @@ def _impacts(world: World, simulated: Array) -> Mask:
     if name not in world.channels:
         return mask
     height = simulated[:, :, world.channels.index(name)]
+    # Behind the end of a shorter run heights are NaN, and no lowest point.
     with np.errstate(invalid="ignore"):
         low = (height[:, 1:-1] <= height[:, :-2]) & (height[:, 1:-1] < height[:, 2:])
     for shift in range(-NEAR_IMPACT, NEAR_IMPACT + 1):
@@ -117,9 +135,11 @@ def _saturated(world: World) -> Mask:
     mask = np.zeros(world.observed.shape[:2], dtype=bool)
     for r, track in enumerate(world.tracks):
         for signal in list(track.scenario.inputs.values())[:1]:
-            extreme = np.abs(signal) >= 0.999 * max(float(np.abs(signal).max()), 1e-300)
-            mask[r, : signal.size] = extreme & (np.abs(signal) > 0)
+            size = np.abs(signal)
+            largest = max(float(size.max()), 1e-300)
+            mask[r, : signal.size] = (size >= EXTREME * largest) & (size > 0)
     lasting = _lasting(mask)
+    # A constant or square input is at its extreme always, which is no saturation.
     return lasting if lasting.mean() < 0.5 else np.zeros_like(mask)
 
 
@@ -129,17 +149,17 @@ def profiles(world: World, before: Array, after: Array, sigma: Array) -> list[Pr
     """
     name = world.simulator.system.reading(world.channels)
     c = world.channels.index(name)
-    found = []
+    shown = []
     for variable, unit, values in _variables(world, after):
         good = np.isfinite(world.observed[:, :, c]) & np.isfinite(values)
-        if not good.any() or np.ptp(values[good]) == 0:
+        edges = _edges(values[good])
+        if edges is None:
             continue
-        low, high = (float(v) for v in np.quantile(values[good], [0.005, 0.995]))
-        edges = np.linspace(low, high, BINS + 1)
-        if not edges[-1] > edges[0]:
-            continue
-        bins = np.clip(np.searchsorted(edges, values[good], side="right") - 1, 0, BINS - 1)
+        # What lies beyond the edges counts in the outermost bins.
+        places = np.searchsorted(edges, values[good], side="right") - 1
+        bins = np.clip(places, 0, BINS - 1)
         counts = np.bincount(bins, minlength=BINS).astype(np.float64)
+        # An empty bin has no mean: NaN, not drawn.
         with np.errstate(invalid="ignore", divide="ignore"):
             means = [
                 np.bincount(bins, (world.observed - simulated)[:, :, c][good], BINS) / counts
@@ -147,16 +167,25 @@ def profiles(world: World, before: Array, after: Array, sigma: Array) -> list[Pr
             ]
             error = sigma[c] / np.sqrt(counts)
         error[counts == 0] = np.nan
-        found.append(
-            Profile(name, variable, unit, (edges[1:] + edges[:-1]) / 2.0, means[0], means[1], error)
-        )
-    return found
+        centres = (edges[1:] + edges[:-1]) / 2.0
+        shown.append(Profile(name, variable, unit, centres, means[0], means[1], error))
+    return shown
+
+
+def _edges(values: Array) -> Array | None:
+    """(BINS + 1,) edges over most of the values; None where they do not differ."""
+    if not values.size or np.ptp(values) == 0:
+        return None
+    low, high = (float(v) for v in np.quantile(values, [TAILS, 1.0 - TAILS]))
+    edges: Array = np.linspace(low, high, BINS + 1)
+    return edges if edges[-1] > edges[0] else None
 
 
 def _variables(world: World, simulated: Array) -> Iterator[tuple[str, str, Array]]:
     """Name, unit and (R, T) values of what a residual may follow."""
     shape = simulated.shape[:2]
     times = np.full(shape, np.nan)
+    # From the beginning of each run: clocks of runs may stand anywhere.
     for r, track in enumerate(world.tracks):
         times[r, : len(track.observed)] = track.scenario.times - track.scenario.times[0]
     yield "time", "s", times
@@ -167,7 +196,8 @@ def _variables(world: World, simulated: Array) -> Iterator[tuple[str, str, Array
         yield "position", units[primary], simulated[:, :, world.channels.index(primary)]
     speed = speeds(world, simulated)
     if speed is not None:
-        yield "speed", f"{units.get(primary, 'm')}/s", np.where(np.isfinite(times), speed, np.nan)
+        unit = f"{units.get(primary, 'm')}/s"
+        yield "speed", unit, np.where(np.isfinite(times), speed, np.nan)
     for channel in world.kind.inputs:
         values = np.full(shape, np.nan)
         for r, track in enumerate(world.tracks):

@@ -1,4 +1,4 @@
-"""What an explanation tells: plain data that the account, the figures and the report are made from."""
+"""What an explanation tells: plain data that account, figures and report are made from."""
 
 from __future__ import annotations
 

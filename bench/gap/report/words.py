@@ -1,4 +1,4 @@
-"""Numbers, units and names as a person reads them; shared by the account, the figures and the page."""
+"""Numbers, units and names as a person reads them, in the account, the figures and the page."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from sims import effects
 from sims.base import InputError
 
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
-_SMALL, _LARGE = 1e-3, 1e5
-"""Magnitudes beyond which numbers are written with a power of ten."""
+"""Digits and the sign as they stand in a power."""
+_SMALL = 1e-3
+"""Magnitude below which numbers are written with a power of ten."""
+_LARGE = 1e5
+"""Magnitude from which on numbers are written with a power of ten."""
 _FEW = log10(3.55)
 """Mantissa of an interval below which it is written with two digits (Particle Data Group's rule).
 """
@@ -23,10 +26,15 @@ def clean(text: object, most: int = 400) -> str:
     """Text from a file or plugin on one line: what a terminal would obey is spelled out, what is
     too long cut.
     """
-    plain = "".join(
-        c if c.isprintable() else " " if c.isspace() else ascii(c)[1:-1] for c in str(text)
-    ).strip()
+    plain = "".join(_harmless(c) for c in str(text)).strip()
     return plain if len(plain) <= most else plain[: most - 1] + "…"
+
+
+def _harmless(character: str) -> str:
+    if character.isprintable():
+        return character
+    # A line break or tab is a space; an escape sequence or a change of direction is spelled out.
+    return " " if character.isspace() else ascii(character)[1:-1]
 
 
 def noun(effect: str) -> str:
@@ -64,17 +72,16 @@ def sentence(text: object) -> str:
     plain = clean(text)
     if not plain:
         return plain
-    begin = (
-        plain[0].upper() if plain.split()[0].rstrip(",:;.").isalpha() else plain[0]
-    )  # a name stays as it is
+    # A name with digits or underscores stays as it is.
+    word = plain.split()[0].rstrip(",:;.").isalpha()
+    begin = plain[0].upper() if word else plain[0]
     return begin + plain[1:] + ("" if plain[-1] in ".!?…" else ".")
 
 
 def pretty(unit: str) -> str:
     """A unit as printed, ``kg·m²``; empty for a pure number."""
-    raised = re.sub(
-        r"(?:\^|\*\*)(-?\d+)", lambda power: power[1].translate(_RAISED), clean(unit, 60)
-    )
+    power = r"(?:\^|\*\*)(-?\d+)"
+    raised = re.sub(power, lambda match: match[1].translate(_RAISED), clean(unit, 60))
     return "" if raised == "1" else raised.replace("*", "·")
 
 
@@ -94,6 +101,7 @@ def number(value: float | None, digits: int = 3) -> str:
         return "–"
     if value == 0:
         return "0"
+    # Rounded first: 0.0009996 is 0.001, which needs no power of ten.
     rounded = float(f"{value:.{digits - 1}e}")
     exponent = _exponent(abs(rounded))
     decimals = max(0, digits - 1 - floor(log10(abs(rounded))) + exponent)
@@ -107,13 +115,14 @@ def estimate(value: float, low: float | None, high: float | None) -> str:
     """
     if low is None or high is None or not (isfinite(low) and isfinite(high)) or high <= low:
         return f"{number(value)} (no interval)"
+    # One power of ten for all three, or they could not be compared at a glance.
     exponent = _exponent(max(abs(value), abs(low), abs(high)))
     half = log10((high - low) / 2) - exponent
     decimals = min(max(0, (half % 1 < _FEW) - floor(half)), 9)
-    texts = [
+    middle, left, right = (
         _signed(f"{x / 10.0**exponent:.{decimals}f}") + _power(exponent) for x in (value, low, high)
-    ]
-    return f"{texts[0]} ({texts[1]} to {texts[2]})"
+    )
+    return f"{middle} ({left} to {right})"
 
 
 def percent(share: float | None) -> str:
@@ -121,6 +130,7 @@ def percent(share: float | None) -> str:
     if share is None or not isfinite(share):
         return "–"
     size = abs(100 * share)
+    # 99.6 % is not all, and 0.4 % is not nothing.
     decimals = 1 if 0 < size < 9.95 or 99 < size < 99.95 else 0
     return _signed(f"{100 * share:.{decimals}f}") + " %"
 
@@ -133,6 +143,7 @@ def probability(p: float | None) -> str:
 
 
 def _exponent(size: float) -> int:
+    """The power of ten that a number is written with; 0 for none."""
     return 0 if size == 0 or _SMALL <= size < _LARGE else floor(log10(size))
 
 
@@ -141,5 +152,6 @@ def _power(exponent: int) -> str:
 
 
 def _signed(text: str) -> str:
+    """With a true minus sign, and none before a zero."""
     zero = not text.strip("-0.")
     return text.lstrip("-") if zero else text.replace("-", "−")

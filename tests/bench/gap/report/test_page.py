@@ -7,7 +7,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from bench.gap.report.page import framed, page
+from bench.gap.report.elements import framed
+from bench.gap.report.page import page
 from bench.gap.report.sections import errors_of
 from tests.bench.gap.report.test_account import VERDICTS
 from tests.bench.gap.stories import DRAG, EVIL, HELD_OUT, TILT, evil, story
