@@ -194,6 +194,7 @@ class Tuner:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        # of its own: a subclass of a named tuner is another tuner
         if "name" not in cls.__dict__:
             cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
 
@@ -218,6 +219,10 @@ class Tuner:
         """
 
 
+_PATIENCE = 5.0
+"""Seconds in which an optimiser must let go of its thread."""
+
+
 class _Stopped(BaseException):
     """Raised inside a callback optimiser's thread when the harness ends its run."""
 
@@ -239,7 +244,9 @@ def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) ->
     to_optimiser: list[float] = []
     outcome: list[str | None] = []
     failure: list[BaseException] = []
-    asked, answered = threading.Semaphore(0), threading.Semaphore(0)
+    # each side waits for the other's semaphore, so that one of the two is at work at any time
+    asked = threading.Semaphore(0)
+    answered = threading.Semaphore(0)
     closing = False
 
     def objective(point: Array) -> float:
@@ -259,11 +266,14 @@ def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) ->
                 outcome.append(minimise(objective))
         except _Stopped:
             pass
-        except BaseException as error:  # handed to the harness, which files it
+        except BaseException as error:
+            # an exception that ends this thread would be lost; the harness files it
             failure.append(error)
         finally:
+            # nothing was handed over: that is how the harness learns that it is done
             asked.release()
 
+    # a daemon, since an optimiser that never returns must not keep the process alive
     worker = threading.Thread(target=work, daemon=True, name="callback-optimiser")
     worker.start()
     try:
@@ -274,14 +284,16 @@ def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) ->
                 raise failure[0]
             if not to_harness:
                 return outcome[0] if outcome else None
-            seen = yield to_harness.pop()[None, :]
-            to_optimiser.append(float(seen.losses[0]))
+            evaluation = yield to_harness.pop()[None, :]
+            to_optimiser.append(float(evaluation.losses[0]))
             answered.release()
     finally:
+        # the optimiser waits for a loss; it gets an exception in its place
         closing = True
         answered.release()
-        worker.join(timeout=5.0)
+        worker.join(timeout=_PATIENCE)
         if worker.is_alive():
             raise RuntimeError(
-                "the optimiser swallowed the exception that ends its run; its thread cannot be stopped"
+                "the optimiser swallowed the exception that ends its run; "
+                "its thread cannot be stopped"
             )

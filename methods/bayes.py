@@ -4,6 +4,13 @@ it.
 Sources: D. R. Jones, M. Schonlau, W. J. Welch, Efficient global optimization of expensive black-box
 functions, Journal of Global Optimization 13, 1998, doi:10.1023/A:1008306431147; T. Head et al.,
 scikit-optimize, doi:10.5281/zenodo.1157319.
+
+Where the Gaussian process predicts a loss of mean m and standard deviation s, and f is the lowest
+loss so far, the next point is that of the largest expected improvement:
+
+    (1)  EI = (f - m) Phi((f - m) / s) + s phi((f - m) / s)
+
+with Phi and phi the normal distribution and its density.
 """
 
 from __future__ import annotations
@@ -47,15 +54,18 @@ class Bayes(Tuner):
         """Ask, simulate, tell; the start comes first."""
         with _quiet():
             optimiser = self.optimiser(task.dim, int(rng.integers(2**31)))
-        point, worst = task.start, 0.0
+        point = task.start
+        worst = 0.0
         while True:
-            (loss,) = (yield np.array(point)[None]).losses
+            evaluation = yield np.array(point)[None]
+            loss = float(evaluation.losses[0])
+            # the library takes no infinite loss; one far above all others would flatten the process
             if np.isfinite(loss):
-                worst = max(worst, float(loss))
+                worst = max(worst, loss)
+            else:
+                loss = worst
             with _quiet():
-                optimiser.tell(
-                    [float(x) for x in point], float(loss) if np.isfinite(loss) else worst
-                )
+                optimiser.tell([float(x) for x in point], loss)
                 point = optimiser.ask()
 
     def optimiser(self, dim: int, seed: int) -> Any:
@@ -65,7 +75,11 @@ class Bayes(Tuner):
 
         cube = [(0.0, 1.0)] * dim
         process = cook_estimator(
-            "GP", space=cube, random_state=seed, n_restarts_optimizer=self.fits, noise=self.noise
+            "GP",
+            space=cube,
+            random_state=seed,
+            n_restarts_optimizer=self.fits,
+            noise=self.noise,
         )
         return Optimizer(
             cube,
@@ -78,6 +92,7 @@ class Bayes(Tuner):
                 "n_points": self.candidates,
                 "n_restarts_optimizer": self.polished,
             },
+            # the newest process alone: all of them would be kept
             model_queue_size=1,
             random_state=seed,
         )

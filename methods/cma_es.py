@@ -4,6 +4,9 @@ Sources: N. Hansen, The CMA evolution strategy: a tutorial, 2016, arXiv:1604.007
 Akimoto, P. Baudis, CMA-ES/pycma, doi:10.5281/zenodo.2559634; restarts with a growing population: A.
 Auger, N. Hansen, A restart CMA evolution strategy with increasing population size, CEC 2005,
 doi:10.1109/CEC.2005.1554902.
+
+pycma does the mathematics: points x = m + sigma N(0, C), and from those of the lowest losses a new
+mean m, step size sigma and covariance C. Here it is asked, told, and started again.
 """
 
 from __future__ import annotations
@@ -49,20 +52,22 @@ class CMAES(Tuner):
         """One generation in one yield."""
         if self.evaluate_start:
             yield task.start[None]
-        centre, population = task.start, self.population
+        centre = task.start
+        population = self.population
         while True:
             strategy = self._strategy(centre, population, rng)
             while not strategy.stop():
                 generation = strategy.ask()
+                # without the coordinate that the simulation ignores
                 points = np.array(generation)[:, : task.dim]
-                seen = (
-                    yield points
-                    if self.recommend == "best"
-                    else Ask(points, self._mean(strategy, task.dim))
-                )
-                strategy.tell(generation, _finite(seen.losses))
+                asked: Array | Ask = points
+                if self.recommend == "mean":
+                    asked = Ask(points, self._mean(strategy, task.dim))
+                evaluation = yield asked
+                strategy.tell(generation, _finite(evaluation.losses))
             if not self.restarts:
                 return "pycma: " + ", ".join(strategy.stop())
+            # a larger population sees a rugged loss more coarsely; what overshoots would be cut
             centre = rng.uniform(size=task.dim)
             population = max(min(2 * strategy.popsize, task.budget), strategy.popsize)
 
@@ -75,9 +80,11 @@ class CMAES(Tuner):
         options: dict[str, Any] = {
             "bounds": [0.0, 1.0],
             "randn": lambda *shape: rng.standard_normal(shape),
-            "seed": np.nan,  # hands off the global generator
+            # hands off the global generator
+            "seed": np.nan,
             "verbose": -9,
-            "signals_filename": "",  # it would read options from a file in the working directory
+            # it would read options from a file in the working directory
+            "signals_filename": "",
         }
         if population is not None:
             options["popsize"] = population
@@ -93,5 +100,8 @@ class CMAES(Tuner):
 
 def _finite(losses: Array) -> Sequence[float]:
     """Losses with failed simulations ranked last."""
-    worst = np.max(losses, where=np.isfinite(losses), initial=0.0)
-    return [float(x) for x in np.where(np.isfinite(losses), losses, 10.0 * worst + 1.0)]
+    finite = np.isfinite(losses)
+    worst = np.max(losses, where=finite, initial=0.0)
+    # only ranks count, so any number beyond the worst will do
+    ranked = np.where(finite, losses, 10.0 * worst + 1.0)
+    return [float(x) for x in ranked]

@@ -8,7 +8,15 @@ sequence: M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2
 https://extremelearning.com.au/unreasonable-effectiveness-of-quasirandom-sequences/.
 
 The error over the parameters θ is a Gaussian process; P(θ) is the share of its posterior draws
-whose minimiser, among candidates, is θ; the next simulation is where -P log P is largest. As
+whose minimiser, among candidates, is θ; the next simulation is where
+
+    (1)  -P(θ) log P(θ)
+
+is largest. The candidates' sequence in d dimensions, for n = 1, 2, ...:
+
+    (2)  x_n = (shift + n (1/g, 1/g^2, ..., 1/g^d)) mod 1,  g^(d + 1) = g + 1
+
+As
 published the candidates are a fixed grid, which bounds the accuracy, and the search stops when its
 estimate repeats, which is often too early. The default draws new candidates each time, dense around
 the likely minimisers, models the logarithm of the error, and goes on.
@@ -21,7 +29,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from methods.base import Array, Ask, Steps, Task, Tuner
-from methods.gaussian_process import GaussianProcess, Settings
+from methods.learning.gaussian_process import GaussianProcess, Settings
+
+_PUBLISHED_DRAWS = 200
+"""Posterior draws of the published search."""
+_MANY = 20
+"""Simulations from which on the process's hyper-parameters are not fitted after each."""
 
 
 @dataclass(eq=False)
@@ -65,41 +78,52 @@ class EntropySearch(Tuner):
         grid = np.linspace(0.0, 1.0, self.grid)[:, None]
         if task.dim > 1:
             grid = spread(self.grid, rng.uniform(size=task.dim))
+        # a noise-free simulation; the little noise keeps the covariance invertible
         settings = Settings(kernel="rbf", noise=(1e-8, 0.01))
-        points, losses = np.empty((0, task.dim)), np.empty(0)
-        asked, hyper = task.start, None
+        points = np.empty((0, task.dim))
+        losses = np.empty(0)
+        proposal = task.start
+        hyper = None
         estimate: Array | None = None
         while True:
-            seen = yield Ask(asked[None], estimate)
-            points, losses = np.vstack([points, seen.proposals]), np.append(losses, seen.losses)
+            evaluation = yield Ask(proposal[None], estimate)
+            points = np.vstack([points, evaluation.proposals])
+            losses = np.append(losses, evaluation.losses)
             process = GaussianProcess(points, finite(losses), settings, hyper)
+            # the next fit begins where this one ended: one point more changes little
             hyper = process.hyper
-            p = minimiser_probability(process, grid, 200, rng)
-            last, estimate = estimate, grid[p.argmax()]
+            p = minimiser_probability(process, grid, _PUBLISHED_DRAWS, rng)
+            last = estimate
+            estimate = grid[p.argmax()]
             if last is not None and np.abs(estimate - last).max() <= self.repeats_within:
                 return "the estimate repeated"
-            asked = grid[uncertainty(p).argmax()]
+            proposal = grid[uncertainty(p).argmax()]  # (1)
 
     def _refined(self, task: Task, rng: np.random.Generator) -> Steps:
         """New candidates for every simulation; never stops."""
         design = spread(self.initial, rng.uniform(size=task.dim))
-        points, losses = np.empty((0, task.dim)), np.empty(0)
-        asked, hyper = task.start, None
+        points = np.empty((0, task.dim))
+        losses = np.empty(0)
+        proposal = task.start
+        hyper = None
         while True:
-            seen = yield asked[None]
-            points, losses = np.vstack([points, seen.proposals]), np.append(losses, seen.losses)
+            evaluation = yield proposal[None]
+            points = np.vstack([points, evaluation.proposals])
+            losses = np.append(losses, evaluation.losses)
             n = len(points)
             if n < self.initial:
-                asked = design[n]
+                proposal = design[n]
                 continue
+            # near the minimum the loss spans decades, of which only a logarithm shows the last
             values = logarithm(finite(losses))
-            process = GaussianProcess(
-                points, values, self.process, hyper, fit=n < 20 or n % self.refit == 0
-            )
+            fit = n < _MANY or n % self.refit == 0
+            process = GaussianProcess(points, values, self.process, hyper, fit=fit)
             hyper = process.hyper
             candidates = self._candidates(process, points[values.argmin()], rng)
-            score = uncertainty(minimiser_probability(process, candidates, self.draws, rng))
-            asked = candidates[score[1:].argmax() + 1]  # the first is simulated already
+            p = minimiser_probability(process, candidates, self.draws, rng)
+            score = uncertainty(p)  # (1)
+            # the first candidate is simulated already
+            proposal = candidates[score[1:].argmax() + 1]
 
     def _candidates(self, process: GaussianProcess, best: Array, rng: np.random.Generator) -> Array:
         """The best point seen, quasi-random points, and points around the likely minimisers at all
@@ -108,13 +132,15 @@ class EntropySearch(Tuner):
         dim = len(best)
         wide = spread(self.everywhere, rng.uniform(size=dim))
         distances = np.linalg.norm(process.points - best, axis=1)
-        finest = max(0.1 * np.min(distances, where=distances > 0.0, initial=0.5), 1e-9)
-        scales = np.exp(rng.uniform(np.log(finest), np.log(0.5), size=(self.nearby, 1))) / np.sqrt(
-            dim
-        )
-        centres = np.where(
-            np.arange(self.nearby)[:, None] % 2 == 0, best, wide[process.predict(wide).argmin()]
-        )
+        # from a tenth of the way to the nearest neighbour up to half the cube
+        nearest = np.min(distances, where=distances > 0.0, initial=0.5)
+        finest = max(0.1 * nearest, 1e-9)
+        exponents = rng.uniform(np.log(finest), np.log(0.5), size=(self.nearby, 1))
+        # of like length in any number of dimensions
+        scales = np.exp(exponents) / np.sqrt(dim)
+        expected = wide[process.predict(wide).argmin()]
+        even = np.arange(self.nearby)[:, None] % 2 == 0
+        centres = np.where(even, best, expected)
         near = centres + scales * rng.standard_normal((self.nearby, dim))
         return np.vstack([best, wide, np.clip(near, 0.0, 1.0)])
 
@@ -122,22 +148,28 @@ class EntropySearch(Tuner):
 def minimiser_probability(
     process: GaussianProcess, candidates: Array, draws: int, rng: np.random.Generator
 ) -> Array:
-    """P (n,): the share of joint posterior draws in which each candidate (n, dim) is the minimiser."""
+    """P (n,): the share of joint posterior draws whose minimiser each candidate (n, dim) is."""
     minimisers = process.sample(candidates, draws, rng).argmin(axis=1)
     return np.bincount(minimisers, minlength=len(candidates)) / draws
 
 
 def uncertainty(p: Array) -> Array:
     """-P log P, and -1 where P = 0, which is never chosen while there is anything else."""
-    return np.where(p > 0.0, -p * np.log(np.where(p > 0.0, p, 1.0)), -1.0)
+    possible = p > 0.0
+    logarithms = np.log(np.where(possible, p, 1.0))
+    return np.where(possible, -p * logarithms, -1.0)
 
 
 def spread(n: int, shift: Array) -> Array:
     """(n, dim) quasi-random points in the unit cube: an additive recurrence, shifted by (dim,)."""
-    dim, root = len(shift), 2.0
+    dim = len(shift)
+    root = 2.0
+    # a fixed point of g = (1 + g)^(1 / (d + 1)); the error is more than halved each time
     for _ in range(60):
-        root = (1.0 + root) ** (1.0 / (dim + 1))  # the solution of root^(dim+1) = root + 1
-    points: Array = (shift + np.arange(1, n + 1)[:, None] * root ** -np.arange(1.0, dim + 1)) % 1.0
+        root = (1.0 + root) ** (1.0 / (dim + 1))
+    steps = root ** -np.arange(1.0, dim + 1)
+    numbers = np.arange(1, n + 1)[:, None]
+    points: Array = (shift + numbers * steps) % 1.0  # (2)
     return points
 
 

@@ -4,6 +4,11 @@ Levenberg-Marquardt.
 The network's first steps are worth more than any search's, since it knows the simulator. Its last
 ones are not: outside its training range and under noise its estimate may settle where the
 simulation does not fit. The loss tells which it is.
+
+The linear model with which the finish begins has a Jacobian J that explains what was simulated
+nearby, with steps s from the best point and changes y of the residual:
+
+    (1)  J s = y for each, by least squares
 """
 
 from __future__ import annotations
@@ -14,15 +19,22 @@ from typing import ClassVar
 import numpy as np
 
 from methods.base import Array, Ask, Steps, Task
-from methods.least_squares import LeastSquares, Model, Run, Simulates
+from methods.least_squares import LeastSquares, Mask, Model, Run, Simulates
 from methods.tunenet import SETTLED, Search, TuneNet
 
 _EXACT = 1e-13
 """Rounding: a loss below this share of the observation's root mean square."""
 _WHOLE = LeastSquares(
-    (1.0,), ahead=True, patience=2, damping=1e-6, step_tolerance=_EXACT, reproduced=_EXACT
+    (1.0,),
+    ahead=True,
+    patience=2,
+    damping=1e-6,
+    step_tolerance=_EXACT,
+    reproduced=_EXACT,
 )
 """All samples at once, for a start that is near."""
+_ACROSS = 0.5
+"""Share of a step that must lie across those already taken, for a secant that says more."""
 
 
 @dataclass(eq=False)
@@ -55,8 +67,10 @@ class Hybrid(TuneNet):
         run = Run(task, _EXACT)
         enough = run.enough / _EXACT * finish.reproduced
         trusted = yield from self._approach(run, task)
+        # nothing to begin with: the middle of the training range is as good as any point
         if not np.isfinite(run.losses).any():
             yield from finish.fit_from(run, task.training.mean(axis=0))
+        # growing horizons only where all samples at once have failed: they cost simulations
         for fit in (_WHOLE, finish):
             if run.finished or not np.isfinite(run.losses).any():
                 break
@@ -72,17 +86,23 @@ class Hybrid(TuneNet):
 
     def _approach(self, run: Run, task: Task) -> Simulates[bool]:
         """TuneNet's own steps, while they pay; returns whether they did to the end."""
-        estimate, search = self.fitted().estimator(task), Search(task)
-        guess, lowest, idle = task.start, np.inf, 0
+        estimate = self.fitted().estimator(task)
+        search = Search(task)
+        guess = task.start
+        lowest = np.inf
+        idle = 0
         while not run.finished:
-            seen = yield Ask(guess, recommend=guess)
-            run.seen(seen)
-            loss = float(seen.losses[0])
-            idle = 0 if loss < self.pays * lowest or not np.isfinite(lowest) else idle + 1
+            evaluation = yield Ask(guess, recommend=guess)
+            run.seen(evaluation)
+            loss = float(evaluation.losses[0])
+            # the first simulation that succeeds has nothing to be compared with
+            pays = loss < self.pays * lowest or not np.isfinite(lowest)
+            idle = 0 if pays else idle + 1
             lowest = min(lowest, loss)
+            # two in succession: one setback in a jagged loss is no sign
             if idle == self.patience:
                 return False
-            guess = search.after(seen.proposals[0], estimate(seen.observations))
+            guess = search.after(evaluation.proposals[0], estimate(evaluation.observations))
             if np.abs(guess - search.best).max() <= SETTLED:
                 break
         return idle == 0
@@ -91,43 +111,59 @@ class Hybrid(TuneNet):
         """The linear model at the lowest loss: secants to points nearby, finite differences in what
         they leave out.
         """
-        best = int(np.nanargmin(np.where(np.isfinite(run.losses), run.losses, np.nan)))
-        point, residual = run.tried[best], run.residuals[best]
+        finite = np.isfinite(run.losses)
+        best = int(np.nanargmin(np.where(finite, run.losses, np.nan)))
+        point = run.tried[best]
+        residual = run.residuals[best]
         steps = np.array(run.tried) - point
-        usable = np.isfinite(run.losses) & (np.abs(steps).max(axis=1) <= self.near)
-        usable &= (
-            np.abs(steps).max(axis=1) >= finish.smallest_difference
-        )  # nearer ones differ by rounding
-        order = [i for i in np.argsort((steps**2).sum(axis=1), kind="stable") if usable[i]]
-        basis: list[Array] = []
-        chosen: list[int] = []
-        for i in order:
-            across = steps[i] - sum((q * (q @ steps[i]) for q in basis), np.zeros(len(point)))
-            if np.linalg.norm(across) > 0.5 * np.linalg.norm(steps[i]):
-                basis.append(across / np.linalg.norm(across))
-                chosen.append(int(i))
-        directions, changes = steps[chosen], [run.residuals[i] - residual for i in chosen]
+        chosen, basis = self._secants(steps, finite, finish.smallest_difference)
+        directions = steps[chosen]
+        changes = [run.residuals[i] - residual for i in chosen]
         missing = _complement(basis, len(point))
         if len(missing):
+            # as long as the secants, so that all columns are as coarse
             size = float(np.abs(directions).max()) if chosen else finish.difference
             size = min(max(size, finish.smallest_difference), finish.difference)
             inward = np.where(missing @ (0.5 - point) < 0.0, -size, size)
             moved = np.clip(point + missing * inward[:, None], 0.0, 1.0)
-            found = yield from run.simulate(moved)
-            whole = ~np.isnan(found).any(axis=1)
+            residuals = yield from run.simulate(moved)
+            whole = ~np.isnan(residuals).any(axis=1)
             directions = np.concatenate([directions, (moved - point)[whole]])
-            changes += list(found[whole] - residual)
+            changes += list(residuals[whole] - residual)
+        # nothing succeeded nearby: no step at all is promised then
         if not changes:
             return Model(point, residual, np.zeros((len(residual), len(point))))
-        slopes = np.asarray(
-            np.linalg.lstsq(directions, np.array(changes), rcond=None)[0], dtype=np.float64
-        )
+        solution = np.linalg.lstsq(directions, np.array(changes), rcond=None)[0]  # (1)
+        slopes = np.asarray(solution, dtype=np.float64)
         return Model(point, residual, slopes.T)
+
+    def _secants(
+        self, steps: Array, finite: Mask, smallest: float
+    ) -> tuple[list[int], list[Array]]:
+        """Numbers of the steps (n, dim) that serve as secants, and an orthonormal basis of them."""
+        lengths = np.abs(steps).max(axis=1)
+        # those nearer than the smallest difference differ by rounding
+        usable = finite & (lengths <= self.near)
+        usable &= lengths >= smallest
+        nearest = np.argsort((steps**2).sum(axis=1), kind="stable")
+        basis: list[Array] = []
+        chosen: list[int] = []
+        # the nearest first, each by Gram and Schmidt
+        for i in nearest[usable[nearest]]:
+            step = steps[i]
+            along = sum((q * (q @ step) for q in basis), np.zeros(len(step)))
+            across = step - along
+            length = np.linalg.norm(across)
+            if length > _ACROSS * np.linalg.norm(step):
+                basis.append(across / length)
+                chosen.append(int(i))
+        return chosen, basis
 
 
 def _complement(basis: list[Array], dim: int) -> Array:
-    """Orthonormal directions (m, dim) across all of `basis`; the axes themselves where it is empty."""
+    """Orthonormal directions (m, dim) across all of `basis`; the axes where it is empty."""
     if not basis:
         return np.eye(dim)
+    # the right singular vectors beyond the rank
     directions: Array = np.linalg.svd(np.array(basis))[2][len(basis) :]
     return directions

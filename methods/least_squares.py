@@ -9,6 +9,15 @@ Tingleff, Methods for non-linear least squares problems, 2nd ed., IMM lecture no
 3.5 (the secant version). C. G. Broyden, A class of methods for solving nonlinear simultaneous
 equations, Math. Comp. 19, 1965, doi:10.1090/S0025-5718-1965-0198670-6.
 
+With r the residual at θ, J its Jacobian, s a step and D the diagonal of J^T J:
+
+    (1)  (J^T J + mu D) s = -J^T r                       Marquardt's step
+    (2)  gain = decrease of r^T r / the decrease promised by r + J s
+    (3)  mu <- mu max(1/3, 1 - (2 gain - 1)^3) where gain > 0, else mu <- mu nu, nu <- 2 nu
+    (4)  J <- J + (r(θ + s) - r - J s) s^T / (s^T s)     Broyden's update
+
+(3) is Nielsen's rule.
+
 Two things go beyond the textbook. A small change of a parameter grows along a simulation until
 impacts fall into other time steps, so the residual as a whole is jagged, with many local minima,
 while its first part is smooth: the fit starts on the first samples of each run and takes in more of
@@ -32,6 +41,18 @@ Result = TypeVar("Result")
 Simulates = Generator["Array | Ask", Evaluation, Result]
 """A part of a run: it may simulate, and returns a Result."""
 Mask = NDArray[np.bool_]
+_POLISHED = 1e-8
+"""Share of the sum of squares that a step must promise on all samples."""
+_COARSE = 0.1
+"""The same on a horizon that only leads to the next, which need not be polished."""
+_KEPT = 0.5
+"""Share of what was promised from which on a model is trusted."""
+_DEAF = 1e-6
+"""Of the mean sensitivity over all samples: a horizon that responds less tells nothing."""
+_FLAT = 1e-6
+"""Of the largest sensitivity: a parameter of less is damped as one of so much."""
+_CANDIDATES = 64
+"""Random points, per parameter, of which a new start is the farthest from all tried ones."""
 
 
 @dataclass(eq=False)
@@ -86,15 +107,16 @@ class LeastSquares(Tuner):
     def fit_from(self, run: Run, point: Array) -> Simulates[None]:
         """One fit from `point`, of which nothing is known."""
         (residual,) = yield from run.simulate(point[None])
+        # without a residual there is nothing to differentiate
         if not np.isnan(residual).any():
-            yield from self.fit_model(
-                run, (yield from self._differentiate(run, point, residual, self.difference))
-            )
+            model = yield from self._differentiate(run, point, residual, self.difference)
+            yield from self.fit_model(run, model)
 
     def fit_model(self, run: Run, model: Model) -> Simulates[None]:
         """One fit over all horizons, beginning with a model."""
         for share in self.horizons:
             chosen = run.samples(share)
+            # before the first impact nothing may depend on the parameters
             if share >= 1.0 or model.sensitive(chosen):
                 model = yield from self._descend(run, model, chosen)
             if run.finished:
@@ -110,46 +132,56 @@ class LeastSquares(Tuner):
         steps = np.where(point + h > 1.0, -h, h)
         moved = yield from run.simulate(point + np.diag(steps))
         failed = np.isnan(moved).any(axis=1)
-        if failed.any():  # and where both sides fail, the column stays zero
+        if failed.any():
             steps[failed] *= -1.0
             moved[failed] = yield from run.simulate(point + np.diag(steps)[failed])
-        return Model(point, residual, np.nan_to_num((moved - residual) / steps[:, None]).T)
+        slopes = (moved - residual) / steps[:, None]
+        # where both sides fail, the column stays zero
+        return Model(point, residual, np.nan_to_num(slopes).T)
 
     def _descend(self, run: Run, model: Model, chosen: Mask) -> Simulates[Model]:
         """Levenberg-Marquardt on the chosen samples until they are fitted, or it is stuck."""
-        worthwhile = (
-            1e-8 if chosen.all() else 0.1
-        )  # of the sum of squares; early horizons need not be polished
-        damping, stalled, failed = _Damping(self.damping), 0, 0
+        worthwhile = _POLISHED if chosen.all() else _COARSE
+        damping = _Damping(self.damping)
+        stalled = 0
+        failed = 0
         while stalled < self.patience:
             before = model.error(chosen)
             step, promised = model.step(chosen, damping.mu)
             if np.abs(step).max() < self.step_tolerance or promised <= worthwhile * before:
                 break
-            hopeful = model.point + step if self.ahead and model.trusted and chosen.all() else None
-            (residual,) = yield from run.simulate((model.point + step)[None], hopeful)
-            after = float(residual[chosen] @ residual[chosen])  # NaN where the simulation failed
+            proposal = model.point + step
+            # on an early horizon, or after a broken promise, a step is a guess
+            trusted = self.ahead and model.trusted and chosen.all()
+            hopeful = proposal if trusted else None
+            (residual,) = yield from run.simulate(proposal[None], hopeful)
+            # NaN where the simulation failed, which compares as no better
+            after = float(residual[chosen] @ residual[chosen])
             better = after < before
+            # a step that failed to lead down still tells the slope along it
             if np.isfinite(after):
                 model.update(step, residual)
             if better:
-                model.point, model.residual = model.point + step, residual
-            model.trusted = before - after > 0.5 * promised
-            damping.adapt((before - after) / promised)
+                model.point = proposal
+                model.residual = residual
+            decrease = before - after
+            model.trusted = decrease > _KEPT * promised
+            damping.adapt(decrease / promised)  # (2)
             failed = 0 if better else failed + 1
             stalled = 0 if after < (1.0 - self.progress) * before else stalled + 1
             if run.finished:
                 break
-            if (better and not self.secant) or (failed == 2 and len(step) > 1):
-                model = yield from self._differentiate(
-                    run, model.point, model.residual, float(np.abs(step).max())
-                )
+            # with one parameter the secant is the slope; with several it may have gone stale
+            stale = failed == 2 and len(step) > 1
+            if stale or (better and not self.secant):
+                longest = float(np.abs(step).max())
+                model = yield from self._differentiate(run, model.point, model.residual, longest)
         return model
 
 
 @dataclass
 class _Damping:
-    """Nielsen's rule: gentle where the model is good, ever stronger where it fails."""
+    """Nielsen's rule (3): gentle where the model is good, ever stronger where it fails."""
 
     mu: float
     nu: float = 2.0
@@ -157,13 +189,14 @@ class _Damping:
     def adapt(self, gain: float) -> None:
         """`gain`: decrease as a share of what the model promised; NaN for a failed simulation."""
         if gain > 0.0:
-            self.mu, self.nu = self.mu * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 2.0
+            self.mu *= max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+            self.nu = 2.0
         elif np.isnan(gain):
-            self.mu = (
-                4.0 * self.mu + 3.0
-            )  # a quarter of the step, where the parameters do not interact
+            # a quarter of the step, where the parameters do not interact: (1) divides by 1 + mu
+            self.mu = 4.0 * self.mu + 3.0
         else:
-            self.mu, self.nu = self.mu * self.nu, self.nu * 2.0
+            self.mu *= self.nu
+            self.nu *= 2.0
 
 
 @dataclass
@@ -185,20 +218,26 @@ class Model:
 
     def sensitive(self, chosen: Mask) -> bool:
         """Whether the chosen samples respond to any parameter, compared with all samples."""
-        return bool((self.jacobian[chosen] ** 2).mean() > 1e-6 * (self.jacobian**2).mean())
+        here = (self.jacobian[chosen] ** 2).mean()
+        return bool(here > _DEAF * (self.jacobian**2).mean())
 
     def step(self, chosen: Mask, mu: float) -> tuple[Array, float]:
-        """(JᵀJ + μ diag JᵀJ) s = -Jᵀr within the cube, and the decrease of the sum of squares that
-        it promises.
-        """
-        r, jacobian = self.residual[chosen], self.jacobian[chosen]
+        """The step (1) within the cube, and the decrease of the sum of squares that it promises."""
+        r = self.residual[chosen]
+        jacobian = self.jacobian[chosen]
         gradient = jacobian.T @ r
-        free = ~((self.point <= 0.0) & (gradient > 0.0) | (self.point >= 1.0) & (gradient < 0.0))
+        # a parameter at a border that would leave the cube stays there
+        below = (self.point <= 0.0) & (gradient > 0.0)
+        above = (self.point >= 1.0) & (gradient < 0.0)
+        free = ~(below | above)
         scale = np.sqrt((jacobian**2).sum(0))
-        scale = np.maximum(scale, 1e-6 * scale.max())
+        scale = np.maximum(scale, _FLAT * scale.max())
+        # (1) as a least-squares problem, which does not square the condition of J
         stacked = np.vstack([jacobian, np.diag(np.sqrt(mu) * scale)])[:, free]
         step = np.zeros_like(self.point)
-        step[free] = np.linalg.lstsq(stacked, np.append(-r, np.zeros_like(step)), rcond=None)[0]
+        target = np.append(-r, np.zeros_like(step))
+        step[free] = np.linalg.lstsq(stacked, target, rcond=None)[0]
+        # what leaves the cube on the way is cut, and the promise is that of the cut step
         step = np.clip(self.point + step, 0.0, 1.0) - self.point
         remaining = r + jacobian @ step
         return step, float(r @ r - remaining @ remaining)
@@ -206,7 +245,7 @@ class Model:
     def update(self, step: Array, residual: Array) -> None:
         """Broyden's update: the smallest change of the Jacobian that explains what the step did."""
         missed = residual - self.residual - self.jacobian @ step
-        self.jacobian = self.jacobian + np.outer(missed, step / (step @ step))
+        self.jacobian = self.jacobian + np.outer(missed, step / (step @ step))  # (4)
 
 
 @dataclass
@@ -227,14 +266,14 @@ class Run:
     def simulate(self, points: Array, recommend: Array | None = None) -> Simulates[Array]:
         """Residuals (n, samples) of the points; rows of NaN where the simulation failed."""
         points = np.clip(points, 0.0, 1.0)
-        return self.seen((yield points if recommend is None else Ask(points, recommend)))
+        evaluation = yield points if recommend is None else Ask(points, recommend)
+        return self.seen(evaluation)
 
     def seen(self, evaluation: Evaluation) -> Array:
         """Note what was simulated; its residuals."""
         proposals, observations, losses = evaluation
-        residuals = np.where(
-            np.isfinite(losses)[:, None], self.task.residuals(observations), np.nan
-        )
+        finite = np.isfinite(losses)
+        residuals = np.where(finite[:, None], self.task.residuals(observations), np.nan)
         self.tried.extend(proposals)
         self.residuals.extend(residuals)
         self.losses.extend(losses.tolist())
@@ -248,7 +287,8 @@ class Run:
 
     def untried(self, rng: np.random.Generator) -> Array:
         """The point farthest from all tried ones, among random candidates."""
-        candidates = rng.uniform(size=(64 * self.task.dim, self.task.dim))
+        dim = self.task.dim
+        candidates = rng.uniform(size=(_CANDIDATES * dim, dim))
         squares = [((candidates - point) ** 2).sum(1) for point in self.tried]
         farthest: Array = candidates[np.min(squares, axis=0).argmax()]
         return farthest

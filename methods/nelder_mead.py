@@ -4,6 +4,10 @@ Sources: J. A. Nelder, R. Mead, A simplex method for function minimization, The 
 7(4), 1965, doi:10.1093/comjnl/7.4.308; the treatment of bounds: M. J. Box, The Computer Journal
 8(1), 1965, doi:10.1093/comjnl/8.1.42; S. G. Johnson, The NLopt nonlinear-optimization package,
 https://github.com/stevengj/nlopt.
+
+The simplex has dim + 1 corners; the worst is reflected through the middle of the others, and the
+new one is expanded, contracted, or all shrink towards the best. nlopt does that; here its questions
+are handed over.
 """
 
 from __future__ import annotations
@@ -42,6 +46,7 @@ class NelderMead(Tuner):
 
         def objective(point: Array, gradient: Array) -> float:  # noqa: ARG001 - nlopt's signature
             value = loss(point)
+            # NaN compares with nothing: the simplex could not order its corners
             return value if np.isfinite(value) else np.inf
 
         optimiser = nlopt.opt(nlopt.LN_NELDERMEAD, task.dim)
@@ -54,5 +59,6 @@ class NelderMead(Tuner):
         try:
             optimiser.optimize(task.start)
         except nlopt.RoundoffLimited:
+            # with a tolerance of 0 the usual end, and no fault
             return "the simplex reached the limit of rounding"
         return "the simplex has collapsed to a point"

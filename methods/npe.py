@@ -7,6 +7,13 @@ Macke, Automatic posterior transformation for likelihood-free inference, ICML 20
 1905.07488; the flow: G. Papamakarios, T. Pavlakou, I. Murray, Masked autoregressive flow for
 density estimation, NeurIPS 2017, arXiv 1705.07057. Built and trained by the `sbi` package (JOSS
 5(52), 2020, doi:10.21105/joss.02505), which is an optional extra: pip install -e ".[npe]".
+
+With θ drawn uniformly from the training range and o simulated from it, the flow q of weights w is
+trained by
+
+    (1)  the minimum over w of the mean of -log q_w(θ | o)
+
+whose minimum over all densities is the posterior p(θ | o).
 """
 
 from __future__ import annotations
@@ -71,22 +78,27 @@ class NPE(Tuner):
         Raises:
             ValueError: a budget of less than two scenarios.
         """
-        data = rehearse(
-            simulator, rng, budget, self.scenarios, max(self.each, 2 * (simulator.dim + 1))
-        )
+        dim = simulator.dim
+        each = max(self.each, 2 * (dim + 1))
+        data = rehearse(simulator, rng, budget, self.scenarios, each)
         spoilt = data.spoilt(self.noise * data.flat.std(axis=(0, 1)), rng)
         self._read = read = Reader.learned(data, self._reading())
+        # each simulation twice, clean and spoilt: targets may be either
         rows = np.concatenate([read.table(some).reshape(-1, read.size) for some in (data, spoilt)])
-        theta = np.tile(data.parameters.reshape(-1, simulator.dim), (2, 1))
+        theta = np.tile(data.parameters.reshape(-1, dim), (2, 1))
         with quietly(rng):
             from sbi import inference
 
             trainer = inference.NPE(
-                density_estimator=self._builder(), tracker=Silent(), show_progress_bars=False
+                density_estimator=self._builder(),
+                tracker=Silent(),
+                show_progress_bars=False,
             )
             trainer.append_simulations(_tensor(theta), _tensor(rows))
+            # (1), until the loss of the rows that sbi holds out no longer falls
             self._flow = trainer.train(
-                max_num_epochs=self.epochs, training_batch_size=min(100, len(rows) // 4)
+                max_num_epochs=self.epochs,
+                training_batch_size=min(100, len(rows) // 4),
             )
 
     def _reading(self) -> Reading:
@@ -96,7 +108,9 @@ class NPE(Tuner):
         from sbi.neural_nets import posterior_nn
 
         builder: Callable[[Any, Any], Any] = posterior_nn(
-            "maf", hidden_features=self.hidden, num_transforms=self.transforms
+            "maf",
+            hidden_features=self.hidden,
+            num_transforms=self.transforms,
         )
         return builder
 
@@ -116,9 +130,8 @@ class NPE(Tuner):
             ValueError: arrays of other names or shapes, or numbers that are not finite.
         """
         flow = {name: array for name, array in state.items() if name.startswith("flow.")}
-        read, foreign = Reader.restored(
-            {n: a for n, a in state.items() if n not in flow}, self._reading()
-        )
+        others = {name: array for name, array in state.items() if name not in flow}
+        read, foreign = Reader.restored(others, self._reading())
         broken = [name for name, array in flow.items() if not np.isfinite(array).all()]
         if foreign or broken:
             raise ValueError(
@@ -139,9 +152,10 @@ class NPE(Tuner):
             raise ValueError("expected the arrays of a flow, found others")
         rng = np.random.default_rng(0)
         with quietly(rng):
-            flow = self._builder()(
-                *(_tensor(rng.standard_normal((4, size))) for size in (dim, inputs))
-            )
+            # sbi reads the sizes off example data; its scaling comes with the tensors
+            theta = _tensor(rng.standard_normal((4, dim)))
+            rows = _tensor(rng.standard_normal((4, inputs)))
+            flow = self._builder()(theta, rows)
             try:
                 flow.load_state_dict(
                     {name: torch.from_numpy(np.array(a)) for name, a in arrays.items()}
@@ -158,15 +172,14 @@ class NPE(Tuner):
             raise RuntimeError("npe has not been trained; call fit or restore first")
         row = self._read(task.observed[None], task.lengths, task.scene)
         with quietly(rng):
-            drawn = (
-                self._flow.sample((max(self.draws, task.budget),), condition=_tensor(row))
-                .detach()[:, 0]
-                .numpy()
-            )
-        drawn = np.clip(np.nan_to_num(drawn.astype(np.float64), nan=0.5), 0.0, 1.0)
-        mean = drawn.mean(axis=0)
+            count = max(self.draws, task.budget)
+            samples = self._flow.sample((count,), condition=_tensor(row))
+            raw = samples.detach()[:, 0].numpy()
+        # a flow has mass beyond the range it was trained on, and may overflow far from it
+        draws = np.clip(np.nan_to_num(raw.astype(np.float64), nan=0.5), 0.0, 1.0)
+        mean = draws.mean(axis=0)
         yield Ask(mean, recommend=mean)
-        for point in drawn:
+        for point in draws:
             yield point[None]
         return "its draws are used up"
 

@@ -61,8 +61,12 @@ class Regressor(PairTuner):
         """How the network is built and trained."""
         if self.published:
             return PUBLISHED
+        # its two inputs are no pair that could change places
         return Design(
-            antisymmetric=False, epochs=self.epochs, rate=self.rate, weight_decay=self.weight_decay
+            antisymmetric=False,
+            epochs=self.epochs,
+            rate=self.rate,
+            weight_decay=self.weight_decay,
         )
 
     def reading(self) -> Reading:
@@ -81,12 +85,17 @@ class Regressor(PairTuner):
 
     def layout(self, dim: int) -> tuple[int, int]:
         """Training scenarios at most, and simulations in each."""
-        return (800, 1) if self.published else (self.scenarios, max(self.each, 2 * (dim + 1)))
+        if self.published:
+            return 800, 1
+        # enough for a linear fit of the parameters in each scenario, and as many to judge it by
+        return self.scenarios, max(self.each, 2 * (dim + 1))
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002 (the contract's signature)
         """One estimate from the target, simulated once."""
         network = self.fitted().suited(task)
         target = network.read(task.observed[None], task.lengths, task.scene)[0]
-        guess = np.clip(network.difference(np.zeros_like(target), target), 0.0, 1.0)
+        # the proposed input is zero, so the difference is the parameters themselves
+        nothing = np.zeros_like(target)
+        guess = np.clip(network.difference(nothing, target), 0.0, 1.0)
         yield Ask(guess, recommend=guess)
         return "it estimates once"

@@ -1,4 +1,16 @@
-"""TuneNet: residual tuning, Allevato et al., CoRL 2019, arXiv 1907.11200, Eq. 1 and Algorithm 1."""
+"""TuneNet: residual tuning, Allevato et al., CoRL 2019, arXiv 1907.11200, Eq. 1 and Algorithm 1.
+
+A network h estimates the difference of parameters from two observations, o_P of the proposed
+simulation and o_T of the target. Algorithm 1 repeats
+
+    (1)  zeta_k = zeta_{k-1} + h(o_P, o_T)
+
+which stops at a root of h as a function of zeta, wherever that is. Here the root is sought by
+Broyden's method (Math. Comp. 19, 1965), with the slope B of h, a step s and the change y of h:
+
+    (2)  s = -B^-1 h,  at first B = -1, which is (1)
+    (3)  B <- B + (y - B s) s^T / (s^T s)
+"""
 
 from __future__ import annotations
 
@@ -90,17 +102,20 @@ class TuneNet(PairTuner):
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002 (the contract's signature)
         """Algorithm 1, one simulation an iteration."""
-        estimate, search = self.fitted().estimator(task), Search(task)
+        estimate = self.fitted().estimator(task)
+        search = Search(task)
         guess = task.start
         while True:
-            seen = yield Ask(guess, recommend=guess)
-            residual = estimate(seen.observations)
+            evaluation = yield Ask(guess, recommend=guess)
+            point = evaluation.proposals[0]
+            residual = estimate(evaluation.observations)
             if self.broyden:
-                guess = search.after(seen.proposals[0], residual)
+                guess = search.after(point, residual)
                 if np.abs(guess - search.best).max() <= SETTLED:
                     return "the estimate no longer changes"
             else:
-                guess = np.clip(seen.proposals[0] + np.nan_to_num(residual), 0.0, 1.0)
+                # (1); a simulation that failed tells nothing, and its point is tried again
+                guess = np.clip(point + np.nan_to_num(residual), 0.0, 1.0)
 
 
 @dataclass(eq=False)
@@ -115,7 +130,8 @@ class TuneNetPublished(PairTuner):
     name: ClassVar[str] = "tunenet-published"
     known_failures: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("check_easy_problem_is_improved", "check_beats_random_search"),
-        "240 training simulations in raw units are too few for 200 epochs of plain gradient descent",
+        "240 training simulations in raw units are too few "
+        "for 200 epochs of plain gradient descent",
     )
 
     points: int = 400
@@ -134,10 +150,12 @@ class TuneNetPublished(PairTuner):
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002 (the contract's signature)
         """Algorithm 1; guesses are kept from falling below zero, and from nothing else."""
-        estimate, guess = self.fitted().estimator(task), task.start
+        estimate = self.fitted().estimator(task)
+        guess = task.start
         while True:
-            seen = yield Ask(guess, recommend=guess)
-            guess = np.maximum(seen.proposals[0] + np.nan_to_num(estimate(seen.observations)), 0.0)
+            evaluation = yield Ask(guess, recommend=guess)
+            residual = np.nan_to_num(estimate(evaluation.observations))
+            guess = np.maximum(evaluation.proposals[0] + residual, 0.0)  # (1)
 
 
 SETTLED = 1e-10
@@ -161,26 +179,35 @@ class Search:
         self._last: tuple[Array, Array] | None = None
         self._residual: Array | None = None
         self._setbacks = 0
-        self._low, self._high = -np.inf, np.inf
+        # in one dimension: the largest point known to be too low, the smallest too high
+        self._low = -np.inf
+        self._high = np.inf
         self.best = task.start
 
     def after(self, point: Array, residual: Array) -> Array:
         """The next guess, once `residual` has been seen at `point`."""
-        if not np.isfinite(residual).all():  # the simulation failed: half the way back
-            return (point + (self._fallback if self._residual is None else self.best)) / 2.0
+        if not np.isfinite(residual).all():
+            # the simulation failed: half the way back to where one succeeded, or should
+            refuge = self._fallback if self._residual is None else self.best
+            return (point + refuge) / 2.0
         if self._last is not None:
-            step, change = point - self._last[0], residual - self._last[1]
-            if step @ step > 0.0:
-                self._slope = self._slope + np.outer(change - self._slope @ step, step) / (
-                    step @ step
-                )
+            self._learn(point - self._last[0], residual - self._last[1])
         self._last = point, residual
         if self._residual is None or residual @ residual < self._residual @ self._residual:
-            self.best, self._residual, self._setbacks = point, residual, 0
+            self.best = point
+            self._residual = residual
+            self._setbacks = 0
         else:
             self._setbacks += 1
         guess: Array = np.clip(self.best + self._step(self._residual), 0.0, 1.0)
         return self._bracketed(guess, point, residual) if len(point) == 1 else guess
+
+    def _learn(self, step: Array, change: Array) -> None:
+        """Broyden's update (3); a step of no length teaches nothing."""
+        square = step @ step
+        if square > 0.0:
+            missed = change - self._slope @ step
+            self._slope = self._slope + np.outer(missed, step) / square
 
     def _step(self, residual: Array) -> Array:
         """Broyden's step from the best point, at most twice Algorithm 1's; the latter where the
@@ -190,14 +217,14 @@ class Search:
         halved each time.
         """
         try:
-            step = np.linalg.solve(self._slope, -residual)
+            step = np.linalg.solve(self._slope, -residual)  # (2)
         except np.linalg.LinAlgError:
             step = residual
+        # against the estimate itself: then the slope is wrong, since h is trained to point right
         if not step @ residual > 0.0:
             step = residual
-        longest = (
-            _LONGEST * float(np.linalg.norm(residual)) / max(float(np.linalg.norm(step)), 1e-300)
-        )
+        length = max(float(np.linalg.norm(step)), 1e-300)
+        longest = _LONGEST * float(np.linalg.norm(residual)) / length
         share = min(1.0, longest) / 2.0 ** max(self._setbacks - 1, 0)
         return np.asarray(step * share, dtype=np.float64)
 
@@ -212,11 +239,12 @@ class Search:
             self._low = max(self._low, point[0])
         elif residual[0] < 0.0:
             self._high = min(self._high, point[0])
+        # rough estimates may contradict each other, and then there is no interval
         known = np.isfinite([self._low, self._high]).all() and self._low < self._high
         if self._setbacks and known and not self._low < guess[0] < self._high:
-            far = (
-                _REACH * float(np.abs(self._residual).max()) if self._residual is not None else 1.0
-            )
+            far = 1.0
+            if self._residual is not None:
+                far = _REACH * float(np.abs(self._residual).max())
             halfway = np.array([(self._low + self._high) / 2.0])
             inside: Array = np.clip(halfway, self.best - far, self.best + far)
             return inside

@@ -52,4 +52,5 @@ class TuneNetVision(TuneNet):
     def reading(self) -> Reading:
         """What each side reads."""
         target = super().reading()
+        # the simulation shows heights whatever the camera is
         return replace(target, proposed=replace(target, told=False, channels=(0, 0)))

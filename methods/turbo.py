@@ -5,6 +5,12 @@ via local Bayesian optimization, NeurIPS 2019, arXiv 1910.01739 (section 2; cons
 supplement); M. Balandat et al., BoTorch: a framework for efficient Monte-Carlo Bayesian
 optimization, NeurIPS 2020, arXiv 1910.06403. Gaussian process and sampling are the `botorch`
 package's, which is an optional extra: pip install -e ".[turbo]".
+
+The region is a box around the best point of sides
+
+    (1)  length * l_i / (l_1 l_2 ... l_d)^(1/d)
+
+with the process's length scales l_i, so that its volume is length^d whatever they are.
 """
 
 from __future__ import annotations
@@ -18,6 +24,21 @@ import numpy as np
 
 from methods.base import Array, Steps, Task, Tuner
 from methods.learning.quiet import quietly
+
+_BETTER = 0.999
+"""Of the lowest loss: what is not below it is no improvement."""
+_FAILURES = 4
+"""Failures in succession, at least, after which the side is halved."""
+_MOVED = 20.0
+"""Coordinates in which a candidate differs from the centre, on average at most."""
+_SHORTEST_SCALE = 0.005
+"""Least length scale of the process, unit cube."""
+_LONGEST_SCALE = 4.0
+"""Largest length scale of the process, unit cube."""
+_LEAST_NOISE = 1e-8
+"""Least variance of the noise, losses being scaled to variance 1."""
+_MOST_NOISE = 1e-3
+"""Largest variance of the noise: simulations repeat exactly."""
 
 
 @dataclass(eq=False)
@@ -55,27 +76,42 @@ class TuRBO(Tuner):
         """
         first: Array | None = task.start
         while True:
-            points = list(_spread(rng, max(2, self.initial * task.dim), task.dim))
+            count = max(2, self.initial * task.dim)
+            points = list(_spread(rng, count, task.dim))
+            # the start belongs to the first region alone
             if first is not None:
-                points[0], first = first, None
+                points[0] = first
+                first = None
             losses = []
             for point in points:
-                losses.append(float((yield point).losses[0]))
+                evaluation = yield point
+                losses.append(float(evaluation.losses[0]))
             yield from self._region(task.dim, rng, np.array(points), np.array(losses))
 
     def _region(self, dim: int, rng: np.random.Generator, points: Array, losses: Array) -> Steps:
         """One trust region, until it has collapsed."""
-        length, succeeded, failed = self.length, 0, 0
+        length = self.length
+        succeeded = 0
+        failed = 0
         while length >= self.shortest:
             point = self._sampled(points, losses, length, rng)
-            loss = float((yield point).losses[0])
-            better = loss < 0.999 * losses.min()
-            succeeded, failed = (succeeded + 1, 0) if better else (0, failed + 1)
+            evaluation = yield point
+            loss = float(evaluation.losses[0])
+            # a gain by rounding is no success
+            if loss < _BETTER * losses.min():
+                succeeded += 1
+                failed = 0
+            else:
+                succeeded = 0
+                failed += 1
             if succeeded == self.successes:
-                length, succeeded = min(2.0 * length, self.longest), 0
-            elif failed == max(4, dim):
-                length, failed = length / 2.0, 0
-            points, losses = np.vstack([points, point]), np.append(losses, loss)
+                length = min(2.0 * length, self.longest)
+                succeeded = 0
+            elif failed == max(_FAILURES, dim):
+                length = length / 2.0
+                failed = 0
+            points = np.vstack([points, point])
+            losses = np.append(losses, loss)
         return None
 
     def _sampled(
@@ -94,7 +130,9 @@ class TuRBO(Tuner):
             from botorch.generation.sampling import MaxPosteriorSampling
 
             model = _process(points, -(values - values.mean()) / scale)
-            sides = np.asarray(model.covar_module.base_kernel.lengthscale.detach().numpy()).ravel()
+            scales = model.covar_module.base_kernel.lengthscale.detach().numpy()
+            sides = np.asarray(scales).ravel()
+            # (1)
             sides = length * sides / np.exp(np.log(sides).mean())
             candidates = self._candidates(points[values.argmin()], sides, rng)
             with torch.no_grad():
@@ -108,10 +146,13 @@ class TuRBO(Tuner):
         """Points in the box around `centre`; in many dimensions each differs from it in about 20 of
         them.
         """
-        low, high = np.clip(centre - sides / 2.0, 0.0, 1.0), np.clip(centre + sides / 2.0, 0.0, 1.0)
-        spread = low + (high - low) * _spread(rng, self.candidates, len(centre))
-        moved = rng.uniform(size=spread.shape) <= min(20.0 / len(centre), 1.0)
-        moved[~moved.any(axis=1), rng.integers(len(centre))] = True
+        dim = len(centre)
+        low = np.clip(centre - sides / 2.0, 0.0, 1.0)
+        high = np.clip(centre + sides / 2.0, 0.0, 1.0)
+        spread = low + (high - low) * _spread(rng, self.candidates, dim)
+        moved = rng.uniform(size=spread.shape) <= min(_MOVED / dim, 1.0)
+        # the centre itself has been simulated
+        moved[~moved.any(axis=1), rng.integers(dim)] = True
         return np.where(moved, spread, centre)
 
 
@@ -137,13 +178,22 @@ def _process(points: Array, values: Array) -> Any:
     from gpytorch.mlls import ExactMarginalLogLikelihood
 
     kernel = MaternKernel(
-        nu=2.5, ard_num_dims=points.shape[1], lengthscale_constraint=Interval(0.005, 4.0)
+        nu=2.5,
+        ard_num_dims=points.shape[1],
+        lengthscale_constraint=Interval(_SHORTEST_SCALE, _LONGEST_SCALE),
     )
-    likelihood = GaussianLikelihood(noise_constraint=Interval(1e-8, 1e-3))
-    x, y = torch.from_numpy(points), torch.from_numpy(values)[:, None]
+    likelihood = GaussianLikelihood(noise_constraint=Interval(_LEAST_NOISE, _MOST_NOISE))
+    x = torch.from_numpy(points)
+    y = torch.from_numpy(values)[:, None]
     model = SingleTaskGP(
-        x, y, covar_module=ScaleKernel(kernel), likelihood=likelihood, outcome_transform=None
+        x,
+        y,
+        covar_module=ScaleKernel(kernel),
+        likelihood=likelihood,
+        # losses are scaled before
+        outcome_transform=None,
     )
-    with suppress(ModelFittingError):  # the kernel as it stands serves as well
+    # where the fit fails, the kernel as it stands serves as well
+    with suppress(ModelFittingError):
         fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
     return model.eval()

@@ -10,7 +10,7 @@ from methods.entropy_search import (
     spread,
     uncertainty,
 )
-from methods.gaussian_process import GaussianProcess, Settings
+from methods.learning.gaussian_process import GaussianProcess, Settings
 from tests.methods.problems import START, TRUTH, decays, errors, run, smooth
 
 PUBLISHED = EntropySearch(published=True)

@@ -14,7 +14,7 @@ TRAINING = {1: np.array([[0.3], [0.7]]), 2: np.array([[0.3, 0.2], [0.7, 0.6]])}
 
 
 def swing(points: Array, amplitude: float, samples: int = 60) -> Array:
-    """A damped oscillation and its rate, two channels: damping and, with two parameters, frequency."""
+    """A damped oscillation and its rate, two channels: damping and, where asked, frequency."""
     t = np.linspace(0.0, 6.0, samples)
     damping = 0.1 + 0.9 * points[:, :1]
     frequency = 2.0 + (points[:, 1:2] if points.shape[1] > 1 else 0.0)

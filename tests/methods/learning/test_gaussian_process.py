@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.optimize import check_grad
 
-from methods.gaussian_process import GaussianProcess, Settings
+from methods.learning.gaussian_process import GaussianProcess, Settings
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(size=(25, 2))

@@ -2,7 +2,14 @@
 values.
 
 Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, 2006,
-doi:10.7551/mitpress/3206.001.0001; equation numbers are theirs.
+doi:10.7551/mitpress/3206.001.0001; equation numbers are theirs. With K the correlation of the
+points with noise on its diagonal, L its Cholesky factor, y the values and m the mean:
+
+    (2.25)  posterior mean = m + k* K^-1 (y - m)
+    (2.26)  posterior covariance = variance (k** - k* K^-1 k*^T)
+    (2.30)  log likelihood = -(y - m)^T K^-1 (y - m) / (2 variance) - log |K| / 2 - ...
+
+The mean and variance of the largest likelihood are known in closed form, given the rest.
 """
 
 from __future__ import annotations
@@ -52,12 +59,17 @@ class GaussianProcess:
         """Condition on `values` (n,) at `points` (n, dim); start the fit from `hyper`, or take it
         as it is.
         """
-        self.points, self.values, self.settings = points, values, settings
+        self.points = points
+        self.values = values
+        self.settings = settings
         self._squares = (points[:, None] - points) ** 2
         dim = points.shape[1]
-        self._centre = np.log(np.append(np.full(dim, settings.length[0]), settings.noise[0]))
-        self._width = np.append(np.full(dim, settings.length[1]), settings.noise[1])
+        length, length_width = settings.length
+        noise, noise_width = settings.noise
+        self._centre = np.log(np.append(np.full(dim, length), noise))
+        self._width = np.append(np.full(dim, length_width), noise_width)
         self.hyper = self._centre if hyper is None else hyper
+        # two points, or values all alike, say nothing of a length
         if fit and len(points) > 2 and np.ptp(values) > 0.0:
             self.hyper = self._most_probable()
         k, _ = self._correlation(self._squares)
@@ -71,11 +83,13 @@ class GaussianProcess:
         lengths = (self.hyper if hyper is None else hyper)[:-1]
         scaled = squares @ np.exp(-2.0 * lengths)
         if self.settings.kernel == "rbf":
-            k = np.exp(-0.5 * scaled)
+            k = np.exp(-0.5 * scaled)  # (4.9)
             return k, -0.5 * k
         root = np.sqrt(5.0 * scaled)
         decay = np.exp(-root)
-        return (1.0 + root + root**2 / 3.0) * decay, -5.0 / 6.0 * (1.0 + root) * decay
+        k = (1.0 + root + root**2 / 3.0) * decay  # (4.17)
+        # by the scaled sum and not by the distance, whose derivative at zero would divide by it
+        return k, -5.0 / 6.0 * (1.0 + root) * decay
 
     def _most_probable(self) -> Array:
         """Maximum of likelihood times prior, by L-BFGS."""
@@ -83,12 +97,14 @@ class GaussianProcess:
 
         def objective(hyper: Array) -> tuple[float, Array]:
             value, slope = self._evidence(hyper)
+            # the priors, normal in the logarithms
             z = (hyper - self._centre) / self._width
             return value + 0.5 * float(z @ z), slope + z / self._width
 
-        low, high = self._centre - 4.0 * self._width, self._centre + 4.0 * self._width
+        low = self._centre - 4.0 * self._width
+        high = self._centre + 4.0 * self._width
         bounds = list(zip(low, high, strict=True))
-        found = minimize(
+        optimum = minimize(
             objective,
             self.hyper,
             jac=True,
@@ -96,7 +112,7 @@ class GaussianProcess:
             method="L-BFGS-B",
             options={"maxiter": 20},
         )
-        return np.asarray(found.x)
+        return np.asarray(optimum.x)
 
     def _evidence(self, hyper: Array) -> tuple[float, Array]:
         """Negative logarithm of the marginal likelihood (2.30), and its gradient (5.9)."""
@@ -106,12 +122,15 @@ class GaussianProcess:
         k, slope = self._correlation(self._squares, hyper)
         lower = _cholesky(k, float(np.exp(hyper[-1])))
         _, variance, alpha = _profile(lower, self.values)
+        # (2.30) with the best variance: its quadratic term is then n / 2, a constant
         value = 0.5 * n * np.log(variance) + np.log(np.diag(lower)).sum()
-        weight = 0.5 * (cho_solve((lower, True), np.eye(n)) - np.outer(alpha, alpha) / variance)
-        by_length = (
-            np.einsum("ij,ijd->d", weight * slope, self._squares) * -2.0 * np.exp(-2.0 * hyper[:-1])
-        )
-        return float(value), np.append(by_length, np.trace(weight) * np.exp(hyper[-1]))
+        inverse = cho_solve((lower, True), np.eye(n))
+        weight = 0.5 * (inverse - np.outer(alpha, alpha) / variance)  # (5.9)
+        by_squares = np.einsum("ij,ijd->d", weight * slope, self._squares)
+        # the chain rule: squares are divided by squared lengths, whose logarithms are the variables
+        by_length = by_squares * -2.0 * np.exp(-2.0 * hyper[:-1])
+        by_noise = np.trace(weight) * np.exp(hyper[-1])
+        return float(value), np.append(by_length, by_noise)
 
     def predict(self, points: Array) -> Array:
         """Posterior mean (2.25) at (m, dim)."""
@@ -128,22 +147,21 @@ class GaussianProcess:
         cross, _ = self._correlation((points[:, None] - self.points) ** 2)
         prior, _ = self._correlation((points[:, None] - points) ** 2)
         explained = solve_triangular(self._lower, cross.T, lower=True)
-        spread = _cholesky(prior - explained.T @ explained, 1e-10)
+        spread = _cholesky(prior - explained.T @ explained, 1e-10)  # (2.26)
         noise = rng.standard_normal((draws, len(points)))
-        return np.asarray(
-            self.mean + cross @ self._alpha + self.variance**0.5 * (noise @ spread.T),
-            dtype=np.float64,
-        )
+        centre = self.mean + cross @ self._alpha  # (2.25)
+        drawn = centre + self.variance**0.5 * (noise @ spread.T)
+        return np.asarray(drawn, dtype=np.float64)
 
 
 def _cholesky(matrix: Array, jitter: float) -> Array:
     """Lower factor of matrix + jitter, with as much more jitter as it takes."""
     while True:
+        shifted = matrix + jitter * np.eye(len(matrix))
         try:
-            return np.asarray(
-                np.linalg.cholesky(matrix + jitter * np.eye(len(matrix))), dtype=np.float64
-            )
+            return np.asarray(np.linalg.cholesky(shifted), dtype=np.float64)
         except np.linalg.LinAlgError:
+            # points that nearly coincide leave rounding below zero
             jitter = max(10.0 * jitter, 1e-12)
 
 
@@ -154,4 +172,6 @@ def _profile(lower: Array, values: Array) -> tuple[float, float, Array]:
     weights = cho_solve((lower, True), np.ones(len(values)))
     mean = float(weights @ values / weights.sum())
     alpha = cho_solve((lower, True), values - mean)
-    return mean, max(float((values - mean) @ alpha) / len(values), 1e-20), alpha
+    variance = float((values - mean) @ alpha) / len(values)
+    # values all alike have none, and its logarithm is taken
+    return mean, max(variance, 1e-20), alpha
