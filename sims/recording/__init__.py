@@ -1,0 +1,8 @@
+"""Measured data on disk, `NAME.csv` and `NAME.toml`; the rooms in the order in which to read them.
+
+* `recording`: what a recording is, and how one is read: the contract, and all that others need
+* `description`: the TOML file, what the columns are
+* `table`: the CSV file, cell by cell; `fast` reads large faultless ones
+* `units`: how the file's units become SI
+* `write`: a recording written such that reading gives the same back
+"""

@@ -30,13 +30,17 @@ def read_fast(
     import pyarrow as arrow
     from pyarrow import csv
 
+    types = {"run": arrow.string()}
+    types |= {name: arrow.float64() for name in wanted}
     try:
         table = csv.read_csv(
             path,
+            # one thread: workers run beside each other, one a core
             csv.ReadOptions(column_names=list(header), skip_rows=1, use_threads=False),
+            # quotes may hide commas and line ends; they are left to the other reader
             csv.ParseOptions(quote_char=False),
             csv.ConvertOptions(
-                column_types={"run": arrow.string(), **{name: arrow.float64() for name in wanted}},
+                column_types=types,
                 null_values=[""],
                 strings_can_be_null=False,
             ),
@@ -47,7 +51,9 @@ def read_fast(
     for name in wanted:
         cells = table[name]
         values = cells.to_numpy()
-        if np.count_nonzero(~np.isfinite(values)) != (cells.null_count if name in gaps else 0):
+        # an empty cell is NaN and allowed in a gap; a NaN or inf that is written is not
+        allowed = cells.null_count if name in gaps else 0
+        if np.count_nonzero(~np.isfinite(values)) != allowed:
             return None
         columns[name] = values
     runs = table["run"].combine_chunks().dictionary_encode()

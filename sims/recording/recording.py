@@ -118,14 +118,17 @@ def divided(recording: Recording) -> Recording:
 
 
 _UNMARKED = RunMarks({}, {}, None)
+"""What is said of a run that the description does not mention."""
+_THIRD = 3
+"""Of the runs, or of a single one's samples, one in so many is held out."""
 
 
 def _run(table: Path, part: TableRun, about: Description) -> Run:
+    """A run in SI units, with what the description says of it."""
     marks = about.runs.get(part.name, _UNMARKED)
-    channels, inputs = (
-        {n: _converted(table, part, n, s) for n, s in scales.items()}
-        for scales in (about.channels, about.inputs)
-    )
+    channels = {n: _converted(table, part, n, s) for n, s in about.channels.items()}
+    inputs = {n: _converted(table, part, n, s) for n, s in about.inputs.items()}
+    # no system reads them, so they keep their unit
     extra = {name: part.columns[name] for name in about.extra}
     return Run(
         part.name,
@@ -140,14 +143,21 @@ def _run(table: Path, part: TableRun, about: Description) -> Run:
 
 
 def _converted(table: Path, part: TableRun, name: str, scale: Scale) -> Array:
+    """One column in SI units.
+
+    Raises:
+        InputError: a value is too large for that.
+    """
     values = part.columns[name]
     if scale == SAME:
         return values
+    # reported below with its place, which a warning would not have
     with np.errstate(over="ignore"):
         result = values * scale.gain + scale.offset
     if np.isinf(result).any():
         raise InputError(
-            f"{table}: run {part.name!r}, column {name}: a value is too large to convert to SI units"
+            f"{table}: run {part.name!r}, column {name}: "
+            "a value is too large to convert to SI units"
         )
     return frozen(result)
 
@@ -159,29 +169,46 @@ def _split(path: Path, runs: Sequence[Run]) -> tuple[Run, ...]:
     if any(run.held_out for run in runs):
         if all(run.held_out for run in runs):
             raise InputError(
-                f"{path}: every run is marked held_out; expected at least one that is not, for fitting"
+                f"{path}: every run is marked held_out; "
+                "expected at least one that is not, for fitting"
             )
         return tuple(runs)
     if len(runs) == 1:
         return _halves(path, runs[0])
-    marked = [i % 3 == 2 or (len(runs) == 2 and i == 1) for i in range(len(runs))]
+    # the last of each three, so that early and late runs are fitted; of two the second
+    marked = [i % _THIRD == _THIRD - 1 or (len(runs) == 2 and i == 1) for i in range(len(runs))]
     return tuple(replace(run, held_out=mark) for run, mark in zip(runs, marked, strict=True))
 
 
 def _halves(path: Path, run: Run) -> tuple[Run, ...]:
-    cut = (2 * len(run.times)) // 3
+    """A run's beginning, and its last third held out."""
+    count = len(run.times)
+    cut = (2 * count) // _THIRD
     parts = _slice(run, slice(None, cut), False), _slice(run, slice(cut, None), True)
     for part in parts:
-        if len(part.times) < 2 or not any(np.isfinite(v).any() for v in part.channels.values()):
+        measured = any(np.isfinite(values).any() for values in part.channels.values())
+        if len(part.times) < 2 or not measured:
             raise InputError(
-                f"{path}: the only run is too short to hold its last third out: {len(run.times)} rows; expected at "
-                "least 4, with samples in both parts"
+                f"{path}: the only run is too short to hold its last third out: {count} rows; "
+                "expected at least 4, with samples in both parts"
             )
     return parts
 
 
 def _slice(run: Run, part: slice, held_out: bool) -> Run:
-    signals = run.channels, run.inputs, run.extra
-    channels, inputs, extra = ({k: v[part] for k, v in each.items()} for each in signals)
+    """A part of a run, as a run."""
+
+    def cut(signals: Mapping[str, Array]) -> dict[str, Array]:
+        return {name: values[part] for name, values in signals.items()}
+
+    # a known initial state is that of the run's beginning
     initial = run.initial if part.start is None else {}
-    return Run(run.name, run.times[part], channels, inputs, run.constants, initial, held_out, extra)
+    return replace(
+        run,
+        times=run.times[part],
+        channels=cut(run.channels),
+        inputs=cut(run.inputs),
+        initial=initial,
+        held_out=held_out,
+        extra=cut(run.extra),
+    )

@@ -20,7 +20,9 @@ from sims.recording.fast import WORTHWHILE, read_fast
 from sims.user_toml import shown
 
 _CHUNK = 1 << 13
+"""Rows that are turned into numbers at once; memory for text is what they cost."""
 _NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
+"""A number as instruments write it; what float() takes besides, `inf` or `1_000`, is a mistake."""
 
 
 class TableRun(NamedTuple):
@@ -53,6 +55,7 @@ def read_table(
 
 
 def _not_text(path: Path) -> InputError:
+    """What is wrong with a table that is no UTF-8."""
     data = path.read_bytes()
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return InputError(f"{path}: expected UTF-8 text, found UTF-16; save it as UTF-8")
@@ -78,10 +81,11 @@ class _Table:
     def read(self) -> list[TableRun]:
         records = self._records()
         header = self._header(next(records, []))
-        found = None
+        quick = None
         if self.path.stat().st_size >= WORTHWHILE:
-            found = read_fast(self.path, header, self.wanted[1:], self.gaps)
-        names, columns = found or self._cells(header, records)
+            quick = read_fast(self.path, header, self.wanted[1:], self.gaps)
+        # whatever the fast reader did not like is looked at cell by cell, and gets its message
+        names, columns = quick or self._cells(header, records)
         if not names:
             raise InputError(f"{self.path}: expected rows of data, found none")
         for name in self.channels:
@@ -96,21 +100,16 @@ class _Table:
         names: list[str] = []
         parts: list[list[Array]] = []
         while rows := list(islice(records, _CHUNK)):
-            cells = dict(
-                zip(
-                    header,
-                    zip(*self._even(rows, len(header), len(names)), strict=True),
-                    strict=True,
-                )
-            )
+            even = self._even(rows, len(header), len(names))
+            by_column = zip(*even, strict=True)
+            cells = dict(zip(header, by_column, strict=True))
             parts.append([self._numbers(name, cells[name], len(names)) for name in self.wanted[1:]])
             names += [name.strip() for name in cells["run"]]
-        columns = (
-            map(np.concatenate, zip(*parts, strict=True))
-            if parts
-            else [np.empty(0)] * len(self.wanted[1:])
-        )
-        return names, dict(zip(self.wanted[1:], columns, strict=True))
+        numeric = self.wanted[1:]
+        if not parts:
+            return names, {name: np.empty(0) for name in numeric}
+        columns = map(np.concatenate, zip(*parts, strict=True))
+        return names, dict(zip(numeric, columns, strict=True))
 
     def _records(self) -> Iterator[list[str]]:
         """Header and rows; blank lines are passed over."""
@@ -124,13 +123,16 @@ class _Table:
                 ) from None
 
     def _header(self, cells: list[str]) -> list[str]:
+        """The columns' names, checked against what was declared."""
         header = [cell.strip() for cell in cells]
+        # the likeliest reason for one column is another separator
         if len(header) < 2:
             text = "".join(header)
             marks = [name for mark, name in ((";", "semicolons"), ("\t", "tabs")) if mark in text]
             found = f"{marks[0]} (save it with commas)" if marks else shown(text)
             raise InputError(
-                f"{self.path}, row 1: expected columns {', '.join(self.wanted)} between commas, found {found}"
+                f"{self.path}, row 1: expected columns {', '.join(self.wanted)} between commas, "
+                f"found {found}"
             )
         for place, name in enumerate(header):
             if not name:
@@ -155,8 +157,8 @@ class _Table:
         if set(map(len, rows)) != {width}:
             record, row = next((i, row) for i, row in enumerate(rows) if len(row) != width)
             raise InputError(
-                f"{self.path}, row {self._line(first + record)}: expected {width} cells as in the header, "
-                f"found {len(row)}"
+                f"{self.path}, row {self._line(first + record)}: "
+                f"expected {width} cells as in the header, found {len(row)}"
             )
         return rows
 
@@ -168,9 +170,8 @@ class _Table:
             values = np.array([float(c) if _NUMBER.fullmatch(c) else math.nan for c in cells])
         suspects: Iterable[int] = np.flatnonzero(~np.isfinite(values)).tolist()
         joined = "".join(cells)
-        if (
-            "_" in joined or not joined.isascii()
-        ):  # float() takes 1_000 and the digits of other scripts
+        # float() takes 1_000 and the digits of other scripts
+        if "_" in joined or not joined.isascii():
             suspects = range(len(cells))
         for i in suspects:
             if cells[i].strip() or name not in self.gaps:
@@ -179,14 +180,12 @@ class _Table:
 
     def _check(self, name: str, cell: str, record: int) -> None:
         if not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
-            more = (
-                "; an input has no missing samples"
-                if name in self.inputs and not cell.strip()
-                else ""
-            )
+            missing = name in self.inputs and not cell.strip()
+            more = "; an input has no missing samples" if missing else ""
             self._fault(record, name, f"expected a finite number, found {shown(cell)}{more}")
 
     def _runs(self, names: list[str], columns: dict[str, Array]) -> list[TableRun]:
+        """The runs, each a stretch of rows of one name."""
         edges = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(names)) if a != b), len(names)]
         self._increasing(columns["t"], edges)
         runs: dict[str, TableRun] = {}
@@ -211,10 +210,11 @@ class _Table:
         return list(runs.values())
 
     def _increasing(self, t: Array, edges: list[int]) -> None:
+        """Check the times between edges."""
         bad = t[1:] <= t[:-1]
-        bad[np.array(edges[1:-1], dtype=int) - 1] = (
-            False  # a run may begin earlier than the one before ended
-        )
+        # a run may begin earlier than the one before ended
+        begins = np.array(edges[1:-1], dtype=int)
+        bad[begins - 1] = False
         if bad.any():
             i = int(np.argmax(bad))
             self._fault(i + 1, "t", f"expected more than {t[i]:.12g} s, found {t[i + 1]:.12g} s")
@@ -223,7 +223,7 @@ class _Table:
         raise InputError(f"{self.path}, row {self._line(record)}, column {column}: {message}")
 
     def _line(self, record: int) -> int:
-        """The line on which row `record` (from 0) ends: read again, since only a fault asks for it."""
+        """The line on which row `record` (from 0) ends: read again, as only a fault asks for it."""
         with self.path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True, skipinitialspace=True)
             next(islice((row for row in reader if row), record + 1, None))
@@ -232,4 +232,7 @@ class _Table:
 
 def _listed(names: Sequence[str], most: int = 12) -> str:
     """Names for a message, the first few of many."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+    text = ", ".join(names[:most])
+    if len(names) > most:
+        text += f" and {len(names) - most} more"
+    return text

@@ -13,6 +13,9 @@ from typing import Any, NamedTuple
 from sims.base import InputError
 
 _LONGEST = 60
+"""Characters of a unit."""
+_ROUNDING = 1e-9
+"""Share of the gain by which a conversion in proportion may miss being one."""
 # All that a unit needs, and nothing that could make the parser behind compute for long: names, 1,
 # small powers.
 _TOKEN = re.compile(
@@ -29,6 +32,7 @@ class Scale(NamedTuple):
 
 
 SAME = Scale(1.0, 0.0)
+"""Nothing to convert, so that values stay as they are, bit for bit."""
 
 
 @lru_cache(maxsize=256)
@@ -46,20 +50,24 @@ def scale(unit: str, target: str) -> Scale:
     registry = _registry()
     try:
         parsed = registry.parse_units(unit or "1")
-    except Exception:  # the parser raises whatever it trips over
+    except Exception:
+        # the parser raises whatever it trips over
         raise InputError(f"unknown unit {unit!r}; expected one that converts to {target}") from None
     try:
+        # three values tell gain and offset, and whether that is all there is to it
         zero, one, two = (
             float(registry.Quantity(v, parsed).to(target).magnitude) for v in (0.0, 1.0, 2.0)
         )
-    except Exception:  # dimensions differ, or the unit is logarithmic
+    except Exception:
+        # dimensions differ, or the unit is logarithmic
         hint = "; standard gravity is g_0" if unit == "g" else ""
         raise InputError(
             f"expected a unit that converts to {target}, found {unit!r}{hint}"
         ) from None
     gain = one - zero
-    if abs(two - one - gain) > 1e-9 * abs(gain):
+    if abs(two - one - gain) > _ROUNDING * abs(gain):
         raise InputError(f"expected a unit that converts to {target} in proportion, found {unit!r}")
+    # what differs from 1 by rounding is 1
     return SAME if zero == 0.0 and abs(gain - 1.0) < 1e-12 else Scale(gain, zero)
 
 
@@ -76,10 +84,13 @@ def _plain(unit: str) -> bool:
 
 @lru_cache(maxsize=1)
 def _registry() -> Any:
-    import pint  # takes a second, and most recordings are in SI
+    # here, since it takes a second, and most recordings are in SI
+    import pint
 
     registry: Any = pint.UnitRegistry(on_redefinition="ignore")
     registry.define("radian = [angle] = rad")
-    registry.define("newton_meter = newton * meter = Nm")  # it means the count of a yarn otherwise
-    registry._build_cache()  # forgets that an angle was a plain number
+    # it means the count of a yarn otherwise
+    registry.define("newton_meter = newton * meter = Nm")
+    # forgets that an angle was a plain number
+    registry._build_cache()
     return registry

@@ -67,7 +67,7 @@ def bouncing(times, top=4.4, restitution=0.55):
 
 @pytest.mark.parametrize("seed", [1, 4, 23])
 def test_a_ball_that_comes_to_rest_is_seen_to_the_end(seed, tmp_path):
-    """It lies beside its shadow for half of the film, and both get into the median of its frames."""
+    """It lies beside its shadow for half of the film; both get into the median of its frames."""
     times = np.arange(240) / 60
     camera, scene = stage(seed)
     points = upright(bouncing(times))

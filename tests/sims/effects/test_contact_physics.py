@@ -11,7 +11,7 @@ G, RADIUS = 9.81, 0.5
 
 
 def first_rebound(heights, fixed, e):
-    """Speed of the first impact and of leaving it, from the height dropped and the apex after it."""
+    """Speed of the first impact and of leaving it, from the drop height and the apex after it."""
     times = np.arange(0, 2.4, 0.002)
     ball = Ball(observe=["z"], engine="batch", fixed=fixed)
     scenarios = [Scenario(times, {"z": RADIUS + h}) for h in heights]

@@ -146,7 +146,7 @@ def test_load_friction_takes_a_share_of_the_drive():
 
 @pytest.mark.parametrize(("factor", "holds"), [(0.995, True), (1.005, False)])
 def test_load_friction_holds_in_the_band_of_equilibrium(factor, holds):
-    """|u - w| <= c (u + w): u may be w (1 + c) / (1 - c) at most and w (1 - c) / (1 + c) at least."""
+    """|u - w| <= c (u + w): u is w (1 + c) / (1 - c) at most and w (1 - c) / (1 + c) at least."""
     times, c, w = np.arange(0, 1, 0.01), 0.2, WEIGHT * np.sin(0.5)
     for u in (w * (1 + c) / (1 - c) * factor, w * (1 - c) / (1 + c) / factor):
         q, _ = swing(times, {"friction.load": c}, u=u, q=0.5)

@@ -1,4 +1,4 @@
-"""Array functions of input and sensor effects against numbers worked out by hand and closed forms."""
+"""Array functions of input and sensor effects against numbers by hand and closed forms."""
 
 import numpy as np
 import pytest

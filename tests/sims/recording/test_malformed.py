@@ -44,13 +44,17 @@ TOML = {
     "runs": {"2": {"held_out": True, "mass": 2.0, "initial": {"q": 0.5}}},
 }
 JUNK = [
-    "", " ", "abc", "nan", "NaN", "inf", "-Infinity", "1e999", "1,5", '"', '"1', '1"', "1_000", "٣", "\x00", "0x10",
-    "1e", "--1", "true", "None", "1 2", "9" * 400, "x" * 200_000, "#", "=1+1", "\u2028", "é", "\ufeff1", "a\nb", "1\n",
+    "", " ", "abc", "nan", "NaN", "inf", "-Infinity", "1e999", "1,5", '"', '"1', '1"', "1_000",
+    "٣", "\x00", "0x10",
+    "1e", "--1", "true", "None", "1 2", "9" * 400, "x" * 200_000, "#", "=1+1", "\u2028", "é",
+    "\ufeff1", "a\nb", "1\n",
     "\x1b[31m",
 ]  # fmt: skip
 UNITS = [
-    "", "deg", "radians", "m", "kg*m", "rad/s", "°", "turn", "furlong", "wibble", "9**9**9", "m**-1000", "((((", "m)(",
-    "1/0", "rad rad", "deg/s", "Hz", "rpm", "degC", "dB", "N·m", "Nm", "mN*m", "%", "1", "import os", "\n", "q" * 300,
+    "", "deg", "radians", "m", "kg*m", "rad/s", "°", "turn", "furlong", "wibble", "9**9**9",
+    "m**-1000", "((((", "m)(",
+    "1/0", "rad rad", "deg/s", "Hz", "rpm", "degC", "dB", "N·m", "Nm", "mN*m", "%", "1",
+    "import os", "\n", "q" * 300,
     "π", "rad^",
 ]  # fmt: skip
 
@@ -71,7 +75,8 @@ def table(header, rows, mark=",", end="\n"):
 
 cells = st.one_of(st.sampled_from(JUNK), st.text(max_size=6), st.floats().map(repr))
 leaves = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8), st.sampled_from(UNITS + JUNK[:-12]),
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8),
+    st.sampled_from(UNITS + JUNK[:-12]),
     st.just(10**400), st.just(datetime.date(2020, 2, 29)),
 )  # fmt: skip
 values = st.recursive(
