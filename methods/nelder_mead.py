@@ -37,7 +37,7 @@ class NelderMead(Tuner):
     initial_step: float | None = None
     step_tolerance: float = 0.0
 
-    def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002 - the simplex is deterministic
+    def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
         """Hand nlopt's questions over one by one."""
         return from_callback(lambda loss: self._minimise(task, loss))
 

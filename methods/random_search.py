@@ -18,7 +18,7 @@ class RandomSearch(Tuner):
     """The start, then points drawn uniformly from the cube; recommends the lowest loss seen."""
 
     name = "random"
-    known_failures = {"check_beats_random_search": "it is random search"}  # noqa: RUF012 - as in any class
+    known_failures = {"check_beats_random_search": "it is random search"}  # noqa: RUF012
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
         """One point at a time, for ever."""

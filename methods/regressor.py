@@ -90,7 +90,7 @@ class Regressor(PairTuner):
         # enough for a linear fit of the parameters in each scenario, and as many to judge it by
         return self.scenarios, max(self.each, 2 * (dim + 1))
 
-    def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002 (the contract's signature)
+    def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
         """One estimate from the target, simulated once."""
         network = self.fitted().suited(task)
         target = network.read(task.observed[None], task.lengths, task.scene)[0]

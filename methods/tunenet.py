@@ -100,7 +100,7 @@ class TuneNet(PairTuner):
         """Training scenarios at most, and simulations in each."""
         return self.scenarios, max(self.each, 2 * (dim + 1))
 
-    def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002 (the contract's signature)
+    def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
         """Algorithm 1, one simulation an iteration."""
         estimate = self.fitted().estimator(task)
         search = Search(task)
@@ -148,7 +148,7 @@ class TuneNetPublished(PairTuner):
         """Training scenarios at most, and simulations in each."""
         return 800, 2
 
-    def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002 (the contract's signature)
+    def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
         """Algorithm 1; guesses are kept from falling below zero, and from nothing else."""
         estimate = self.fitted().estimator(task)
         guess = task.start

@@ -66,8 +66,10 @@ class GaussianProcess:
         dim = points.shape[1]
         length, length_width = settings.length
         noise, noise_width = settings.noise
-        self._centre = np.log(np.append(np.full(dim, length), noise))
-        self._width = np.append(np.full(dim, length_width), noise_width)
+        lengths = np.full(dim, length)
+        widths = np.full(dim, length_width)
+        self._centre = np.log(np.append(lengths, noise))
+        self._width = np.append(widths, noise_width)
         self.hyper = self._centre if hyper is None else hyper
         # two points, or values all alike, say nothing of a length
         if fit and len(points) > 2 and np.ptp(values) > 0.0:
@@ -80,14 +82,16 @@ class GaussianProcess:
         """Correlation of pairs with squared differences (n, m, dim), and its derivative by their
         scaled sum.
         """
-        lengths = (self.hyper if hyper is None else hyper)[:-1]
+        chosen = self.hyper if hyper is None else hyper
+        lengths = chosen[:-1]
         scaled = squares @ np.exp(-2.0 * lengths)
         if self.settings.kernel == "rbf":
             k = np.exp(-0.5 * scaled)  # (4.9)
             return k, -0.5 * k
         root = np.sqrt(5.0 * scaled)
         decay = np.exp(-root)
-        k = (1.0 + root + root**2 / 3.0) * decay  # (4.17)
+        polynomial = 1.0 + root + root**2 / 3.0
+        k = polynomial * decay  # (4.17)
         # by the scaled sum and not by the distance, whose derivative at zero would divide by it
         return k, -5.0 / 6.0 * (1.0 + root) * decay
 
@@ -123,9 +127,11 @@ class GaussianProcess:
         lower = _cholesky(k, float(np.exp(hyper[-1])))
         _, variance, alpha = _profile(lower, self.values)
         # (2.30) with the best variance: its quadratic term is then n / 2, a constant
-        value = 0.5 * n * np.log(variance) + np.log(np.diag(lower)).sum()
+        half_determinant = np.log(np.diag(lower)).sum()
+        value = 0.5 * n * np.log(variance) + half_determinant
         inverse = cho_solve((lower, True), np.eye(n))
-        weight = 0.5 * (inverse - np.outer(alpha, alpha) / variance)  # (5.9)
+        outer = np.outer(alpha, alpha)
+        weight = 0.5 * (inverse - outer / variance)  # (5.9)
         by_squares = np.einsum("ij,ijd->d", weight * slope, self._squares)
         # the chain rule: squares are divided by squared lengths, whose logarithms are the variables
         by_length = by_squares * -2.0 * np.exp(-2.0 * hyper[:-1])
@@ -134,8 +140,9 @@ class GaussianProcess:
 
     def predict(self, points: Array) -> Array:
         """Posterior mean (2.25) at (m, dim)."""
-        k, _ = self._correlation((points[:, None] - self.points) ** 2)
-        mean: Array = self.mean + k @ self._alpha
+        squares = (points[:, None] - self.points) ** 2
+        k, _ = self._correlation(squares)
+        mean: Array = self.mean + k @ self._alpha  # (2.25)
         return mean
 
     def sample(self, points: Array, draws: int, rng: np.random.Generator) -> Array:
@@ -144,8 +151,10 @@ class GaussianProcess:
         """
         from scipy.linalg import solve_triangular
 
-        cross, _ = self._correlation((points[:, None] - self.points) ** 2)
-        prior, _ = self._correlation((points[:, None] - points) ** 2)
+        to_known = (points[:, None] - self.points) ** 2
+        among = (points[:, None] - points) ** 2
+        cross, _ = self._correlation(to_known)
+        prior, _ = self._correlation(among)
         explained = solve_triangular(self._lower, cross.T, lower=True)
         spread = _cholesky(prior - explained.T @ explained, 1e-10)  # (2.26)
         noise = rng.standard_normal((draws, len(points)))
@@ -171,7 +180,8 @@ def _profile(lower: Array, values: Array) -> tuple[float, float, Array]:
 
     weights = cho_solve((lower, True), np.ones(len(values)))
     mean = float(weights @ values / weights.sum())
-    alpha = cho_solve((lower, True), values - mean)
-    variance = float((values - mean) @ alpha) / len(values)
+    rest = values - mean
+    alpha = cho_solve((lower, True), rest)
+    variance = float(rest @ alpha) / len(values)
     # values all alike have none, and its logarithm is taken
     return mean, max(variance, 1e-20), alpha

@@ -72,7 +72,8 @@ def survey(frames: Iterable[tuple[float, Image]]) -> Survey:
             raise InputError(f"frame {number}: expected {expected}, found another size")
         height, width = picture.shape[:2]
         size = width, height
-        skip = max(1, int((height * width / _PIXELS) ** 0.5))
+        share = height * width / _PIXELS
+        skip = max(1, int(share**0.5))
         coarse = picture[::skip, ::skip].astype(np.int16)
         earlier = coarse if before is None else before
         change = np.abs(coarse - earlier).max(axis=2)
@@ -82,7 +83,8 @@ def survey(frames: Iterable[tuple[float, Image]]) -> Survey:
             change[:] = 0
         times.append(time)
         # small changes are noise; they would make a resting picture look busy
-        beyond = change - 2 * np.median(change) - _GRAIN
+        usual = np.median(change)
+        beyond = change - 2 * usual - _GRAIN
         moved.append(float(np.maximum(beyond, 0).mean()))
         before = coarse
     return Survey(np.array(times), np.array(moved), tuple(cuts), size)
@@ -172,6 +174,7 @@ def noise(pictures: list[Image], background: Image) -> float:
 def _difference(picture: Image, background: Image) -> NDArray[np.int16]:
     """The largest difference (height, width) over the colours."""
     # whole numbers without sign would wrap round
-    apart = np.abs(picture.astype(np.int16) - background)
+    signed = picture.astype(np.int16)
+    apart = np.abs(signed - background)
     result: NDArray[np.int16] = apart.max(axis=2)
     return result

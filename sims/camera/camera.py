@@ -183,7 +183,8 @@ class Camera:
             far_end = np.tan(tilt + half)
             away = (near_end + far_end) / 2  # (5)
             lean = away * np.sin(tilt) + np.cos(tilt)
-            across = (lean / np.cos(half)) ** 2 - away**2 - 1  # (6), b^2
+            ratio = lean / np.cos(half)
+            across = ratio**2 - away**2 - 1  # (6), b^2
             # in the middle of the picture any direction will do
             divisor = np.where(aside > 0, aside, 1.0)
             direction = sideways / divisor[..., None]
@@ -221,7 +222,9 @@ class Camera:
             ratio = (pixels - shift - self.middle) / self.focal
             constant = base[:2] - ratio * base[2]
             slope = up[:2] - ratio * up[2]
-            z = -(constant * slope).sum(axis=-1) / (slope * slope).sum(axis=-1)  # (7)
+            along = (constant * slope).sum(axis=-1)
+            square = (slope * slope).sum(axis=-1)
+            z = -along / square  # (7)
             everywhere = np.ones_like(z)
             points = np.stack([x * everywhere, y * everywhere, z], axis=-1)
             centre, _ = self.outline(points, radius)

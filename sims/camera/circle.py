@@ -146,7 +146,8 @@ def through_an_arc(points: Array) -> Circle | None:
     if (np.abs(np.linalg.det(normal)) < _SINGULAR).any():
         return None
     squares = (arcs**2).sum(axis=2)[..., None]
-    doubled_u, doubled_v, rest = np.linalg.solve(normal, turned @ squares)[..., 0].T  # (4)
+    solution = np.linalg.solve(normal, turned @ squares)  # (4)
+    doubled_u, doubled_v, rest = solution[..., 0].T
     u = doubled_u / 2
     v = doubled_v / 2
     radius = np.sqrt(np.maximum(rest + u**2 + v**2, 0.0))

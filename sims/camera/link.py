@@ -118,7 +118,8 @@ class Path:
     @property
     def travel(self) -> float:
         """How far it gets, corner to corner of what it visits, in pixels."""
-        return float(np.linalg.norm(np.ptp(self.places, axis=0)))
+        spans = np.ptp(self.places, axis=0)
+        return float(np.linalg.norm(spans))
 
     @property
     def weight(self) -> float:

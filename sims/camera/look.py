@@ -68,9 +68,10 @@ class Look:
         while np.max(np.abs(np.subtract(ball, ground))) < _CONTRAST:
             ball = _colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
         sky = _colour(rng, saturation=(0.0, 0.3), value=(0.7, 1.0))
-        bearing = rng.uniform(0, 2 * np.pi, _WAVES)
+        turn = 2 * np.pi
+        bearing = rng.uniform(0, turn, _WAVES)
         length = rng.uniform(0.5, 6.0, _WAVES)
-        phase = rng.uniform(0, 2 * np.pi, _WAVES)
+        phase = rng.uniform(0, turn, _WAVES)
         amplitude = rng.uniform(0.0, 0.04, _WAVES)
         across = length * np.cos(bearing)
         along = length * np.sin(bearing)

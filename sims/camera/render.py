@@ -216,11 +216,16 @@ class Stage:
         # the renderer counts pixels from their corner: half a fine pixel, measured on spheres
         shift = 0.5 / fine
         u, v = camera.middle - (shift, -shift)
+        # edges of the window, half a pixel from the centres of its outermost ones
+        left_edge = left - 0.5 - u
+        right_edge = right - 0.5 - u
+        lower_edge = bottom - 0.5 - v
+        upper_edge = top - 0.5 - v
         projection = p.computeProjectionMatrix(
-            at * (left - 0.5 - u),
-            at * (right - 0.5 - u),
-            -at * (bottom - 0.5 - v),
-            -at * (top - 0.5 - v),
+            at * left_edge,
+            at * right_edge,
+            -at * lower_edge,
+            -at * upper_edge,
             _NEAR,
             _FAR,
         )

@@ -103,6 +103,7 @@ class Spot(NamedTuple):
             area = a * c - b * b
             if area < _SINGULAR:
                 return self
+            # Cramer's rule
             du = (c * p - b * q) / area
             dv = (a * q - b * p) / area
             u += du
@@ -229,7 +230,8 @@ class Finder:
         there = picture[rows, columns].astype(np.float32)
         plain = self._plain[rows, columns]
         # least squares over the three colours
-        factor = (there * plain).sum(axis=1) / self._square[rows, columns]
+        product = (there * plain).sum(axis=1)
+        factor = product / self._square[rows, columns]
         apart = np.abs(there - factor[:, None] * plain).max(axis=1)
         rest = apart / np.maximum(factor, 1)
         # shadow gone is judged as shadow is, by the inverse
@@ -391,10 +393,11 @@ class Finder:
         area = total / max(peak, 1.0)
         if area < _LEAST_AREA / 2:
             return None
-        u = float((weights * columns).sum() / total)
-        v = float((weights * rows).sum() / total)
+        u = u0 + float((weights * columns).sum() / total)
+        v = v0 + float((weights * rows).sum() / total)
+        equal = float(np.sqrt(area / np.pi))
         # no rays, so no share of them: as good as the worst circle
-        return Spot(u + u0, v + v0, float(np.sqrt(area / np.pi)), _AGREE, 0.2)
+        return Spot(u, v, equal, _AGREE, 0.2)
 
 
 def _medians(picture: Image, inside: Mask, around: Mask) -> tuple[Array, Array]:
