@@ -143,7 +143,7 @@ class Together:
         return runtimes.joint_runtime_figure(experiment, style, self._shares())
 
     def _shares(self) -> dict[str, Array]:
-        """By tuner: the share reached after 0..100 hundredths of the budget, the mean of problems."""
+        """By tuner: the share reached after 0..100 hundredths of the budget, mean of problems."""
         each = [
             problem
             for part in self.parts

@@ -60,6 +60,7 @@ class Price:
         """Seconds a target at `cost` seconds a simulation, where the training is shared by so many
         targets.
         """
+        # Of its training, what the simulations took here is replaced by what they cost there.
         learning = max(self.fit_seconds - self.fit_simulations * self.simulation_seconds, 0.0)
         marginal = self.effort.ert() * cost + self.effort.tuner_seconds()
         result: Array = marginal + (self.fit_simulations * cost + learning) / targets
@@ -98,10 +99,10 @@ def break_even(learned: Price, search: Price, picked: NDArray[np.int64] | None =
 
     0 where the search never reaches the threshold, infinite where training never pays.
     """
+    # Solved for n: fit / (ert_search - ert_learned).
     hopeless = np.isinf(learned.effort.ert(picked))
-    with np.errstate(
-        invalid="ignore", divide="ignore"
-    ):  # neither gets there, or they need the same
+    # Where neither gets there, or they need the same, there is no number.
+    with np.errstate(invalid="ignore", divide="ignore"):
         saved = search.effort.ert(picked) - learned.effort.ert(picked)
         result: Array = np.where(hopeless | ~(saved > 0), np.inf, learned.fit_simulations / saved)
     return result
@@ -116,6 +117,7 @@ def break_even_table(
     lines = []
     for name, learned in held.items():
         for other, search in held.items():
+            # Only one that was trained can have paid for it, and only against one that was not.
             if not learned.fit_simulations or search.fit_simulations:
                 continue
             picked = resampled(len(learned.effort.successes), experiment, kind)
@@ -135,7 +137,9 @@ def winners(held: Mapping[str, Price], targets: float) -> list[tuple[float, floa
     if not names:
         return []
     best = np.argmin([held[name].seconds(COSTS, targets) for name in names], axis=0)
-    edges = [0, *(np.flatnonzero(np.diff(best)) + 1).tolist(), len(COSTS)]
+    changes = np.flatnonzero(np.diff(best)) + 1
+    edges = [0, *changes.tolist(), len(COSTS)]
     return [
-        (float(COSTS[a]), float(COSTS[b - 1]), names[best[a]]) for a, b in itertools.pairwise(edges)
+        (float(COSTS[begin]), float(COSTS[end - 1]), names[best[begin]])
+        for begin, end in itertools.pairwise(edges)
     ]

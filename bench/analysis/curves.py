@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sims.base import Array
 
 FAILED = ("crashed", "timeout", "diverged")
+"""Statuses of runs that delivered nothing one could trust."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,7 @@ class Curves:
 
 
 KEYS = ["run", "experiment", "tuner", "range", "target", "seed"]
+"""Columns that are the same in every row of a run."""
 
 
 class Rows:
@@ -81,8 +83,10 @@ class Rows:
 
     def __init__(self, runs: pd.DataFrame, statuses: pd.DataFrame, budget: int) -> None:
         self._runs, self._budget = runs, budget
+        # Every metric fills a matrix by the same places: they are worked out once.
         codes, names = pd.factorize(runs["run"])
         self._codes, self._k = codes, runs["k"].to_numpy(dtype=np.int64)
+        # Written from behind, so that what stays is the place of each run's first row.
         first = np.zeros(len(names), dtype=np.int64)
         first[codes[::-1]] = np.arange(len(codes))[::-1]
         self.keys = runs[[k for k in KEYS if k in runs]].iloc[first].reset_index(drop=True)
@@ -102,6 +106,7 @@ class Rows:
     def curves(self, metric: str) -> Curves:
         """A metric after k simulations; a run that ended early keeps its last value."""
         values = self.matrix(metric)
+        # Behind its end a run stands by its last recommendation.
         last = np.minimum(self.used, self._budget)[:, None]
         columns = np.minimum(np.arange(self._budget + 1)[None], last)
         return Curves(
@@ -118,7 +123,8 @@ def mean_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Array
     NaN.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # nothing but NaN has no mean: NaN
+        # Nothing but NaN has no mean: NaN.
+        warnings.simplefilter("ignore", RuntimeWarning)
         return np.array([np.nanmean(values[rows], axis=0) for rows in groups])
 
 
@@ -139,11 +145,8 @@ def primary(runs: pd.DataFrame) -> Decisive:
     Where some target's data leave a direction sloppy, it is the error along stiff directions:
     nobody could know the others. A target without a stiff direction then decides nothing.
     """
-    if (
-        "sloppy_error" in runs
-        and runs["sloppy_error"].notna().any()
-        and runs["stiff_error"].notna().any()
-    ):
+    sloppy = "sloppy_error" in runs and runs["sloppy_error"].notna().any()
+    if sloppy and runs["stiff_error"].notna().any():
         return Decisive("stiff_error", runs[runs["stiff_error"].notna()], in_widths=True)
     candidates: tuple[Any, ...] = ("param_error", "heldout_error", "obs_error")
     metric = next(str(m) for m in candidates if m in runs and runs[m].notna().any())

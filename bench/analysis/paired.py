@@ -40,15 +40,15 @@ PROBLEMS = 5
 
 
 def log_errors(curves: Curves) -> pd.DataFrame:
-    """Logarithms of final errors, one row a target, one column a tuner; the mean over seeds first."""
+    """Logarithms of final errors, a row a target, a column a tuner; the mean over seeds first."""
     columns = {}
     for tuner in curves.tuners():
         mine = curves.of(tuner=tuner)
         names, groups = mine.by_target()
         errors = mean_over_seeds(mine.final(), groups)
-        columns[tuner] = pd.Series(
-            np.where(np.isinf(errors), _WORST, np.log(np.maximum(errors, LEAST))), index=names
-        )
+        logs = np.log(np.maximum(errors, LEAST))
+        # A failure in one seed makes the target's mean infinite: it counts as failed.
+        columns[tuner] = pd.Series(np.where(np.isinf(errors), _WORST, logs), index=names)
     return pd.DataFrame(columns)
 
 
@@ -69,6 +69,7 @@ def pairs(curves: Curves) -> pd.DataFrame:
             (experiment, kind, a, b, *_compared(logs[a].to_numpy(), logs[b].to_numpy()))
             for a, b in itertools.combinations(logs.columns, 2)
         ]
+        # A single tuner makes no pair.
         if lines:
             part = pd.DataFrame(lines, columns=PAIR_COLUMNS[:-1])
             part["p_holm"] = multipletests(part["p_value"].to_numpy(), method="holm")[1]
@@ -79,26 +80,25 @@ def pairs(curves: Curves) -> pd.DataFrame:
 def _compared(a: Array, b: Array) -> tuple[int, float, float, float, float]:
     from scipy.stats import rankdata, wilcoxon
 
+    """Targets, share on which a is better, effect, ratio of errors and p-value."""
     there = ~(np.isnan(a) | np.isnan(b))
     difference = a[there] - b[there]
-    better = (
-        float(((difference < 0) + 0.5 * (difference == 0)).mean()) if len(difference) else np.nan
-    )
+    wins = (difference < 0) + 0.5 * (difference == 0)
+    better = float(wins.mean()) if len(difference) else np.nan
+    # Wilcoxon drops ties: they speak for neither.
     unequal = difference[difference != 0]
     if not len(unequal):
         return len(difference), better, 0.0, 1.0, 1.0
     ranks = rankdata(np.abs(unequal))
+    # Kerby's simple difference: the share of ranks in favour less the share against.
     effect = float((ranks[unequal < 0].sum() - ranks[unequal > 0].sum()) / ranks.sum())
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # few pairs or ties: it says that it approximates
+        # Of few pairs or ties it says that it approximates.
+        warnings.simplefilter("ignore")
         p = float(wilcoxon(unequal).pvalue)
-    return (
-        len(difference),
-        better,
-        effect,
-        float(np.exp(np.clip(np.median(difference), -700, 700))),
-        p,
-    )
+    # A failure against none makes a ratio beyond what a number holds.
+    ratio = float(np.exp(np.clip(np.median(difference), -700, 700)))
+    return len(difference), better, effect, ratio, p
 
 
 def ranks(curves: Curves) -> pd.DataFrame:
@@ -112,6 +112,7 @@ def ranks(curves: Curves) -> pd.DataFrame:
         logs = log_errors(curves.of(experiment=str(experiment), range=str(kind)))
         rows[f"{experiment} {kind}"] = logs.median(axis=0)
     medians = pd.DataFrame(rows).T.dropna(axis="columns")
+    # Rounded, so that errors that differ by the last bit share a rank.
     return medians.round(9).rank(axis=1)
 
 

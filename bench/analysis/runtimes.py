@@ -36,7 +36,9 @@ def thresholds(curves: Curves, simulated: bool) -> tuple[Array, tuple[float, ...
     if simulated:
         return THRESHOLDS, LEVELS
     start = float(np.nanmedian(curves.values[:, 0]))
+    # At least half the way: where nobody improved, thresholds must differ all the same.
     best = min(float(np.nanmin(curves.final())), 0.5 * start)
+    # A little above the best, so that rounding does not keep the best from reaching it.
     spread = np.geomspace(start, 1.001 * best, 21)
     return spread, tuple(float(x) for x in spread[[5, 10, 15, 18, 20]])
 
@@ -45,9 +47,11 @@ def reached(curves: Curves, threshold: float) -> Array:
     """(R,) simulations after which the error stays at or below `threshold`; infinite where it never
     does.
     """
-    beyond = ~(curves.values <= threshold)  # a NaN is beyond
+    # Negated, so that a NaN is beyond.
+    beyond = ~(curves.values <= threshold)
     steps = beyond.shape[1]
-    last = steps - np.argmax(beyond[:, ::-1], axis=1)  # one behind the last that is beyond
+    # One behind the last that is beyond: from there on the error stays.
+    last = steps - np.argmax(beyond[:, ::-1], axis=1)
     last = np.where(beyond.any(axis=1), last, 0)
     return np.where((last >= steps) | curves.failed, np.inf, last.astype(np.float64))
 
@@ -106,6 +110,7 @@ def effort(
     spent = np.where(success, times, unsuccessful)
     seconds = np.zeros(len(spent))
     if tuner_seconds is not None:
+        # A run that went beyond the budget of interest counts with its seconds there.
         column = np.minimum(spent, tuner_seconds.shape[1] - 1).astype(np.int64)
         seconds = tuner_seconds[np.arange(len(spent)), column]
     _, groups = curves.by_target()
@@ -126,6 +131,7 @@ def resampled(targets: int, *names: str, resamples: int = 1000) -> NDArray[np.in
 
 def percentile_interval(values: Array) -> tuple[float, float]:
     """95 % percentile interval of resampled values, which may be infinite."""
+    # Order statistics, no interpolation: between a number and infinity lies nothing.
     ordered = np.sort(values)
     n = len(ordered)
     return float(ordered[int(0.025 * (n - 1))]), float(ordered[int(np.ceil(0.975 * (n - 1)))])
@@ -154,9 +160,9 @@ def ert_table(curves: Curves, levels: tuple[float, ...], budget: int) -> pd.Data
             mine = part.of(tuner=tuner)
             for level in levels:
                 spent = effort(mine, level, budget)
-                low, high = percentile_interval(
-                    spent.ert(resampled(len(spent.successes), str(experiment), str(kind)))
-                )
+                # The same draws for every tuner: what they share does not blur a comparison.
+                picked = resampled(len(spent.successes), str(experiment), str(kind))
+                low, high = percentile_interval(spent.ert(picked))
                 counts = int(spent.successes.sum()), spent.runs, int(mine.failed.sum())
                 lines.append(
                     (experiment, kind, tuner, level, float(spent.ert()), low, high, *counts)
@@ -165,6 +171,6 @@ def ert_table(curves: Curves, levels: tuple[float, ...], budget: int) -> pd.Data
 
 
 def solved(curves: Curves, spread: Array, points: NDArray[np.int64]) -> Array:
-    """(P,) share of pairs of run and threshold that are reached after each of `points` simulations."""
+    """(P,) share of pairs of run and threshold reached after each of `points` simulations."""
     times = np.concatenate([reached(curves, float(t)) for t in spread])
     return np.array([(times <= k).mean() for k in points])

@@ -14,7 +14,7 @@ from bench.analysis.runtimes import thresholds
 from bench.problem.experiment import Experiment
 
 PRICED = 3
-"""Levels, the loosest first, of which prices are worked out: on tighter ones hardly a tuner gets."""
+"""Levels, the loosest first, that have prices: tighter ones hardly a tuner reaches."""
 
 
 class Statistics:

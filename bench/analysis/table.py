@@ -21,6 +21,7 @@ from bench.problem.seeds import rng_for
 from sims.base import Array
 
 CHECKPOINTS = (0, 1, 2, 3, 5, 10, 20, 50, 100)
+"""Numbers of simulations that tables and axes name."""
 METRICS = (
     "param_abs_error",
     "param_error",
@@ -29,6 +30,7 @@ METRICS = (
     "obs_error",
     "heldout_error",
 )
+# Also those that were never run: the table shows what is missing.
 FAILURES = ("crashed", "timeout", "diverged", "skipped")
 COLUMNS = [
     "experiment",
@@ -72,10 +74,8 @@ def table(
     """
     points = checkpoints(budget)
     rows = Rows(runs, statuses, budget)
-    spent = [
-        rows.spent(name) if name in runs else None
-        for name in ("tuner_seconds", "simulator_seconds")
-    ]
+    timed = ("tuner_seconds", "simulator_seconds")
+    spent = [rows.spent(name) if name in runs else None for name in timed]
     curves = {m: rows.curves(m) for m in METRICS if m in runs and runs[m].notna().any()}
     lines = []
     for (experiment, tuner, kind), part in rows.keys.groupby(
@@ -90,26 +90,15 @@ def table(
         counts = len(mine), int(rows.failed[mine].sum())
         for metric, curve in curves.items():
             values = _over_targets(curve, mine, points, (str(tuner), str(kind), metric), resamples)
-            lines += [
-                (
-                    experiment,
-                    tuner,
-                    kind,
-                    k,
-                    metric,
-                    *values[:, i],
-                    *counts,
-                    *fit,
-                    seconds[0][i],
-                    seconds[1][i],
-                )
-                for i, k in enumerate(points)
-            ]
+            for i, k in enumerate(points):
+                errors, times = values[:, i], (seconds[0][i], seconds[1][i])
+                key = (experiment, tuner, kind, k, metric)
+                lines.append((*key, *errors, *counts, *fit, *times))
+    # Who could not be used has a line too: nothing is left out in silence.
     skipped = statuses[statuses["status"] == "skipped"]
+    name = runs["experiment"].iloc[0] if len(runs) else ""
     nothing = (0, "", *[np.nan] * 4, 0, 1, 0.0, 0.0, np.nan, np.nan)
-    lines += [
-        (runs["experiment"].iloc[0] if len(runs) else "", t, "", *nothing) for t in skipped["tuner"]
-    ]
+    lines += [(name, tuner, "", *nothing) for tuner in skipped["tuner"]]
     return pd.DataFrame(lines, columns=COLUMNS)
 
 
@@ -125,9 +114,8 @@ def _over_targets(
     values = mean_over_seeds(curves.values[mine][:, points], groups)
     low, high = interval(values, np.mean, *names, resamples=resamples)
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", RuntimeWarning
-        )  # a column of failures alone has no mean: NaN, shown
+        # A column of failures alone has no mean: NaN, which is shown.
+        warnings.simplefilter("ignore", RuntimeWarning)
         return np.array([np.nanmedian(values, axis=0), np.nanmean(values, axis=0), low, high])
 
 
@@ -160,9 +148,8 @@ def interval(
 
     rng = rng_for("bootstrap", *names)
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", RuntimeWarning
-        )  # a constant column: the interval is that constant
+        # Of a constant column the interval is that constant.
+        warnings.simplefilter("ignore", RuntimeWarning)
         found = bootstrap(
             (values,),
             statistic,

@@ -45,6 +45,7 @@ def error_figure(
         parameter: the parameter with its unit where there is one; empty for several.
     """
     real = "real" in experiment.ranges
+    # Of a recording nobody knows the truth: what counts is its error on what was not fitted.
     if real:
         metrics = [m for m in ("heldout_error", "obs_error") if runs[m].notna().any()]
         panels = [(runs, m, TITLES[m], f"RMSE of {channel}") for m in metrics]
@@ -104,6 +105,7 @@ def samples_panel(axis: Axes, runs: pd.DataFrame, metric: str, budget: int, styl
             continue
         low, high = interval(curves, np.median, "figure", str(tuner), metric, resamples=_RESAMPLES)
         look = style.of(str(tuner))
+        # Marks only where tables have numbers; the line goes through all points.
         axis.plot(points, np.median(curves, axis=0), markevery=marks, markersize=4.5, **look)
         axis.fill_between(points, low, high, color=look["color"], alpha=0.13, linewidth=0)
     axis.set_yscale("log")
@@ -149,6 +151,7 @@ def distance_figure(experiment: Experiment, runs: pd.DataFrame, parameter: str) 
 
 def _binned(distances: pd.Series[float]) -> tuple[pd.Series[Any], list[str]]:
     """The bin of each target, -1 within the training range, and the names of all bins."""
+    # Bins of one width; targets on the edge of the training range are within it.
     edges = np.linspace(0.0, float(distances.max()), _BINS + 1)
     outside = np.searchsorted(edges[1:-1], distances, side="left")
     bins = pd.Series(np.where(distances > 0, outside, -1), index=distances.index)
@@ -170,7 +173,7 @@ def _distance_line(
         median = float(np.median(part))
         places.append(b + 1 + style.offset(tuner))
         middle.append(median)
-        # One target has no interval.
+        # One target has no interval: its bar has no length.
         bars.append((median - low[0], high[0] - median) if len(part) > 1 else (0.0, 0.0))
     # A percentile interval may lie to one side of the median by rounding; a bar has no such side.
     lengths = np.maximum(np.array(bars).T, 0.0)

@@ -79,6 +79,7 @@ def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
         across = part["direction"] + within + (place - 0.5 * (len(ranges) - 1)) * 0.4
         axis.plot(
             across,
+            # A direction that the data do not touch has an infinite sigma: it is drawn at the edge.
             part["sigma"].clip(_FLOOR, _CEILING),
             marker,
             color=colour,
@@ -109,7 +110,7 @@ def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
 
 def _directions(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
     """Shares of the parameters in each direction, as a grid of numbers."""
-    # A direction has length 1, so that its squared components are shares; their signs are arbitrary.
+    # A direction has length 1: its squared components are shares, whatever their signs.
     squares = table.set_index("direction")[names] ** 2
     shares = squares.groupby(level=0).mean().to_numpy().T
     axis.imshow(shares, cmap="Greys", vmin=0.0, vmax=1.0, aspect="auto")

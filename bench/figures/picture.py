@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 class Picture(Figure):
     """A figure that pyplot does not know of, and that a notebook's cell shows all the same.
 
-    A notebook shows figures as pictures only after pyplot has told it how; one that was made without
-    pyplot would be shown as a line of text.
+    A notebook shows figures as pictures only after pyplot has told it how; one that was made
+    without pyplot would be shown as a line of text.
     """
 
     def _repr_png_(self) -> bytes:

@@ -96,6 +96,7 @@ def _placed(runs: Sequence[Run]) -> list[_Placed]:
     if len(runs) > _MOST_RUNS:
         chosen = np.linspace(0, len(runs) - 1, _MOST_RUNS).round().astype(int)
         runs = [runs[i] for i in chosen]
+    # The more runs, the less room between them.
     lengths = [float(run.times[-1] - run.times[0]) for run in runs]
     apart = _APART * sum(lengths) / max(1.0, len(runs) ** 0.5)
     begins = np.concatenate([[0.0], np.cumsum(np.array(lengths) + apart)[:-1]])

@@ -52,6 +52,7 @@ def runtime_figure(experiment: Experiment, style: Styles, curves: Curves, spread
     for axis, kind in zip(axes, ranges, strict=True):
         part = curves.of(range=str(kind))
         for tuner in part.tuners():
+            # Steps, not slopes: between two simulations nothing is reached.
             share = solved(part.of(tuner=tuner), spread, points)
             look = style.of(tuner)
             axis.step(points, share, where="post", markevery=marks, markersize=4.5, **look)
@@ -60,8 +61,9 @@ def runtime_figure(experiment: Experiment, style: Styles, curves: Curves, spread
         axis.set_ylabel("share of (run, threshold) pairs reached for good")
         targets = part.keys["target"].nunique()
         axis.set_title(f"{TITLES[str(kind)]} ({targets} targets)", fontsize=10)
+    between = f"from {spread[0]:.2g} to {spread[-1]:.2g} on a logarithmic scale"
     caption = (
-        f"{len(spread)} thresholds from {spread[0]:.2g} to {spread[-1]:.2g} on a logarithmic scale. "
+        f"{len(spread)} thresholds {between}. "
         "Reached: the recommendation's error stays at or below it from there on. "
         "A failed run reaches none."
     )
@@ -107,6 +109,7 @@ def amortisation_figure(
 
 def _mark_even(axis: Axes, prices: Mapping[str, Price]) -> None:
     """A ring at each break-even point, with its 95 % interval as a bar."""
+    # Only against each other: who needs no training has nothing to get back.
     learning = [p for p in prices.values() if p.fit_simulations]
     searching = [p for p in prices.values() if not p.fit_simulations]
     for learned in learning:
@@ -140,8 +143,9 @@ def cost_figure(experiment: Experiment, style: Styles, prices: Prices, level: fl
         axis.set_ylabel("seconds for one target")
         axis.set_title(TITLES[kind], fontsize=10)
     caption = (
-        f"To reach an error of {level:.2g} for good: ERT × seconds of a simulation + seconds of the "
-        f"tuner as measured; training shared by {SHARED} targets. The strip names who needs least."
+        f"To reach an error of {level:.2g} for good: ERT × seconds of a simulation + seconds of "
+        f"the tuner as measured; training shared by {SHARED} targets. "
+        "The strip names who needs least."
     )
     finish(figure, axes, style, experiment, caption)
     return figure
@@ -152,6 +156,7 @@ def _strip(axis: Axes, prices: Mapping[str, Price], style: Styles) -> None:
     for low, high, tuner in winners(prices, SHARED):
         colour = style.of(tuner)["color"]
         axis.axvspan(low, high, ymin=0.0, ymax=0.035, color=colour, linewidth=0)
+        # In the middle of its part, on a logarithmic scale.
         if high / low > _WIDE:
             axis.annotate(
                 tuner,

@@ -222,7 +222,7 @@ def pdf(figure: Figure) -> bytes:
 
 
 def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
-    """Write a figure as PNG and PDF, both whole or neither; folders are made where they are missing.
+    """Write a figure as PNG and PDF, both whole or neither; missing folders are made.
 
     Args:
         figure: what to write.

@@ -92,6 +92,7 @@ def _overlaid(track: Track) -> Image:
     """The background with the balls of a few frames in it."""
     picture = track.background.copy()
     v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
+    # Of each kept frame only the disc of the ball is laid over the scene.
     for k, frame in track.pictures.items():
         if 0 <= k < len(track.u) and np.isfinite(track.u[k]):
             ball = np.hypot(u - track.u[k], v - track.v[k]) <= track.radius[k]

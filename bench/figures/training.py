@@ -36,6 +36,7 @@ def loss_figure(title: str, rows: Sequence[Row]) -> Figure:
         title: above the figure.
         rows: of all epochs.
     """
+    # In the order in which they were trained.
     stages = list(dict.fromkeys(row[1] for row in rows))
     seeds = sorted({row[0] for row in rows})
     figure, axes = blank(1, len(stages), (1.0 + 4.0 * len(stages), 3.4), sharey=True)

@@ -1,4 +1,4 @@
-"""The result of `explain`: to look at in a notebook, to ask for its parts, to write into a folder."""
+"""The result of `explain`: to look at in a notebook, to ask for its parts, to write to a folder."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Explanation:
 
     @property
     def verdict(self) -> VerdictName:
-        """``adequate``, ``named``, ``ambiguous``, ``partial``, ``unknown`` or ``unidentifiable``."""
+        """``adequate``, ``named``, ``ambiguous``, ``partial``, ``unknown``, ``unidentifiable``."""
         return self.answer.verdict
 
     @property
@@ -55,7 +55,7 @@ class Explanation:
 
     @property
     def figures(self) -> tuple[str, ...]:
-        """Names of the figures that there are: ``overview``, ``where`` and ``candidates`` at most."""
+        """Names of the figures that there are: ``overview``, ``where``, ``candidates`` at most."""
         return pictures.names(self.story)
 
     def figure(self, name: str) -> Figure:
@@ -117,13 +117,13 @@ class Explanation:
         return f"{share} of the gap closed{interval(held_out)} on held-out runs"
 
     def _repr_html_(self) -> str:
-        """The report for a cell of a notebook, in a frame of its own so that its styles stay there."""
+        """The report for a notebook's cell, in a frame of its own so that its styles stay there."""
         # Nothing lies beside a cell: no file is named for print.
         return framed(self._page(pictures.printed(self.story), for_print=False))
 
 
 def _in_words(cause: Cause) -> str:
-    """``drag.linear or friction.coulomb: coefficient 2.2×10⁻⁴ (2.0×10⁻⁴ to 2.4×10⁻⁴) N·m·s/rad``."""
+    """``drag.linear or friction.coulomb: coefficient 2.2×10⁻⁴ (2.0×10⁻⁴ to 2.4×10⁻⁴) N·s/m``."""
     effects = joined([cause.effect, *cause.alternatives], "or")
     numbers = [
         f"{name} {with_unit(estimate(c.value, c.low, c.high), c.unit)}"

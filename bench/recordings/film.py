@@ -25,6 +25,7 @@ def write(recording: Path, out: Path, run: str | None, pixels: int, seed: int) -
     Raises:
         InputError: the recording is of no ball or has no heights, or the video cannot be written.
     """
+    # Before the work: a film takes a while.
     refuse_existing([out, beside(out)])
     if pixels < 16 or pixels % 2:
         raise InputError(f"--size {pixels}: expected an even number of at least 16 pixels")
@@ -37,22 +38,20 @@ def write(recording: Path, out: Path, run: str | None, pixels: int, seed: int) -
     chosen = runs[run] if run is not None else data.runs[0]
     if "z" not in chosen.channels:
         raise InputError(f"{recording}: expected the channel z, found {', '.join(chosen.channels)}")
+    # A drop that was recorded by its height alone falls straight down at the origin.
     zero = np.zeros(chosen.times.size)
     positions = np.stack([chosen.channels.get(name, zero) for name in ("x", "y", "z")], axis=1)
     if not np.isfinite(positions).all():
-        raise InputError(
-            f"{recording}: run {chosen.name}: has missing samples; a film shows the ball in every frame"
-        )
+        missing = "has missing samples; a film shows the ball in every frame"
+        raise InputError(f"{recording}: run {chosen.name}: {missing}")
     radius = {**data.constants, **chosen.constants}.get("radius", _default("radius"))
     rng = rng_for("film", seed)
     camera, look = Camera.published(rng, pixels), Look.drawn(rng)
     stage = Stage(camera, look, radius, rng)
-    told = {
-        beside(out): described(
-            Filmed(camera, radius, float(positions[0, 0]), float(positions[0, 1]))
-        )
-    }
-    write_video(out, stage.film(positions), chosen.times, look.crf, told)
+    filmed = Filmed(camera, radius, float(positions[0, 0]), float(positions[0, 1]))
+    # The camera is published with the film: with it, heights follow exactly.
+    description = {beside(out): described(filmed)}
+    write_video(out, stage.film(positions), chosen.times, look.crf, description)
     return len(positions), float(chosen.times[-1] - chosen.times[0])
 
 

@@ -13,10 +13,26 @@ from sims.base import Array, Channel, InputError, Simulator
 from sims.recording.recording import Recording, Run, divided, read_recording, system_of
 
 _MOST_RUNS = 40
+"""Runs that are listed."""
+_MOST_NAMES = 12
+"""Runs that are named in one line."""
 _CAVEAT = (
-    "estimated: from second and third differences, white noise assumed; coloured noise makes it too small, motion that "
-    "is fast against the sampling too large"
+    "estimated: from second and third differences, white noise assumed; coloured noise makes it "
+    "too small, motion that is fast against the sampling too large"
 )
+_RUN_HEAD = (
+    "run",
+    "use",
+    "samples",
+    "seconds",
+    "rate [Hz]",
+    "intervals [ms]: min",
+    "median",
+    "max",
+    "gaps",
+    "missing",
+)
+_SIGNAL_HEAD = ("signal", "kind", "unit", "min", "max", "missing", "noise: stated", "estimated", "")
 
 
 def load(
@@ -49,6 +65,7 @@ def summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
     seconds = sum(run.times[-1] - run.times[0] for run in runs)
     held_out = len(recording.held_out())
     yield recording.title
+    # One run alone is divided: then two parts have one name.
     whole = len({run.name for run in runs})
     held = "its last third held out" if whole < len(runs) else f"{held_out} held out"
     size = f"{_count(whole, 'run')} ({held}), {samples} samples, {seconds:.4g} s"
@@ -64,23 +81,11 @@ def summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
     yield from _constants(recording, kind)
 
 
-_RUN_HEAD = (
-    "run",
-    "use",
-    "samples",
-    "seconds",
-    "rate [Hz]",
-    "intervals [ms]: min",
-    "median",
-    "max",
-    "gaps",
-    "missing",
-)
-
-
 def _run_row(run: Run) -> tuple[str, ...]:
     intervals = 1e3 * np.diff(run.times)
-    low, median, high = float(intervals.min()), float(np.median(intervals)), float(intervals.max())
+    low, high = float(intervals.min()), float(intervals.max())
+    # The mean would be drawn away by a gap.
+    median = float(np.median(intervals))
     missing = sum(int(np.isnan(v).sum()) for v in run.channels.values())
     return (
         run.name,
@@ -96,23 +101,24 @@ def _run_row(run: Run) -> tuple[str, ...]:
     )
 
 
-_SIGNAL_HEAD = ("signal", "kind", "unit", "min", "max", "missing", "noise: stated", "estimated", "")
-
-
 def _signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[str, ...]]:
     for channel, what in declared(recording, kind):
         signals = [(run.times, _of(run, channel.name)) for run in recording.runs]
         values = np.concatenate([v for _, v in signals])
-        noise = estimated(signals) if what == "channel" else Noise(np.nan, 0.0)
+        missing = np.isnan(values)
+        # An input is what was commanded: it has no noise.
+        measured = what == "channel"
+        noise = estimated(signals) if measured else Noise(np.nan, 0.0)
         stated = recording.noise.get(channel.name)
+        not_stated = "-" if measured else ""
         yield (
             channel.name,
             what,
             channel.unit,
             f"{np.nanmin(values):.4g}",
             f"{np.nanmax(values):.4g}",
-            f"{np.isnan(values).mean():.1%}" if np.isnan(values).any() else "0",
-            ("-" if what == "channel" else "") if stated is None else f"{stated:.3g}",
+            f"{missing.mean():.1%}" if missing.any() else "0",
+            not_stated if stated is None else f"{stated:.3g}",
             f"{noise.sigma:.3g}" if np.isfinite(noise.sigma) else "",
             f"in steps of {noise.step:.3g}" if noise.step else "",
         )
@@ -131,33 +137,36 @@ def _of(run: Run, name: str) -> Array:
 
 def _constants(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
     for constant in kind.constants:
-        usual = recording.constants.get(constant.name, constant.value)
-        note = "" if constant.name in recording.constants else " (the system's default; not stated)"
-        by_value: dict[float, list[str]] = {}
-        for run in recording.runs:
-            by_value.setdefault(run.constants.get(constant.name, usual), []).append(run.name)
-        unit = "" if constant.unit == "1" else f" {constant.unit}"
-        if len(by_value) == 1:
-            value = next(iter(by_value))
-            stated = any(constant.name in run.constants for run in recording.runs)
-            yield f"{constant.name} = {value:g}{unit}{'' if stated else note}"
-        else:
-            parts = [f"{value:g}{unit} in {_named(names)}" for value, names in by_value.items()]
-            yield f"{constant.name} differs by run: {'; '.join(parts)}"
-    known = [
-        f"{run.name} ({', '.join(f'{k} = {v:g}' for k, v in run.initial.items())})"
-        for run in recording.runs
-        if run.initial
-    ]
+        yield _constant(recording, constant.name, constant.value, constant.unit)
+    known = []
+    for run in recording.runs:
+        if run.initial:
+            states = ", ".join(f"{name} = {value:g}" for name, value in run.initial.items())
+            known.append(f"{run.name} ({states})")
     if known:
         yield f"initial states stated: {', '.join(known[:_MOST_RUNS])}"
 
 
+def _constant(recording: Recording, name: str, default: float, unit: str) -> str:
+    """What a constant is, and in which runs where it differs."""
+    usual = recording.constants.get(name, default)
+    runs_by_value: dict[float, list[str]] = {}
+    for run in recording.runs:
+        runs_by_value.setdefault(run.constants.get(name, usual), []).append(run.name)
+    unit = "" if unit == "1" else f" {unit}"
+    if len(runs_by_value) > 1:
+        parts = [f"{value:g}{unit} in {_named(runs)}" for value, runs in runs_by_value.items()]
+        return f"{name} differs by run: {'; '.join(parts)}"
+    value = next(iter(runs_by_value))
+    stated = name in recording.constants or any(name in run.constants for run in recording.runs)
+    note = "" if stated else " (the system's default; not stated)"
+    return f"{name} = {value:g}{unit}{note}"
+
+
 def _named(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:12])
-    return f"run{'s' * (len(names) > 1)} {shown}" + (
-        f" and {len(names) - 12} more" if len(names) > 12 else ""
-    )
+    runs = f"run{'s' * (len(names) > 1)} {', '.join(names[:_MOST_NAMES])}"
+    more = len(names) - _MOST_NAMES
+    return f"{runs} and {more} more" if more > 0 else runs
 
 
 def _count(number: int, what: str) -> str:
@@ -168,8 +177,6 @@ def _aligned(rows: Sequence[Sequence[str]], left: int) -> Iterator[str]:
     """Columns, the first `left` of them to the left."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        cells = [
-            c.ljust(w) if i < left else c.rjust(w)
-            for i, (c, w) in enumerate(zip(row, widths, strict=True))
-        ]
-        yield "  ".join(cells).rstrip()
+        cells = zip(row, widths, strict=True)
+        aligned = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(cells)]
+        yield "  ".join(aligned).rstrip()
