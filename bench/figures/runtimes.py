@@ -61,9 +61,9 @@ def runtime_figure(experiment: Experiment, style: Styles, curves: Curves, spread
         axis.set_ylabel("share of (run, threshold) pairs reached for good")
         targets = part.keys["target"].nunique()
         axis.set_title(f"{TITLES[str(kind)]} ({targets} targets)", fontsize=10)
-    between = f"from {spread[0]:.2g} to {spread[-1]:.2g} on a logarithmic scale"
+    span = f"from {spread[0]:.2g} to {spread[-1]:.2g} on a logarithmic scale"
     caption = (
-        f"{len(spread)} thresholds {between}. "
+        f"{len(spread)} thresholds {span}. "
         "Reached: the recommendation's error stays at or below it from there on. "
         "A failed run reaches none."
     )
