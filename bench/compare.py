@@ -1,16 +1,24 @@
-"""Begins a comparison in a new folder, or finishes one that was interrupted; what `simgap compare`
-and `status` do.
+"""A comparison in its folder: begun there, or resumed where it was interrupted, made, looked at, and
+reported.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.store.folder import Configuration, configuration, create, free_folder, write_results
+from bench.store.folder import (
+    Configuration,
+    configuration,
+    create,
+    free_folder,
+    read,
+    write_results,
+)
 from bench.store.journal import FOLDER, Journal, finished, read_plan, write_plan
+from bench.store.standing import MISSING, End, Made, Standing
+from bench.store.status import STATUS_COLUMNS, Status
 from sims.base import InputError
 from sims.files import write
 
@@ -22,198 +30,216 @@ if TYPE_CHECKING:
 Say = Callable[[str], None]
 
 
-def begin(
-    experiment: Experiment, plugins: Sequence[str], out: str | None, jobs: int
-) -> tuple[Path, Results]:
-    """A new folder and the results that will be kept there.
+class Comparison:
+    """Tuners x targets x seeds, kept in a folder; fulfils `bench.study.Study`.
+
+    Args:
+        folder: of a comparison, to be looked at and reported. `begin` and `resume` give one that
+            can be made too.
+
+    Attributes:
+        folder: where everything lies.
+        configuration: what it is for.
+        results: the problem, the plan and what is kept; None where it is only looked at.
 
     Raises:
-        InputError: a fault in the experiment, or the folder is not free.
+        InputError: it is no such folder, or it is damaged.
     """
-    from bench.runs.identity import fingerprint
-    from bench.runs.runner import prepare
 
-    folder = free_folder(experiment, Path(out) if out else None)
-    results = prepare(experiment)
-    create(folder, Configuration(experiment, list(plugins), fingerprint(experiment, plugins)), jobs)
-    _attach(folder, results)
-    return folder, results
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.configuration = configuration(folder)
+        self.plugins = self.configuration.plugins
+        self.results: Results | None = None
 
+    @classmethod
+    def begin(
+        cls,
+        experiment: Experiment,
+        plugins: Sequence[str] = (),
+        folder: Path | None = None,
+        jobs: int = 2,
+    ) -> Comparison:
+        """A comparison in a new folder; the plan stands, and nothing has been run.
 
-def resume(folder: Path, plugins: Sequence[str]) -> tuple[list[str], Results]:
-    """The plugins and results of a folder that was interrupted: what is finished is kept, what is
-    missing remains.
+        Args:
+            experiment: what is compared.
+            plugins: plugin files that it needs; the caller has loaded them.
+            folder: new or empty; one below results/ that is named for the time where None.
+            jobs: worker processes that it is meant to be made with; 0 for none.
 
-    Raises:
-        InputError: it is no such folder, it is damaged, or something that matters has changed since
-            it was begun.
-    """
-    from bench.registry import load_plugins
-    from bench.runs.identity import fingerprint, refuse_changes
-    from bench.runs.runner import prepare
+        Raises:
+            InputError: a fault in the experiment, or the folder is not free.
+        """
+        from bench.runs.identity import fingerprint
+        from bench.runs.runner import prepare, refuse_unreachable
 
-    held = configuration(folder)
-    given = {str(Path(p).resolve()) for p in plugins}
-    everything = held.plugins + sorted(given - set(held.plugins))
-    load_plugins(everything)
-    refuse_changes(folder, held.fingerprint, fingerprint(held.experiment, everything))
-    results = prepare(held.experiment)
-    _attach(folder, results)
-    return everything, results
+        place = free_folder(experiment, folder)
+        results = prepare(experiment)
+        # Before there is a folder: a fault of the user's leaves nothing behind.
+        if jobs:
+            refuse_unreachable(experiment)
+        hashes = fingerprint(experiment, plugins)
+        create(place, Configuration(experiment, list(plugins), hashes), jobs)
+        comparison = cls(place)
+        comparison._attach(results)
+        return comparison
 
+    @classmethod
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Comparison:
+        """A comparison that was interrupted: what is finished is kept, what is missing remains.
 
-def only_resume(options: object) -> None:
-    """Refuse options of the command line that would change what is resumed.
+        Args:
+            folder: the comparison's.
+            plugins: plugin files beside those that it was begun with.
 
-    Raises:
-        InputError: there are some.
-    """
-    names = (
-        "experiment",
-        "tuners",
-        "targets",
-        "seeds",
-        "budget",
-        "training_budget",
-        "timeout",
-        "memory",
-        "out",
-    )
-    given = [name for name in names if getattr(options, name) is not None]
-    if given:
-        raise InputError(
-            f"--resume takes the configuration of its folder as it is; leave out {', '.join(given)}"
-        )
+        Raises:
+            InputError: it is no such folder, it is damaged, or something that matters has changed
+                since it was begun.
+        """
+        from bench.runs.identity import unchanged
+        from bench.runs.runner import prepare
 
+        comparison = cls(folder)
+        comparison.plugins = unchanged(folder, comparison.configuration, plugins)
+        comparison._attach(prepare(comparison.configuration.experiment))
+        return comparison
 
-def _attach(folder: Path, results: Results) -> None:
-    """Open the journal of the folder, write or check the plan."""
-    ids = [job.order.run for job in results.plan]
-    if not (folder / FOLDER).exists():
-        results.kept.statuses = _complete(folder, ids)
-        return
-    planned = read_plan(folder)
-    journal = Journal(folder)
-    if planned is None:
-        write_plan(folder, ids)
-    foreign = [
-        place for place, s in journal.statuses.items() if place >= len(ids) or ids[place] != s.run
-    ]
-    if foreign or (planned is not None and planned != ids):
-        journal.close()
-        raise InputError(
-            f"{folder}: its plan is not the one that its configuration gives; start a new comparison"
-        )
-    results.kept = journal
-
-
-def _complete(folder: Path, ids: list[str]) -> dict[int, Any]:
-    """The statuses of a folder that says it is finished.
-
-    Raises:
-        InputError: it holds other runs than those planned.
-    """
-    from bench.store.folder import read
-
-    stored = [
-        str(name)
-        for name in read(folder, ["run", "tuner", "k"]).statuses.query("status != 'skipped'")["run"]
-    ]
-    if stored != ids:
-        raise InputError(
-            f"{folder}: expected {len(ids)} runs, found {len(stored)} or others; start a new comparison"
-        )
-    return dict.fromkeys(range(len(ids)))
-
-
-def make(
-    folder: Path,
-    results: Results,
-    plugins: Sequence[str],
-    jobs: int,
-    bar: Progress,
-    pool: Pool | None,
-) -> bool:
-    """Make what is missing and write the results; returns whether the comparison is complete.
-
-    Raises:
-        InputError: workers cannot be had; what was finished is kept.
-    """
-    from bench.runs.runner import run
-
-    journal = results.kept
-    if not isinstance(journal, Journal):  # complete before we came
-        return True
-    try:
-        run(results, plugins, jobs, bar, pool)
-    finally:
-        write_results(folder, journal, results.training_rows(), results.skipped_rows())
-        _write_spectra(folder, results)
-        complete = len(journal.statuses) == len(results.plan)
-        if complete:
-            journal.discard()
-        else:
+    def _attach(self, results: Results) -> None:
+        """Open the journal of the folder, write or check the plan."""
+        self.results = results
+        ids = [job.order.run for job in results.plan]
+        if not (self.folder / FOLDER).exists():
+            results.kept.statuses = self._complete(ids)
+            return
+        planned = read_plan(self.folder)
+        journal = Journal(self.folder)
+        if planned is None:
+            write_plan(self.folder, ids)
+        foreign = [
+            place
+            for place, status in journal.statuses.items()
+            if place >= len(ids) or ids[place] != status.run
+        ]
+        if foreign or (planned is not None and planned != ids):
             journal.close()
-    return complete
+            raise InputError(
+                f"{self.folder}: its plan is not the one that its configuration gives; "
+                "start a new comparison"
+            )
+        results.kept = journal
+
+    def _complete(self, ids: list[str]) -> dict[int, Status]:
+        """The statuses of a folder that says it is finished.
+
+        Raises:
+            InputError: it holds other runs than those planned.
+        """
+        statuses = self._stored()
+        if [status.run for status in statuses] != ids:
+            raise InputError(
+                f"{self.folder}: expected {len(ids)} runs, found {len(statuses)} or others; "
+                "start a new comparison"
+            )
+        return dict(enumerate(statuses))
+
+    def _stored(self) -> list[Status]:
+        """How the runs of a finished comparison ended, in the order of its plan."""
+        statuses = read(self.folder, ["run", "tuner", "k"]).statuses
+        made = statuses[statuses["status"] != "skipped"]
+        # Of a damaged table some columns may be missing; the run and its end are there.
+        rows: list[dict[str, Any]] = [
+            {name: row.get(name) for name in STATUS_COLUMNS} for row in made.to_dict("records")
+        ]
+        return [Status(**row) for row in rows]
+
+    def make(
+        self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
+    ) -> Made:
+        """Make what is missing and write the results.
+
+        Args:
+            jobs: worker processes; 0 for none, and everything in this one.
+            progress: told of every step.
+            pool: where to run instead, e.g. on a cluster.
+
+        Raises:
+            InputError: workers cannot be had; what was finished is kept.
+        """
+        from bench.runs.runner import run, silent
+
+        results = self._begun()
+        journal = results.kept
+        if not isinstance(journal, Journal):  # complete before we came
+            return Made(len(results.plan), len(results.plan))
+        try:
+            run(results, self.plugins, jobs, progress or silent, pool)
+        finally:
+            # Also where a worker cannot be had: what there is can be looked at.
+            write_results(self.folder, journal, results.training_rows(), results.skipped_rows())
+            self._write_spectra(results)
+            made = Made(
+                len(journal.statuses), len(results.plan), results.interrupted, results.stopped
+            )
+            if made.complete:
+                journal.discard()
+            else:
+                journal.close()
+        return made
+
+    def _begun(self) -> Results:
+        if self.results is None:
+            raise InputError(f"{self.folder}: opened to be looked at; resume it to make the rest")
+        return self.results
+
+    def _write_spectra(self, results: Results) -> None:
+        """Write identifiability.csv, a row a target and direction, of several parameters."""
+        if results.spectra:
+            from bench.analysis.spectra import spectra_table
+
+            problem = results.problem
+            table = spectra_table(problem.experiment, results.spectra, problem.cube.parameters)
+            write(self.folder / "identifiability.csv", table.to_csv(index=False))
+
+    def status(self) -> Standing:
+        """What the folder holds and what is missing; another process may be at work there.
+
+        Raises:
+            InputError: it is damaged.
+        """
+        held = self.configuration
+        ends = tuple(self._ends())
+        return Standing(held.experiment.name, "runs finished", held.fingerprint, ends)
+
+    def _ends(self) -> list[End]:
+        if (self.folder / FOLDER).exists():
+            planned = read_plan(self.folder) or []
+            made = {status.run: status for status in finished(self.folder).values()}
+        else:
+            made = {status.run: status for status in self._stored()}
+            planned = list(made)
+        return [_end(name, made.get(name)) for name in planned]
+
+    def finish(self, say: Say) -> int:
+        """Write tables and figures of what there is, and say what came out.
+
+        Returns:
+            How many runs failed.
+
+        Raises:
+            InputError: nothing has been written yet, or it is damaged.
+        """
+        from bench.problem.problem import Problem
+        from bench.report import finish
+
+        results = self.results
+        problem = results.problem if results else Problem(self.configuration.experiment)
+        return finish(self.folder, problem, say)
 
 
-def _write_spectra(folder: Path, results: Results) -> None:
-    """Write identifiability.csv, a row a target and direction, where there are several parameters."""
-    if results.spectra:
-        from bench.analysis.spectra import spectra_table
-
-        table = spectra_table(
-            results.problem.experiment, results.spectra, results.problem.cube.parameters
-        )
-        write(folder / "identifiability.csv", table.to_csv(index=False))
-
-
-def status(folder: Path, every: bool, say: Say) -> bool:
-    """Say what a folder holds and what is missing; returns whether it is complete.
-
-    Raises:
-        InputError: it is not the folder of a comparison, or it is damaged.
-    """
-    held = configuration(folder)
-    planned, ends = _ends(folder)
-    missing = len(planned) - len(ends)
-    say(
-        f"{held.experiment.name}: {len(ends)} of {len(planned)} runs finished"
-        + (", complete" if not missing else "")
-    )
-    say("  " + ", ".join(f"{what} {value}" for what, value in held.fingerprint.items()))
-    tuners = dict.fromkeys(name.split("/")[0] for name in planned)
-    counts = Counter((run.split("/")[0], status) for run, (status, _) in ends.items())
-    total = Counter(name.split("/")[0] for name in planned)
-    width = max([len(t) for t in tuners], default=0)
-    for tuner in tuners:
-        parts = [f"{n} {status}" for (name, status), n in sorted(counts.items()) if name == tuner]
-        left = total[tuner] - sum(n for (name, _), n in counts.items() if name == tuner)
-        say(f"  {tuner:{width}}  {', '.join(parts + [f'{left} missing'] * (left > 0))}")
-    shown = [(run, *ends.get(run, ("missing", ""))) for run in planned]
-    if not every:
-        unfinished = [line for line in shown if line[1] not in ("done", "converged")]
-        shown = (unfinished or shown)[:20]
-    for run, end, reason in shown:
-        say(f"{end:10} {run}  {(reason.strip().splitlines() or [''])[-1]}".rstrip())
-    if not every and len(planned) > len(shown):
-        say(f"({len(shown)} of {len(planned)} runs listed; --runs lists all)")
-    if missing:
-        say(f"to finish it: simgap compare --resume {folder}")
-    return not missing
-
-
-def _ends(folder: Path) -> tuple[list[str], dict[str, tuple[str, str]]]:
-    """Ids of all planned runs, and status and reason of the finished ones."""
-    if (folder / FOLDER).exists():
-        planned = read_plan(folder) or []
-        return planned, {s.run: (s.status, s.reason) for s in finished(folder).values()}
-    from bench.store.folder import read
-
-    rows = read(folder, ["run", "tuner", "k"]).statuses
-    rows = rows[rows["status"] != "skipped"]
-    ends = {
-        str(run): (str(s), str(r))
-        for run, s, r in zip(rows["run"], rows["status"], rows["reason"], strict=True)
-    }
-    return list(ends), ends
+def _end(name: str, status: Status | None) -> End:
+    """How a planned run ended, or that it is missing; its id begins with its tuner's label."""
+    tuner = name.partition("/")[0]
+    if status is None:
+        return End(name, tuner, MISSING)
+    return End(name, tuner, str(status.status), str(status.reason))

@@ -12,12 +12,13 @@ from bench.analysis.amortisation import EVEN_COLUMNS, SHARED, break_even_table, 
 from bench.analysis.paired import pairs
 from bench.analysis.runtimes import ert_table
 from bench.analysis.statistics import Statistics
-from bench.analysis.table import FAILURES, summary, table
+from bench.analysis.table import summary, table
 from bench.figures import comparison
 from bench.figures.comparison import Labels, labels_of, statistics_of
 from bench.figures.style import save
 from bench.problem.problem import Problem
 from bench.store.folder import Stored, read
+from bench.store.status import FAILURES
 from sims.files import write
 
 NEEDED = (

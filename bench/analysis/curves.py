@@ -13,10 +13,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from bench.store.status import FAILED
 from sims.base import Array
-
-FAILED = ("crashed", "timeout", "diverged")
-"""Statuses of runs that delivered nothing one could trust."""
 
 
 @dataclass(frozen=True)

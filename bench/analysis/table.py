@@ -30,8 +30,6 @@ METRICS = (
     "obs_error",
     "heldout_error",
 )
-# Also those that were never run: the table shows what is missing.
-FAILURES = ("crashed", "timeout", "diverged", "skipped")
 COLUMNS = [
     "experiment",
     "tuner",

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.compare import begin, make
 from bench.problem.experiment import Experiment, load
 from bench.registry import load_plugins
 from bench.registry import tuners as registered
-from bench.report import finish
 from bench.store.folder import Stored, configuration, read
+from bench.study import begin
 from methods.base import Tuner
 from sims.base import InputError, unknown
 
@@ -67,15 +66,10 @@ def compare(
         timeout=timeout,
         memory=memory,
     )
-    folder, results = begin(chosen, files, None if out is None else str(out), jobs)
-    make(folder, results, files, jobs, _unseen, None)
-    finish(folder, results.problem, lambda _: None)
-    return Compared(folder)
-
-
-def _unseen(_title: str, _steps: int) -> Callable[[], None]:
-    """Progress that nobody looks at."""
-    return lambda: None
+    study = begin(chosen, files, None if out is None else Path(out), jobs)
+    study.make(jobs)
+    study.finish(lambda _: None)
+    return Compared(study.folder)
 
 
 def choose(

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.commands.options import add_plugin, positive, seconds
+from bench.commands.options import add_plugin, names, natural, positive, said_as, seconds
 
 if TYPE_CHECKING:
     from bench.problem.experiment import Experiment
+    from bench.runs.pools import Pool
+    from bench.store.standing import Made, Standing
+    from bench.study import Study
 
 INTERRUPTED = 130
+"""Exit code of what a person interrupted, as shells have it."""
+_FEW = 20
+"""Runs that `simgap status` lists unless all are asked for."""
+_CHANGES = ("targets", "budget", "training_budget", "timeout", "memory")
+"""Options that change an experiment's key of the same name."""
 
 
 def add_compare(compare: argparse.ArgumentParser) -> None:
@@ -38,10 +47,18 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
         help="simulations that a tuner may learn from",
     )
     compare.add_argument(
-        "--jobs", type=positive, metavar="N", default=2, help="worker processes (default: 2)"
+        "--jobs",
+        type=natural,
+        metavar="N",
+        default=2,
+        help="worker processes; 0 runs everything in this one, for prints and breakpoints "
+        "(default: 2)",
     )
     compare.add_argument(
-        "--out", metavar="DIR", help="folder to write (default: a new one below results/)"
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="folder to write (default: a new one below results/)",
     )
     add_plugin(compare, "tuners")
     compare.add_argument(
@@ -67,15 +84,21 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
 
 def add_status(status: argparse.ArgumentParser) -> None:
     """The options of `simgap status`."""
-    status.add_argument("run", metavar="DIR", type=Path, help="the comparison's folder")
-    status.add_argument("--runs", action="store_true", help="list every run by its id")
+    status.add_argument(
+        "run", metavar="DIR", type=Path, help="the folder of a comparison or bounce shot"
+    )
+    status.add_argument("--runs", action="store_true", help="list every run or shot")
     status.set_defaults(command=_status)
 
 
 def add_plot(plot: argparse.ArgumentParser) -> None:
     """The options of `simgap plot`."""
     plot.add_argument(
-        "runs", metavar="RUN", type=Path, nargs="+", help="a comparison's folder; several: ranks"
+        "runs",
+        metavar="RUN",
+        type=Path,
+        nargs="+",
+        help="the folder of a comparison or bounce shot; several comparisons: ranks",
     )
     plot.add_argument(
         "--out", metavar="DIR", type=Path, help="folder for what several comparisons give together"
@@ -86,101 +109,152 @@ def add_plot(plot: argparse.ArgumentParser) -> None:
 
 def _chosen(options: argparse.Namespace) -> Experiment:
     """The experiment that the options of `compare` describe."""
-    from bench.problem.experiment import load
-    from bench.registry import load_plugins, tuners
-    from sims.base import InputError, unknown
+    from bench.api.compare import choose
+    from bench.registry import load_plugins
+    from sims.base import InputError
 
     if options.experiment is None:
         raise InputError("expected an experiment (see `simgap list experiments`), or --resume DIR")
     load_plugins(options.plugin)
-    changes = {
-        name: getattr(options, name)
-        for name in ("targets", "budget", "training_budget", "timeout", "memory")
-    }
-    experiment = load(options.experiment).chosen(**changes)
-    if options.seeds:
-        experiment = experiment.with_seeds(options.seeds)
-    if options.tuners:
-        labels = [label.strip() for label in options.tuners.split(",") if label.strip()]
-        known = {*tuners.names(), *(entry.label for entry in experiment.tuners)}
-        for label in labels:
-            if label not in known:
-                raise unknown("tuner", label, sorted(known))
-        experiment = experiment.with_tuners(labels)
-    return experiment
+    labels = names(options.tuners) if options.tuners else None
+    changes = {name: getattr(options, name) for name in _CHANGES}
+    return choose(options.experiment, labels, options.seeds, **changes)
+
+
+def _refuse_beside_resume(options: argparse.Namespace) -> None:
+    """Refuse options that would change what is resumed.
+
+    Raises:
+        InputError: there are some.
+    """
+    from sims.base import InputError
+
+    described = ("experiment", "tuners", "seeds", "out", *_CHANGES)
+    given = [name for name in described if getattr(options, name) is not None]
+    if given:
+        raise InputError(
+            f"--resume takes the configuration of its folder as it is; leave out {', '.join(given)}"
+        )
+
+
+def _begun(options: argparse.Namespace) -> Study:
+    """The study that is begun or resumed."""
+    from bench.study import begin, resume
+
+    if options.resume:
+        _refuse_beside_resume(options)
+        return resume(options.resume, options.plugin)
+    with said_as("--out", options.out):
+        return begin(_chosen(options), options.plugin, options.out, options.jobs)
+
+
+def _cluster(address: str | None) -> Pool | None:
+    if not address:
+        return None
+    from bench.runs.cluster import ClusterPool
+
+    with said_as("--cluster", address):
+        return ClusterPool(address)
 
 
 def _compare(options: argparse.Namespace) -> int:
     from bench.commands.progress import Bars
-    from bench.compare import begin, make, only_resume, resume
-    from bench.report import finish
-    from bench.shot.study import begin as begin_shot
-    from bench.shot.study import is_shot
 
-    pool = None
-    if options.cluster:
-        from bench.runs.cluster import ClusterPool
-
-        pool = ClusterPool(options.cluster)
-    if options.resume:
-        only_resume(options)
-        folder = options.resume
-        if is_shot(folder):
-            return _shoot(folder, options)
-        plugins, results = resume(folder, options.plugin)
-    else:
-        plugins = options.plugin
-        experiment = _chosen(options)
-        if experiment.shot:
-            return _shoot(begin_shot(experiment, plugins, options.out, options.jobs), options)
-        folder, results = begin(experiment, plugins, options.out, options.jobs)
+    # First of all: a scheduler that does not answer leaves no folder behind.
+    pool = _cluster(options.cluster)
+    study = _begun(options)
     with Bars() as bars:
-        complete = make(folder, results, plugins, options.jobs, bars.start, pool)
-    failed = finish(folder, results.problem, print)
-    if not complete:
-        done, planned = len(results.kept.statuses), len(results.plan)
-        what = "interrupted" if results.interrupted else results.stopped or "stopped"
-        print(f"simgap: {what}; {done} of {planned} runs are finished and kept", file=sys.stderr)
-        print(f"simgap: to finish: simgap compare --resume {folder}", file=sys.stderr)
-        return INTERRUPTED if results.interrupted else 1
+        made = study.make(options.jobs, bars.start, pool)
+    if made.skipped:
+        print(f"skipped: {made.skipped}")
+        return 0
+    failed = study.finish(print)
+    if not made.complete:
+        return _left(study, made)
     return 1 if failed and not options.allow_failures else 0
 
 
-def _shoot(folder: Path, options: argparse.Namespace) -> int:
-    """A bounce shot: begun or resumed in its folder."""
-    from bench.commands.progress import Bars
-    from bench.shot.study import make
-
-    with Bars() as bars:
-        return make(folder, options.plugin, options.jobs, bars.start, print)
+def _left(study: Study, made: Made) -> int:
+    """Say what is missing and how to go on; returns the exit code."""
+    why = "interrupted" if made.interrupted else made.stopped or "stopped"
+    what = study.status().what
+    for line in (
+        f"{why}; {made.finished} of {made.planned} {what}, and kept",
+        f"to finish: simgap compare --resume {study.folder}",
+    ):
+        print(f"simgap: {line}", file=sys.stderr)
+    return INTERRUPTED if made.interrupted else 1
 
 
 def _status(options: argparse.Namespace) -> int:
-    from bench.compare import status
-    from bench.shot.study import is_shot
-    from bench.shot.study import status as status_of_shots
+    from bench.study import opened
 
-    if is_shot(options.run):
-        return 0 if status_of_shots(options.run, print) else 1
-    return 0 if status(options.run, options.runs, print) else 1
+    standing = opened(options.run).status()
+    planned, what = len(standing.ends), standing.what
+    complete = ", complete" if standing.complete else ""
+    print(f"{standing.name}: {standing.finished} of {planned} {what}{complete}")
+    print("  " + ", ".join(f"{name} {value}" for name, value in standing.hashes.items()))
+    for line in _counts(standing):
+        print(f"  {line}")
+    for line in _listed(standing, options.runs):
+        print(line)
+    if standing.complete:
+        return 0
+    print(f"to finish it: simgap compare --resume {options.run}")
+    return 1
+
+
+def _counts(standing: Standing) -> list[str]:
+    """A line for each tuner or kind of ball: how many ended how."""
+    from bench.store.standing import MISSING
+
+    groups = dict.fromkeys(end.group for end in standing.ends)
+    width = max(map(len, groups), default=0)
+    lines = []
+    for group in groups:
+        ends = Counter(end.status for end in standing.ends if end.group == group)
+        missing = ends.pop(MISSING, 0)
+        parts = [f"{n} {status}" for status, n in sorted(ends.items())]
+        if missing:
+            parts.append(f"{missing} missing")
+        lines.append(f"{group:{width}}  {', '.join(parts)}")
+    return lines
+
+
+def _listed(standing: Standing, every: bool) -> list[str]:
+    """A line a run: all of them, or a few of those of which there is something to say."""
+    from bench.store.standing import FINE
+
+    shown = standing.ends
+    if not every:
+        telling = tuple(end for end in shown if end.status not in FINE)
+        shown = (telling or shown)[:_FEW]
+    lines = []
+    for end in shown:
+        # A traceback ends with what went wrong.
+        reason = (end.reason.strip().splitlines() or [""])[-1]
+        lines.append(f"{end.status:10} {end.name}  {reason}".rstrip())
+    if not every and len(standing.ends) > len(shown):
+        lines.append(f"({len(shown)} of {len(standing.ends)} listed; --runs lists all)")
+    return lines
 
 
 def _plot(options: argparse.Namespace) -> int:
-    from bench.problem.problem import Problem
     from bench.registry import load_plugins
-    from bench.report import finish
-    from bench.store.folder import configuration
+    from bench.study import opened
     from sims.base import InputError
 
     load_plugins(options.plugin)
-    if len(options.runs) > 1 or options.out:
-        from bench.across import across
-
-        if not options.out:
-            raise InputError(
-                "several comparisons give one result: name a folder for it with --out DIR"
-            )
-        across(options.runs, options.out, print)
+    if len(options.runs) == 1 and not options.out:
+        opened(options.runs[0]).finish(print)
         return 0
-    finish(options.runs[0], Problem(configuration(options.runs[0]).experiment), print)
+    if not options.out:
+        raise InputError("several comparisons give one result: name a folder for it with --out DIR")
+    from bench.across import across
+    from bench.compare import Comparison
+
+    for folder in options.runs:
+        if not isinstance(opened(folder), Comparison):
+            raise InputError(f"{folder}: expected the folder of a comparison, found a bounce shot")
+    across(options.runs, options.out, print)
     return 0

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 def add_plugin(parser: argparse.ArgumentParser, more: str) -> None:
@@ -27,6 +29,17 @@ def positive(text: str) -> int:
     return value
 
 
+def natural(text: str) -> int:
+    """A whole number of at least 0."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, found '{text}'")
+    return value
+
+
 def seconds(text: str) -> float:
     """A number of seconds above 0."""
     try:
@@ -41,3 +54,19 @@ def seconds(text: str) -> float:
 def names(text: str) -> list[str]:
     """Names with commas between."""
     return [name.strip() for name in text.split(",") if name.strip()]
+
+
+@contextmanager
+def said_as(option: str, value: object) -> Iterator[None]:
+    """A fault that begins with the value is said with the option that gave it.
+
+    What has no command line around it knows values, and says nothing of options.
+    """
+    from sims.base import InputError
+
+    try:
+        yield
+    except InputError as error:
+        if value is None or not str(error).startswith(f"{value}:"):
+            raise
+        raise InputError(f"{option} {error}") from None

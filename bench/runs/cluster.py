@@ -15,15 +15,14 @@ import logging
 import multiprocessing
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from bench.runs.pools import Call, LocalPool, LostError
 from bench.runs.sources import rooms, versions
 from bench.runs.training import Training, folder, train
-from bench.runs.worker import Order
 from sims.base import InputError
 from sims.files import first_line, write
 
@@ -36,6 +35,19 @@ _LOSSES = 20
 
 Files = tuple[tuple[str, bytes], ...]
 """Name and content of files."""
+
+
+@runtime_checkable
+class Travelling(Protocol):
+    """An argument of a call that names files, which must be there where the call is made."""
+
+    def files(self) -> Sequence[Path]:
+        """The files, of different names."""
+        ...
+
+    def moved(self, places: Mapping[Path, Path]) -> Travelling:
+        """The argument where its files have other places."""
+        ...
 
 
 class ClusterPool:
@@ -51,7 +63,7 @@ class ClusterPool:
             from distributed import Client
         except ImportError:
             raise InputError(
-                '--cluster: needs the package distributed (pip install -e ".[cluster]")'
+                'a cluster needs the package distributed (pip install -e ".[cluster]")'
             ) from None
         for name in [
             *logging.root.manager.loggerDict,
@@ -64,28 +76,28 @@ class ClusterPool:
             self._client = Client(address, timeout=10.0, set_as_default=False)
         except (OSError, ValueError, TypeError, ImportError) as error:
             raise InputError(
-                f"--cluster {address}: no Dask scheduler answers there ({first_line(error)})"
+                f"{address}: no Dask scheduler answers there ({first_line(error)})"
             ) from None
         self._files: Files = ()
-        self._weights: dict[str, Any] = {}
+        self._sent_files: dict[Path, Any] = {}
         self._check()
 
     def _check(self) -> None:
         threads = self._client.nthreads()
         if not threads:
             raise InputError(
-                f"--cluster {self.address}: has no workers; start some: dask worker {self.address}"
+                f"{self.address}: has no workers; start some: dask worker {self.address}"
             )
         here = (rooms(), versions())
         try:
             others = [w for w, there in self._client.run(_identity).items() if there != here]
         except Exception as error:
             raise InputError(
-                f"--cluster {self.address}: its workers lack simgap ({first_line(error)})"
+                f"{self.address}: its workers lack simgap ({first_line(error)})"
             ) from None
         if others:
             raise InputError(
-                f"--cluster {self.address}: worker {others[0]} has other code or package versions than this process; "
+                f"{self.address}: worker {others[0]} has other code or package versions than this process; "
                 "install the same on both"
             )
 
@@ -173,28 +185,23 @@ class ClusterPool:
 
     def _submit(self, call: Call, seconds: float) -> Any:
         function, arguments = call
-        weights = None
-        if (
-            len(arguments) == 2
-            and isinstance(order := arguments[1], Order)
-            and order.weights is not None
-        ):
-            weights = self._sent(order.weights)
-            arguments = (arguments[0], replace(order, weights=Path(order.weights.name)))
+        travelling = [argument for argument in arguments if isinstance(argument, Travelling)]
+        paths = [path for argument in travelling for path in argument.files()]
+        contents = [self._sent(path) for path in paths]
         return self._client.submit(
-            on_worker, function, arguments, seconds, self._files, weights, pure=False
+            on_worker, function, arguments, seconds, self._files, paths, contents, pure=False
         )
 
     def _sent(self, path: Path) -> Any:
-        """The content of a file of weights, held by the cluster once, whoever needs it.
+        """The name and content of a file, held by the cluster once, whoever needs it.
 
         A task gives it, since scattered data are gone with the worker that held them, and a task is
         made again.
         """
-        if path.name not in self._weights:
+        if path not in self._sent_files:
             content = (path.name, path.read_bytes())
-            self._weights[path.name] = self._client.submit(_itself, content, pure=False)
-        return self._weights[path.name]
+            self._sent_files[path] = self._client.submit(_itself, content, pure=False)
+        return self._sent_files[path]
 
     def _received(self, result: Any) -> Any:
         """What a worker sent; trained weights are put into this machine's cache."""
@@ -230,33 +237,51 @@ def on_worker(
     arguments: tuple[Any, ...],
     seconds: float,
     plugins: Files,
-    weights: tuple[str, bytes] | None,
+    paths: Sequence[Path],
+    contents: Sequence[tuple[str, bytes]],
 ) -> tuple[str, Any, bytes]:
     """Runs on a cluster's worker: makes the call in an isolated process of this machine.
+
+    Args:
+        function: what to call.
+        arguments: of the call; files that they name lie on the machine that asks.
+        seconds: soft limit of the call.
+        plugins: plugin files that the process loads.
+        paths: places of the files there.
+        contents: their names and contents, in the same order.
 
     Returns:
         What the call gave ("value") or the error that ended it, or a training and the content of
         its file ("weights").
     """
-    if weights is not None:
-        path = folder() / weights[0]
-        _keep(path, weights[1])
-        arguments = (arguments[0], replace(arguments[1], weights=path))
+    if paths:
+        # In one folder: a recording's description is looked for beside its table.
+        folder_here = _unpacked(tuple(contents))
+        places = {path: folder_here / name for path, (name, _) in zip(paths, contents, strict=True)}
+        arguments = tuple(
+            argument.moved(places) if isinstance(argument, Travelling) else argument
+            for argument in arguments
+        )
     key = (threading.get_ident(), plugins)
     if key not in _pools:
         # Dask's workers are daemons, which may not have children for fear that these outlive them;
         # ours do not.
         multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
         _pools[key] = LocalPool(1)
-        _pools[key].load([str(_unpacked(name, content)) for name, content in plugins])
+        # Each in a folder of its own, so that a file is the same whatever else there is.
+        _pools[key].load([str(_unpacked((file,)) / file[0]) for file in plugins])
     ((_, result),) = _pools[key].results([(function, arguments)], seconds)
     if function is train and isinstance(result, Training):
         return "weights", result, result.path.read_bytes()
     return "value", result, b""
 
 
-def _unpacked(name: str, content: bytes) -> Path:
-    """A plugin file on this machine, under its own name."""
-    path = Path(tempfile.gettempdir()) / f"simgap-{hashlib.sha256(content).hexdigest()[:16]}" / name
-    _keep(path, content)
-    return path
+def _unpacked(files: Files) -> Path:
+    """A folder on this machine that holds these files under their own names."""
+    hashed = hashlib.sha256()
+    for name, content in files:
+        hashed.update(name.encode() + hashlib.sha256(content).digest())
+    place = Path(tempfile.gettempdir()) / f"simgap-{hashed.hexdigest()[:16]}"
+    for name, content in files:
+        _keep(place / name, content)
+    return place

@@ -13,7 +13,7 @@ from time import perf_counter
 
 import numpy as np
 
-from methods.base import Ask, Evaluation, Task, Tuner
+from methods.base import Ask, Evaluation, Steps, Task, Tuner
 from sims.base import Array
 
 Evaluate = Callable[[Array], "tuple[Array, Array]"]
@@ -72,6 +72,61 @@ def _inside(points: Array) -> bool:
     return bool((points >= 0.0).all() and (points <= 1.0).all())
 
 
+class _Record:
+    """What a run has done so far."""
+
+    def __init__(self, task: Task) -> None:
+        self.used = 0
+        self._dim = task.dim
+        self._proposals: list[Array] = []
+        self._losses: list[Array] = []
+        self._recommended: list[Array] = [task.start]
+        self._tuner_seconds: list[tuple[int, float]] = []
+        self._simulator_seconds: list[tuple[int, float]] = []
+        self._best_loss, self._best = np.inf, task.start
+
+    def recommend(self, recommendation: Array) -> None:
+        """Take what the tuner would deliver now, after all that it has seen."""
+        self._recommended[-1] = _points(recommendation, self._dim, "recommendations")[0]
+
+    def add(self, points: Array, losses: Array, stays: bool) -> None:
+        """Add simulated points (n, dim) and their losses (n,).
+
+        Args:
+            points: as the tuner gets them back.
+            losses: likewise.
+            stays: whether the tuner's last recommendation holds until it gives another; else the
+                best point so far is recommended.
+        """
+        # The tuner gets these very arrays: sorting them would spoil the record.
+        points.setflags(write=False)
+        losses.setflags(write=False)
+        self.used += len(points)
+        self._proposals.append(points)
+        self._losses.append(losses)
+        for i, loss in enumerate(losses.tolist()):
+            if loss < self._best_loss:
+                self._best_loss, self._best = loss, points[i]
+            self._recommended.append(self._recommended[-1] if stays else self._best)
+
+    def time(self, points: int, tuner: float, simulator: float) -> None:
+        """Add the seconds that so many points took."""
+        self._tuner_seconds.append((points, tuner))
+        self._simulator_seconds.append((points, simulator))
+
+    def trace(self, status: str, reason: str) -> Trace:
+        """The whole run, now that it has ended."""
+        return Trace(
+            status,
+            reason,
+            np.concatenate(self._proposals) if self._proposals else np.empty((0, self._dim)),
+            np.concatenate(self._losses) if self._losses else np.empty(0),
+            np.stack(self._recommended),
+            _shared_out(self._tuner_seconds),
+            _shared_out(self._simulator_seconds),
+        )
+
+
 def drive(
     tuner: Tuner,
     task: Task,
@@ -95,60 +150,14 @@ def drive(
     Returns:
         The trace; failures are a status there, never an exception.
     """
-    dim, budget = task.dim, task.budget
-    proposals: list[Array] = []
-    losses: list[Array] = []
-    recommended: list[Array] = [task.start]
-    tuner_time: list[tuple[int, float]] = []
-    simulator_time: list[tuple[int, float]] = []
-    best_loss, best = np.inf, task.start
-    used = 0
-    status, reason = "done", ""
+    record = _Record(task)
     started = perf_counter()
     steps = None
     try:
         steps = tuner.tune(task, rng)
-        before = perf_counter()
-        asked = next(steps)
-        while True:
-            recommendation = None
-            if type(asked) is Ask:
-                asked, recommendation = asked
-                if recommendation is not None:
-                    recommended[-1] = _points(recommendation, dim, "recommendations")[0]
-            points = _points(asked, dim, "proposals")
-            if used >= budget:
-                break
-            cut = len(points) > budget - used
-            if cut:
-                points = points[: budget - used]
-            n = len(points)
-            now = perf_counter()
-            observations, loss = evaluate(points)
-            after = perf_counter()
-            used += n
-            tuner_time.append((n, now - before))
-            simulator_time.append((n, after - now))
-            points.setflags(
-                write=False
-            )  # the tuner gets these very arrays: sorting them would spoil the record
-            loss.setflags(write=False)
-            proposals.append(points)
-            losses.append(loss)
-            for i, value in enumerate(loss.tolist()):
-                if value < best_loss:
-                    best_loss, best = value, points[i]
-                recommended.append(best if recommendation is None else recommended[-1])
-            if after - started > seconds:
-                status, reason = (
-                    "timeout",
-                    f"stopped after {after - started:.1f} s, limit {seconds:g} s",
-                )
-                break
-            if cut:
-                break
-            before = perf_counter()
-            asked = steps.send(Evaluation(points, observations, loss))
+        status, reason = _exchange(steps, task, evaluate, record, started + seconds)
+        if status == "timeout":
+            reason = f"stopped after {perf_counter() - started:.1f} s, limit {seconds:g} s"
     except StopIteration as stop:
         status, reason = "converged", str(stop.value or "the tuner stopped")
     except _DivergenceError as error:
@@ -156,20 +165,63 @@ def drive(
     except Exception:
         status, reason = "crashed", traceback.format_exc()
     finally:
-        if steps is not None and hasattr(steps, "close"):
-            try:
-                steps.close()
-            except Exception:
-                status, reason = "crashed", traceback.format_exc()
-    return Trace(
-        status,
-        reason,
-        np.concatenate(proposals) if proposals else np.empty((0, dim)),
-        np.concatenate(losses) if losses else np.empty(0),
-        np.stack(recommended),
-        _shared_out(tuner_time),
-        _shared_out(simulator_time),
-    )
+        # Also where a person interrupts: what the tuner holds open is its own to close.
+        fault = _closed(steps)
+    if fault:
+        status, reason = "crashed", fault
+    return record.trace(status, reason)
+
+
+def _exchange(
+    steps: Steps, task: Task, evaluate: Evaluate, record: _Record, deadline: float
+) -> tuple[str, str]:
+    """Simulate what the tuner asks for, until the budget or the time is used: status and reason.
+
+    Raises:
+        StopIteration: the tuner stopped; its value says why.
+        _DivergenceError: it gave something that is not finite.
+        Exception: it failed, or the simulator did.
+    """
+    before = perf_counter()
+    asked = next(steps)
+    while True:
+        recommendation = None
+        if type(asked) is Ask:
+            asked, recommendation = asked
+            if recommendation is not None:
+                record.recommend(recommendation)
+        points = _points(asked, task.dim, "proposals")
+        # Only now: what the tuner recommends after its last simulation counts.
+        left = task.budget - record.used
+        if left <= 0:
+            return "done", ""
+        cut = len(points) > left
+        if cut:
+            points = points[:left]
+        now = perf_counter()
+        observations, losses = evaluate(points)
+        after = perf_counter()
+        record.time(len(points), now - before, after - now)
+        record.add(points, losses, stays=recommendation is not None)
+        if after > deadline:
+            return "timeout", ""
+        # A batch is handed back whole or not at all.
+        if cut:
+            return "done", ""
+        before = perf_counter()
+        asked = steps.send(Evaluation(points, observations, losses))
+
+
+def _closed(steps: Steps | None) -> str:
+    """Close a tuner's generator; returns the traceback of what that raised, or nothing."""
+    # What is no generator has failed already, with a message of its own.
+    if steps is None or not hasattr(steps, "close"):
+        return ""
+    try:
+        steps.close()
+    except Exception:
+        return traceback.format_exc()
+    return ""
 
 
 def _shared_out(batches: list[tuple[int, float]]) -> Array:

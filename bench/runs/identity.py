@@ -13,7 +13,7 @@ from pathlib import Path
 
 from bench.problem.experiment import Entry, Experiment
 from bench.problem.targets import SealedTarget
-from bench.registry import SkippedError, simulators, tuners
+from bench.registry import SkippedError, load_plugins, simulators, tuners
 from bench.runs.sources import (
     digest,
     effect_sources,
@@ -24,6 +24,7 @@ from bench.runs.sources import (
     versions,
     what_matters,
 )
+from bench.store.folder import Configuration
 from sims.base import InputError
 
 NOT_OF_A_RUN = {
@@ -88,6 +89,24 @@ def refuse_changes(folder: Path, before: dict[str, str], now: dict[str, str]) ->
                 f"{hashed} now); runs of two kinds are not mixed: put it back as it was, or start "
                 "a new comparison"
             )
+
+
+def unchanged(folder: Path, held: Configuration, plugins: Sequence[str]) -> list[str]:
+    """See that a study can be taken up where it was left; returns all the plugin files it needs.
+
+    Args:
+        folder: the study's.
+        held: what it was begun with; these plugins are loaded.
+        plugins: plugin files beside those; loaded too.
+
+    Raises:
+        InputError: something that matters changed since it was begun.
+    """
+    given = {str(Path(p).resolve()) for p in plugins}
+    everything = held.plugins + sorted(given - set(held.plugins))
+    load_plugins(everything)
+    refuse_changes(folder, held.fingerprint, fingerprint(held.experiment, everything))
+    return everything
 
 
 class Identities:

@@ -1,5 +1,5 @@
 """Worker processes that can be killed: one run at a time in each, a hard limit, and a death costs
-no more than a run.
+no more than a run. Or no worker process at all, where somebody wants to look on.
 
 Every worker is a pebble pool of its own with a single process. pebble shares one channel, guarded
 by two locks, among the workers of a pool: a worker that is killed while it holds them would stop
@@ -12,10 +12,12 @@ import math
 import multiprocessing
 import os
 import threading
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from concurrent.futures import TimeoutError as FutureTimeoutError
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any, Protocol
@@ -40,6 +42,9 @@ _FUTILE = 10
 _SHORT = 1.0
 """Seconds below which a worker is given its next call ahead of time."""
 
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""What tells numerical libraries how many threads they may have."""
+
 Call = tuple[Callable[..., Any], tuple[Any, ...]]
 
 
@@ -54,7 +59,7 @@ class LostError(RuntimeError):
 
 
 class Pool(Protocol):
-    """What makes calls in isolation: worker processes here, or a cluster's."""
+    """What makes calls: worker processes here, a cluster's, or this process itself."""
 
     def load(self, plugins: Sequence[str]) -> None:
         """Make these plugin files known to the workers; before the first call."""
@@ -71,6 +76,69 @@ class Pool(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
 
+def pool_of(jobs: int) -> Pool:
+    """So many worker processes on this machine; for 0 this process makes the calls itself.
+
+    Raises:
+        InputError: fewer than 0.
+    """
+    if jobs < 0:
+        raise InputError(f"jobs: expected a number of worker processes from 0 on, found {jobs}")
+    return LocalPool(jobs) if jobs else InProcessPool()
+
+
+class InProcessPool:
+    """Makes the calls in this process, one after another: prints show, and breakpoints hold.
+
+    Nothing is isolated. A call that hangs hangs all, one that ends its process ends all, a class
+    need not be in a file, and nothing but a tuner's good manners keeps it from the truth.
+    """
+
+    def load(self, plugins: Sequence[str]) -> None:
+        """Nothing is to be done: who makes the calls has loaded the plugins."""
+
+    def __enter__(self) -> InProcessPool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        from bench.runs.worker import release
+
+        # A notebook may define a simulator anew under its old name before the next comparison.
+        release()
+
+    def results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:  # noqa: ARG002 - there is nobody who could end a call past its limit
+        """Place and result (or exception) of each call, in their order.
+
+        What a call raises is said on stderr too, while the person who wrote it is looking.
+        """
+        with _one_thread():
+            for place in range(len(calls)):
+                function, arguments = calls[place]
+                try:
+                    result = function(*arguments)
+                except InputError as error:
+                    result = error
+                except Exception as error:
+                    traceback.print_exc()
+                    result = error
+                except SystemExit as error:
+                    traceback.print_exc()
+                    result = DeathError(f"it asked to exit with {error.code!r}")
+                yield place, result
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Within the block arithmetic has one thread, as in a worker: sums come out the same."""
+    from threadpoolctl import threadpool_limits
+
+    # For libraries that are loaded within the block; threadpoolctl knows those that are there.
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
+    with threadpool_limits(limits=1):
+        yield
+
+
 @dataclass
 class _Given:
     """A call handed to a worker."""
@@ -80,6 +148,28 @@ class _Given:
     given: float = field(default_factory=monotonic)
 
 
+@dataclass
+class _Pace:
+    """How many calls a worker has at a time: short ones come in twos, so that none waits for the
+    next.
+    """
+
+    depth: int = 1
+    ended: int = 0
+    busy: float = 0.0
+
+    def note(self, seconds: float) -> None:
+        """Count a call that ended after so many seconds."""
+        self.ended += 1
+        self.busy += seconds
+
+    def adapt(self) -> None:
+        """Choose the depth for what comes."""
+        # While two are given ahead, a call's time counts the wait for the one before it.
+        short = self.ended and self.busy / self.ended < self.depth * _SHORT
+        self.depth = 2 if short else 1
+
+
 class LocalPool:
     """Worker processes on this machine, each a fresh interpreter with one arithmetic thread.
 
@@ -87,10 +177,9 @@ class LocalPool:
         jobs: how many.
     """
 
-    _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
     def __init__(self, jobs: int) -> None:
-        for name in self._THREADS:
+        # Workers inherit it; libraries read it when they are first loaded.
+        for name in THREADS:
             os.environ.setdefault(name, "1")
         self._jobs = jobs
         self._plugins: list[str] = []
@@ -119,22 +208,28 @@ class LocalPool:
         limit = None if math.isinf(seconds) else seconds + GRACE
         self._slots = self._slots or [_Slot(self._plugins) for _ in range(self._jobs)]
         following = deque(_Given(place) for place in range(len(calls)))
-        depth, finished, busy = 1, 0, 0.0
+        pace = _Pace()
         while True:
-            for _ in range(depth):
-                for slot in self._slots:
-                    if following and len(slot.given) < depth:
-                        slot.give(following.popleft(), calls, limit)
+            self._hand_out(following, pace.depth, calls, limit)
             futures = [future for slot in self._slots for future in slot.given]
             if not futures:
                 return
+            # Not for ever: a worker that left with code 0 ends no future.
             wait(futures, timeout=1.0, return_when=FIRST_COMPLETED)
             for slot in self._slots:
                 for one, result in slot.collect(following):
-                    finished += 1
-                    busy += monotonic() - one.given
+                    pace.note(monotonic() - one.given)
                     yield one.place, result
-            depth = 2 if finished and busy / finished < depth * _SHORT else 1
+            pace.adapt()
+
+    def _hand_out(
+        self, following: deque[_Given], depth: int, calls: Sequence[Call], limit: float | None
+    ) -> None:
+        """Give every worker up to `depth` calls; everybody the first before anybody the second."""
+        for _ in range(depth):
+            for slot in self._slots:
+                if following and len(slot.given) < depth:
+                    slot.give(following.popleft(), calls, limit)
 
 
 class _Slot:
@@ -191,22 +286,13 @@ class _Slot:
         lost = False
         for future in [future for future in self.given if future.done()]:
             one, error = self.given.pop(future), future.exception()
-            code = getattr(error, "exitcode", None)
-            lost = (
-                lost or code is not None or isinstance(error, BrokenExecutor | FutureTimeoutError)
-            )
+            lost = lost or _loses_the_worker(error)
             if error is None:
                 self._futile = 0
-                ended.append((one, future.result()))
-            elif isinstance(error, BrokenExecutor) or (code in _OUTSIDE and one.deaths < RETRIES):
-                one.deaths += code is not None
+            if _is_to_be_made_again(one, error):
                 again.appendleft(one)
-            elif isinstance(error, FutureTimeoutError):
-                ended.append(
-                    (one, TimeoutError(str(error)))
-                )  # before Python 3.11 the two are different classes
             else:
-                ended.append((one, error if code is None else DeathError(_says(code))))
+                ended.append((one, future.result() if error is None else _end_of(error)))
         if not lost and self._died_quietly():
             lost = True
             at = next(future for future in self.given if future.running())
@@ -234,6 +320,34 @@ class _Slot:
         self.stop()
         self._births.close()
         self._start()
+
+
+def _exit_code(error: BaseException | None) -> int | None:
+    """How the worker process left, where pebble says that this ended the call."""
+    return getattr(error, "exitcode", None)
+
+
+def _loses_the_worker(error: BaseException | None) -> bool:
+    """Whether the worker of a call with this end is gone: it died, or was killed at its limit."""
+    return _exit_code(error) is not None or isinstance(error, BrokenExecutor | FutureTimeoutError)
+
+
+def _is_to_be_made_again(one: _Given, error: BaseException | None) -> bool:
+    """Whether the end of a call says nothing about the call; counts the deaths that it has met."""
+    code = _exit_code(error)
+    # A pool that broke had not begun the call, or not told what came of it.
+    again = isinstance(error, BrokenExecutor) or (code in _OUTSIDE and one.deaths < RETRIES)
+    if again:
+        one.deaths += code is not None
+    return again
+
+
+def _end_of(error: BaseException) -> BaseException:
+    """What a call that failed gives in place of a result."""
+    if isinstance(error, FutureTimeoutError):
+        return TimeoutError(str(error))  # before Python 3.11 the two are different classes
+    code = _exit_code(error)
+    return error if code is None else DeathError(_says(code))
 
 
 def _says(code: int) -> str:

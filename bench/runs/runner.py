@@ -1,5 +1,5 @@
-"""Runs an experiment: tuners x targets x seeds in worker processes; every finished run is kept the
-moment it ends.
+"""Runs an experiment: tuners x targets x seeds, in worker processes or in this one; every finished
+run is kept the moment it ends.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from bench.problem.experiment import Entry, Experiment
 from bench.problem.identifiability import Spectrum
 from bench.problem.problem import Problem
 from bench.problem.targets import Target
-from bench.registry import SkippedError, tuners
+from bench.registry import Registry, SkippedError, effects, simulators, tuners
 from bench.runs.guard import limits
 from bench.runs.identity import Identities
-from bench.runs.pools import Call, DeathError, LocalPool, LostError, Pool
+from bench.runs.pools import Call, DeathError, LostError, Pool, pool_of
 from bench.runs.rows import rows, status_of, unfinished
+from bench.runs.sources import effect_names
 from bench.runs.training import Training, WeightsError, build, train
 from bench.runs.worker import Order, Outcome, perform
 from bench.store.status import Status
@@ -28,7 +29,8 @@ Progress = Callable[[str, int], Callable[[], None]]
 """Called with a title and a number of steps; gives the function to call after each step."""
 
 
-def _silent(_title: str, _steps: int) -> Callable[[], None]:
+def silent(_title: str, _steps: int) -> Callable[[], None]:
+    """Progress that nobody looks at."""
     return lambda: None
 
 
@@ -118,6 +120,29 @@ def check(experiment: Experiment) -> dict[str, str]:
     return skipped
 
 
+def refuse_unreachable(experiment: Experiment) -> None:
+    """Refuse classes that this process alone has, for work in other processes.
+
+    A worker starts afresh, so that no tuner finds a truth in its memory; it gets plugin files and
+    installed packages, and not what a notebook's cell or a script defined.
+
+    Raises:
+        InputError: the simulator, a tuner or an effect is one.
+    """
+    used: list[tuple[Registry[Any], str]] = [(simulators, experiment.simulator)]
+    used += [(tuners, entry.tuner) for entry in experiment.tuners]
+    used += [(effects, name) for name in effect_names(experiment.settings, experiment.world)]
+    for registry, name in used:
+        added = registry.snapshot().get(name)
+        if added is not None and added.path is None:
+            raise InputError(
+                f"{registry.kind} {name}: class {added.part.__qualname__} of "
+                f"{added.part.__module__} exists in this process alone, and worker processes load "
+                "files; use jobs=0, which runs everything here, or put the class into a file and "
+                "give that as a plugin"
+            )
+
+
 def prepare(experiment: Experiment) -> Results:
     """Check an experiment whole before any work: its simulator, recording, tuners and their
     options; plan its runs.
@@ -127,7 +152,7 @@ def prepare(experiment: Experiment) -> Results:
     """
     if not experiment.tuners:
         raise InputError(
-            f"experiment {experiment.name}: names no tuner; add a [tuners.NAME] table or use --tuners"
+            f"experiment {experiment.name}: names no tuner; add a [tuners.NAME] table or choose some"
         )
     if experiment.memory:
         limits()
@@ -153,7 +178,7 @@ def run(
     results: Results,
     plugins: Sequence[str] = (),
     jobs: int = 2,
-    progress: Progress = _silent,
+    progress: Progress = silent,
     pool: Pool | None = None,
 ) -> None:
     """Make every run of a prepared experiment that is not kept already; `results.kept` gets each as
@@ -162,14 +187,17 @@ def run(
     Args:
         results: from `prepare`.
         plugins: plugin files that workers need; the caller has loaded them in this process.
-        jobs: worker processes. The results do not depend on their number.
+        jobs: worker processes; 0 for none, and everything in this one. The results do not depend
+            on their number.
         progress: told of every step.
         pool: where to run instead, e.g. on a cluster.
 
     Raises:
-        InputError: workers cannot be had.
+        InputError: workers cannot be had, or a class that they cannot have is wanted.
     """
-    with pool or LocalPool(jobs) as workers:
+    if pool is not None or jobs:
+        refuse_unreachable(results.problem.experiment)
+    with pool or pool_of(jobs) as workers:
         workers.load(plugins)
         try:
             _run(results, workers, progress)
@@ -230,29 +258,34 @@ class _Calls(Sequence[Call]):
 
 
 def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, int], Exception]:
-    """Train every learned entry with each of its seeds; returns the reasons of those that failed."""
+    """Train every learned entry with each of its seeds; returns the reasons of those that failed.
+
+    Raises:
+        WeightsError: trained weights are there and damaged: the user's to mend, and nothing has
+            been run yet.
+    """
     experiment = results.problem.experiment
-    usable = [
-        e
-        for e in experiment.tuners
-        if e.label not in results.skipped and tuners.get(e.tuner).learned
+    wanted = [
+        (entry, seed)
+        for entry in experiment.tuners
+        if entry.label not in results.skipped and tuners.get(entry.tuner).learned
+        for seed in range(seeds_of(experiment, entry))
     ]
-    wanted = [(e, seed) for e in usable for seed in range(seeds_of(experiment, e))]
     failures: dict[tuple[str, int], Exception] = {}
-    if wanted:
-        step = progress("training", len(wanted))
-        calls = [(train, (experiment, entry, seed)) for entry, seed in wanted]
-        for place, trained in pool.results(calls, math.inf):
-            entry, seed = wanted[place]
-            if isinstance(trained, Training):
-                results.trainings[entry.label, seed] = trained
-            elif isinstance(
-                trained, WeightsError
-            ):  # a fault of the user's: nothing has been run yet
-                raise trained
-            else:
-                failures[entry.label, seed] = trained
-            step()
+    # A bar that has nothing to do would stand there for ever.
+    if not wanted:
+        return failures
+    step = progress("training", len(wanted))
+    calls = [(train, (experiment, entry, seed)) for entry, seed in wanted]
+    for place, training in pool.results(calls, math.inf):
+        entry, seed = wanted[place]
+        if isinstance(training, Training):
+            results.trainings[entry.label, seed] = training
+        elif isinstance(training, WeightsError):
+            raise training
+        else:
+            failures[entry.label, seed] = training
+        step()
     return failures
 
 

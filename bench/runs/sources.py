@@ -14,7 +14,7 @@ import json
 import linecache
 import platform
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
@@ -234,14 +234,17 @@ def _installed() -> frozenset[str]:
 
 def effect_sources(*settings: Mapping[str, Any]) -> list[str]:
     """Sources of the effects that settings of a simulator name, which its class does not hold."""
-    return [source(effects.get(name)) for name in sorted({*_named(settings)})]
+    return [source(effects.get(name)) for name in effect_names(*settings)]
 
 
-def _named(settings: Iterable[Mapping[str, Any]]) -> Iterator[str]:
-    """Names of effects in ``effects`` and ``fixed``; what is no effect is the simulator's affair."""
+def effect_names(*settings: Mapping[str, Any]) -> list[str]:
+    """Names of the effects in ``effects`` and ``fixed`` of these settings, each once, sorted."""
     known = effects.names()
+    names: set[str] = set()
     for table in settings:
         for key in ("effects", "fixed"):
             value = table.get(key, ())
+            # What is no list, or no effect, is the simulator's to refuse.
             if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
-                yield from (name for name in value if name in known)
+                names.update(name for name in value if name in known)
+    return sorted(names)

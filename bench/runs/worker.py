@@ -7,7 +7,9 @@ scores.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
@@ -35,6 +37,14 @@ class Order:
     target: SealedTarget
     budget: int
     weights: Path | None = None
+
+    def files(self) -> tuple[Path, ...]:
+        """What must travel with the order to another machine."""
+        return () if self.weights is None else (self.weights,)
+
+    def moved(self, places: Mapping[Path, Path]) -> Order:
+        """The order where its files have other places."""
+        return self if self.weights is None else replace(self, weights=places[self.weights])
 
 
 @dataclass(frozen=True)
@@ -65,10 +75,16 @@ def problem_of(experiment: Experiment) -> Problem:
     """The problem of an experiment, built once in each process."""
     held = _problems.get(0)
     if held is None or held[0] != experiment:
-        if held is not None:
-            held[1].close()
+        release()
         held = _problems[0] = (experiment, Problem(experiment))
     return held[1]
+
+
+def release() -> None:
+    """Close the problem that this process has kept, and forget it."""
+    for _, problem in _problems.values():
+        problem.close()
+    _problems.clear()
 
 
 def perform(experiment: Experiment, order: Order) -> Outcome:
@@ -98,10 +114,12 @@ def perform(experiment: Experiment, order: Order) -> Outcome:
         trace = drive(tuner, task, evaluator, rng, experiment.timeout)
     seconds = perf_counter() - started
     beside = problem.simulated - before - len(trace.losses)
-    if (
-        beside > 0 and trace.status != "crashed"
-    ):  # a simulator that raises has simulated, and nothing came of it
+    # A simulator that raises has simulated, and nothing came of it.
+    if beside > 0 and trace.status != "crashed":
         raise CheatError(f"{beside} simulations beside the budget")
+    if trace.status == "crashed":
+        # Nobody sees a worker's stderr; without workers the person who wrote the tuner does.
+        sys.stderr.write(trace.reason)
     heldout = None
     if target.held_out.scenarios:
         heldout = Evaluator(problem, target.held_out).rmse(

@@ -3,74 +3,91 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from bench.problem.experiment import Experiment
 from bench.shot.animation import animate
-from bench.shot.deal import deals
+from bench.shot.kept import read
 from bench.shot.pictures import draw, examples
-from bench.shot.settings import Settings
-from bench.shot.study import read
-from bench.shot.table import FAILED, table, text
+from bench.shot.table import NO_SHOT, table, text
 from bench.store.journal import FOLDER
 from bench.store.status import STATUS_COLUMNS
 from sims.files import write
 
+if TYPE_CHECKING:
+    from bench.shot.study import BounceShotStudy
 
-def finish(
-    folder: Path,
-    experiment: Experiment,
-    settings: Settings,
-    skipped: Mapping[str, str],
-    say: Callable[[str], None],
-) -> int:
-    """Write and say what the shots in `folder` came to; returns the exit code: 1 where a method
-    failed or died.
+SIMULATOR = "bounce-shot"
+"""What status.csv says that a shot is planned in."""
+_NUMBERS = (
+    "off",
+    "margin",
+    "planned_margin",
+    "prediction_error",
+    "drop_height",
+    "restitution",
+    "seconds",
+)
+"""Columns of the shots that may be empty."""
+_FAILED = ("crashed", "timeout")
+"""Failures of the method and not of its plan, which make the command fail."""
+
+
+def finish(study: BounceShotStudy, say: Callable[[str], None]) -> int:
+    """Write and say what the shots in a study's folder came to.
+
+    Returns:
+        How many times a method crashed or took too long.
     """
-    dealt = deals(experiment, settings)
-    kept = {one.name: made for one in dealt if (made := read(folder, one)) is not None}
-    rows = pd.DataFrame([row for made in kept.values() for row in made["rows"]])
-    for name in (
-        "off",
-        "margin",
-        "planned_margin",
-        "prediction_error",
-        "drop_height",
-        "restitution",
-        "seconds",
-    ):
+    folder = study.folder
+    kept = {}
+    for one in study.deals:
+        if (shot := read(folder, one)) is not None:
+            kept[one.name] = shot
+    if not kept:
+        say("no shot was made")
+        return 0
+    rows = pd.DataFrame([row for shot in kept.values() for row in shot["rows"]])
+    for name in _NUMBERS:
+        # A column that is empty throughout has no type of its own.
         rows[name] = pd.to_numeric(rows[name])
     lines = table(rows)
-    write(folder / "table.csv", lines.to_csv(index=False, float_format="%.6g"))
-    write(folder / "shots.csv", rows.to_csv(index=False, float_format="%.6g"))
-    write(folder / "status.csv", _statuses(rows, skipped).to_csv(index=False, float_format="%.6g"))
-    figures = draw(folder, experiment, settings, dealt, kept, rows, lines)
-    figures += [
-        animate(folder, settings, example, kept) for example in examples(dealt, kept, rows)[:1]
-    ]
+    statuses = _statuses(rows, study.skipped)
+    for name, frame in (("table", lines), ("shots", rows), ("status", statuses)):
+        write(folder / f"{name}.csv", frame.to_csv(index=False, float_format="%.6g"))
+    figures = draw(folder, study.experiment, study.settings, study.deals, kept, rows, lines)
+    for example in examples(study.deals, kept, rows)[:1]:
+        figures.append(animate(folder, study.settings, example, kept))
+    # Every new folder has one for a journal, which a bounce shot does not keep.
     journal = folder / FOLDER
     if journal.is_dir() and not any(journal.iterdir()):
         journal.rmdir()
     say("\n" + text(lines))
-    for label, reason in skipped.items():
-        say(f"skipped {label}: {reason}")
-    failed = rows[rows["status"].isin(FAILED)]
-    for (method, status), part in failed.groupby(["method", "status"]):
-        say(f"{status}: {method} in {len(part)} shots; {part['reason'].iloc[0]}")
+    failed = rows[rows["status"].isin(NO_SHOT)]
+    _say_faults(failed, study.skipped, say)
     say(f"\ntable   {folder / 'table.csv'}\nshots   {folder / 'shots.csv'}")
     for figure in figures:
         say(f"figure  {figure}")
-    return 1 if failed["status"].isin(("crashed", "timeout")).any() else 0
+    return int(failed["status"].isin(_FAILED).sum())
+
+
+def _say_faults(
+    failed: pd.DataFrame, skipped: Mapping[str, str], say: Callable[[str], None]
+) -> None:
+    for label, reason in skipped.items():
+        say(f"skipped {label}: {reason}")
+    for (method, status), part in failed.groupby(["method", "status"]):
+        say(f"{status}: {method} in {len(part)} shots; {part['reason'].iloc[0]}")
 
 
 def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
+    """Rows of status.csv: a line a method and shot, and one a tuner that could not be used."""
     made = pd.DataFrame(
         {
             "run": rows["method"] + "/" + rows["shot"],
             "tuner": rows["method"],
-            "simulator": "bounce-shot",
+            "simulator": SIMULATOR,
             "target": rows["shot"],
             "seed": 0,
             "status": rows["status"],
@@ -79,8 +96,11 @@ def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
             "seconds": rows["seconds"],
         }
     )
+    # An empty frame beside it would change the types of the columns.
+    if not skipped:
+        return made
     left = [
-        (label, label, "bounce-shot", "", 0, "skipped", reason, 0, 0.0)
+        (label, label, SIMULATOR, "", 0, "skipped", reason, 0, 0.0)
         for label, reason in skipped.items()
     ]
-    return pd.concat([made, pd.DataFrame(left, columns=STATUS_COLUMNS)]) if left else made
+    return pd.concat([made, pd.DataFrame(left, columns=STATUS_COLUMNS)])

@@ -1,175 +1,265 @@
-"""Runs a bounce-shot experiment: records drops, has every method plan, makes the shots, keeps what
-is finished.
-"""
+"""A bounce shot in its folder: drops are recorded, every method plans, the shots are made and kept."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 from bench.problem.experiment import Experiment
-from bench.runs.pools import Call, LocalPool
-from bench.runs.runner import Progress, check
+from bench.registry import tuners
+from bench.runs.pools import Call, LostError, Pool, pool_of
+from bench.runs.runner import Progress, check, refuse_unreachable, silent
+from bench.runs.training import Training, train
 from bench.shot import tune
 from bench.shot.deal import RECORDINGS, Deal, deals, in_view, record
+from bench.shot.kept import SHOTS, keep, missing
 from bench.shot.settings import Settings, settings_of
-from bench.shot.throw import thrown
 from bench.store.folder import Configuration, configuration, create, free_folder
+from bench.store.standing import MISSING, End, Made, Standing
 from sims.base import InputError
 from sims.camera import packages
-from sims.files import write
 from sims.shot import world
 
 Say = Callable[[str], None]
-SHOTS = "shots"
 
 
-def begin(experiment: Experiment, plugins: Sequence[str], out: str | None, jobs: int) -> Path:
-    """Check the experiment and make its folder.
+class BounceShotStudy:
+    """Shots x methods, kept in a folder; fulfils `bench.study.Study`.
+
+    Args:
+        folder: of a bounce shot.
+
+    Attributes:
+        folder: where everything lies.
+        configuration: what it is for.
+        plugins: plugin files that its tuners need.
 
     Raises:
-        InputError: a fault in it, or the folder is not free.
+        InputError: it is no such folder, or it is damaged.
     """
-    from bench.runs.identity import fingerprint
 
-    if settings_of(experiment).filmed:
-        packages.require("; or set shot.filmed = 0")
-    if experiment.simulator != "ball" or experiment.observe != ("z",):
-        raise InputError(
-            f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.configuration = configuration(folder)
+        self.plugins = self.configuration.plugins
+
+    @classmethod
+    def begin(
+        cls,
+        experiment: Experiment,
+        plugins: Sequence[str] = (),
+        folder: Path | None = None,
+        jobs: int = 2,
+    ) -> BounceShotStudy:
+        """A bounce shot in a new folder; nothing has been dropped yet.
+
+        Args:
+            experiment: with a [shot] table.
+            plugins: plugin files that it needs; the caller has loaded them.
+            folder: new or empty; one below results/ that is named for the time where None.
+            jobs: worker processes that it is meant to be made with; 0 for none.
+
+        Raises:
+            InputError: a fault in the experiment, or the folder is not free.
+        """
+        from bench.runs.identity import fingerprint
+
+        if settings_of(experiment).filmed:
+            packages.require("; or set shot.filmed = 0")
+        if experiment.simulator != "ball" or experiment.observe != ("z",):
+            raise InputError(
+                f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'
+            )
+        place = free_folder(experiment, folder)
+        # Before there is a folder: a fault of the user's leaves nothing behind.
+        check(experiment)
+        if jobs:
+            refuse_unreachable(experiment)
+        hashes = fingerprint(experiment, plugins)
+        create(place, Configuration(experiment, list(plugins), hashes), jobs)
+        return cls(place)
+
+    @classmethod
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> BounceShotStudy:
+        """A bounce shot that was interrupted: what is kept stays, what is missing remains.
+
+        Args:
+            folder: the study's.
+            plugins: plugin files beside those that it was begun with.
+
+        Raises:
+            InputError: it is damaged, or something that matters has changed since it was begun.
+        """
+        from bench.runs.identity import unchanged
+
+        study = cls(folder)
+        study.plugins = unchanged(folder, study.configuration, plugins)
+        return study
+
+    @cached_property
+    def skipped(self) -> dict[str, str]:
+        """The tuners that cannot be used here, by label, and why."""
+        return check(self.configuration.experiment)
+
+    @cached_property
+    def experiment(self) -> Experiment:
+        """What is shot, with the tuners that can be used."""
+        whole = self.configuration.experiment
+        labels = [entry.label for entry in whole.tuners if entry.label not in self.skipped]
+        return whole.with_tuners(labels)
+
+    @cached_property
+    def settings(self) -> Settings:
+        """The [shot] table."""
+        return settings_of(self.configuration.experiment)
+
+    @cached_property
+    def deals(self) -> list[Deal]:
+        """All shots."""
+        return deals(self.configuration.experiment, self.settings)
+
+    def make(
+        self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
+    ) -> Made:
+        """Make what is missing.
+
+        Args:
+            jobs: worker processes; 0 for none, and everything in this one.
+            progress: told of every step.
+            pool: where tuners train and tune instead, e.g. on a cluster. Drops are recorded on
+                this machine, since who records them knows the balls.
+
+        Raises:
+            InputError: workers cannot be had; what was finished is kept.
+        """
+        if reason := world.missing():
+            return self._made(skipped=reason)
+        if pool is not None or jobs:
+            refuse_unreachable(self.experiment)
+        try:
+            left = missing(self.folder, self.deals)
+            if left:
+                _Making(self, left, progress or silent).run(jobs, pool)
+        except KeyboardInterrupt:  # the balls take turns, so what there is tells of all of them
+            return self._made(interrupted=True)
+        except LostError as error:
+            return self._made(stopped=str(error))
+        return self._made()
+
+    def _made(self, **why: Any) -> Made:
+        left = missing(self.folder, self.deals)
+        return Made(len(self.deals) - len(left), len(self.deals), **why)
+
+    def status(self) -> Standing:
+        """Which shots the folder holds and which are missing."""
+        left = {one.name for one in missing(self.folder, self.deals)}
+        ends = tuple(
+            End(one.name, one.ball.name, MISSING if one.name in left else "made")
+            for one in self.deals
         )
-    folder = free_folder(experiment, Path(out) if out else None)
-    create(folder, Configuration(experiment, list(plugins), fingerprint(experiment, plugins)), jobs)
-    return folder
+        held = self.configuration
+        return Standing(held.experiment.name, "shots made", held.fingerprint, ends)
+
+    def finish(self, say: Say) -> int:
+        """Write tables and figures of what there is, and say what came out.
+
+        Returns:
+            How many times a method failed.
+
+        Raises:
+            InputError: the file of a shot is damaged.
+        """
+        from bench.shot.report import finish
+
+        return finish(self, say)
 
 
-def is_shot(folder: Path) -> bool:
-    """Whether a folder holds a bounce shot."""
-    return bool(configuration(folder).experiment.shot)
+class _Making:
+    """The work on the shots that are missing, one stage after another."""
 
+    def __init__(self, study: BounceShotStudy, left: list[Deal], progress: Progress) -> None:
+        self._study, self._left, self._progress = study, left, progress
+        self._experiment, self._settings = study.experiment, study.settings
+        self._paths = [study.folder / RECORDINGS / f"{one.name}.csv" for one in left]
 
-def status(folder: Path, say: Say) -> bool:
-    """Say how many shots a folder holds; returns whether that is all."""
-    experiment = configuration(folder).experiment
-    dealt = deals(experiment, settings_of(experiment))
-    made = sum(_path(folder, one).exists() for one in dealt)
-    complete = made == len(dealt)
-    say(
-        f"{experiment.name}: {made} of {len(dealt)} shots made" + (", complete" if complete else "")
-    )
-    if not complete:
-        say(f"to finish it: simgap compare --resume {folder}")
-    return complete
+    def run(self, jobs: int, pool: Pool | None) -> None:
+        """Record the drops, train, tune and plan, make the shots.
 
+        Raises:
+            LostError: what makes the calls is gone.
+            WeightsError: trained weights are there and damaged.
+        """
+        for name in (SHOTS, RECORDINGS):
+            (self._study.folder / name).mkdir(exist_ok=True)
+        # These workers know the balls, and tune nothing; those that tune are others.
+        with pool_of(jobs) as workers:
+            faults = self._record(workers)
+        with pool or pool_of(jobs) as workers:
+            workers.load(self._study.plugins)
+            weights = self._train(workers)
+            self._shoot(workers, faults, weights)
 
-def make(folder: Path, plugins: Sequence[str], jobs: int, bar: Progress, say: Say) -> int:
-    """Make what is missing in the folder, write table and figures; returns the exit code."""
-    from bench.shot.report import finish
-
-    experiment = configuration(folder).experiment
-    if reason := world.missing():
-        say(f"skipped: {reason}")
-        return 0
-    skipped = check(experiment)
-    experiment = experiment.with_tuners(
-        [e.label for e in experiment.tuners if e.label not in skipped]
-    )
-    settings = settings_of(experiment)
-    missing = [one for one in deals(experiment, settings) if not _path(folder, one).exists()]
-    if missing:
-        _unchanged(folder, plugins)
-    try:
-        _shoot(folder, experiment, settings, missing, plugins, jobs, bar)
-    except KeyboardInterrupt:  # the balls take turns, so what there is tells of all of them
-        if any((folder / SHOTS).glob("*.json")):
-            finish(folder, experiment, settings, skipped, say)
-        say(f"simgap: interrupted; to finish: simgap compare --resume {folder}")
-        return 130
-    return finish(folder, experiment, settings, skipped, say)
-
-
-def _unchanged(folder: Path, plugins: Sequence[str]) -> None:
-    """Refuse to mix shots of two configurations."""
-    from bench.runs.identity import fingerprint, refuse_changes
-
-    held = configuration(folder)
-    everything = held.plugins + sorted(
-        {str(Path(p).resolve()) for p in plugins} - set(held.plugins)
-    )
-    refuse_changes(folder, held.fingerprint, fingerprint(held.experiment, everything))
-
-
-def _shoot(
-    folder: Path,
-    experiment: Experiment,
-    settings: Settings,
-    missing: list[Deal],
-    plugins: Sequence[str],
-    jobs: int,
-    bar: Progress,
-) -> None:
-    if not missing:
-        return
-    weights = _trained(experiment, settings, bar)
-    for name in (SHOTS, RECORDINGS):
-        (folder / name).mkdir(exist_ok=True)
-    paths = [folder / RECORDINGS / f"{one.name}.csv" for one in missing]
-    drops: list[Call] = [
-        (record, (experiment, one, settings, path))
-        for one, path in zip(missing, paths, strict=True)
-    ]
-    step = bar("dropping", len(missing))
-    unseen: dict[int, BaseException] = {}
-    with LocalPool(jobs) as pool:  # these workers know the balls, and tune nothing
-        for place, fault in pool.results(drops, experiment.timeout):
+    def _record(self, workers: Pool) -> dict[int, BaseException]:
+        """Record every drop; returns what went wrong, by place."""
+        calls: list[Call] = [
+            (record, (self._experiment, one, self._settings, path))
+            for one, path in zip(self._left, self._paths, strict=True)
+        ]
+        step = self._progress("dropping", len(calls))
+        faults: dict[int, BaseException] = {}
+        for place, fault in workers.results(calls, self._experiment.timeout):
             if isinstance(fault, BaseException):
-                unseen[place] = fault
+                faults[place] = fault
             step()
-    seen = [place for place in range(len(missing)) if place not in unseen]
-    known = {
-        place: tune.Known(missing[place].name, paths[place], missing[place].scene, weights)
-        for place in seen
-    }
-    step = bar("shooting", len(missing))
-    for place, fault in unseen.items():
-        status = "no recording" if isinstance(fault, InputError) else "crashed"
-        _keep(folder, missing[place], settings, _failed(experiment, fault, status), 0.0)
-        step()
-    with LocalPool(jobs) as pool:
-        pool.load(plugins)
-        calls: list[Call] = [(tune.models, (experiment, settings, known[place])) for place in seen]
-        for at, made in pool.results(calls, experiment.timeout):
+        return faults
+
+    def _train(self, workers: Pool) -> dict[str, Path]:
+        """The files of the learned tuners' weights, by label.
+
+        Raises:
+            Exception: a training failed; an untrained tuner must not be taken for a trained one.
+        """
+        learned = [e for e in self._experiment.tuners if tuners.get(e.tuner).learned]
+        grounds = [tune.tuned_in(self._experiment, self._settings, entry) for entry in learned]
+        calls: list[Call] = [
+            (train, (ground, entry, 0)) for ground, entry in zip(grounds, learned, strict=True)
+        ]
+        step = self._progress("training", len(calls))
+        weights = {}
+        for place, training in workers.results(calls, math.inf):
+            if not isinstance(training, Training):
+                raise training
+            weights[learned[place].label] = training.path
+            step()
+        return weights
+
+    def _shoot(
+        self, workers: Pool, faults: dict[int, BaseException], weights: dict[str, Path]
+    ) -> None:
+        """Have every method tune and plan, and make the shots."""
+        seen = [place for place in range(len(self._left)) if place not in faults]
+        calls: list[Call] = []
+        for place in seen:
+            one = self._left[place]
+            known = tune.Known(one.name, self._paths[place], one.scene, weights)
+            calls.append((tune.models, (self._experiment, self._settings, known)))
+        step = self._progress("shooting", len(self._left))
+        for place, fault in faults.items():
+            status = "no recording" if isinstance(fault, InputError) else "crashed"
+            self._keep(place, _failed(self._experiment, fault, status), 0.0)
+            step()
+        for at, models in workers.results(calls, self._experiment.timeout):
             place = seen[at]
-            models = _failed(experiment, made) if isinstance(made, BaseException) else made
-            _keep(folder, missing[place], settings, models, in_view(paths[place], experiment))
+            if isinstance(models, BaseException):
+                models = _failed(self._experiment, models)
+            self._keep(place, models, in_view(self._paths[place], self._experiment))
             step()
 
-
-def _keep(
-    folder: Path, dealt: Deal, settings: Settings, models: list[dict[str, Any]], seen: float
-) -> None:
-    kept = {
-        "models": models,
-        "rows": [{**row, "seen": seen} for row in thrown(dealt, settings, models)],
-    }
-    write(_path(folder, dealt), json.dumps(_plain(kept), indent=1, allow_nan=False) + "\n")
-
-
-def _trained(experiment: Experiment, settings: Settings, bar: Progress) -> dict[str, Path]:
-    from bench.registry import tuners
-    from bench.runs.training import train
-
-    learned = [entry for entry in experiment.tuners if tuners.get(entry.tuner).learned]
-    step = bar("training", len(learned))
-    weights = {}
-    for entry in learned:
-        weights[entry.label] = train(tune.tuned_in(experiment, settings, entry), entry, 0).path
-        step()
-    return weights
+    def _keep(self, place: int, models: list[dict[str, Any]], seen: float) -> None:
+        keep(self._study.folder, self._left[place], self._settings, models, seen)
 
 
 def _failed(
@@ -183,41 +273,6 @@ def _failed(
     nothing = partial(
         tune.Model, effects={}, simulations=0, seconds=math.nan, status=status, reason=str(error)
     )
-    labels = [e.label for e in experiment.tuners]
+    labels = [entry.label for entry in experiment.tuners]
     methods = [tune.NOMINAL, *labels, tune.EXPLAINED, *(label + tune.AFTER for label in labels)]
     return [vars(nothing(method=method, restitution=math.nan)) for method in methods]
-
-
-def read(folder: Path, dealt: Deal) -> dict[str, Any] | None:
-    """What is kept of a shot; None where it has not been made."""
-    path = _path(folder, dealt)
-    if not path.exists():
-        return None
-    try:
-        kept: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        for model in kept["models"]:
-            model.update(
-                {
-                    k: math.nan
-                    for k in ("height", "margin", "restitution", "seconds")
-                    if model[k] is None
-                }
-            )
-        return kept
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: damaged; delete it and finish with --resume {folder}") from None
-
-
-def _path(folder: Path, dealt: Deal) -> Path:
-    return folder / SHOTS / f"{dealt.name}.json"
-
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold: numbers that are none become null."""
-    if isinstance(value, dict):
-        return {key: _plain(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -8,6 +8,8 @@ import math
 
 import pandas as pd
 
+from bench.store.status import FAILED
+
 ALL = "all"
 COLUMNS = [
     "method",
@@ -25,7 +27,8 @@ COLUMNS = [
     "seconds",
     "failures",
 ]
-FAILED = ("crashed", "timeout", "diverged", "no plan", "no recording")
+NO_SHOT = (*FAILED, "no plan", "no recording")
+"""Statuses of a method that did not come to a shot, or to one that was planned in a tuned model."""
 
 
 def wilson(hits: int, shots: int, z: float = 1.959963984540054) -> tuple[float, float]:
@@ -57,7 +60,7 @@ def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
     shots, hits = len(part), int(part["hit"].sum())
     off = part["off"].abs().fillna(math.inf)
     errors = part["prediction_error"]
-    failures = int(part["status"].isin(FAILED).sum())
+    failures = int(part["status"].isin(NO_SHOT).sum())
     near = off.quantile([0.5, 0.9], interpolation="higher").tolist()
     return [
         method,

@@ -73,6 +73,15 @@ class Known:
     scene: Scene
     weights: Mapping[str, Path]
 
+    def files(self) -> tuple[Path, ...]:
+        """What must travel with it to another machine."""
+        return self.recording, self.recording.with_suffix(".toml"), *self.weights.values()
+
+    def moved(self, places: Mapping[Path, Path]) -> Known:
+        """The same where its files have other places."""
+        weights = {label: places[path] for label, path in self.weights.items()}
+        return replace(self, recording=places[self.recording], weights=weights)
+
 
 def models(experiment: Experiment, settings: Settings, known: Known) -> list[dict[str, Any]]:
     """Every method's model and plan, as plain dictionaries."""

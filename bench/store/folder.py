@@ -38,7 +38,10 @@ def free_folder(experiment: Experiment, out: Path | None, results: Path = RESULT
         InputError: `out` exists and has something in it.
     """
     folder = out or stamped(results, experiment.name)
-    refuse_full(folder)
+    try:
+        refuse_full(folder)
+    except InputError as error:
+        raise InputError(f"{error}, or resume what is in it") from None
     return folder
 
 
@@ -207,7 +210,7 @@ def read(folder: Path, columns: Sequence[str] | None = None) -> Stored:
     path = folder / "runs.parquet"
     if not path.exists() and (folder / FOLDER).exists():
         raise InputError(
-            f"{folder}: not finished, and nothing written yet; simgap compare --resume {folder}"
+            f"{folder}: not finished, and nothing written yet; resume it to make the rest"
         )
     try:
         there = parquet.read_schema(path).names

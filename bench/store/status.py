@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 
 @dataclass(frozen=True)
 class Status:
-    """How a run ended: a row of status.csv."""
+    """How a run ended: a row of status.csv.
+
+    Attributes:
+        run: its id.
+        tuner: the label of its entry.
+        simulator: registered name.
+        target: name.
+        seed: of the tuner.
+        status: done, converged, timeout, crashed, diverged or skipped.
+        reason: why, in words; the traceback of a crash.
+        simulations: used on the target.
+        seconds: wall-clock time.
+    """
 
     run: str
     tuner: str
@@ -20,14 +32,10 @@ class Status:
     seconds: float
 
 
-STATUS_COLUMNS = [
-    "run",
-    "tuner",
-    "simulator",
-    "target",
-    "seed",
-    "status",
-    "reason",
-    "simulations",
-    "seconds",
-]
+STATUS_COLUMNS = [field.name for field in fields(Status)]
+"""Of status.csv."""
+
+FAILED = ("crashed", "timeout", "diverged")
+"""Ends of a run that was made and delivered nothing one could trust."""
+FAILURES = (*FAILED, "skipped")
+"""And of one that was never made: the tables show what is missing."""

@@ -13,6 +13,7 @@ import tomli_w
 
 from bench.cli import main
 from bench.store.journal import finished
+from sims.base import InputError
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING
 from tests.plugins.chaos import STATUSES
@@ -276,3 +277,32 @@ def test_first_line_says_what_and_where():
         == "the worker process exited with code 3"
     )
     assert first_line("") == ""
+
+
+def test_one_function_tells_which_study_an_experiment_or_a_folder_is(tmp_path, spring):
+    from bench.compare import Comparison
+    from bench.problem.experiment import load
+    from bench.shot.study import BounceShotStudy
+    from bench.study import begin, kind_of, opened
+    from tests.experiments import spring_experiment
+
+    assert kind_of(load("bounce-shot")) is BounceShotStudy
+    assert kind_of(load("ball-drop")) is Comparison
+    begun = begin(spring_experiment(), [SPRING_PLUGIN], tmp_path / "out")
+    begun.results.kept.close()
+    there = opened(tmp_path / "out")
+    assert isinstance(there, Comparison)
+    standing = there.status()
+    assert (standing.finished, len(standing.ends), standing.complete) == (0, 16, False)
+    with pytest.raises(InputError, match="opened to be looked at; resume it"):
+        there.make()
+
+
+def test_without_workers_the_command_makes_all_in_its_own_process(tmp_path, capsys, spring):
+    experiment = write(tmp_path / "e.toml", targets=1, tuners={"random": {}})
+    out = tmp_path / "out"
+    assert main(["compare", str(experiment), "--jobs", "0", "--out", str(out)]) == 0
+    assert json.loads((out / "environment.json").read_text())["jobs"] == 0
+    with pytest.raises(SystemExit):
+        main(["compare", str(experiment), "--jobs", "-1", "--out", str(tmp_path / "no")])
+    assert "expected a whole number of at least 0, found '-1'" in capsys.readouterr().err

@@ -10,7 +10,7 @@ import tomli_w
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bench.compare import begin, make, resume, status
+from bench.compare import Comparison
 from bench.problem.experiment import load
 from bench.problem.problem import Problem
 from bench.registry import load_plugins
@@ -170,14 +170,13 @@ def test_spoilt_plugins(folder, pieces, junk, tail):
 def results(folder):
     """A finished folder, and one that was interrupted."""
     experiment = spring_experiment(targets=1, seeds=1, tuners={"random": {}})
-    done, results = begin(experiment, [SPRING_PLUGIN], str(folder / "done"), 1)
-    make(done, results, [SPRING_PLUGIN], 1, lambda *_: lambda: None, None)
-    half, results = begin(experiment, [SPRING_PLUGIN], str(folder / "half"), 1)
+    Comparison.begin(experiment, [SPRING_PLUGIN], folder / "done").make(jobs=1)
+    results = Comparison.begin(experiment, [SPRING_PLUGIN], folder / "half").results
     from bench.runs.runner import run
 
     run(results, [SPRING_PLUGIN], 1)
     results.kept.close()
-    return done, half
+    return folder / "done", folder / "half"
 
 
 @st.composite
@@ -224,17 +223,13 @@ def test_half_written_and_damaged_folders(folder, results, damage):
     for act in (
         lambda: read(place),
         lambda: configuration(place),
-        lambda: status(place, True, lambda line: seen.update(["said"])),
-        lambda: resume(place, []),
+        lambda: seen.update(["said"] * len(Comparison(place).status().ends)),
+        lambda: Comparison.resume(place),
     ):
         try:
             made = act()
-            if (
-                isinstance(made, tuple)
-                and hasattr(made[-1], "kept")
-                and hasattr(made[-1].kept, "close")
-            ):
-                made[-1].kept.close()
+            if isinstance(made, Comparison) and hasattr(made.results.kept, "close"):
+                made.results.kept.close()
         except InputError as error:
             is_one_line(error)
 

@@ -16,7 +16,7 @@ from time import perf_counter
 
 import numpy as np
 
-from bench.compare import begin
+from bench.compare import Comparison
 from bench.registry import load_plugins
 from bench.report import NEEDED, finish
 from bench.runs.drive import Trace
@@ -51,7 +51,8 @@ def measure(targets, budget, figures):
     experiment = spring_experiment(targets=targets, seeds=5, budget=budget, tuners=TUNERS)
     with tempfile.TemporaryDirectory() as place:
         before, started = memory(), perf_counter()
-        folder, results = begin(experiment, [], str(Path(place) / "out"), 1)
+        folder = Path(place) / "out"
+        results = Comparison.begin(experiment, [], folder).results
         planned = perf_counter() - started
         plan_memory = memory() - before
         rng = np.random.default_rng(0)

@@ -195,7 +195,7 @@ def test_a_million_rows_are_read_for_the_table_within_five_seconds(tmp_path):
     import time
 
     from bench.analysis.table import table
-    from bench.compare import begin
+    from bench.compare import Comparison
     from bench.registry import load_plugins
     from bench.report import NEEDED
     from bench.store.folder import read
@@ -204,8 +204,9 @@ def test_a_million_rows_are_read_for_the_table_within_five_seconds(tmp_path):
     from tests.experiments import spring_experiment
 
     load_plugins([PLUGINS / "spring.py"])
-    folder, results = begin(spring_experiment(targets=1), [], str(tmp_path / "out"), 1)
-    Journal.close(results.kept)
+    folder = tmp_path / "out"
+    comparison = Comparison.begin(spring_experiment(targets=1), [], folder)
+    Journal.close(comparison.results.kept)
     runs, k = 10_000, np.arange(100)
     names = np.char.add("random/in-", np.char.zfill(np.arange(runs).astype(str), 6))
     rng = np.random.default_rng(0)

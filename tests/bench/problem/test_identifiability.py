@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from bench.analysis.curves import primary
-from bench.compare import begin, make
+from bench.compare import Comparison
 from bench.problem.experiment import load, parse
 from bench.problem.identifiability import STIFF, of_jacobian, spectrum
 from bench.problem.problem import Problem
@@ -156,11 +156,10 @@ def folder(tmp_path_factory):
     experiment = spring_experiment(
         targets=2, budget=6, tuners={"random": {}, "nelder_mead": {}}, **changes
     )
-    folder, results = begin(
-        experiment, PLUGIN_FILES, str(tmp_path_factory.mktemp("found") / "run"), 2
-    )
-    assert make(folder, results, PLUGIN_FILES, 2, lambda *_: lambda: None, None)
-    return folder, results
+    folder = tmp_path_factory.mktemp("found") / "run"
+    comparison = Comparison.begin(experiment, PLUGIN_FILES, folder)
+    assert comparison.make().complete
+    return folder, comparison.results
 
 
 def test_errors_along_directions_and_of_prediction_are_recorded(folder):

@@ -90,6 +90,37 @@ def test_runs_are_isolated_there_too_and_a_lost_scheduler_leaves_a_folder_to_res
     }
 
 
+SHOT = """
+simulator = "ball"
+observe = ["z"]
+targets = 1
+budget = 6
+training_budget = 60
+settings = { engine = "batch" }
+constants = { gravity = 9.81, radius = 0.03 }
+noise = { z = 0.01 }
+initial = { z = [1.4, 1.8] }
+sampling = { rate = 60.0, samples = 100 }
+tuners = { least_squares = {}, regressor = {} }
+shot = { balls = ["golf", "tennis"] }
+"""
+
+
+def test_bounce_shot_on_a_cluster_is_the_one_of_two_local_workers(started, tmp_path):
+    """Recordings and weights travel there; workers find none of them on this machine's paths."""
+    (tmp_path / "shot.toml").write_text(SHOT)
+    tables = []
+    for name, where in (("local", ["--jobs", 2]), ("far", ["--cluster", started.address])):
+        environment = {**os.environ, "SIMGAP_CACHE": str(tmp_path / f"cache-{name}")}
+        folder = tmp_path / name
+        done = simgap("compare", tmp_path / "shot.toml", *where, "--out", folder, env=environment)
+        assert done.returncode == 0, done.stderr
+        tables.append(pd.read_csv(folder / "shots.csv").drop(columns="seconds"))
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+    assert len(tables[0]) == 2 * (2 + 2 * 2)
+    assert set(tables[0]["status"]) <= {"done", "converged"}
+
+
 def test_nobody_there_is_one_line(tmp_path, capsys):
     experiment = write(tmp_path / "e.toml")
     common = [

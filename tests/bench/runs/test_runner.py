@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.compare import begin, make
+from bench.compare import Comparison
 from bench.registry import load_plugins
 from bench.runs.runner import Results, prepare, run
 from bench.store.folder import read
@@ -32,8 +32,8 @@ def frame(results):
 
 
 def tables(experiment, folder, jobs):
-    folder, results = begin(experiment, PLUGIN_FILES, str(folder), jobs)
-    assert make(folder, results, PLUGIN_FILES, jobs, lambda *_: lambda: None, None)
+    comparison = Comparison.begin(experiment, PLUGIN_FILES, folder, jobs)
+    assert comparison.make(jobs).complete
     return read(folder)
 
 

@@ -14,6 +14,8 @@ from scipy.stats import binomtest
 
 from bench import cli
 from bench.problem.experiment import load, names
+from bench.registry import REGISTRIES
+from bench.runs.pools import LostError
 from bench.runs.training import train
 from bench.shot import study, tune
 from bench.shot.deal import deal, deals, record
@@ -26,10 +28,11 @@ from sims.ball.simulator import Ball
 from sims.base import InputError
 from sims.recording.recording import read_recording
 from sims.shot.world import Ground, fly
+from tests.conftest import PLUGINS
 
 vision = pytest.mark.skipif(
     not all(map(importlib.util.find_spec, ("av", "cv2"))),
-    reason="PyAV and OpenCV are not installed: simgap[vision]",
+    reason='PyAV and OpenCV are not installed: pip install -e ".[vision]"',
 )
 
 
@@ -309,3 +312,134 @@ shot = {{ balls = ["golf"] }}
     (out / "shots" / "golf-000.json").write_text("{")
     assert cli.main(["compare", "--resume", str(out)]) == 2
     assert "damaged; delete it" in capsys.readouterr().err
+
+
+DROPS = """
+budget = 6
+constants = { gravity = 9.81, radius = 0.03 }
+noise = { z = 0.01 }
+initial = { z = [1.4, 1.8] }
+sampling = { rate = 60.0, samples = 100 }
+shot = { balls = ["golf"] }
+"""
+
+
+def explained(_):
+    return Model("explain", 0.5, {}, 0, 0.0, "done"), {}
+
+
+@pytest.fixture
+def crashing(tmp_path, monkeypatch, fresh_registries):
+    """An experiment with a tuner that fails, and the options that name it; explain and pictures cost
+    nothing.
+    """
+    monkeypatch.setattr(tune, "_explained", explained)
+    monkeypatch.setattr("bench.shot.report.draw", lambda *_: [])
+    monkeypatch.setattr("bench.shot.report.animate", lambda *_: "animation")
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        SMALL.replace("least_squares = {}", "least_squares = {}, crashing = {}") + DROPS
+    )
+    return [str(path), "--plugin", str(PLUGINS / "awkward.py"), "--jobs", "0"]
+
+
+def test_without_workers_failures_count_unless_allowed_and_it_is_plotted_again(
+    crashing, tmp_path, capsys
+):
+    out = tmp_path / "out"
+    assert cli.main(["compare", *crashing, "--out", str(out)]) == 1
+    said = capsys.readouterr()
+    assert "crashed: crashing in 1 shots; RuntimeError: boom" in said.out
+    assert said.err.count("RuntimeError: boom") == 2, "as it is and after explain, when it happens"
+    allowed = ["compare", *crashing, "--allow-failures", "--out", str(tmp_path / "allowed")]
+    assert cli.main(allowed) == 0
+    table = (out / "table.csv").read_bytes()
+    (out / "table.csv").unlink()
+    assert cli.main(["plot", str(out), "--plugin", crashing[2]]) == 0
+    assert (out / "table.csv").read_bytes() == table
+    capsys.readouterr()
+    assert cli.main(["status", str(out), "--runs"]) == 0
+    said = capsys.readouterr().out
+    assert "mine: 1 of 1 shots made, complete" in said
+    assert "  golf  1 made" in said
+    assert "made       golf-000" in said
+    assert cli.main(["plot", str(out), str(out), "--out", str(tmp_path / "across")]) == 2
+    said = capsys.readouterr().err
+    assert f"{out}: expected the folder of a comparison, found a bounce shot" in said
+    assert cli.main(["compare", *crashing, "--out", str(out)]) == 2
+    assert f"simgap: --out {out}: exists and is not empty" in capsys.readouterr().err
+
+
+def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refused(
+    crashing, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    path = tmp_path / "mine.toml"
+    path.write_text(path.read_text().replace("targets = 1", "targets = 2"))
+    shoot = tune.models
+
+    def interrupted(experiment, settings, known):
+        if known.name.endswith("001"):
+            raise KeyboardInterrupt
+        return shoot(experiment, settings, known)
+
+    monkeypatch.setattr(tune, "models", interrupted)
+    assert cli.main(["compare", *crashing, "--out", str(out)]) == 130
+    said = capsys.readouterr()
+    assert "simgap: interrupted; 1 of 2 shots made, and kept" in said.err
+    assert f"simgap: to finish: simgap compare --resume {out}" in said.err
+    assert len(pd.read_csv(out / "status.csv")) == 6, "what there is is reported"
+    assert cli.main(["status", str(out)]) == 1
+    assert "missing    golf-001" in capsys.readouterr().out
+    monkeypatch.setattr(tune, "models", shoot)
+    first = (out / "shots" / "golf-000.json").read_bytes()
+
+    def resumed(*options):
+        return cli.main(["compare", "--resume", str(out), "--jobs", "0", *options])
+
+    assert resumed("--budget", "5") == 2
+    assert "leave out budget" in capsys.readouterr().err
+    with monkeypatch.context() as patch:
+        patch.setattr("bench.runs.identity.rooms", lambda: "0123456789")
+        assert resumed() == 2
+    assert "its code changed since it was begun" in capsys.readouterr().err
+    for registry in REGISTRIES:
+        registry.restore({})
+    assert resumed("--allow-failures") == 0, "the plugin is known from the folder"
+    assert (out / "shots" / "golf-000.json").read_bytes() == first
+    assert len(pd.read_csv(out / "status.csv")) == 12
+
+
+def test_what_is_lost_on_the_way_is_said_and_no_untrained_tuner_is_shot_with(
+    tmp_path, monkeypatch, fresh_registries
+):
+    """A pool that is gone leaves a folder to resume; a training that fails ends the study."""
+
+    class Gone:
+        def __init__(self, fault):
+            self._fault = fault
+
+        def load(self, plugins):
+            pass
+
+        def results(self, calls, seconds):
+            if isinstance(self._fault, LostError):
+                raise self._fault
+            yield 0, self._fault
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+    path = tmp_path / "mine.toml"
+    path.write_text(SMALL.replace("least_squares = {}", "regressor = {}") + DROPS)
+    begun = study.BounceShotStudy.begin(load(str(path)), folder=tmp_path / "out", jobs=1)
+    made = begun.make(jobs=1, pool=Gone(LostError("the scheduler is gone")))
+    assert (made.finished, made.planned, made.stopped) == (0, 1, "the scheduler is gone")
+    said = []
+    assert begun.finish(said.append) == 0
+    assert said == ["no shot was made"]
+    with pytest.raises(RuntimeError, match="cannot learn"):
+        begun.make(jobs=1, pool=Gone(RuntimeError("cannot learn")))

@@ -1,0 +1,77 @@
+"""What is kept of each shot: a file with every method's model and what became of its plan."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.shot.deal import Deal
+from bench.shot.settings import Settings
+from bench.shot.throw import thrown
+from sims.base import InputError
+from sims.files import write
+
+SHOTS = "shots"
+"""The folder of finished shots, in a study's."""
+_NUMBERS = ("height", "margin", "restitution", "seconds")
+"""Of a model; each may be none."""
+
+
+def path_of(folder: Path, dealt: Deal) -> Path:
+    """The file of a shot in a study's folder; it is there when the shot has been made."""
+    return folder / SHOTS / f"{dealt.name}.json"
+
+
+def missing(folder: Path, dealt: Sequence[Deal]) -> list[Deal]:
+    """The shots that have not been made."""
+    return [one for one in dealt if not path_of(folder, one).exists()]
+
+
+def keep(
+    folder: Path, dealt: Deal, settings: Settings, models: list[dict[str, Any]], seen: float
+) -> None:
+    """Make a shot with every method's model, and keep all of it, whole or not at all.
+
+    Args:
+        folder: the study's.
+        dealt: ball, scene and release error.
+        settings: of the study.
+        models: as `bench.shot.tune.models` gives them.
+        seen: the share of the drop's sample times at which its recording has a height.
+    """
+    rows = [{**row, "seen": seen} for row in thrown(dealt, settings, models)]
+    document = _plain({"models": models, "rows": rows})
+    write(path_of(folder, dealt), json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def read(folder: Path, dealt: Deal) -> dict[str, Any] | None:
+    """What is kept of a shot; None where it has not been made.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    path = path_of(folder, dealt)
+    if not path.exists():
+        return None
+    try:
+        kept: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        for model in kept["models"]:
+            # JSON has no NaN, and null is no number to plan with.
+            model.update({name: math.nan for name in _NUMBERS if model[name] is None})
+        return kept
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: damaged; delete it, and resume to make it again") from None
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold: numbers that are none become null."""
+    if isinstance(value, dict):
+        return {key: _plain(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

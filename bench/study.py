@@ -1,0 +1,128 @@
+"""Studies: what an experiment asks for, made in a folder. Comparisons and bounce shots are two kinds
+of one contract, and this is the one place that tells which is which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from bench.compare import Say
+    from bench.problem.experiment import Experiment
+    from bench.runs.pools import Pool
+    from bench.runs.runner import Progress
+    from bench.store.folder import Configuration
+    from bench.store.standing import Made, Standing
+
+
+class Study(Protocol):
+    """A study in its folder.
+
+    ``Kind(folder)`` opens one to look at it and to report it, without hindering whoever is at work
+    there; `begin` and `resume` give one that can be made.
+
+    Attributes:
+        folder: where everything lies.
+        configuration: what it is for.
+    """
+
+    folder: Path
+    configuration: Configuration
+
+    def __init__(self, folder: Path) -> None: ...
+
+    @classmethod
+    def begin(
+        cls,
+        experiment: Experiment,
+        plugins: Sequence[str] = (),
+        folder: Path | None = None,
+        jobs: int = 2,
+    ) -> Study:
+        """A study in a new folder, checked and planned.
+
+        Args:
+            experiment: what it is of.
+            plugins: plugin files that it needs; the caller has loaded them.
+            folder: new or empty; one below results/ that is named for the time where None.
+            jobs: worker processes that it is meant to be made with; 0 for none.
+
+        Raises:
+            InputError: a fault in the experiment, or the folder is not free.
+        """
+        ...
+
+    @classmethod
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Study:
+        """A study that was interrupted; its own plugins are loaded, and these.
+
+        Raises:
+            InputError: the folder is damaged, or something that matters has changed since.
+        """
+        ...
+
+    def make(
+        self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
+    ) -> Made:
+        """Make what is missing; says how far it came, also where it was interrupted.
+
+        Args:
+            jobs: worker processes; 0 for none, and everything in this one.
+            progress: told of every step.
+            pool: where to run instead, e.g. on a cluster.
+
+        Raises:
+            InputError: workers cannot be had; what was finished is kept.
+        """
+        ...
+
+    def status(self) -> Standing:
+        """What the folder holds, and what is missing."""
+        ...
+
+    def finish(self, say: Say) -> int:
+        """Write tables and figures of what there is, and say what came out; how many failed."""
+        ...
+
+
+def begin(
+    experiment: Experiment,
+    plugins: Sequence[str] = (),
+    folder: Path | None = None,
+    jobs: int = 2,
+) -> Study:
+    """Begin the study that an experiment asks for; see `Study.begin`."""
+    return kind_of(experiment).begin(experiment, plugins, folder, jobs)
+
+
+def resume(folder: Path, plugins: Sequence[str] = ()) -> Study:
+    """Take up the study in a folder; see `Study.resume`."""
+    return _kind_in(folder).resume(folder, plugins)
+
+
+def opened(folder: Path) -> Study:
+    """The study in a folder, to be looked at and reported.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
+    return _kind_in(folder)(folder)
+
+
+def kind_of(experiment: Experiment) -> type[Study]:
+    """Which study an experiment asks for."""
+    if experiment.shot:
+        from bench.shot.study import BounceShotStudy
+
+        return BounceShotStudy
+    from bench.compare import Comparison
+
+    return Comparison
+
+
+def _kind_in(folder: Path) -> type[Study]:
+    from bench.store.folder import configuration
+
+    return kind_of(configuration(folder).experiment)
