@@ -166,6 +166,11 @@ class Comparison:
         Raises:
             InputError: workers cannot be had; what was finished is kept.
         """
+        # All that the results need is imported before the work: an interrupt in the midst of a first
+        # import leaves half a module behind, and writing what there is would die of it.
+        import pandas as pd  # noqa: F401
+        from pyarrow import compute, parquet  # noqa: F401
+
         from bench.runs.runner import run, silent
 
         results = self._begun()

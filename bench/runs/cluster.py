@@ -30,6 +30,8 @@ _PATIENCE = 20.0
 """Seconds without a scheduler after which it counts as lost."""
 _AHEAD = 3
 """Calls for each thread of the cluster that are under way; so many results wait here at most."""
+_ASKED = 3
+"""How often workers are asked for their code where some are lost meanwhile."""
 _LOSSES = 20
 """Workers that one call may lose before the cluster is taken to be the cause."""
 
@@ -65,10 +67,8 @@ class ClusterPool:
             raise InputError(
                 'a cluster needs the package distributed (pip install -e ".[cluster]")'
             ) from None
-        for name in [
-            *logging.root.manager.loggerDict,
-            "asyncio",
-        ]:  # what is lost is said here, in one line
+        # What is lost is said here, in one line.
+        for name in [*logging.root.manager.loggerDict, "asyncio"]:
             if name.split(".")[0] in ("distributed", "tornado", "asyncio"):
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         self.address = address
@@ -90,16 +90,34 @@ class ClusterPool:
             )
         here = (rooms(), versions())
         try:
-            others = [w for w, there in self._client.run(_identity).items() if there != here]
-        except Exception as error:
+            there = self._identities()
+        except Exception as error:  # whatever a worker without our modules makes of the call
             raise InputError(
                 f"{self.address}: its workers lack simgap ({first_line(error)})"
             ) from None
+        others = [worker for worker, answer in there.items() if answer != here]
         if others:
             raise InputError(
-                f"{self.address}: worker {others[0]} has other code or package versions than this process; "
-                "install the same on both"
+                f"{self.address}: worker {others[0]} has other code or package versions than this "
+                "process; install the same on both"
             )
+
+    def _identities(self) -> dict[str, Any]:
+        """What each worker says of its code.
+
+        Raises:
+            Exception: one could not say anything.
+        """
+        for _ in range(_ASKED):
+            there: dict[str, Any] = self._client.run(_identity, on_error="return")
+            # A worker that is lost while it is asked says nothing about its code.
+            if not any(isinstance(answer, OSError) for answer in there.values()):
+                break
+        answers = {w: answer for w, answer in there.items() if not isinstance(answer, OSError)}
+        for answer in answers.values():
+            if isinstance(answer, BaseException):
+                raise answer
+        return answers
 
     def load(self, plugins: Sequence[str]) -> None:
         """Make these plugin files known to the workers; before the first call."""

@@ -9,17 +9,16 @@ import tomli_w
 
 from bench.analysis.amortisation import EVEN_COLUMNS
 from bench.analysis.paired import PAIR_COLUMNS
-from bench.analysis.table import FAILURES, METRICS
+from bench.analysis.table import METRICS
 from bench.cli import main
-from bench.compare import begin, make
+from bench.compare import Comparison
 from bench.problem.experiment import load
-from bench.problem.problem import Problem
-from bench.report import finish
 from bench.shot.deal import deals
 from bench.shot.settings import settings_of
 from bench.shot.table import COLUMNS as SHOT_COLUMNS
 from bench.shot.throw import thrown
 from bench.shot.tune import Model
+from bench.store.status import FAILURES
 from sims.camera.camera import Camera
 from sims.camera.files import Filmed, described
 from sims.user_toml import read_toml
@@ -74,10 +73,10 @@ def folder(tmp_path_factory, spring):
         held_out={"scenarios": 1},
         tuners={"random": {}, "least_squares": {}, "small": SMALL},
     )
-    out = str(tmp_path_factory.mktemp("results") / "spring")
-    path, results = begin(experiment, [SPRING_PLUGIN], out, 1)
-    make(path, results, [SPRING_PLUGIN], 1, lambda *_: lambda: None, None)
-    finish(path, Problem(experiment), lambda _: None)
+    path = tmp_path_factory.mktemp("results") / "spring"
+    comparison = Comparison.begin(experiment, [SPRING_PLUGIN], path, jobs=1)
+    comparison.make(jobs=1)
+    comparison.finish(lambda _: None)
     return path
 
 
