@@ -162,7 +162,8 @@ def main():
             where = "cluster" if on_cluster else "local"
             seconds = time.monotonic() - started
             print(
-                f"{where}: {dict(hits)} in {rounds} rounds of {runs} runs, {seconds:.0f} s: identical",
+                f"{where}: {dict(hits)} in {rounds} rounds of {runs} runs, {seconds:.0f} s: "
+                "identical",
                 flush=True,
             )
             total += hits

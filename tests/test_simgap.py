@@ -46,7 +46,8 @@ def test_every_name_is_there_and_means_what_type_checkers_are_told():
 def test_the_import_takes_less_than_five_milliseconds_and_brings_nothing_heavy(tmp_path):
     code = (
         "import sys, time; t = time.perf_counter(); import simgap; t = time.perf_counter() - t\n"
-        "print(1e3 * t, *(m for m in ('numpy', 'bench', 'torch', 'matplotlib') if m in sys.modules))"
+        "print(1e3 * t, *(m for m in ('numpy', 'bench', 'torch', 'matplotlib') if m in "
+        "sys.modules))"
     )
     answers = [python(code, tmp_path).stdout.split() for _ in range(5)]
     assert all(len(answer) == 1 for answer in answers), answers

@@ -82,7 +82,8 @@ def test_compare_writes_the_folder_it_promises_and_a_plugin_tuner_is_in_it(exper
     plugin.write_text(PLUGIN_TUNER)
     assert len(PLUGIN_TUNER.strip().splitlines()) - 2 <= 6, "a new tuner takes at most six lines"
     done = simgap(
-        "compare", experiment, "--tuners", "random,nelder_mead,corners", "--plugin", SPRING_PLUGIN, "--plugin", plugin,
+        "compare", experiment, "--tuners", "random,nelder_mead,corners", "--plugin", SPRING_PLUGIN,
+        "--plugin", plugin,
         "--targets", 3, "--seeds", 2, "--budget", 6, "--jobs", 2, "--out", tmp_path / "out",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -96,8 +97,10 @@ def test_compare_writes_the_folder_it_promises_and_a_plugin_tuner_is_in_it(exper
     assert set(corners["runs"]) == {6}
     runs = pd.read_parquet(folder / "runs.parquet")
     assert set(runs.columns) >= {
-        "run", "experiment", "tuner", "simulator", "target", "seed", "range", "k", "loss", "param_error", "obs_error",
-        "heldout_error", "stiff_error", "sloppy_error", "tuner_seconds", "simulator_seconds", "outside",
+        "run", "experiment", "tuner", "simulator", "target", "seed", "range", "k", "loss",
+        "param_error", "obs_error",
+        "heldout_error", "stiff_error", "sloppy_error", "tuner_seconds", "simulator_seconds",
+        "outside",
         "proposal_rate", "recommendation_rate",
     }  # fmt: skip
     assert len(runs) == 2 * 3 * (2 + 1 + 2) * 7, "nelder_mead uses no chance: one seed"
@@ -176,7 +179,8 @@ def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path)
     [
         (
             ["compare", "bal-drop"],
-            "unknown experiment 'bal-drop'; there are: arm-drive, arm-swing, ball-crossengine, ball-drop",
+            "unknown experiment 'bal-drop'; there are: arm-drive, arm-swing, ball-crossengine, "
+            "ball-drop",
         ),
         (["compare", "none.toml"], "none.toml: no such file"),
         (

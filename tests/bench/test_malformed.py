@@ -39,9 +39,12 @@ FULL = {
     "tuners": {"random": {"seeds": 1}, "cma": {"tuner": "cma_es", "options": {"sigma": 0.2}}},
 }
 JUNK = st.one_of(
-    st.none(), st.booleans(), st.integers(-3, 60), st.sampled_from([10**30, -(10**400), 1e308, -0.0, float("nan"),
-    float("inf"), "", "x", "nan", "a\nb", "\x1b[31m", "\u2028", "spring", "random", "[]", [], [1, 2], [2, 1],
-    ["x", "x"], {}, {"x": 1}, {"x": {"y": 1}}, [[1]], "sine:1", "sine:1:0", "real"]), st.text(max_size=5), st.floats(),
+    st.none(), st.booleans(), st.integers(-3, 60),
+    st.sampled_from([10**30, -(10**400), 1e308, -0.0, float("nan"),
+    float("inf"), "", "x", "nan", "a\nb", "\x1b[31m", "\u2028", "spring", "random", "[]", [],
+    [1, 2], [2, 1],
+    ["x", "x"], {}, {"x": 1}, {"x": {"y": 1}}, [[1]], "sine:1", "sine:1:0", "real"]),
+    st.text(max_size=5), st.floats(),
 )  # fmt: skip
 seen: Counter[str] = Counter()
 
@@ -135,10 +138,14 @@ PIECES = [
     "class Odd{n}(Tuner):\n    name = 3", "class Odd{n}(Tuner):\n    name = 'a b'",
     "class Odd{n}(Tuner):\n    name = ''",
     "class Odd{n}(Tuner):\n    requires = 5", "raise ValueError('a\\nb')", "raise SystemExit(3)",
-    "1/0", "def f(:", "\tx = 1", "import no_such_thing", "from sims.base import Simulator", "assert False", "x = (",
-    "class S{n}(Simulator):\n    name = 's{n}'", "class S{n}(Simulator):\n    def simulate(self, a, b): pass",
-    "from sims.system import Effect", "class E{n}(Effect):\n    name = 'drag.linear'", "class E{n}(Effect): pass",
-    "def recurse(): recurse()\nrecurse()", "exit()", "class Odd{n}(Tuner, metaclass=5): pass", "'\\ud800'", "# \x00",
+    "1/0", "def f(:", "\tx = 1", "import no_such_thing", "from sims.base import Simulator",
+    "assert False", "x = (",
+    "class S{n}(Simulator):\n    name = 's{n}'",
+    "class S{n}(Simulator):\n    def simulate(self, a, b): pass",
+    "from sims.system import Effect", "class E{n}(Effect):\n    name = 'drag.linear'",
+    "class E{n}(Effect): pass",
+    "def recurse(): recurse()\nrecurse()", "exit()", "class Odd{n}(Tuner, metaclass=5): pass",
+    "'\\ud800'", "# \x00",
 ]  # fmt: skip
 count = iter(range(10**9))
 
@@ -184,8 +191,10 @@ def damages(draw):
     """Which file of a folder is spoilt, and how."""
     half = draw(st.booleans())
     common = ["experiment.toml", "environment.json"]
-    name = draw(st.sampled_from([*common, *(["segments/plan.txt", "segments/000001.journal"] if half else []),
-                                 *([] if half else ["runs.parquet", "status.csv", "training.csv"])]))  # fmt: skip
+    name = draw(st.sampled_from([*common,
+    *(["segments/plan.txt", "segments/000001.journal"] if half else []),
+                                 *([] if half else ["runs.parquet", "status.csv",
+                                 "training.csv"])]))  # fmt: skip
     return (
         half,
         name,

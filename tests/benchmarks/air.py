@@ -1,8 +1,9 @@
 """How densely the code is written: ``python -m tests.benchmarks.air [FOLDER ...]``.
 
-For each folder of Python files: the share of lines that bear a comment (those to tools, as `noqa`, do not
-count), tokens a line of code (a docstring is no code), comprehensions for each hundred lines of code,
-lines of more than 100 characters, and the lengths of functions (median, 95th percentile, longest).
+For each folder of Python files: the share of lines that bear a comment (those to tools, as `noqa`,
+do not count), tokens a line of code (a docstring is no code), comprehensions for each hundred lines
+of code, lines of more than 100 characters, and the lengths of functions (median, 95th percentile,
+longest).
 """
 
 import ast

@@ -68,9 +68,12 @@ def recording(cls, effects):
 
 
 CASES = [
-    (Ball, ()), (Ball, ("drag.quadratic",)), (Ball, ("drag.quadratic", "lift.magnus", "contact.friction")),
-    (Pendulum, ()), (Pendulum, ("drag.linear",)), (Pendulum, ("friction.coulomb",)), (Pendulum, ("friction.stribeck",)),
-    (Slider, ()), (Slider, ("friction.coulomb",)), (Servo, ()), (Servo, ("friction.load",)), (Servo, ("input.delay",)),
+    (Ball, ()), (Ball, ("drag.quadratic",)),
+    (Ball, ("drag.quadratic", "lift.magnus", "contact.friction")),
+    (Pendulum, ()), (Pendulum, ("drag.linear",)), (Pendulum, ("friction.coulomb",)),
+    (Pendulum, ("friction.stribeck",)),
+    (Slider, ()), (Slider, ("friction.coulomb",)), (Servo, ()), (Servo, ("friction.load",)),
+    (Servo, ("input.delay",)),
 ]  # fmt: skip
 
 

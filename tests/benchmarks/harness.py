@@ -55,7 +55,8 @@ def bare(points, problem, scenario):
 
 def harnessed(points, problem, sealed):
     task = Task(
-        problem.cube.dim, sealed.start, sealed.fitting.observed, problem.scale, problem.cube.training,
+        problem.cube.dim, sealed.start, sealed.fitting.observed, problem.scale,
+        problem.cube.training,
         len(points), (len(sealed.fitting.observed),),
     )  # fmt: skip
     evaluator = Evaluator(problem, sealed.fitting)
@@ -78,7 +79,8 @@ def measure(problem, name):
         ratios.append(seconds / plain)
         started = perf_counter()
         rmse = evaluator.rmse(trace.proposals, trace.recommendations)
-        rows(problem, Order("run", Entry("drawing", "drawing"), 0, target.sealed, EVALUATIONS), target,
+        rows(problem, Order("run", Entry("drawing", "drawing"), 0, target.sealed, EVALUATIONS),
+        target,
              Outcome(trace, rmse, None, 0.0))  # fmt: skip
         scoring.append((perf_counter() - started) / EVALUATIONS * 1e6)
     return {

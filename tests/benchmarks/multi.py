@@ -22,7 +22,8 @@ METRICS = {
 def identified(folders):
     """What the data of each problem identify: a line a problem and range."""
     lines = [
-        "| problem | parameters | range | targets | stiff directions | 1 sigma of the stiffest | of the sloppiest |",
+        "| problem | parameters | range | targets | stiff directions | 1 sigma of the stiffest | "
+        "of the sloppiest |",
         "|---|---|---|---|---|---|---|",
     ]
     for folder in folders:

@@ -94,7 +94,9 @@ def simgap_run():
 
 
 def simgap_fresh():
-    """Milliseconds of the first call in a worker that has to be started: what a killed run costs."""
+    """Milliseconds of the first call in a worker that has to be started: what a killed run
+    costs.
+    """
     times = []
     for _ in range(3):
         started = perf_counter()

@@ -30,7 +30,8 @@ PUBLISHED = {
     "ball_drops/bowling_ball": "nothing measurable",
 }
 HEAD = (
-    "| recording | published | verdict | causes (what explains it as well) | held-out RMSE: base | extended | floor "
+    "| recording | published | verdict | causes (what explains it as well) | held-out RMSE: base | "
+    "extended | floor "
     "| gap closed | s |\n|---|---|---|---|---|---|---|---|---|\n"
 )
 

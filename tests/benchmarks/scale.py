@@ -37,7 +37,8 @@ def outcome(job, rng, budget):
     steps = np.arange(1, budget + 1)
     points = np.clip(0.5 + rng.normal(size=(budget, 2)) / steps[:, None], 0, 1)
     trace = Trace(
-        "done", "", points, rng.exponential(size=budget) / steps, np.vstack([job.target.sealed.start, points]),
+        "done", "", points, rng.exponential(size=budget) / steps,
+        np.vstack([job.target.sealed.start, points]),
         np.full(budget, 1e-4), np.full(budget, 1e-3),
     )  # fmt: skip
     return Outcome(trace, rng.exponential(size=(budget + 1, 1)), None, 0.1)
@@ -74,6 +75,7 @@ def measure(targets, budget, figures):
         write_results(folder, again, [], [])
         written = perf_counter() - started
         runs = len(results.plan)
+        parquet = (folder / "runs.parquet").stat().st_size
         again.discard()
         started = perf_counter()
         read(folder, [*NEEDED])
@@ -86,10 +88,12 @@ def measure(targets, budget, figures):
         print(json.dumps({
             "runs": runs, "rows": runs * (budget + 1), "plan_seconds": round(planned, 2),
             "plan_MiB": round(plan_memory),
-            "keep_milliseconds_a_run": round(1e3 * kept / runs, 3), "segments_bytes_a_run": round(segments / runs),
+            "keep_milliseconds_a_run": round(1e3 * kept / runs, 3),
+            "segments_bytes_a_run": round(segments / runs),
             "reopen_seconds": round(reopened, 2), "write_seconds": round(written, 2),
-            "parquet_bytes_a_row": round((folder / "runs.parquet").stat().st_size / (runs * (budget + 1)), 1),
-            "read_seconds": round(reading, 2), "table_and_all_figures_seconds": whole, "peak_MiB": round(memory()),
+            "parquet_bytes_a_row": round(parquet / (runs * (budget + 1)), 1),
+            "read_seconds": round(reading, 2), "table_and_all_figures_seconds": whole,
+            "peak_MiB": round(memory()),
         }), flush=True)  # fmt: skip
 
 

@@ -100,7 +100,8 @@ def main():
         rows += [(name, str(interval), part) for interval, part in groups]
     table = pd.DataFrame(
         {
-            "by": by, "bin": interval, "drops": part.seed.nunique(), "frames": int(part.error.notna().sum()),
+            "by": by, "bin": interval, "drops": part.seed.nunique(),
+            "frames": int(part.error.notna().sum()),
             "rms_px": rms(part.error), "median_px": float(part.error.median()),
             "p95_px": float(part.error.quantile(0.95)),
             "missed_of_whole_balls": float(part.error[part.whole].isna().mean()),

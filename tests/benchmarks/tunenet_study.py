@@ -229,7 +229,8 @@ def ensemble(study):
     for target in study.targets:
         side = target.sealed.fitting
         truth = study.problem.cube.inverse(target.truth)
-        task = Task(1, target.sealed.start, side.observed, study.problem.scale, study.problem.cube.training, 1,
+        task = Task(1, target.sealed.start, side.observed, study.problem.scale,
+        study.problem.cube.training, 1,
                     (len(side.observed),))  # fmt: skip
         seen = study.problem.simulate(target.sealed.start[None], side.scenarios)
         h = np.array([m.fitted().estimator(task)(seen)[0] for m in members])
@@ -372,7 +373,8 @@ def main():
         within = (part["error"] <= 2.0 * part["spread"]).mean()
         ratio = (part["error"] / part["spread"]).median()
         print(
-            f"{kind}: rank correlation {ranks:.2f}, within 2 spreads {within:.0%}, median error/spread {ratio:.2g}"
+            f"{kind}: rank correlation {ranks:.2f}, within 2 spreads {within:.0%}, median "
+            f"error/spread {ratio:.2g}"
         )
     save(path_figure(table), options.out / "figures" / "path")
     save(differences_figure(study, kept), options.out / "figures" / "differences")

@@ -48,7 +48,8 @@ def _power(groups):
             [[part["share"] - part["low"], part["high"] - part["share"]] for part in parts]
         ).T
         axis.errorbar(
-            sizes * shift, middle, yerr=np.maximum(bars, 0.0), fmt=f"{marker}-", color=colour, markersize=4.5,
+            sizes * shift, middle, yerr=np.maximum(bars, 0.0), fmt=f"{marker}-", color=colour,
+            markersize=4.5,
             linewidth=1.1, capsize=2.5, label=label,
         )  # fmt: skip
     for size, part, _ in groups:

@@ -25,8 +25,10 @@ SYSTEMS = ("ball", "pendulum", "slider")
 KINDS = ("clean", "single", "double", "foreign")
 SMALL = (0.1, 0.2, 0.3, 0.5)  # sizes asked for the power curve only
 
-APART = 1.0  # noise: what must be left when only one of two effects, or no foreign cause, is in the model
-TELLING = 0.4  # noise: what the simpler form of an effect must leave, or else the simpler one is the right answer
+# Noises that must be left when only one of two effects, or no foreign cause, is in the model.
+APART = 1.0
+# Noises that the simpler form of an effect must leave, or else it is the right answer.
+TELLING = 0.4
 SIMPLER = {
     "friction.stribeck": ("friction.coulomb",),
     "wind": (
@@ -136,8 +138,10 @@ def draw(kind, system, seed, effect=None, size=None):
     hidden = _hidden(kind, system, effect, rng)
     setting = _setting(name, system, hidden)
     item = Item(
-        name, system, kind, {}, 0.0, setting.noise.kind, setting.noise.stated, setting.rate, setting.seconds,
-        len(setting.scenarios), str(rng.choice(["scipy", "mujoco"])), setting.driven, setting.channels, seed,
+        name, system, kind, {}, 0.0, setting.noise.kind, setting.noise.stated, setting.rate,
+        setting.seconds,
+        len(setting.scenarios), str(rng.choice(["scipy", "mujoco"])), setting.driven,
+        setting.channels, seed,
         setting.parameters,
     )  # fmt: skip
     wanted = size or float(

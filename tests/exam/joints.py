@@ -18,7 +18,8 @@ from scipy.optimize import brentq
 
 TOLERANCES = {"rtol": 1e-8, "atol": 1e-10}
 SHORT = 0.011  # seconds: up to here a method of fifth order is cheaper than one of eighth
-EDGE = 0.05  # a region's borders are soft over this share of its half width, so that the solver keeps its order
+# Share of its half width over which a region's borders are soft: the solver keeps its order.
+EDGE = 0.05
 
 Law = Callable[[float, float, float], float]
 

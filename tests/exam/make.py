@@ -60,12 +60,14 @@ def main(arguments):
             if not (given.out / f"{item.name}.csv").exists():
                 realise(item, given.out)
             print(
-                f"{item.name}: size {item.size:.2f}, {item.noise} noise, {item.source}, {item.effects}",
+                f"{item.name}: size {item.size:.2f}, {item.noise} noise, {item.source}, "
+                f"{item.effects}",
                 flush=True,
             )
         if made < given.count:
             print(
-                f"{given.system} {name or given.kind}: {made} of {given.count}, the others cannot show",
+                f"{given.system} {name or given.kind}: {made} of {given.count}, the others cannot "
+                "show",
                 flush=True,
             )
 

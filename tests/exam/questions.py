@@ -18,7 +18,8 @@ QUICK = (
     ("single", "ball", "restitution.speed", 3.0), ("single", "ball", "drag.quadratic", 4.0),
     ("single", "pendulum", "friction.coulomb", 3.0), ("single", "pendulum", "input.delay", 5.0),
     ("single", "slider", "spring.linear", 3.0), ("single", "slider", "input.deadband", 5.0),
-    ("foreign", "ball", "updraft", None), ("foreign", "pendulum", "gust", None), ("foreign", "slider", "patch", None),
+    ("foreign", "ball", "updraft", None), ("foreign", "pendulum", "gust", None),
+    ("foreign", "slider", "patch", None),
 )  # fmt: skip
 
 

@@ -24,7 +24,9 @@ def write(folder, rows):
 
 
 def marks(summary):
-    """Rows (what, wanted, reached, interval, whether met) of the marks that `explain` must reach."""
+    """Rows (what, wanted, reached, interval, whether met) of the marks that `explain` must
+    reach.
+    """
     single, clean, double = summary["single"], summary["clean"], summary["double"]
     at_least = [
         (
@@ -105,7 +107,8 @@ def _seconds(summary):
     times = summary["seconds"]
     if times["median"] is None:
         return "no times"
-    return f"seconds an item: median {times['median']:.1f}, 95th percentile {times['p95']:.1f}, most {times['max']:.1f}"
+    middle, high, most = (f"{times[name]:.1f}" for name in ("median", "p95", "max"))
+    return f"seconds an item: median {middle}, 95th percentile {high}, most {most}"
 
 
 def page(summary):
@@ -164,17 +167,19 @@ BREAKDOWNS = (
     ("Two effects by system, up to equivalence", "double", "by system up to equivalence"),
     ("Causes outside the library", "foreign", "by effect"),
 )
-INTRODUCTION = """Recordings of independent simulators (scipy and MuJoCo; never the engine that `explain` itself
-uses), in each one hidden effect, two, a cause that the library does not have, or none; `explain` sees the recording
-alone. `python -m tests.exam` makes all of this again. Size is the root mean square of the gap that base parameters and
-initial states, refitted, leave in the runs for fitting, in units of the noise. Intervals are Wilson's, of alarms
-Clopper and Pearson's.
+INTRODUCTION = """Recordings of independent simulators (scipy and MuJoCo; never the engine that
+`explain` itself uses), in each one hidden effect, two, a cause that the library
+does not have, or none; `explain` sees the recording alone. `python -m tests.exam`
+makes all of this again. Size is the root mean square of the gap that base
+parameters and initial states, refitted, leave in the runs for fitting, in units of
+the noise. Intervals are Wilson's, of alarms Clopper and Pearson's.
 
-`items.csv` has a row an item, `items.jsonl` all that was answered, `confusion.csv` counts what was named first.
-`figures/power` shows the share of effects that are found against their size, `figures/confusion` what is taken for
-what."""
-CANNOT = """Drawn again and again, these did not reach the wanted size within twice the plausible range, because base
-parameters or initial states absorb them: so many of the questions about them could be asked."""
+`items.csv` has a row an item, `items.jsonl` all that was answered, `confusion.csv`
+counts what was named first. `figures/power` shows the share of effects that are
+found against their size, `figures/confusion` what is taken for what."""
+CANNOT = """Drawn again and again, these did not reach the wanted size within twice the
+plausible range, because base parameters or initial states absorb them: so many of
+the questions about them could be asked."""
 
 
 def _confusion(path, counts):

@@ -2,9 +2,9 @@
 
 | outcome | of | when |
 |---|---|---|
-| right | all | clean: adequate; single, double: all causes named and no other; foreign: unknown or partial |
+| right | all | clean: adequate; single, double: all causes, no other; foreign: unknown or partial |
 | set | single, double | the cause stands in a set that the data are said not to tell apart |
-| class | single, double | only an effect is named that is equivalent in any data (`tests.exam.items.EQUIVALENT`) |
+| class | single, double | an effect is named that is equivalent in any data (`items.EQUIVALENT`) |
 | one | double | one of the two is named (alone or in a set), the other is not |
 | wrong | single, double, foreign | something else is named; foreign: anything is, as all there is |
 | extra | single | the cause is named, and another beside it |

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 from bench.gap.verdict import Verdict
 
 ADEQUATE = {
-    "verdict": "adequate", "system": "", "engine": "batch", "causes": [], "parameters": {}, "heldout": None,
+    "verdict": "adequate", "system": "", "engine": "batch", "causes": [], "parameters": {},
+    "heldout": None,
     "candidates": [], "next_experiment": None, "simulations": 1, "seconds": 0.0,
 }  # fmt: skip
 

@@ -1,4 +1,6 @@
-"""The exam's questions: as large as wanted, the same for the same seed, and readable as recordings."""
+"""The exam's questions: as large as wanted, the same for the same seed, and readable as
+recordings.
+"""
 
 import json
 from dataclasses import replace

@@ -7,7 +7,7 @@ the library has nothing like them:
 
 | cause | numbers | it does |
 |---|---|---|
-| `patch` | friction, centre, half width | pendulum, slider: dry friction within a region of position |
+| `patch` | friction, centre, half width | pendulum, slider: dry friction in a region of position |
 | `gust` | force, seconds, begin in run 0, in run 1, ... | pendulum, slider: a force for a while |
 | `gust` | along x, upward, seconds, begin in run 0, ... | ball: an acceleration for a while |
 | `ageing` | growth | pendulum, slider: damping -c t v, which grows with time |

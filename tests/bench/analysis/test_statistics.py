@@ -222,9 +222,12 @@ def test_a_million_rows_are_read_for_the_table_within_five_seconds(tmp_path):
         )
     }
     pd.DataFrame({
-        "run": np.repeat(names, 100), "experiment": "e", "tuner": np.repeat(np.array(list("abcdefghij")), 100_000),
-        "simulator": "spring", "target": np.repeat(np.tile(np.char.add("in-", np.arange(200).astype(str)), 50), 100),
-        "seed": np.repeat(np.arange(runs) // 200 % 5, 100), "range": "in", "k": np.tile(k, runs), **numbers,
+        "run": np.repeat(names, 100), "experiment": "e",
+        "tuner": np.repeat(np.array(list("abcdefghij")), 100_000),
+        "simulator": "spring",
+        "target": np.repeat(np.tile(np.char.add("in-", np.arange(200).astype(str)), 50), 100),
+        "seed": np.repeat(np.arange(runs) // 200 % 5, 100), "range": "in", "k": np.tile(k, runs),
+        **numbers,
     }).to_parquet(folder / "runs.parquet")  # fmt: skip
     pd.DataFrame({"run": names, "tuner": "a", "status": "done", "reason": ""}).to_csv(
         folder / "status.csv"

@@ -9,7 +9,8 @@ def runs_of(curves, tuner="a", kind="in", metric="param_abs_error"):
     """curves: {(target, seed): errors after 0..k}"""
     frames = [
         pd.DataFrame({
-            "run": f"{tuner}/{kind}-{target}/{seed}", "experiment": "e", "tuner": tuner, "target": f"{kind}-{target}",
+            "run": f"{tuner}/{kind}-{target}/{seed}", "experiment": "e", "tuner": tuner,
+            "target": f"{kind}-{target}",
             "seed": seed, "range": kind, "k": range(len(errors)), metric: errors,
         })
         for (target, seed), errors in curves.items()

@@ -8,7 +8,8 @@ import simgap
 @pytest.fixture(scope="module")
 def swing():
     return simgap.simulate(
-        "pendulum", effects={"drag.linear": 8e-4}, noise={"q": 0.003, "qd": 0.02}, runs=3, seconds=1.5, rate=60
+        "pendulum", effects={"drag.linear": 8e-4}, noise={"q": 0.003, "qd": 0.02}, runs=3,
+        seconds=1.5, rate=60
     )  # fmt: skip
 
 

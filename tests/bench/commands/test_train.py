@@ -66,7 +66,8 @@ def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
     assert "seed 1, noisy: 100%" in said.err
     rows = list(csv.DictReader((tmp_path / "out" / "loss.csv").read_text().splitlines()))
     assert [(r["seed"], r["stage"], r["epoch"]) for r in rows[:5]] == [
-        ("0", "clean", "1"), ("0", "clean", "2"), ("0", "clean", "3"), ("0", "clean", "4"), ("0", "noisy", "1"),
+        ("0", "clean", "1"), ("0", "clean", "2"), ("0", "clean", "3"), ("0", "clean", "4"),
+        ("0", "noisy", "1"),
     ]  # fmt: skip
     assert float(rows[3]["training_loss"]) < float(rows[0]["training_loss"])
     assert {path.name for path in (tmp_path / "out" / "figures").iterdir()} == {
@@ -96,7 +97,8 @@ def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
 
 def test_hybrid_starts_from_the_same_network_as_tunenet(experiment):
     settings = load(str(experiment))
-    one, two = (dict(np.load(train(settings, Entry("x", name, TUNER["options"]), 1).path)) for name in
+    one, two = (dict(np.load(train(settings, Entry("x", name, TUNER["options"]),
+    1).path)) for name in
                 ("tunenet", "hybrid"))  # fmt: skip
     arrays = [name for name in one if "." in name]
     assert len(arrays) > 6
@@ -153,7 +155,9 @@ def foreign(path):
 
 
 def another(path):
-    """Weights that were trained with another seed, or for other shapes, put in the place of these."""
+    """Weights that were trained with another seed, or for other shapes, put in the place of
+    these.
+    """
     other = next(file for file in path.parent.iterdir() if file != path)
     path.write_bytes(other.read_bytes())
 

@@ -31,8 +31,10 @@ def odd(tmp_path):
     rows += [f"last,{100 + 0.01 * i:.2f},1,{0.2 + 0.001 * i}" for i in range(30)]
     (tmp_path / "odd.csv").write_text("\n".join(rows))
     (tmp_path / "odd.toml").write_text(
-        'system = "servo"\ntitle = "Odd"\n[channels.q]\nunit = "deg"\nnoise = 0.5\n[inputs.goal]\nunit = "rad"\n'
-        "[constants]\nmass = 0.3\n[runs.fast]\nkp = 100\n[runs.last]\nkp = 100\nheld_out = true\ninitial = {q = 0.25}\n"
+        'system = "servo"\ntitle = "Odd"\n[channels.q]\nunit = "deg"\nnoise = 0.5\n[inputs.goal]\n'
+        'unit = "rad"\n'
+        "[constants]\nmass = 0.3\n[runs.fast]\nkp = 100\n[runs.last]\nkp = 100\nheld_out = true\n"
+        "initial = {q = 0.25}\n"
     )
     return tmp_path / "odd.csv"
 

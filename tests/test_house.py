@@ -1,0 +1,95 @@
+"""The house: which rooms there are, that they stand in layers, and that no import runs in a
+circle.
+"""
+
+import shutil
+import subprocess
+import sys
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import grimp
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("bench", "methods", "sims")
+ROOMS = {
+    "across", "analysis", "api", "checks", "cli", "commands", "compare", "experiments", "figures",
+    "gap", "problem",
+    "recordings", "registry", "report", "runs", "shot", "store",
+}  # fmt: skip
+
+
+def linted(root):
+    """The verdict on the contracts of pyproject.toml about the code below `root`."""
+    return subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from importlinter.cli import lint_imports_command as c; c(['--no-cache'])",
+        ],
+        cwd=root,
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def circle(imports):
+    """Modules that import each other in a circle, the first of them again at the end; or
+    nothing.
+    """
+    try:
+        tuple(TopologicalSorter(imports).static_order())
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+@pytest.fixture(scope="module")
+def imports():
+    """By module, what it imports, also inside functions, and for type checkers alone."""
+    graph = grimp.build_graph(*PACKAGES, cache_dir=None)
+    return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+
+
+def test_the_rooms_of_the_harness_are_these():
+    there = {p.stem for p in (ROOT / "bench").iterdir() if p.suffix == ".py" or p.is_dir()}
+    assert there - {"__init__", "__pycache__"} == ROOMS
+
+
+def test_imports_run_downwards_and_never_in_a_circle(imports):
+    said = linted(ROOT)
+    assert said.returncode == 0, said.stdout
+    assert "0 broken" in said.stdout
+    assert circle(imports) == []
+    assert circle({**imports, "bench.registry": {"bench.cli"}})[:1] != []
+
+
+@pytest.mark.parametrize(
+    ("module", "line", "contract"),
+    [
+        ("bench/store/journal.py", "import bench.runs.drive",
+        "the rooms of the harness stand in layers"),
+        ("bench/gap/model/fit.py", "import methods.base", "explain runs a tuner as anybody does"),
+        ("bench/gap/model/fit.py", "import bench.gap.causes.search",
+        "the rooms of explain stand in layers"),
+        ("methods/cma_es.py", "import sims.base",
+        "methods know neither the harness nor the worlds"),
+        ("sims/base.py", "import bench.registry",
+        "worlds know neither the harness nor the methods"),
+    ],
+)  # fmt: skip
+def test_an_import_that_climbs_is_found(module, line, contract, tmp_path):
+    for package in PACKAGES:
+        shutil.copytree(
+            ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__")
+        )
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    path = tmp_path / module
+    path.write_text(path.read_text() + f"\n{line}\n")
+    said = linted(tmp_path)
+    assert said.returncode == 1
+    broken = [title for title in said.stdout.splitlines() if title.endswith("BROKEN")]
+    assert any(contract in title for title in broken), said.stdout
