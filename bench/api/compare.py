@@ -1,23 +1,34 @@
-"""`simgap.compare`: a comparison from Python, and its results as tables and figures."""
+"""`simgap.compare` and `simgap.sweep`: experiments from Python, their results as tables and figures."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.problem.experiment import Experiment, load
+from bench import study
+from bench.figures import comparison
+from bench.problem.experiment import Experiment, expand, load
+from bench.problem.problem import Problem
 from bench.registry import load_plugins
 from bench.registry import tuners as registered
-from bench.store.folder import Stored, configuration, read
-from bench.study import begin
+from bench.report import tables
+from bench.store.folder import Stored, read
 from methods.base import Tuner
 from sims.base import InputError, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
+
+    from bench.runs.pools import Pool
+
+Progress = Callable[[str, int], Callable[[], None]]
+"""Called with a title and a number of steps; gives the function to call after each step."""
+_ROWS = 200
+"""Rows of a table that a notebook shows."""
 
 
 def compare(
@@ -33,6 +44,8 @@ def compare(
     jobs: int = 2,
     out: str | Path | None = None,
     plugins: Sequence[str | Path] = (),
+    cluster: str | None = None,
+    progress: Progress | None = None,
 ) -> Compared:
     """Run an experiment: tuners x targets x seeds; returns its tables and figures.
 
@@ -43,22 +56,22 @@ def compare(
         seeds: of each tuner that uses chance.
         budget: simulations on one target.
         training_budget: simulations that a learned tuner may learn from.
-        timeout: seconds that a run may take.
+        timeout: seconds that a run may take, then it is ended.
         memory: MiB that a run may take; 0 is no limit.
         jobs: worker processes; 0 runs everything in this process, where prints show and
-            breakpoints hold.
+            breakpoints hold, and which a class that is defined in a notebook's cell needs.
         out: folder to write, a new one; below results/ where None.
         plugins: Python files with more tuners, simulators and effects.
+        cluster: address of a Dask scheduler to run on instead.
+        progress: told of every step.
 
     Raises:
-        InputError: a fault in what was asked for, in one line.
+        InputError: a fault in what was asked for, in one line; nothing has been run then.
     """
-    files = [str(Path(plugin).resolve()) for plugin in plugins]
-    load_plugins(files)
-    labels = None if tuners is None else [_label(tuner) for tuner in tuners]
+    files = _loaded(plugins)
     chosen = choose(
         experiment,
-        labels,
+        None if tuners is None else [_label(tuner) for tuner in tuners],
         seeds,
         targets=targets,
         budget=budget,
@@ -66,10 +79,71 @@ def compare(
         timeout=timeout,
         memory=memory,
     )
-    study = begin(chosen, files, None if out is None else Path(out), jobs)
-    study.make(jobs)
-    study.finish(lambda _: None)
-    return Compared(study.folder)
+    if chosen.sweep:
+        raise InputError(f"experiment {chosen.name} sweeps over values: use simgap.sweep")
+    pool = _cluster(cluster)
+    begun = study.begin(chosen, files, None if out is None else Path(out), jobs)
+    return _made(begun, jobs, progress, pool)
+
+
+def sweep(
+    experiment: str | Path | Experiment,
+    *,
+    jobs: int = 2,
+    out: str | Path | None = None,
+    plugins: Sequence[str | Path] = (),
+    progress: Progress | None = None,
+) -> list[Compared]:
+    """Run every experiment that one with a ``[sweep]`` stands for, one after another.
+
+    Args:
+        experiment: its name, the path of its TOML file, or itself.
+        jobs: as in `compare`.
+        out: folder in which each gets its own, named as the experiment is.
+        plugins: as in `compare`.
+        progress: told of every step.
+
+    Returns:
+        Their results, in the order of the file's values.
+
+    Raises:
+        InputError: a fault in what was asked for, in one line; nothing has been run then.
+    """
+    files = _loaded(plugins)
+    begun = study.begin_all(choose(experiment), files, None if out is None else Path(out), jobs)
+    return [_made(one, jobs, progress, None) for one in begun]
+
+
+def _loaded(plugins: Sequence[str | Path]) -> list[str]:
+    files = [str(Path(plugin).resolve()) for plugin in plugins]
+    load_plugins(files)
+    return files
+
+
+def _cluster(address: str | None) -> Pool | None:
+    if address is None:
+        return None
+    from bench.runs.cluster import ClusterPool
+
+    return ClusterPool(address)
+
+
+def _made(
+    begun: study.Study, jobs: int, progress: Progress | None, pool: Pool | None
+) -> Compared:
+    """The study, made and reported."""
+    made = begun.make(jobs, progress, pool)
+    if made.skipped:
+        raise InputError(f"{begun.configuration.experiment.name}: skipped: {made.skipped}")
+    begun.finish(_unsaid)
+    if made.interrupted:
+        # In a notebook the cell ends as the person wished; what was finished is in the folder.
+        raise KeyboardInterrupt(f"what was finished is kept in {begun.folder}")
+    return Compared(begun.folder)
+
+
+def _unsaid(_line: str) -> None:
+    """What the command prints; from Python the tables are at hand."""
 
 
 def choose(
@@ -114,8 +188,12 @@ def _label(tuner: str | type[Tuner]) -> str:
 class Compared:
     """A comparison that has been made, read from its folder.
 
+    Args:
+        folder: of a comparison or a bounce shot, finished or not.
+
     Attributes:
         folder: where everything lies.
+        experiment: what was asked for.
 
     Raises:
         InputError: the folder is not that of a comparison.
@@ -123,29 +201,66 @@ class Compared:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        self.experiment = configuration(self.folder).experiment
+        self.experiment: Experiment = study.opened(self.folder).configuration.experiment
 
     @cached_property
     def _stored(self) -> Stored:
         return read(self.folder)
 
+    @cached_property
+    def _labels(self) -> comparison.Labels:
+        problem = Problem(self.experiment)
+        try:
+            return comparison.labels_of(problem)
+        finally:
+            problem.close()
+
+    @cached_property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """The tables by name: table, ert, pairs, break_even, who_wins; see docs/results.md."""
+        return tables(self._stored)
+
     @property
     def table(self) -> pd.DataFrame:
-        """Error after N simulations by tuner, range and metric, in long form: table.csv."""
-        import pandas as pd
-
-        return pd.read_csv(self.folder / "table.csv")
+        """Error after N simulations by tuner, range and metric, in long form, as table.csv."""
+        return self.tables["table"]
 
     @property
     def runs(self) -> pd.DataFrame:
-        """A row for each simulation: runs.parquet."""
+        """A row for each simulation, as runs.parquet."""
         return self._stored.runs
 
     @property
     def statuses(self) -> pd.DataFrame:
-        """A row for each run, how it ended and why: status.csv."""
+        """A row for each run, how it ended and why, as status.csv."""
         return self._stored.statuses
 
+    @property
+    def figures(self) -> list[str]:
+        """Names of the figures that there are."""
+        return comparison.names(self._stored)
+
+    def figure(self, name: str = "error") -> Figure:
+        """One of the figures, made anew; a notebook shows it inline.
+
+        Raises:
+            InputError: there is none of that name.
+        """
+        return comparison.figure(self._stored, self._labels, name)
+
+    def summary(self) -> pd.DataFrame:
+        """The last mean error of each tuner, the best first, with how many runs failed."""
+        table = self.table
+        last = table[table["simulations"] == table["simulations"].max()]
+        first = last[last["metric"] == last["metric"].iloc[0]]
+        columns = ["tuner", "range", "metric", "mean", "low", "high", "runs", "failures"]
+        return first[columns].sort_values(["range", "mean"]).reset_index(drop=True)
+
     def __repr__(self) -> str:
-        runs = len(self.statuses)
-        return f"<Compared {self.experiment.name}: {runs} runs in {self.folder}>"
+        failed = int((~self.statuses["status"].isin(("done", "converged"))).sum())
+        runs = f"{len(self.statuses)} runs, {failed} of them failed or skipped"
+        return f"<comparison {self.experiment.name}: {runs}; {self.folder}>"
+
+    def _repr_html_(self) -> str:
+        html: str = self.summary().head(_ROWS).to_html(index=False, float_format="%.3g")
+        return html
