@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from bench import __version__
-    from bench.api.compare import Compared, compare
+    from bench.api.compare import Compared, compare, sweep
     from bench.api.explain import explain, score
     from bench.api.recordings import read_recording, simulate
     from bench.checks import parametrize
@@ -71,7 +71,7 @@ if TYPE_CHECKING:
 
 _WHERE = {
     "bench": ("__version__",),
-    "bench.api.compare": ("Compared", "compare"),
+    "bench.api.compare": ("Compared", "compare", "sweep"),
     "bench.api.explain": ("explain", "score"),
     "bench.api.recordings": ("read_recording", "simulate"),
     "bench.checks": ("parametrize",),
@@ -162,6 +162,7 @@ __all__ = [
     "score",
     "simulate",
     "simulators",
+    "sweep",
     "tuners",
 ]
 

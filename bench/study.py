@@ -4,9 +4,12 @@ of one contract, and this is the one place that tells which is which.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
+
+from sims.files import refuse_full, stamped
 
 if TYPE_CHECKING:
     from bench.compare import Say
@@ -15,6 +18,10 @@ if TYPE_CHECKING:
     from bench.runs.runner import Progress
     from bench.store.folder import Configuration
     from bench.store.standing import Made, Standing
+
+
+CONFIGURATION = "experiment.toml"
+"""The file by which the folder of a study is known."""
 
 
 class Study(Protocol):
@@ -95,6 +102,50 @@ def begin(
 ) -> Study:
     """Begin the study that an experiment asks for; see `Study.begin`."""
     return kind_of(experiment).begin(experiment, plugins, folder, jobs)
+
+
+def begin_all(
+    experiment: Experiment,
+    plugins: Sequence[str] = (),
+    folder: Path | None = None,
+    jobs: int = 2,
+) -> list[Study]:
+    """Begin the study, or the studies where the experiment sweeps over values.
+
+    Args:
+        experiment: what is asked for.
+        plugins: as in `Study.begin`.
+        folder: of the study; of several the folder in which each gets its own, named as its
+            experiment is.
+        jobs: as in `Study.begin`.
+
+    Raises:
+        InputError: a fault in one of them, or the folder is not free; nothing is left behind.
+    """
+    from bench.problem.experiment import expand
+
+    wanted = expand(experiment)
+    if len(wanted) == 1:
+        return [begin(wanted[0], plugins, folder, jobs)]
+    parent = folder or stamped(Path("results"), experiment.name)
+    refuse_full(parent)
+    try:
+        # All before the first is made: a fault in the last would show after hours.
+        return [begin(one, plugins, parent / one.name, jobs) for one in wanted]
+    except BaseException:
+        for one in wanted:
+            shutil.rmtree(parent / one.name, ignore_errors=True)
+        if parent.is_dir() and not any(parent.iterdir()):
+            parent.rmdir()
+        raise
+
+
+def parts_of(folder: Path) -> list[Path]:
+    """The folders of the studies in a folder: itself, or those that a sweep has put there."""
+    if (folder / CONFIGURATION).exists() or not folder.is_dir():
+        return [folder]
+    inside = sorted(path for path in folder.iterdir() if (path / CONFIGURATION).exists())
+    return inside or [folder]
 
 
 def resume(folder: Path, plugins: Sequence[str] = ()) -> Study:

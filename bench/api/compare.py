@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from bench import study
 from bench.figures import comparison
-from bench.problem.experiment import Experiment, expand, load
+from bench.problem.experiment import Experiment, load
 from bench.problem.problem import Problem
 from bench.registry import load_plugins
 from bench.registry import tuners as registered
@@ -128,9 +128,7 @@ def _cluster(address: str | None) -> Pool | None:
     return ClusterPool(address)
 
 
-def _made(
-    begun: study.Study, jobs: int, progress: Progress | None, pool: Pool | None
-) -> Compared:
+def _made(begun: study.Study, jobs: int, progress: Progress | None, pool: Pool | None) -> Compared:
     """The study, made and reported."""
     made = begun.make(jobs, progress, pool)
     if made.skipped:
@@ -254,7 +252,8 @@ class Compared:
         last = table[table["simulations"] == table["simulations"].max()]
         first = last[last["metric"] == last["metric"].iloc[0]]
         columns = ["tuner", "range", "metric", "mean", "low", "high", "runs", "failures"]
-        return first[columns].sort_values(["range", "mean"]).reset_index(drop=True)
+        best: pd.DataFrame = first[columns].sort_values(["range", "mean"])
+        return best.reset_index(drop=True)
 
     def __repr__(self) -> str:
         failed = int((~self.statuses["status"].isin(("done", "converged"))).sum())
@@ -262,5 +261,9 @@ class Compared:
         return f"<comparison {self.experiment.name}: {runs}; {self.folder}>"
 
     def _repr_html_(self) -> str:
-        html: str = self.summary().head(_ROWS).to_html(index=False, float_format="%.3g")
+        html: str = (
+            self.summary()
+            .head(_ROWS)
+            .to_html(index=False, float_format=lambda value: f"{value:.3g}")
+        )
         return html

@@ -137,15 +137,15 @@ def _refuse_beside_resume(options: argparse.Namespace) -> None:
         )
 
 
-def _begun(options: argparse.Namespace) -> Study:
-    """The study that is begun or resumed."""
-    from bench.study import begin, resume
+def _begun(options: argparse.Namespace) -> list[Study]:
+    """The study that is begun or resumed; several of a sweep."""
+    from bench.study import begin_all, parts_of, resume
 
     if options.resume:
         _refuse_beside_resume(options)
-        return resume(options.resume, options.plugin)
+        return [resume(part, options.plugin) for part in parts_of(options.resume)]
     with said_as("--out", options.out):
-        return begin(_chosen(options), options.plugin, options.out, options.jobs)
+        return begin_all(_chosen(options), options.plugin, options.out, options.jobs)
 
 
 def _cluster(address: str | None) -> Pool | None:
@@ -158,11 +158,23 @@ def _cluster(address: str | None) -> Pool | None:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from bench.commands.progress import Bars
-
     # First of all: a scheduler that does not answer leaves no folder behind.
     pool = _cluster(options.cluster)
-    study = _begun(options)
+    studies = _begun(options)
+    codes = []
+    for study in studies:
+        if len(studies) > 1:
+            print(f"\n{study.configuration.experiment.name}")
+        codes.append(_made(study, pool, options))
+        if codes[-1] == INTERRUPTED:
+            break
+    return max(codes)
+
+
+def _made(study: Study, pool: Pool | None, options: argparse.Namespace) -> int:
+    """Make and report one study; returns the exit code."""
+    from bench.commands.progress import Bars
+
     with Bars() as bars:
         made = study.make(options.jobs, bars.start, pool)
     if made.skipped:
@@ -187,21 +199,26 @@ def _left(study: Study, made: Made) -> int:
 
 
 def _status(options: argparse.Namespace) -> int:
-    from bench.study import opened
+    from bench.study import opened, parts_of
 
-    standing = opened(options.run).status()
+    complete = [_stands(opened(part), options.runs) for part in parts_of(options.run)]
+    return 0 if all(complete) else 1
+
+
+def _stands(study: Study, every: bool) -> bool:
+    """Say how far a study is; returns whether it is complete."""
+    standing = study.status()
     planned, what = len(standing.ends), standing.what
     complete = ", complete" if standing.complete else ""
     print(f"{standing.name}: {standing.finished} of {planned} {what}{complete}")
     print("  " + ", ".join(f"{name} {value}" for name, value in standing.hashes.items()))
     for line in _counts(standing):
         print(f"  {line}")
-    for line in _listed(standing, options.runs):
+    for line in _listed(standing, every):
         print(line)
-    if standing.complete:
-        return 0
-    print(f"to finish it: simgap compare --resume {options.run}")
-    return 1
+    if not standing.complete:
+        print(f"to finish it: simgap compare --resume {study.folder}")
+    return standing.complete
 
 
 def _counts(standing: Standing) -> list[str]:
@@ -241,12 +258,13 @@ def _listed(standing: Standing, every: bool) -> list[str]:
 
 def _plot(options: argparse.Namespace) -> int:
     from bench.registry import load_plugins
-    from bench.study import opened
+    from bench.study import opened, parts_of
     from sims.base import InputError
 
     load_plugins(options.plugin)
     if len(options.runs) == 1 and not options.out:
-        opened(options.runs[0]).finish(print)
+        for part in parts_of(options.runs[0]):
+            opened(part).finish(print)
         return 0
     if not options.out:
         raise InputError("several comparisons give one result: name a folder for it with --out DIR")
