@@ -192,6 +192,11 @@ class Comparison:
                 journal.close()
         return made
 
+    def close(self) -> None:
+        """Let go of the folder without making what is missing."""
+        if self.results is not None and isinstance(self.results.kept, Journal):
+            self.results.kept.close()
+
     def _begun(self) -> Results:
         if self.results is None:
             raise InputError(f"{self.folder}: opened to be looked at; resume it to make the rest")

@@ -85,6 +85,10 @@ class Study(Protocol):
         """
         ...
 
+    def close(self) -> None:
+        """Let go of the folder without making what is missing."""
+        ...
+
     def status(self) -> Standing:
         """What the folder holds, and what is missing."""
         ...
@@ -129,15 +133,19 @@ def begin_all(
         return [begin(wanted[0], plugins, folder, jobs)]
     parent = folder or stamped(Path("results"), experiment.name)
     refuse_full(parent)
+    begun: list[Study] = []
     try:
         # All before the first is made: a fault in the last would show after hours.
-        return [begin(one, plugins, parent / one.name, jobs) for one in wanted]
-    except BaseException:
         for one in wanted:
-            shutil.rmtree(parent / one.name, ignore_errors=True)
+            begun.append(begin(one, plugins, parent / one.name, jobs))
+    except BaseException:
+        for study in begun:
+            study.close()
+            shutil.rmtree(study.folder, ignore_errors=True)
         if parent.is_dir() and not any(parent.iterdir()):
             parent.rmdir()
         raise
+    return begun
 
 
 def parts_of(folder: Path) -> list[Path]:

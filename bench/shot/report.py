@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Protocol
 
 import pandas as pd
 
+from bench.problem.experiment import Experiment
 from bench.shot.animation import animate
+from bench.shot.deal import Deal
 from bench.shot.kept import read
 from bench.shot.pictures import draw, examples
+from bench.shot.settings import Settings
 from bench.shot.table import NO_SHOT, table, text
 from bench.store.journal import FOLDER
 from bench.store.status import STATUS_COLUMNS
 from sims.files import write
-
-if TYPE_CHECKING:
-    from bench.shot.study import BounceShotStudy
 
 SIMULATOR = "bounce-shot"
 """What status.csv says that a shot is planned in."""
@@ -34,7 +35,33 @@ _FAILED = ("crashed", "timeout")
 """Failures of the method and not of its plan, which make the command fail."""
 
 
-def finish(study: BounceShotStudy, say: Callable[[str], None]) -> int:
+class Shots(Protocol):
+    """What is reported: the shots of a study.
+
+    Attributes:
+        folder: where they lie.
+    """
+
+    folder: Path
+
+    @property
+    def experiment(self) -> Experiment:
+        """What was asked for, with the tuners that can be used here."""
+
+    @property
+    def settings(self) -> Settings:
+        """Of the scene."""
+
+    @property
+    def deals(self) -> list[Deal]:
+        """Every shot that is planned."""
+
+    @property
+    def skipped(self) -> Mapping[str, str]:
+        """Why tuners cannot be used here, by label."""
+
+
+def finish(study: Shots, say: Callable[[str], None]) -> int:
     """Write and say what the shots in a study's folder came to.
 
     Returns:

@@ -153,6 +153,9 @@ class BounceShotStudy:
         left = missing(self.folder, self.deals)
         return Made(len(self.deals) - len(left), len(self.deals), **why)
 
+    def close(self) -> None:
+        """Let go of the folder; a shot's holds nothing open."""
+
     def status(self) -> Standing:
         """Which shots the folder holds and which are missing."""
         left = {one.name for one in missing(self.folder, self.deals)}

@@ -70,7 +70,10 @@ def test_a_class_is_compared_its_figures_and_summary_are_at_hand(experiment, tmp
     assert isinstance(figure, matplotlib.figure.Figure)
     assert len(figure.axes) == 2
     assert matplotlib.get_backend() == backend
-    with pytest.raises(simgap.InputError, match="unknown figure 'eror'; there are: cost, directions, distance, error"):
+    with pytest.raises(
+        simgap.InputError,
+        match="unknown figure 'eror'; there are: cost, directions, distance, error",
+    ):
         run.figure("eror")
     best = run.summary().groupby("range")["mean"].min()
     shown = run._repr_html_()
