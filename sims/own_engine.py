@@ -12,7 +12,7 @@ P, which it does not say and which is taken from the step before,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -20,8 +20,33 @@ from sims.base import Array, InputError
 from sims.engines.external import evened
 from sims.system import Force, Friction, Lanes, Moment, Motion, System
 
-if TYPE_CHECKING:
-    from sims.own import OwnSimulator
+
+class Stepping(Protocol):
+    """What is stepped, as `sims.own.OwnSimulator` is; its methods are described there."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def coordinates(self) -> tuple[str, ...]: ...
+
+    @property
+    def rates(self) -> tuple[str, ...]: ...
+
+    def reset(
+        self,
+        theta: Mapping[str, float],
+        constants: Mapping[str, float],
+        initial: Mapping[str, float],
+    ) -> None: ...
+
+    def step(self, inputs: Mapping[str, float], seconds: float) -> None: ...
+
+    def observe(self) -> Mapping[str, float]: ...
+
+    def apply_force(self, force: Array) -> None: ...
+
+    def inertia(self) -> float: ...
 
 
 class OwnEngine:
@@ -30,7 +55,7 @@ class OwnEngine:
     name = "own"
     requires: tuple[str, ...] = ()
 
-    def __init__(self, world: OwnSimulator, step: float) -> None:
+    def __init__(self, world: Stepping, step: float) -> None:
         self.world = world
         self.largest_step = float(step)
 
@@ -98,7 +123,7 @@ class OwnEngine:
         return [_seen(self.world, seen, c.name) for c in system.channels]
 
 
-def _seen(world: OwnSimulator, seen: Mapping[str, float], name: str) -> float:
+def _seen(world: Stepping, seen: Mapping[str, float], name: str) -> float:
     if name not in seen:
         raise InputError(
             f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(seen)}"
@@ -109,7 +134,7 @@ def _seen(world: OwnSimulator, seen: Mapping[str, float], name: str) -> float:
 class _Forces:
     """The effects' forces on one lane."""
 
-    def __init__(self, lanes: Lanes, lane: int, world: OwnSimulator) -> None:
+    def __init__(self, lanes: Lanes, lane: int, world: Stepping) -> None:
         here = [(effect, c[:, lane : lane + 1]) for effect, c in lanes.effects]
         acting = [(effect, c) for effect, c in here if c.any()]
         self.forces = [(effect, c) for effect, c in acting if isinstance(effect, Force)]

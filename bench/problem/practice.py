@@ -2,24 +2,43 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
-from methods.base import BudgetExceededError
-from sims.base import Array
-
-if TYPE_CHECKING:
-    from bench.problem.problem import Problem
+from methods.base import BudgetExceededError, Scene
+from sims.base import Array, Scenario, UnitCube
 
 _SLACK = 1e-9
 """How far outside the training range a point may lie, unit cube: a sum that rounds is no breach."""
 
 
+class Ground(Protocol):
+    """What is practised on, as `bench.problem.problem.Problem` is.
+
+    Attributes:
+        cube: between bounds and unit cube.
+        scale: (C,) what a residual is divided by.
+    """
+
+    cube: UnitCube
+    scale: Array
+
+    def scenarios(self, rng: np.random.Generator) -> tuple[Scenario, ...]:
+        """Those of one target."""
+
+    def scene(self, scenarios: Sequence[Scenario]) -> Scene:
+        """What tuners are told of them."""
+
+    def simulate(self, points: Array, scenarios: tuple[Scenario, ...]) -> Array:
+        """Observations (n, T, C) of points (n, dim) of the unit cube."""
+
+
 class Practice:
     """The practice ground of learned tuners; see `methods.base.Practice`."""
 
-    def __init__(self, problem: Problem, budget: int) -> None:
+    def __init__(self, problem: Ground, budget: int) -> None:
         self._problem = problem
         self.dim = problem.cube.dim
         self.training = problem.cube.training

@@ -8,18 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
-from bench.problem.recorded import Side
+from bench.problem.experiment import Drawn, Experiment
+from bench.problem.recorded import Measured, Side
 from bench.problem.seeds import rng_for
 from bench.problem.signals import signal
-from sims.base import Array, Scenario
-
-if TYPE_CHECKING:
-    from bench.problem.experiment import Drawn, Experiment
-    from bench.problem.problem import Problem
+from sims.base import Array, Channel, Scenario, Simulator, UnitCube
 
 _CUBE = np.array([[0.0], [1.0]])
 """Corners of the unit cube, in as many dimensions as there are."""
@@ -54,7 +51,30 @@ class Target:
     truth: Array | None
 
 
-def draw(problem: Problem, kind: str, index: int) -> Target:
+class Drawing(Protocol):
+    """What targets are drawn of, as `bench.problem.problem.Problem` is.
+
+    Attributes:
+        experiment: as it was read.
+        world: the simulator that makes the targets.
+        cube: between bounds and unit cube.
+        channels: observed, in order.
+        noise: (C,) 1 sigma of each channel.
+        recording: what the experiment's recording holds; None for simulated targets.
+    """
+
+    experiment: Experiment
+    world: Simulator
+    cube: UnitCube
+    channels: tuple[Channel, ...]
+    noise: Array
+    recording: Measured | None
+
+    def scenarios(self, rng: np.random.Generator) -> tuple[Scenario, ...]:
+        """Those of one target."""
+
+
+def draw(problem: Drawing, kind: str, index: int) -> Target:
     """Target `index` of range `kind`; it depends on the experiment's name, not on tuners, seeds or
     budgets.
     """
@@ -106,7 +126,7 @@ def _drawn(rng: np.random.Generator, value: Drawn) -> float:
     return rng.uniform(*value) if isinstance(value, tuple) else value
 
 
-def _held_out(problem: Problem, theta: Array, names: tuple[str, str, int]) -> Side:
+def _held_out(problem: Drawing, theta: Array, names: tuple[str, str, int]) -> Side:
     """Unseen scenarios, and what the target's world does in them, without sensor noise: what is to
     be predicted.
 
