@@ -168,7 +168,8 @@ __all__ = [
 
 
 def _refuse_namesakes() -> None:
-    """Say in one line whose folder hides one of simgap's own packages, before something odd happens.
+    """Say in one line whose folder hides one of simgap's own packages, before something odd
+    happens.
 
     Raises:
         ImportError: a package that is called as one of simgap's would be imported in its place.
@@ -183,7 +184,8 @@ def _refuse_namesakes() -> None:
         for place in places:
             if dirname(realpath(place)) != home:
                 raise ImportError(
-                    f"simgap cannot be imported here: the package '{name}' in {realpath(place)} hides "
+                    f"simgap cannot be imported here: the package '{name}' in {realpath(place)} "
+                    "hides "
                     f"simgap's own; rename that folder, or run from another one"
                 )
 

@@ -1,5 +1,5 @@
-"""Studies: what an experiment asks for, made in a folder. Comparisons and bounce shots are two kinds
-of one contract, and this is the one place that tells which is which.
+"""Studies: what an experiment asks for, made in a folder. Comparisons and bounce shots are two
+kinds of one contract, and this is the one place that tells which is which.
 """
 
 from __future__ import annotations

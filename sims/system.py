@@ -277,8 +277,8 @@ class Effect(ABC):
 
     Attributes:
         name: ``family.form``.
-        noun: what a report calls it, with its article, such as ``linear drag`` or ``a sensor bias``;
-            without one its name and the beginning of `says` stand there.
+        noun: what a report calls it, with its article, such as ``linear drag`` or ``a sensor
+            bias``; without one its name and the beginning of `says` stand there.
         says: one sentence that a person understands, as the end of "the data say that ...".
         source: where the law stands.
         coefficients: its numbers; all zero is off, and must change nothing, bit for bit. Those that

@@ -1,4 +1,6 @@
-"""`simgap.compare` and `simgap.sweep`: experiments from Python, their results as tables and figures."""
+"""`simgap.compare` and `simgap.sweep`: experiments from Python, their results as tables and
+figures.
+"""
 
 from __future__ import annotations
 

@@ -50,7 +50,8 @@ def _system(kind: type[Simulator]) -> list[str]:
         low, high = p.bounds
         inner = f", training {p.training[0]:g} to {p.training[1]:g}" if p.training else ""
         result.append(
-            f"  parameter {p.name:18} {p.unit:12} {low:g} to {high:g}{inner}; nominal {p.nominal:g}  {p.says}"
+            f"  parameter {p.name:18} {p.unit:12} {low:g} to {high:g}{inner}; nominal "
+            f"{p.nominal:g}  {p.says}"
         )
     result += [f"  constant  {c.name:18} {c.unit:12} {c.value:g}  {c.says}" for c in kind.constants]
     result += _channels("input", kind.inputs)

@@ -52,7 +52,8 @@ def add_track(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scale",
         choices=("camera", "diameter", "fall"),
-        help="where metres come from (default: VIDEO.camera.toml if there, else the diameter if given, else the fall)",
+        help="where metres come from (default: VIDEO.camera.toml if there, else the diameter if "
+        "given, else the fall)",
     )
     parser.set_defaults(command=track)
 

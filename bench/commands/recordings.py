@@ -103,7 +103,8 @@ def _simulate(options: argparse.Namespace) -> int:
     channels = ", ".join(simulated.recording.runs[0].channels)
     runs = f"{options.runs} run{'s' * (options.runs > 1)}"
     print(
-        f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels {channels}"
+        f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels "
+        f"{channels}"
     )
     print(f"{options.out.with_suffix('.truth.toml')}: what made it")
     return 0

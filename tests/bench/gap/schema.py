@@ -7,7 +7,8 @@ from math import isfinite
 
 VERDICTS = {"adequate", "named", "ambiguous", "partial", "unknown", "unidentifiable"}
 KEYS = {
-    "verdict", "system", "engine", "causes", "parameters", "heldout", "candidates", "next_experiment", "simulations",
+    "verdict", "system", "engine", "causes", "parameters", "heldout", "candidates",
+    "next_experiment", "simulations",
     "seconds",
 }  # fmt: skip
 CAUSE = {"effect", "alternatives", "says", "coefficients", "p_value"}

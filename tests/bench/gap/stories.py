@@ -109,7 +109,9 @@ def candidates():
 
 
 def story(verdict="named", **changes):
-    """A story with this verdict; `changes` replace entries of the verdict or fields of the story."""
+    """A story with this verdict; `changes` replace entries of the verdict or fields of the
+    story.
+    """
     gap = verdict not in ("adequate", "unidentifiable")
     fitting, held_out = sides(gap)
     causes = {"named": [DRAG], "ambiguous": [EITHER], "partial": [DRAG]}.get(verdict, [])
