@@ -189,9 +189,9 @@ def _made(study: Study, pool: Pool | None, options: argparse.Namespace) -> int:
 def _left(study: Study, made: Made) -> int:
     """Say what is missing and how to go on; returns the exit code."""
     why = "interrupted" if made.interrupted else made.stopped or "stopped"
-    what = study.status().what
+    things, ended = study.status().what.rsplit(" ", 1)  # e.g. runs finished
     for line in (
-        f"{why}; {made.finished} of {made.planned} {what}, and kept",
+        f"{why}; {made.finished} of {made.planned} {things} are {ended} and kept",
         f"to finish: simgap compare --resume {study.folder}",
     ):
         print(f"simgap: {line}", file=sys.stderr)
