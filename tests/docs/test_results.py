@@ -12,6 +12,7 @@ from bench.analysis.paired import PAIR_COLUMNS
 from bench.analysis.table import METRICS
 from bench.cli import main
 from bench.compare import Comparison
+from bench.figures.comparison import FILES
 from bench.problem.experiment import load
 from bench.shot.deal import deals
 from bench.shot.settings import settings_of
@@ -23,7 +24,7 @@ from sims.camera.camera import Camera
 from sims.camera.files import Filmed, described
 from sims.user_toml import read_toml
 from tests.conftest import PLUGINS
-from tests.docs.pages import ROOT, quoted, section, tables, text_of
+from tests.docs.pages import quoted, section, tables, text_of
 from tests.experiments import SPRING, spring_experiment
 
 PAGE = text_of("results.md")
@@ -119,8 +120,8 @@ def test_every_figure_is_described(folder):
     assert figures <= names
     # of targets from another simulator, beyond the training range, and with sloppy directions
     assert names - figures <= {"misfit-vs-simulations", "error-vs-distance"}
-    code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "bench").rglob("*.py"))
-    assert [name for name in names if f'"{name}"' not in code] == []
+    rows = tables(section(PAGE, "### Figures of a comparison"))[0][1:]
+    assert {quoted(row[1])[0]: quoted(row[0])[0] for row in rows} == FILES
 
 
 def test_several_comparisons(folder, tmp_path, capsys):
