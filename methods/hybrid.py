@@ -19,8 +19,8 @@ from typing import ClassVar
 import numpy as np
 
 from methods.base import Array, Ask, Steps, Task
-from methods.least_squares import LeastSquares, Mask, Model, Run, Simulates
-from methods.tunenet import SETTLED, Search, TuneNet
+from methods.least_squares import History, LeastSquares, LinearModel, Mask, Simulates
+from methods.tunenet import SETTLED, RootSearch, TuneNet
 
 _EXACT = 1e-13
 """Rounding: a loss below this share of the observation's root mean square."""
@@ -64,7 +64,7 @@ class Hybrid(TuneNet):
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
         """Network steps, then a fit from there, then new starts."""
         finish = LeastSquares(reproduced=_EXACT)
-        run = Run(task, _EXACT)
+        run = History(task, _EXACT)
         enough = run.enough / _EXACT * finish.reproduced
         trusted = yield from self._approach(run, task)
         # nothing to begin with: the middle of the training range is as good as any point
@@ -84,10 +84,10 @@ class Hybrid(TuneNet):
             yield from finish.fit_from(run, run.untried(rng))
         return "the simulation reproduces the target"
 
-    def _approach(self, run: Run, task: Task) -> Simulates[bool]:
+    def _approach(self, run: History, task: Task) -> Simulates[bool]:
         """TuneNet's own steps, while they pay; returns whether they did to the end."""
         estimate = self.fitted().estimator(task)
-        search = Search(task)
+        search = RootSearch(task)
         guess = task.start
         lowest = np.inf
         idle = 0
@@ -107,7 +107,7 @@ class Hybrid(TuneNet):
                 break
         return idle == 0
 
-    def _model(self, run: Run, finish: LeastSquares) -> Simulates[Model]:
+    def _model(self, run: History, finish: LeastSquares) -> Simulates[LinearModel]:
         """The linear model at the lowest loss: secants to points nearby, finite differences in what
         they leave out.
         """
@@ -132,10 +132,10 @@ class Hybrid(TuneNet):
             changes += list(residuals[whole] - residual)
         # nothing succeeded nearby: no step at all is promised then
         if not changes:
-            return Model(point, residual, np.zeros((len(residual), len(point))))
+            return LinearModel(point, residual, np.zeros((len(residual), len(point))))
         solution = np.linalg.lstsq(directions, np.array(changes), rcond=None)[0]  # (1)
         slopes = np.asarray(solution, dtype=np.float64)
-        return Model(point, residual, slopes.T)
+        return LinearModel(point, residual, slopes.T)
 
     def _secants(
         self, steps: Array, finite: Mask, smallest: float

@@ -96,7 +96,7 @@ class LeastSquares(Tuner):
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
         """Fit from the start, then from other points until the target is reproduced."""
-        run = Run(task, self.reproduced)
+        run = History(task, self.reproduced)
         yield from self.fit_from(run, task.start)
         while not run.finished:
             if not self.restart:
@@ -104,7 +104,7 @@ class LeastSquares(Tuner):
             yield from self.fit_from(run, run.untried(rng))
         return "the simulation reproduces the target"
 
-    def fit_from(self, run: Run, point: Array) -> Simulates[None]:
+    def fit_from(self, run: History, point: Array) -> Simulates[None]:
         """One fit from `point`, of which nothing is known."""
         (residual,) = yield from run.simulate(point[None])
         # without a residual there is nothing to differentiate
@@ -112,7 +112,7 @@ class LeastSquares(Tuner):
             model = yield from self._differentiate(run, point, residual, self.difference)
             yield from self.fit_model(run, model)
 
-    def fit_model(self, run: Run, model: Model) -> Simulates[None]:
+    def fit_model(self, run: History, model: LinearModel) -> Simulates[None]:
         """One fit over all horizons, beginning with a model."""
         for share in self.horizons:
             chosen = run.samples(share)
@@ -123,8 +123,8 @@ class LeastSquares(Tuner):
                 return
 
     def _differentiate(
-        self, run: Run, point: Array, residual: Array, longest: float
-    ) -> Simulates[Model]:
+        self, run: History, point: Array, residual: Array, longest: float
+    ) -> Simulates[LinearModel]:
         """One-sided differences, inward at the upper border; to the other side where a simulation
         failed.
         """
@@ -137,9 +137,9 @@ class LeastSquares(Tuner):
             moved[failed] = yield from run.simulate(point + np.diag(steps)[failed])
         slopes = (moved - residual) / steps[:, None]
         # where both sides fail, the column stays zero
-        return Model(point, residual, np.nan_to_num(slopes).T)
+        return LinearModel(point, residual, np.nan_to_num(slopes).T)
 
-    def _descend(self, run: Run, model: Model, chosen: Mask) -> Simulates[Model]:
+    def _descend(self, run: History, model: LinearModel, chosen: Mask) -> Simulates[LinearModel]:
         """Levenberg-Marquardt on the chosen samples until they are fitted, or it is stuck."""
         worthwhile = _POLISHED if chosen.all() else _COARSE
         damping = _Damping(self.damping)
@@ -200,7 +200,7 @@ class _Damping:
 
 
 @dataclass
-class Model:
+class LinearModel:
     """The residual near a point: r(θ + s) ≈ residual + jacobian s; arrays (dim,), (samples,),
     (samples, dim).
 
@@ -249,7 +249,7 @@ class Model:
 
 
 @dataclass
-class Run:
+class History:
     """What one run has simulated."""
 
     task: Task

@@ -103,7 +103,7 @@ class TuneNet(PairTuner):
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
         """Algorithm 1, one simulation an iteration."""
         estimate = self.fitted().estimator(task)
-        search = Search(task)
+        search = RootSearch(task)
         guess = task.start
         while True:
             evaluation = yield Ask(guess, recommend=guess)
@@ -168,7 +168,7 @@ _REACH = 10.0
 """The same of a step that halves an interval."""
 
 
-class Search:
+class RootSearch:
     """Broyden's method on h(simulation of x, target) = 0, beginning with the step of Algorithm 1:
     slope -1.
     """

@@ -48,7 +48,7 @@ def _output_discarded() -> Iterator[None]:
         yield
 
 
-class World:
+class PersistentWorld:
     """One Bullet world: connected when first needed, kept from rollout to rollout, closed with its
     owner.
 
@@ -66,9 +66,11 @@ class World:
         self._built_for: dict[str, float] | None = None
         self._disconnect: Callable[[], object] | None = None
 
-    def __reduce__(self) -> tuple[type[World], tuple[Callable[[int, Mapping[str, float]], int]]]:
+    def __reduce__(
+        self,
+    ) -> tuple[type[PersistentWorld], tuple[Callable[[int, Mapping[str, float]], int]]]:
         # A copy of a simulator, here or in another process, gets a world of its own.
-        return World, (self._build,)
+        return PersistentWorld, (self._build,)
 
     def body(self, constants: Mapping[str, float]) -> tuple[int, int]:
         """The ids (client, body) of a world with these constants."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.recordings.noise import Noise, estimated, gaps
+from bench.recordings.noise import NoiseEstimate, estimated, gaps
 from bench.registry import simulators
 from sims.base import Array, Channel, InputError, Simulator
 from sims.recording.recording import Recording, Run, divided, read_recording, system_of
@@ -108,7 +108,7 @@ def _signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[
         missing = np.isnan(values)
         # An input is what was commanded: it has no noise.
         measured = what == "channel"
-        noise = estimated(signals) if measured else Noise(np.nan, 0.0)
+        noise = estimated(signals) if measured else NoiseEstimate(np.nan, 0.0)
         stated = recording.noise.get(channel.name)
         not_stated = "-" if measured else ""
         yield (

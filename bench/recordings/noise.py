@@ -20,7 +20,7 @@ long.
 """
 
 
-class Noise(NamedTuple):
+class NoiseEstimate(NamedTuple):
     """An estimate of 1 sigma, and the step by which a quantised signal changes (0 where it is not);
     NaN if unknown.
     """
@@ -29,7 +29,7 @@ class Noise(NamedTuple):
     step: float
 
 
-def estimated(signals: Iterable[tuple[Array, Array]]) -> Noise:
+def estimated(signals: Iterable[tuple[Array, Array]]) -> NoiseEstimate:
     """Noise from what is left of samples when a parabola or a line through their neighbours is
     taken off.
 
@@ -49,9 +49,9 @@ def estimated(signals: Iterable[tuple[Array, Array]]) -> Noise:
     runs = [(t[seen], y[seen]) for t, y in signals if (seen := np.isfinite(y)).any()]
     sigmas, step = [_sigma(runs, order) for order in (2, 3)], _step(runs)
     if not np.isfinite(sigmas).any():
-        return Noise(np.nan, step)
+        return NoiseEstimate(np.nan, step)
     # Rounding to steps errs evenly within half a step to either side: 1 sigma is step / sqrt(12).
-    return Noise(max(float(np.nanmin(sigmas)), step / 12**0.5), step)
+    return NoiseEstimate(max(float(np.nanmin(sigmas)), step / 12**0.5), step)
 
 
 def _sigma(runs: list[tuple[Array, Array]], order: int) -> float:

@@ -19,8 +19,8 @@ from bench.shot.settings import Settings
 from sims.ball.simulator import Ball as BallSimulator
 from sims.recording.recording import Recording, Run, read_recording
 from sims.recording.write import write_recording
-from sims.shot.balls import Ball, ball_named
-from sims.shot.scene import Scene
+from sims.shot.balls import BallKind, ball_named
+from sims.shot.scene import ShotScene
 from sims.shot.world import GRAVITY, Ground, fly
 
 RECORDINGS = "recordings"
@@ -39,8 +39,8 @@ class Deal:
     """
 
     name: str
-    ball: Ball
-    scene: Scene
+    ball: BallKind
+    scene: ShotScene
     release: tuple[float, float]
 
 
@@ -54,7 +54,7 @@ def deal(experiment: Experiment, settings: Settings, kind: str, index: int) -> D
         float(rng.uniform(*pair)) for pair in (settings.angle, settings.hoop_x, settings.hoop_drop)
     )
     dx, dz = (settings.release * rng.standard_normal(2)).tolist()
-    scene = Scene(angle, x, ball.radius / math.cos(angle) - drop, settings.hoop_radius)
+    scene = ShotScene(angle, x, ball.radius / math.cos(angle) - drop, settings.hoop_radius)
     return Deal(f"{kind}-{index:03d}", ball, scene, (dx, dz))
 
 

@@ -18,9 +18,9 @@ from bench.shot.deal import Deal
 from bench.shot.settings import Settings
 from bench.shot.table import ALL
 from bench.shot.throw import Throw, throw
-from bench.shot.tune import AFTER, EXPLAINED, NOMINAL, Model
+from bench.shot.tune import AFTER, EXPLAINED, NOMINAL, TunedModel
 from sims.base import Array
-from sims.shot.scene import Scene
+from sims.shot.scene import ShotScene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -254,7 +254,7 @@ class Shown(NamedTuple):
         top: height in metres up to which all of it is seen.
     """
 
-    models: dict[str, Model]
+    models: dict[str, TunedModel]
     throws: dict[str, Throw]
     top: float
 
@@ -263,7 +263,7 @@ def thrown(
     settings: Settings, dealt: Deal, methods: Sequence[str], kept: Mapping[str, Any]
 ) -> Shown:
     """One shot, thrown again by each of the methods."""
-    models = {model["method"]: Model(**model) for model in kept[dealt.name]["models"]}
+    models = {model["method"]: TunedModel(**model) for model in kept[dealt.name]["models"]}
     throws = {method: throw(dealt, settings, models[method]) for method in methods}
     top = max(float(np.nanmax(t.flown[:, 2])) for t in throws.values()) + 0.1
     return Shown(models, throws, top)
@@ -321,7 +321,7 @@ def shot_panel(axis: Axes, dealt: Deal, method: str, shot: Shown) -> None:
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def end_of(path: Array, scene: Scene) -> int:
+def end_of(path: Array, scene: ShotScene) -> int:
     """Index of the sample at which a path is a little below the hoop after its bounce."""
     z = path[:, 2]
     # Before the bounce the ball falls through the same heights.

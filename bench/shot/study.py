@@ -274,7 +274,12 @@ def _failed(
     if isinstance(error, TimeoutError):
         status = "timeout"
     nothing = partial(
-        tune.Model, effects={}, simulations=0, seconds=math.nan, status=status, reason=str(error)
+        tune.TunedModel,
+        effects={},
+        simulations=0,
+        seconds=math.nan,
+        status=status,
+        reason=str(error),
     )
     labels = [entry.label for entry in experiment.tuners]
     methods = [tune.NOMINAL, *labels, tune.EXPLAINED, *(label + tune.AFTER for label in labels)]

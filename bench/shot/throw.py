@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.shot.deal import Deal
 from bench.shot.settings import Settings
-from bench.shot.tune import Model, constants_of, simulator_of, theta_of
+from bench.shot.tune import TunedModel, constants_of, simulator_of, theta_of
 from sims.base import Array
 from sims.shot.planner import flights
 from sims.shot.scene import crossings
@@ -44,7 +44,7 @@ class Throw:
     flown: Array
 
 
-def throw(dealt: Deal, settings: Settings, model: Model) -> Throw:
+def throw(dealt: Deal, settings: Settings, model: TunedModel) -> Throw:
     """Make the planned shot, with the shot's release error."""
     times = np.arange(round(SECONDS * RATE) + 1) / RATE
     if not math.isfinite(model.height):
@@ -82,11 +82,11 @@ def thrown(dealt: Deal, settings: Settings, made: list[dict[str, Any]]) -> list[
     """One row a method: what was planned and what became of it."""
     return [
         _row(dealt, model, throw(dealt, settings, model))
-        for model in (Model(**row) for row in made)
+        for model in (TunedModel(**row) for row in made)
     ]
 
 
-def _row(dealt: Deal, model: Model, made: Throw) -> dict[str, Any]:
+def _row(dealt: Deal, model: TunedModel, made: Throw) -> dict[str, Any]:
     effects: Mapping[str, Any] = model.effects
     return {
         "shot": dealt.name,

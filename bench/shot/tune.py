@@ -28,7 +28,7 @@ from sims.ball.simulator import Ball as BallSimulator
 from sims.base import Array, InputError, Scenario
 from sims.recording.recording import Recording, read_recording
 from sims.shot.planner import Plan, plan
-from sims.shot.scene import Scene
+from sims.shot.scene import ShotScene
 from sims.shot.simulator import BounceShot
 from sims.shot.system import ShotSystem
 
@@ -38,7 +38,7 @@ Effects = Mapping[str, Sequence[float]]
 
 
 @dataclass(frozen=True)
-class Model:
+class TunedModel:
     """A tuned simulator and the shot planned in it.
 
     Attributes:
@@ -70,7 +70,7 @@ class Known:
 
     name: str
     recording: Path
-    scene: Scene
+    scene: ShotScene
     weights: Mapping[str, Path]
 
     def files(self) -> tuple[Path, ...]:
@@ -86,7 +86,7 @@ class Known:
 def models(experiment: Experiment, settings: Settings, known: Known) -> list[dict[str, Any]]:
     """Every method's model and plan, as plain dictionaries."""
     recording = read_recording(known.recording, BallSimulator, whole=True)
-    made = [Model(NOMINAL, _nominal(), {}, 0, 0.0, "done")]
+    made = [TunedModel(NOMINAL, _nominal(), {}, 0, 0.0, "done")]
     made += [
         _tuned(experiment, settings, entry, known, recording, {}) for entry in experiment.tuners
     ]
@@ -116,7 +116,7 @@ def _tuned(
     known: Known,
     recording: Recording,
     effects: Effects,
-) -> Model:
+) -> TunedModel:
     """The model of a tuner, in the simulator with these effects."""
     label, radius = entry.label, _constants(recording)["radius"]
     experiment = tuned_in(experiment, settings, entry)
@@ -143,10 +143,12 @@ def _tuned(
         )
         outcome = perform(experiment, order)
     except InputError as error:
-        return Model(label, _nominal(), {}, 0, 0.0, "crashed", str(error))
+        return TunedModel(label, _nominal(), {}, 0, 0.0, "crashed", str(error))
     trace = outcome.trace
     found = float(problem.cube.physical(trace.recommendations[-1])[0])
-    return Model(label, found, {}, len(trace.losses), outcome.seconds, trace.status, trace.reason)
+    return TunedModel(
+        label, found, {}, len(trace.losses), outcome.seconds, trace.status, trace.reason
+    )
 
 
 def tuned_in(experiment: Experiment, settings: Settings, entry: Entry) -> Experiment:
@@ -178,7 +180,7 @@ def _constants(recording: Recording) -> dict[str, float]:
     return {**BallSimulator().constant_values, **recording.constants, **recording.runs[0].constants}
 
 
-def _explained(recording: Path) -> tuple[Model, Effects]:
+def _explained(recording: Path) -> tuple[TunedModel, Effects]:
     """The model of explain, with the effects that act on the shot, and all that it found."""
     from bench.gap.explain import explain
 
@@ -187,7 +189,9 @@ def _explained(recording: Path) -> tuple[Model, Effects]:
         found = explain(recording)
     except Exception:  # a failure of one method is a row of the table
         last = traceback.format_exc()
-        return Model(EXPLAINED, _nominal(), {}, 0, perf_counter() - started, "crashed", last), {}
+        return TunedModel(
+            EXPLAINED, _nominal(), {}, 0, perf_counter() - started, "crashed", last
+        ), {}
     acting = {
         name: tuple(number.value for number in numbers.values())
         for name, numbers in found.extended.effects.items()
@@ -197,7 +201,7 @@ def _explained(recording: Path) -> tuple[Model, Effects]:
     restitution = found.extended.parameters["restitution"].value
     seconds = perf_counter() - started
     simulations = found.answer.simulations
-    model = Model(EXPLAINED, restitution, carried, simulations, seconds, "done", reason)
+    model = TunedModel(EXPLAINED, restitution, carried, simulations, seconds, "done", reason)
     return model, acting
 
 
@@ -219,7 +223,7 @@ def carry(effects: Effects, gravity: float) -> dict[str, tuple[float, ...]]:
     return carried
 
 
-def simulator_of(model: Model) -> BounceShot:
+def simulator_of(model: TunedModel) -> BounceShot:
     """The planning simulator of a model."""
     return BounceShot(fixed={name: list(values) for name, values in model.effects.items()})
 
@@ -233,18 +237,18 @@ def constants_of(settings: Settings, radius: float) -> dict[str, float]:
     }
 
 
-def theta_of(model: Model) -> Array:
+def theta_of(model: TunedModel) -> Array:
     """The parameters of a model's planning simulator."""
     return np.array([model.restitution])
 
 
-def planned_in(model: Model, settings: Settings, scene: Scene, radius: float) -> Plan:
+def planned_in(model: TunedModel, settings: Settings, scene: ShotScene, radius: float) -> Plan:
     """The shot planned in a model."""
     known = constants_of(settings, radius)
     return plan(simulator_of(model), theta_of(model), scene, known, settings.heights)
 
 
-def _planned(model: Model, settings: Settings, scene: Scene, radius: float) -> Model:
+def _planned(model: TunedModel, settings: Settings, scene: ShotScene, radius: float) -> TunedModel:
     if model.status == "crashed":
         return model
     made = planned_in(model, settings, scene, radius)

@@ -107,14 +107,14 @@ class BulletEngine:
             return
         if own is not None:
             build = partial(cast(BulletBallModule, module).build_native, settings=own)
-            self._world = bullet.World(build)
+            self._world = bullet.PersistentWorld(build)
             self._rollout = partial(native.rollout, NativeBall(self._world, own))
         elif system.bounces:
-            self._world = bullet.World(cast(BulletModule, module).build)
-            self._rollout = partial(flight.rollout, Ball(self._world))
+            self._world = bullet.PersistentWorld(cast(BulletModule, module).build)
+            self._rollout = partial(flight.rollout, BulletBall(self._world))
         else:
             body = cast(BulletJointModule, module)
-            self._world = bullet.World(body.build)
+            self._world = bullet.PersistentWorld(body.build)
             self._rollout = partial(joint.rollout, Joint(self._world, body))
 
     def integrate(self, lanes: Lanes) -> Motion:
@@ -135,7 +135,7 @@ class BulletEngine:
 class Joint:
     """A body on one hinge or guide; see `sims.engines.joint.Joint`."""
 
-    def __init__(self, world: bullet.World, module: BulletJointModule) -> None:
+    def __init__(self, world: bullet.PersistentWorld, module: BulletJointModule) -> None:
         self._world = world
         self._load = module.load
         self._gravity = module.gravity
@@ -189,7 +189,7 @@ class Joint:
 class _Mover:
     """A free ball; see `sims.engines.flight.Mover`."""
 
-    def __init__(self, world: bullet.World) -> None:
+    def __init__(self, world: bullet.PersistentWorld) -> None:
         self._world = world
         self._client = self._body = -1
         self._mass = math.nan
@@ -257,9 +257,9 @@ class _Mover:
             )
 
 
-class Ball(_Mover):
+class BulletBall(_Mover):
     """A ball that does not spin, on ground of restitution and friction 1; see
-    `sims.engines.flight.Ball`.
+    `sims.engines.flight.FlyingBall`.
     """
 
     def start(self, constants: dict[str, float]) -> None:
@@ -296,9 +296,9 @@ class Ball(_Mover):
 
 
 class NativeBall(_Mover):
-    """Bullet's own ball; see `sims.engines.native.Ball`."""
+    """Bullet's own ball; see `sims.engines.native.NativeBall`."""
 
-    def __init__(self, world: bullet.World, settings: Mapping[str, float]) -> None:
+    def __init__(self, world: bullet.PersistentWorld, settings: Mapping[str, float]) -> None:
         super().__init__(world)
         self.damping = settings["linear_damping"]
         self._rough = settings["lateral_friction"]

@@ -65,7 +65,7 @@ class Mover(Protocol):
         ...
 
 
-class Ball(Mover, Protocol):
+class FlyingBall(Mover, Protocol):
     """A ball over level ground."""
 
     def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
@@ -79,7 +79,7 @@ class Ball(Mover, Protocol):
         ...
 
 
-def rollout(ball: Ball, lane: Lane) -> Path:
+def rollout(ball: FlyingBall, lane: Lane) -> Path:
     """Integrate one lane."""
     ball.start(lane.numbers)
     flight = _Flight(ball, lane)
@@ -98,7 +98,7 @@ def rollout(ball: Ball, lane: Lane) -> Path:
 class _Flight:
     """One rollout."""
 
-    def __init__(self, ball: Ball, lane: Lane) -> None:
+    def __init__(self, ball: FlyingBall, lane: Lane) -> None:
         self._ball = ball
         self._contact = Impact(lane)
         self._pull = Pull(lane)

@@ -15,7 +15,7 @@ from typing import cast
 from sims.base import InputError
 from sims.engines import flight, joint, native
 from sims.engines.external import Lane, Path, checked_time_step, integrate
-from sims.engines.mujoco_bodies import Ball, Joint, SoftBall, World, library
+from sims.engines.mujoco_bodies import CompiledWorld, Joint, MujocoBall, SoftBall, library
 from sims.engines.worlds import MujocoJointModule, MujocoModule, world_module
 from sims.system import Engine, Lanes, Motion, System
 
@@ -80,11 +80,11 @@ class MujocoEngine:
         module, self._reason = world_module(system, "mujoco_world", asked)
         if module is None:
             return
-        self._world = World(cast(MujocoModule, module).model)
+        self._world = CompiledWorld(cast(MujocoModule, module).model)
         if stiffness is not None:
             self._rollout = partial(native.rollout, SoftBall(self._world, stiffness))
         elif system.bounces:
-            self._rollout = partial(flight.rollout, Ball(self._world))
+            self._rollout = partial(flight.rollout, MujocoBall(self._world))
         else:
             self._rollout = partial(
                 joint.rollout, Joint(self._world, cast(MujocoJointModule, module))

@@ -52,7 +52,7 @@ def library() -> Any:
     return mujoco
 
 
-class World:
+class CompiledWorld:
     """One MuJoCo model and its state, compiled when first needed and again when the constants
     change.
 
@@ -66,9 +66,9 @@ class World:
         self._model: Any = None
         self._data: Any = None
 
-    def __reduce__(self) -> tuple[type[World], tuple[Callable[[Mapping[str, float]], str]]]:
+    def __reduce__(self) -> tuple[type[CompiledWorld], tuple[Callable[[Mapping[str, float]], str]]]:
         # A copy of a simulator, here or in another process, gets a world of its own.
-        return World, (self._compile,)
+        return CompiledWorld, (self._compile,)
 
     def fresh(self, constants: Mapping[str, float]) -> tuple[Any, Any]:
         """Model and data as newly made, for these constants."""
@@ -94,7 +94,7 @@ class World:
 class Joint:
     """A body on one hinge or guide; see `sims.engines.joint.Joint`."""
 
-    def __init__(self, world: World, module: MujocoJointModule) -> None:
+    def __init__(self, world: CompiledWorld, module: MujocoJointModule) -> None:
         self._world = world
         self._load = module.load
         self._gravity = module.gravity
@@ -144,7 +144,7 @@ class Joint:
 class _Mover:
     """A ball on three slides; see `sims.engines.flight.Mover`."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: CompiledWorld) -> None:
         self._world = world
 
     def start(self, constants: dict[str, float]) -> None:
@@ -206,8 +206,8 @@ class _Mover:
         }
 
 
-class Ball(_Mover):
-    """A ball that MuJoCo's contact sends back in one step; see `sims.engines.flight.Ball`."""
+class MujocoBall(_Mover):
+    """A ball that MuJoCo's contact sends back in one step; see `sims.engines.flight.FlyingBall`."""
 
     def start(self, constants: dict[str, float]) -> None:
         """As every ball's."""
@@ -247,14 +247,14 @@ class Ball(_Mover):
 
 
 class SoftBall(_Mover):
-    """A ball on MuJoCo's springy contact; see `sims.engines.native.Ball`.
+    """A ball on MuJoCo's springy contact; see `sims.engines.native.NativeBall`.
 
     Friction is put in as a force, a share of the normal force of the step before.
     """
 
     damping = 0.0
 
-    def __init__(self, world: World, stiffness: float) -> None:
+    def __init__(self, world: CompiledWorld, stiffness: float) -> None:
         super().__init__(world)
         self._stiffness = stiffness
 

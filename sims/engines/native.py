@@ -27,7 +27,7 @@ _SLOW = 0.2
 """m/s below which Bullet takes a ball on the ground for resting."""
 
 
-class Ball(Mover, Protocol):
+class NativeBall(Mover, Protocol):
     """A ball over level ground in an engine."""
 
     damping: float
@@ -42,7 +42,7 @@ class Ball(Mover, Protocol):
         ...
 
 
-def rollout(ball: Ball, lane: Lane) -> Path:
+def rollout(ball: NativeBall, lane: Lane) -> Path:
     """Integrate one lane."""
     # Unlike in `flight`, the engine's velocity is read as it comes, and so is its contact.
     contact = Impact(lane)

@@ -31,7 +31,7 @@ _SLOWEST = 1e-3
 
 
 @dataclass(frozen=True)
-class Ball:
+class BallKind:
     """One ball.
 
     Attributes:
@@ -63,14 +63,14 @@ class Ball:
         ratio = max(speed, _SLOWEST) / self.speed
         return min(1.0, self.restitution * float(ratio**self.exponent))  # (2)
 
-    def one(self, rng: np.random.Generator) -> Ball:
+    def one(self, rng: np.random.Generator) -> BallKind:
         """A ball of this kind, as its restitution goes."""
         own = self.restitution + self.spread * float(rng.uniform(-1.0, 1.0))
         return replace(self, restitution=own)
 
 
 _BALLS = (
-    Ball(
+    BallKind(
         name="table-tennis",
         mass=0.0027,
         radius=0.0200,
@@ -85,7 +85,7 @@ _BALLS = (
             " (dropped 305 mm, back to 240-260 mm)"
         ),
     ),
-    Ball(
+    BallKind(
         name="tennis",
         mass=0.0577,
         radius=0.0335,
@@ -100,7 +100,7 @@ _BALLS = (
             " (56.0-59.4 g, 65.4-68.6 mm, dropped 254 cm, back to 135-147 cm)"
         ),
     ),
-    Ball(
+    BallKind(
         name="golf",
         mass=0.0459,
         radius=0.02135,
@@ -116,7 +116,7 @@ _BALLS = (
             " The Physics Factbook, Coefficients of Restitution"
         ),
     ),
-    Ball(
+    BallKind(
         name="basketball",
         mass=0.610,
         radius=0.1210,
@@ -131,7 +131,7 @@ _BALLS = (
             " (750-770 mm round, 567-650 g, dropped 1800 mm, back to 960-1160 mm)"
         ),
     ),
-    Ball(
+    BallKind(
         name="rubber",
         mass=0.0460,
         radius=0.0225,
@@ -147,7 +147,7 @@ _BALLS = (
             "doi:10.1119/1.19229; mass of a solid sphere of polybutadiene, 0.96 g/cm^3"
         ),
     ),
-    Ball(
+    BallKind(
         name="squash",
         mass=0.0240,
         radius=0.0200,
@@ -166,7 +166,7 @@ _BALLS = (
 BALLS = MappingProxyType({ball.name: ball for ball in _BALLS})
 
 
-def ball_named(name: str) -> Ball:
+def ball_named(name: str) -> BallKind:
     """The kind of ball of this name.
 
     Raises:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sims.base import Array, InputError, Scenario
-from sims.shot.scene import Scene, margins
+from sims.shot.scene import ShotScene, margins
 from sims.shot.simulator import BounceShot
 
 _GRID = 48
@@ -44,7 +44,7 @@ class Plan:
 def plan(
     simulator: BounceShot,
     theta: Array,
-    scene: Scene,
+    scene: ShotScene,
     constants: Mapping[str, float],
     heights: tuple[float, float],
     seconds: float = 3.0,
@@ -90,7 +90,7 @@ def plan(
 def flights(
     simulator: BounceShot,
     theta: Array,
-    scene: Scene,
+    scene: ShotScene,
     constants: Mapping[str, float],
     heights: Array,
     times: Array,

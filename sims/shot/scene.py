@@ -11,7 +11,7 @@ from sims.base import Array, InputError
 
 
 @dataclass(frozen=True)
-class Scene:
+class ShotScene:
     """What is known of a shot. Heights count from the point of the incline below the release, where
     x = 0.
 
@@ -43,7 +43,7 @@ class Scene:
         return radius / math.cos(self.angle)
 
 
-def crossings(path: Array, scene: Scene) -> Array:
+def crossings(path: Array, scene: ShotScene) -> Array:
     """Where paths (n, T, 3) of centres x, y, z come down through the hoop's plane: (n, 2), NaN for
     never.
 
@@ -78,7 +78,7 @@ def crossings(path: Array, scene: Scene) -> Array:
     return result
 
 
-def margins(path: Array, scene: Scene) -> Array:
+def margins(path: Array, scene: ShotScene) -> Array:
     """(n,) distance in m from where a path comes through the hoop's plane to its rim: > 0 inside;
     NaN for never.
     """

@@ -33,7 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sims.base import Array, InputError
-from sims.shot.balls import Ball
+from sims.shot.balls import BallKind
 
 AIR = 1.2
 """kg/m^3: density of air."""
@@ -69,7 +69,11 @@ class Ground:
 
 
 def fly(
-    ball: Ball, ground: Ground, start: tuple[float, float, float], times: Array, air: float = AIR
+    ball: BallKind,
+    ground: Ground,
+    start: tuple[float, float, float],
+    times: Array,
+    air: float = AIR,
 ) -> Array:
     """The path of a ball let go at rest.
 
@@ -121,7 +125,7 @@ def _restitution(ratio: float) -> float:
 
 
 class _Flight:
-    def __init__(self, ball: Ball, ground: Ground, air: float) -> None:
+    def __init__(self, ball: BallKind, ground: Ground, air: float) -> None:
         import mujoco
 
         self._ball = ball
@@ -205,7 +209,7 @@ class _Flight:
         return -math.copysign(min(stops, held), slip)  # (5)
 
 
-def _mjcf(ball: Ball, ground: Ground) -> str:
+def _mjcf(ball: BallKind, ground: Ground) -> str:
     inertia = ball.inertia_ratio * ball.mass * ball.radius**2
     moments = f"{inertia!r} {inertia!r} {inertia!r}"
     return f"""

@@ -26,7 +26,7 @@ from methods.learning.pair_fit import Fitted, PairTuner, Prepared
 from methods.learning.pair_network import PUBLISHED, Design
 from methods.learning.reader import Reading
 from methods.learning.rehearsal import rehearse
-from methods.tunenet import SETTLED, Search, TuneNet, TuneNetPublished
+from methods.tunenet import SETTLED, RootSearch, TuneNet, TuneNetPublished
 
 AT = (1, 2, 3, 5, 10)
 SEEDS, TARGETS, MEMBERS = 2, 100, 5
@@ -66,7 +66,7 @@ class Variant(PairTuner):
         return lambda seen: np.mean([estimate(seen) for estimate in each], axis=0)
 
     def tune(self, task, rng):
-        estimate, search, guess = self.estimator(task), Search(task), task.start
+        estimate, search, guess = self.estimator(task), RootSearch(task), task.start
         while True:
             seen = yield Ask(guess, recommend=guess)
             difference = estimate(seen.observations)

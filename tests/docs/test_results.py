@@ -18,7 +18,7 @@ from bench.shot.deal import deals
 from bench.shot.settings import settings_of
 from bench.shot.table import COLUMNS as SHOT_COLUMNS
 from bench.shot.throw import thrown
-from bench.shot.tune import Model
+from bench.shot.tune import TunedModel
 from bench.store.status import FAILURES
 from sims.camera.camera import Camera
 from sims.camera.files import Filmed, described
@@ -138,7 +138,7 @@ def test_the_tables_of_the_bounce_shot():
     assert told("### `table.csv` of shots") == SHOT_COLUMNS
     experiment = load("bounce-shot")
     settings = settings_of(experiment)
-    nothing = vars(Model("nominal", 0.5, {}, 0, 0.0, "no plan"))
+    nothing = vars(TunedModel("nominal", 0.5, {}, 0, 0.0, "no plan"))
     (row,) = thrown(deals(experiment, settings)[0], settings, [nothing])
     assert [*row, "seen"] == told("### `shots.csv`")
 

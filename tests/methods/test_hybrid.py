@@ -4,7 +4,7 @@ import pytest
 from bench.runs.drive import drive
 from methods.base import Evaluation, Task
 from methods.hybrid import Hybrid, _complement
-from methods.least_squares import LeastSquares, Run
+from methods.least_squares import History, LeastSquares
 from methods.tunenet import TuneNet
 from tests.methods.test_tunenet import TRAINING, Toy, run
 
@@ -62,7 +62,7 @@ def test_noise_is_averaged_as_least_squares_does(two):
 def seen_so_far(points, matrix, offset=0.0):
     """A run whose residuals are linear in the points."""
     task = Task(2, np.zeros(2), np.zeros((4, 1)), np.ones(1), TRAINING[2], 9, (4,))
-    run = Run(task, 0.0)
+    run = History(task, 0.0)
     residuals = points @ matrix.T + offset
     for point, residual in zip(points, residuals, strict=True):
         run.tried.append(point)

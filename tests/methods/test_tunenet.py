@@ -8,7 +8,7 @@ from methods.base import NOTHING, Array, BudgetExceededError, Task
 from methods.learning.pair_inputs import resample, roughness, weighed_inputs
 from methods.learning.pair_network import PUBLISHED, Design, Sides, estimate, train
 from methods.learning.rehearsal import Rehearsal
-from methods.tunenet import Search, TuneNet, TuneNetPublished
+from methods.tunenet import RootSearch, TuneNet, TuneNetPublished
 
 TRAINING = {1: np.array([[0.3], [0.7]]), 2: np.array([[0.3, 0.2], [0.7, 0.6]])}
 
@@ -340,7 +340,7 @@ def test_inputs_prefer_what_follows_the_parameters():
 def test_search_solves_a_linear_system_in_as_many_steps_as_it_must():
     matrix, root = np.array([[-0.6, 0.2], [0.1, -1.5]]), np.array([0.4, 0.7])
     task = Task(2, np.array([0.1, 0.9]), np.zeros((1, 1)), np.ones(1), TRAINING[2], 9, (1,))
-    search, guess = Search(task), task.start
+    search, guess = RootSearch(task), task.start
     distances = []
     for _ in range(6):
         guess = search.after(guess, matrix @ (guess - root))
@@ -350,7 +350,7 @@ def test_search_solves_a_linear_system_in_as_many_steps_as_it_must():
 
 
 def test_search_survives_a_failed_simulation():
-    search = Search(Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 9, (1,)))
+    search = RootSearch(Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 9, (1,)))
     assert search.after(np.zeros(1), np.array([np.nan])).tolist() == [0.25]
     assert search.after(np.full(1, 0.2), np.array([0.4])).tolist() == pytest.approx([0.6])
     assert search.after(np.full(1, 0.6), np.array([np.nan])).tolist() == pytest.approx([0.4])

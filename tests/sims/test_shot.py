@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from sims.base import InputError, Scenario
 from sims.shot.balls import BALLS, ball_named
 from sims.shot.planner import plan
-from sims.shot.scene import Scene, crossings, margins
+from sims.shot.scene import ShotScene, crossings, margins
 from sims.shot.simulator import BounceShot
 from sims.shot.world import AIR, CONTACT, GRAVITY, Ground, damping_ratio, fly
 
@@ -99,7 +99,7 @@ def test_drag_acts_against_the_velocity_in_the_rooms_frame():
 
 def scene_at(height, drop=0.1, kept=1.0, radius=0.15):
     touching = RADIUS / math.cos(ANGLE)
-    return Scene(ANGLE, landing(height, drop, kept), touching - drop, radius)
+    return ShotScene(ANGLE, landing(height, drop, kept), touching - drop, radius)
 
 
 KNOWN = {"radius": RADIUS, "friction": 0.0}
@@ -116,20 +116,20 @@ def test_level_launch_and_landing_need_a_height_in_proportion_to_the_distance():
     """Landing at the height of launch: x = 4 a b h with vx = a v, vz = b v."""
     vx, vz = launch(1.0, kept=5 / 7)
     x = 4 * vx * vz / (2 * GRAVITY)
-    scene = Scene(ANGLE, 1.1, RADIUS / math.cos(ANGLE), 0.1)
+    scene = ShotScene(ANGLE, 1.1, RADIUS / math.cos(ANGLE), 0.1)
     found = plan(BounceShot(), np.array([E]), scene, {"radius": RADIUS, "friction": 1.0}, HEIGHTS)
     assert found.height == pytest.approx(1.1 / x, abs=1e-3)
 
 
 def test_hoop_out_of_reach_is_a_plan_that_expects_to_miss_and_dead_ball_none():
-    far = Scene(ANGLE, 9.0, -0.1, 0.15)
+    far = ShotScene(ANGLE, 9.0, -0.1, 0.15)
     found = plan(BounceShot(), np.array([E]), far, KNOWN, HEIGHTS)
     assert found.found
     assert found.height == pytest.approx(3.0, abs=1e-9)
     assert found.margin == pytest.approx(
         0.15 - (9.0 - landing(3.0, 0.1 + RADIUS / math.cos(ANGLE))), abs=1e-3
     )
-    dead = plan(BounceShot(), np.array([0.0]), Scene(ANGLE, 1.0, 0.2, 0.15), KNOWN, HEIGHTS)
+    dead = plan(BounceShot(), np.array([0.0]), ShotScene(ANGLE, 1.0, 0.2, 0.15), KNOWN, HEIGHTS)
     assert not dead.found
     assert math.isnan(dead.margin)
     with pytest.raises(InputError, match="drop heights above 0"):
@@ -137,7 +137,7 @@ def test_hoop_out_of_reach_is_a_plan_that_expects_to_miss_and_dead_ball_none():
 
 
 def test_where_a_path_comes_through_the_hoop_counts_after_its_bounce():
-    scene = Scene(ANGLE, 1.0, 0.5, 0.2)
+    scene = ShotScene(ANGLE, 1.0, 0.5, 0.2)
     falls = [(0, 0, 1), (0, 0, 0.2), (0.4, 0, 0.6), (0.8, 0.06, 0.7), (1.0, 0.12, 0.3)]
     low = [(0, 0, 1), (0, 0, 0.2), (0.4, 0, 0.45), (0.8, 0, 0.4), (1.0, 0, 0.3)]
     where = crossings(np.array([falls, low], dtype=float), scene)
@@ -233,7 +233,7 @@ def test_world_bounces_off_the_incline_as_an_impact_would(friction, inertia, kep
     height, touching = 1.2, ball.radius / math.cos(ANGLE)
     times = np.arange(0, 1.6, 1 / 240)
     seen = fly(ball, Ground(ANGLE, friction), (0, 0, height + touching), times, air=0.0)
-    place = crossings(seen[None], Scene(ANGLE, 1.0, touching, 0.2))[0]
+    place = crossings(seen[None], ShotScene(ANGLE, 1.0, touching, 0.2))[0]
     vx, vz = launch(height, kept=kept)
     assert place[0] == pytest.approx(
         2 * vx * vz / GRAVITY, rel=0.012
@@ -247,7 +247,7 @@ def test_world_spin_bends_the_path_downward_as_lift_of_topspin():
     """
     ball = replace(BALLS["table-tennis"], restitution=E, exponent=0.0)
     touching = ball.radius / math.cos(ANGLE)
-    times, scene = np.arange(0, 1.6, 1 / 240), Scene(ANGLE, 1.0, touching, 0.2)
+    times, scene = np.arange(0, 1.6, 1 / 240), ShotScene(ANGLE, 1.0, touching, 0.2)
     seen = fly(ball, Ground(ANGLE, 0.5), (0, 0, 1.2 + touching), times)
     fall_speed = math.sqrt(GRAVITY / drag_of(ball) * (1 - math.exp(-2 * drag_of(ball) * 1.2)))
     kept = 1 / (1 + ball.inertia_ratio)

@@ -23,7 +23,7 @@ from bench.shot.rows import rows_of
 from bench.shot.settings import settings_of
 from bench.shot.table import ALL, table, wilson
 from bench.shot.throw import throw
-from bench.shot.tune import Known, Model, carry, models
+from bench.shot.tune import Known, TunedModel, carry, models
 from sims.ball.simulator import Ball
 from sims.base import InputError
 from sims.recording.recording import read_recording
@@ -220,7 +220,7 @@ def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp
     """And a failure of explain is a row, not the end."""
 
     def broken(_):
-        return Model("explain", 0.5, {}, 0, 0.0, "crashed", "no"), {}
+        return TunedModel("explain", 0.5, {}, 0, 0.0, "crashed", "no"), {}
 
     monkeypatch.setattr(tune, "_explained", broken)
     settings = settings_of(experiment)
@@ -228,7 +228,7 @@ def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp
     path = tmp_path / "drop.csv"
     record(experiment, dealt, settings, path)
     made = {
-        row["method"]: Model(**row)
+        row["method"]: TunedModel(**row)
         for row in models(experiment, settings, Known("x", path, dealt.scene, {}))
     }
     assert list(made) == ["nominal", "least_squares", "explain"]
@@ -325,7 +325,7 @@ shot = { balls = ["golf"] }
 
 
 def explained(_):
-    return Model("explain", 0.5, {}, 0, 0.0, "done"), {}
+    return TunedModel("explain", 0.5, {}, 0, 0.0, "done"), {}
 
 
 @pytest.fixture
