@@ -3,23 +3,18 @@ lies there.
 
 Source: S. Zhu, A. Kimmel, K. E. Bekris, A. Boularias, Fast model identification via physics engines
 for data-efficient policy search, IJCAI 2018, doi:10.24963/ijcai.2018/451 (arXiv:1710.08893),
-algorithm 1. The candidates' quasi-random
-sequence: M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018,
-https://extremelearning.com.au/unreasonable-effectiveness-of-quasirandom-sequences/.
+algorithm 1.
 
 The error over the parameters θ is a Gaussian process; P(θ) is the share of its posterior draws
 whose minimiser, among candidates, is θ; the next simulation is where
 
     (1)  -P(θ) log P(θ)
 
-is largest. The candidates' sequence in d dimensions, for n = 1, 2, ...:
+is largest. Candidates are quasi-random points (`methods.learning.quasi_random`).
 
-    (2)  x_n = (shift + n (1/g, 1/g^2, ..., 1/g^d)) mod 1,  g^(d + 1) = g + 1
-
-As
-published the candidates are a fixed grid, which bounds the accuracy, and the search stops when its
-estimate repeats, which is often too early. The default draws new candidates each time, dense around
-the likely minimisers, models the logarithm of the error, and goes on.
+As published the candidates are a fixed grid, which bounds the accuracy, and the search stops when
+its estimate repeats, which is often too early. The default draws new candidates each time, dense
+around the likely minimisers, models the logarithm of the error, and goes on.
 """
 
 from __future__ import annotations
@@ -30,6 +25,7 @@ import numpy as np
 
 from methods.base import Array, Ask, Steps, Task, Tuner
 from methods.learning.gaussian_process import GaussianProcess, Settings
+from methods.learning.quasi_random import spread
 
 _PUBLISHED_DRAWS = 200
 """Posterior draws of the published search."""
@@ -158,19 +154,6 @@ def uncertainty(p: Array) -> Array:
     possible = p > 0.0
     logarithms = np.log(np.where(possible, p, 1.0))
     return np.where(possible, -p * logarithms, -1.0)
-
-
-def spread(n: int, shift: Array) -> Array:
-    """(n, dim) quasi-random points in the unit cube: an additive recurrence, shifted by (dim,)."""
-    dim = len(shift)
-    root = 2.0
-    # a fixed point of g = (1 + g)^(1 / (d + 1)); the error is more than halved each time
-    for _ in range(60):
-        root = (1.0 + root) ** (1.0 / (dim + 1))
-    steps = root ** -np.arange(1.0, dim + 1)
-    numbers = np.arange(1, n + 1)[:, None]
-    points: Array = (shift + numbers * steps) % 1.0  # (2)
-    return points
 
 
 def finite(losses: Array) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from bench.registry import tuners
 from bench.runs.drive import Evaluate, drive
 from methods.base import Task
+from methods.learning.quasi_random import spread
 from sims.base import Array, InputError, Parameter, UnitCube
 
 
@@ -77,3 +78,8 @@ def recommended(
     # the last one, whatever the status: a run that failed still recommends where it stood
     best: Array = cube.physical(trace.recommendations[-1])
     return best
+
+
+def evenly(count: int, dim: int) -> Array:
+    """(count, dim) starting points spread evenly over the unit cube, for who has no tuner begin."""
+    return spread(count, np.full(dim, 0.5))

@@ -13,6 +13,7 @@ import numpy as np
 from bench.gap.model.fit import Fit, Fitter, Start
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
+from bench.runs.standalone import evenly
 from sims.base import Array, Parameter
 
 STARTS = 15
@@ -104,24 +105,6 @@ def _starts(world: World, given: Array | None) -> list[Array]:
             theta[place] = _between(parameter, share)
         starts.append(theta)
     return starts
-
-
-def evenly(count: int, dim: int) -> Array:
-    """Points (count, dim) spread evenly over the unit cube: an additive recurrence with the
-    generalised golden ratio g (M. Roberts, The unreasonable effectiveness of quasirandom sequences,
-    2018).
-
-        g^(d + 1) = g + 1                                                                        (1)
-        x_nk = (1/2 + n g^-k) mod 1,   n = 1 ... count, k = 1 ... d                              (2)
-    """
-    ratio = 2.0
-    # (1) as a fixed point, each pass more than halving the error: 60 are beyond rounding
-    for _ in range(60):
-        ratio = (1.0 + ratio) ** (1.0 / (dim + 1))
-    steps = ratio ** -np.arange(1.0, dim + 1)
-    numbers = np.arange(1, count + 1)[:, None]
-    points: Array = (0.5 + numbers * steps) % 1.0  # (2)
-    return points
 
 
 def _between(parameter: Parameter, share: float) -> float:

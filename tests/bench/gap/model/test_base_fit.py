@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from bench.gap.model.base_fit import evenly, fit_base
+from bench.gap.model.base_fit import fit_base
+from bench.runs.standalone import evenly
 from sims.ball.simulator import Ball
 from sims.pendulum.simulator import Pendulum
 from tests.bench.gap.made import recorded, recording, white, with_runs, world
