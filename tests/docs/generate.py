@@ -78,6 +78,7 @@ def sentence(text):
 def options(name, command):
     """A command's arguments and options as a table."""
     rows = [("argument or option", "what")]
+    # argparse has no public way to ask a parser for what was added to it.
     for action in command._actions:
         if isinstance(action, argparse._HelpAction):
             continue
@@ -269,6 +270,7 @@ def of_json(hint):
 def thresholds(module):
     """The numbers that a module names in capitals, each with its sentence."""
     rows = [("threshold", "value", "what")]
+    # Docstrings of attributes are in the text alone: Python does not keep them.
     body = ast.parse(inspect.getsource(module)).body
     for statement, behind in pairwise(body):
         sentence_behind = isinstance(behind, ast.Expr) and isinstance(behind.value, ast.Constant)

@@ -21,6 +21,7 @@ def blocks(text, language=None):
 
 def section(text, heading):
     """What stands below a heading, up to the next of its rank."""
+    # A heading of the same or a higher rank ends what stands below this one.
     marks = heading.split(" ")[0]
     start = f"\n{text}".index(f"\n{heading}\n") + len(heading) + 1
     end = re.search(rf"^#{{1,{len(marks)}}} ", text[start:], re.M)
@@ -30,8 +31,10 @@ def section(text, heading):
 def tables(text):
     """Each table as a list of rows, each a list of cells; the header is the first row."""
     found = [[]]
+    # Blocks of code may hold lines that begin like a table.
     for line in FENCE.sub("", text).splitlines():
         if line.startswith("|"):
+            # A bar behind a backslash is a bar, not the end of a cell.
             cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
             if not all(set(cell) <= set("-:") for cell in cells):
                 found[-1].append(cells)

@@ -23,6 +23,7 @@ def anchors(page):
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     found = []
     for heading in re.findall(r"^#+ (.*)$", text, re.M):
+        # Lower case, spaces as hyphens, all other marks away; a second one of a name is numbered.
         words = re.sub(r"[^\w\- ]", "", LINK.sub("", heading).lower()).replace(" ", "-")
         found.append(f"{words}-{found.count(words)}" if words in found else words)
     return found
@@ -50,6 +51,7 @@ PLACE = re.compile(r"`((?:bench|docs|examples|methods|results|sims|tests)/[\w./*
 def test_files_that_a_page_names_are_there(page):
     named = PLACE.findall(page.read_text(encoding="utf-8"))
     made = {"results/train/", "results/inspect/"}  # by commands
+    # Capitals stand for something that the reader puts in their place.
     fixed = [n for n in named if n not in made and not re.search("[A-Z]{4}", n)]
     assert [name for name in fixed if not [*ROOT.glob(name)]] == []
 

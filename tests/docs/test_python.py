@@ -23,6 +23,7 @@ def test_the_blocks_of_the_page_run(tmp_path, monkeypatch, capsys):
     (tmp_path / "page_on_python.py").write_text(code, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    # A module of its own: a tuner has to have a source that can be told.
     page = importlib.import_module("page_on_python")
     assert set(page.run.statuses["status"]) == {"done"}
     said = capsys.readouterr().out
@@ -50,5 +51,6 @@ def test_a_notebook_runs(path, tmp_path, monkeypatch):
     notebook = nbformat.read(path, as_version=4)
     run = nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": tmp_path}})
     run.execute()
+    # Figures are pictures only where they know how to show themselves without pyplot.
     shown = [set(o.get("data", {})) for cell in notebook.cells for o in cell.get("outputs", [])]
     assert {"image/png"} <= set().union(*shown), "no figure was shown"

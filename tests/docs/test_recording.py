@@ -49,6 +49,7 @@ def test_the_smallest_description_is_enough(files):
 
 @pytest.mark.parametrize("row", FAULTS, ids=[quoted(row[2])[0] for row in FAULTS])
 def test_a_fault_is_told_what_the_page_says(files, row):
+    # Row: file, what stands there, what it is changed to, the message.
     (name,), (before,), (after,), (message,) = map(quoted, row)
     (files / name).write_text(BLOCKS[name].replace(before, after, 1), encoding="utf-8")
     assert before in BLOCKS[name]
@@ -72,6 +73,7 @@ CONSTANTS = {"gravity", "length", "mass"}
 @pytest.mark.parametrize("place", PLACES)
 def test_every_key_that_the_reader_knows_stands_on_the_page_and_none_else(files, place):
     table = PLACES[place]
+    # A key that cannot be: the message lists those that can, which is what is asked for here.
     spoilt = {"": "nonsense = 1\n" + BLOCKS["swing.toml"]}.get(
         table, BLOCKS["swing.toml"].replace(f"[{table}]", f"[{table}]\nnonsense = 1", 1)
     )

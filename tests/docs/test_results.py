@@ -102,6 +102,7 @@ def test_every_column_of_the_runs_is_on_the_page(folder):
 
 def test_every_metric_and_status_is_on_the_page(folder):
     rows = tables(section(PAGE, "### `table.csv`"))[0]
+    # In the cell the metrics stand beside the file whose columns they are.
     (metrics,) = [row[2] for row in rows if row[0] == "`metric`"]
     assert set(quoted(metrics)) - {"runs.parquet"} == set(METRICS)
     statuses = tables(section(PAGE, "### `status.csv`"))[1][1:]
@@ -126,6 +127,7 @@ def test_every_figure_is_described(folder):
 
 def test_several_comparisons(folder, tmp_path, capsys):
     assert main(["plot", str(folder), str(folder), "--out", str(tmp_path / "all")]) == 0
+    # Nemenyi's test needs five problems; two are enough for everything else.
     written = {path.name for path in (tmp_path / "all").glob("*.csv")}
     assert written | {"nemenyi.csv"} == set(told("## plot of several comparisons"))
     names = written_out(told("### `ranks.csv`"), TUNER=TUNERS)
@@ -138,6 +140,7 @@ def test_the_tables_of_the_bounce_shot():
     assert told("### `table.csv` of shots") == SHOT_COLUMNS
     experiment = load("bounce-shot")
     settings = settings_of(experiment)
+    # Without a plan no shot is flown, and the row has its columns all the same.
     nothing = vars(TunedModel("nominal", 0.5, {}, 0, 0.0, "no plan"))
     (row,) = thrown(deals(experiment, settings)[0], settings, [nothing])
     assert [*row, "seen"] == told("### `shots.csv`")
