@@ -1,6 +1,4 @@
-"""A comparison in its folder: begun there, or resumed where it was interrupted, made, looked at, and
-reported.
-"""
+"""A comparison in its folder: begun or resumed there, made, looked at, and reported."""
 
 from __future__ import annotations
 
@@ -114,6 +112,7 @@ class Comparison:
             return
         planned = read_plan(self.folder)
         journal = Journal(self.folder)
+        # Killed between the folder and its plan: there are no runs that could contradict it.
         if planned is None:
             write_plan(self.folder, ids)
         foreign = [
@@ -166,8 +165,8 @@ class Comparison:
         Raises:
             InputError: workers cannot be had; what was finished is kept.
         """
-        # All that the results need is imported before the work: an interrupt in the midst of a first
-        # import leaves half a module behind, and writing what there is would die of it.
+        # All that the results need is imported before the work: an interrupt in the midst of a
+        # first import leaves half a module behind, and writing what there is would die of it.
         import pandas as pd  # noqa: F401
         from pyarrow import compute, parquet  # noqa: F401
 

@@ -1,5 +1,7 @@
-"""Studies: what an experiment asks for, made in a folder. Comparisons and bounce shots are two
-kinds of one contract, and this is the one place that tells which is which.
+"""Studies: what an experiment asks for, made in a folder.
+
+Comparisons and bounce shots are two kinds of one contract, and this is the one place that tells
+which is which.
 """
 
 from __future__ import annotations
@@ -172,6 +174,7 @@ def opened(folder: Path) -> Study:
 
 def kind_of(experiment: Experiment) -> type[Study]:
     """Which study an experiment asks for."""
+    # Imported here: who compares needs none of what makes shots.
     if experiment.shot:
         from bench.shot.study import BounceShotStudy
 

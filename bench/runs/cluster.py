@@ -141,6 +141,7 @@ class ClusterPool:
         from distributed import CancelledError, KilledWorker
 
         waiting: dict[Any, int] = {}
+        # How many workers each call has lost, and the calls that are to be made again.
         losses: dict[int, int] = {}
         following = iter(range(len(calls)))
         again: list[int] = []
@@ -156,11 +157,11 @@ class ClusterPool:
                     return
                 for future in self._done(list(waiting)):
                     place = waiting.pop(future)
-                    error = future.exception() if future.status in ("error", "cancelled") else None
-                    if isinstance(error, KilledWorker | CancelledError) or future.status in (
-                        "lost",
-                        "cancelled",
-                    ):
+                    ended = future.status
+                    error = future.exception() if ended in ("error", "cancelled") else None
+                    killed = isinstance(error, KilledWorker | CancelledError)
+                    # A worker that is lost says nothing about the call it was at.
+                    if killed or ended in ("lost", "cancelled"):
                         losses[place] = losses.get(place, 0) + 1
                         if losses[place] > _LOSSES:
                             raise LostError(
@@ -169,6 +170,7 @@ class ClusterPool:
                         again.append(place)
                         continue
                     result = error if error is not None else self._received(future.result())
+                    # Results stay on the cluster for as long as somebody holds their future.
                     future.release()
                     yield place, result
         except (OSError, TimeoutError, CancelledError) as error:
@@ -186,10 +188,8 @@ class ClusterPool:
             try:
                 with self._client.as_current():
                     wait(futures, timeout=2.0, return_when="FIRST_COMPLETED")
-            except (
-                TimeoutError,
-                CancelledError,
-            ):  # a cancelled one is done, and made again if the scheduler lives
+            # A cancelled one is done, and made again if the scheduler lives.
+            except (TimeoutError, CancelledError):
                 self._there()
             if done := [future for future in futures if future.done()]:
                 self._there()

@@ -50,11 +50,13 @@ class _DivergenceError(Exception):
 
 def _points(asked: object, dim: int, what: str) -> Array:
     """The proposals as a fresh (n, dim) array inside the unit cube."""
+    # A copy: the tuner may go on using its own.
     points = np.array(asked, dtype=np.float64, ndmin=2)
     if points.ndim != 2 or points.shape[1] != dim or not len(points):
         raise ValueError(
             f"the tuner gave {what} of shape {points.shape}; expected (n, {dim}) with n >= 1"
         )
+    # Almost always inside, so what is dear is asked only otherwise.
     if not _inside(points):
         if not np.isfinite(points).all():
             first = points[~np.isfinite(points).all(axis=1)][0]

@@ -21,7 +21,9 @@ def initialise(plugins: Sequence[str], births: Any) -> None:
         plugins: plugin files to load.
         births: where the worker tells that it is there.
     """
+    # A terminal's Ctrl-C reaches every process of the group; the parent alone answers it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # First of all that may fail: a birth that nobody hears of would look like a worker at work.
     births.send(os.getpid())
     threading.Thread(target=_end_with_parent, daemon=True, name="end-with-parent").start()
     from bench.registry import load_plugins
@@ -31,9 +33,10 @@ def initialise(plugins: Sequence[str], births: Any) -> None:
 
 
 def _silence() -> None:
-    """Send what is printed to nowhere: a method that prints would spoil the table, or fill a disk."""
+    """Send what is printed to nowhere: a tuner that prints would spoil the table or fill a disk."""
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
+    # The descriptors and not `sys.stdout`: libraries in C write there too.
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
@@ -47,6 +50,7 @@ def _end_with_parent() -> None:
     parent = parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
+        # Not sys.exit, which would end this thread and leave the run hanging.
         os._exit(1)
 
 
@@ -65,6 +69,7 @@ def memory_limit(mebibytes: int) -> Iterator[None]:
         return
     resource = limits()
     before = resource.getrlimit(resource.RLIMIT_DATA)
+    # Beyond what the process has: how large that is depends on the packages it has loaded.
     wanted = _data_bytes() + mebibytes * 2**20
     soft = wanted if before[1] == resource.RLIM_INFINITY else min(wanted, before[1])
     resource.setrlimit(resource.RLIMIT_DATA, (soft, before[1]))

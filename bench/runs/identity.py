@@ -67,6 +67,7 @@ def _classes(experiment: Experiment) -> list[str]:
     for entry in experiment.tuners:
         try:
             sources.append(source(tuners.get(entry.tuner)))
+        # It has no run that could be mixed with another kind; it shows once it can be used.
         except SkippedError:
             sources.append("skipped")
     return sources
@@ -82,6 +83,7 @@ def refuse_changes(folder: Path, before: dict[str, str], now: dict[str, str]) ->
         raise InputError(
             f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison"
         )
+    # The first that differs says most: what a person changed comes before what follows from it.
     for what, hashed in now.items():
         if before.get(what) != hashed:
             raise InputError(
@@ -102,6 +104,7 @@ def unchanged(folder: Path, held: Configuration, plugins: Sequence[str]) -> list
     Raises:
         InputError: something that matters changed since it was begun.
     """
+    # The folder's own come first, in their order, as when it was begun.
     given = {str(Path(p).resolve()) for p in plugins}
     everything = held.plugins + sorted(given - set(held.plugins))
     load_plugins(everything)
@@ -127,6 +130,7 @@ class Identities:
 
     def run(self, entry: Entry, target: SealedTarget, seed: int, budget: int) -> str:
         """The id of one run."""
+        # Hashed once: a plan may have a million runs.
         if entry.label not in self._entries:
             kind = tuners.get(entry.tuner)
             training = self._experiment.training_budget if kind.learned else 0

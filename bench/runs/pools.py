@@ -246,15 +246,14 @@ class _Slot:
     def _start(self) -> None:
         from pebble import ProcessPool
 
+        # Not forked: a fork inherits the parent's memory, and in it the truth.
         context = multiprocessing.get_context("spawn")
         # Each process that the pool starts tells of its birth here: a second one means that the
         # first is dead, which pebble does not notice where it exited with code 0.
         self._births, telling = context.Pipe(duplex=False)
+        self._born = 0
         arguments = (self._plugins, telling)
-        self._born, self._pool = (
-            0,
-            ProcessPool(1, initializer=initialise, initargs=arguments, context=context),
-        )
+        self._pool = ProcessPool(1, initializer=initialise, initargs=arguments, context=context)
 
     def stop(self) -> None:
         """End the process, and whatever it is at."""
@@ -313,9 +312,8 @@ class _Slot:
     def _renew(self) -> None:
         self._futile += 1
         if self._futile > _FUTILE:
-            raise InputError(
-                "worker processes die as soon as they start; what they say stands above, if anything"
-            )
+            said = "what they say stands above, if anything"
+            raise InputError(f"worker processes die as soon as they start; {said}")
         self.given.clear()
         self.stop()
         self._births.close()

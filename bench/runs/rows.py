@@ -65,20 +65,20 @@ def rows(
     }
     columns |= _parameter_columns(problem, target, outcome)
     if spectrum is not None and target.truth is not None:
+        # Directions mix parameters, so these must have one unit: training widths.
         away = problem.cube.physical(trace.recommendations) - target.truth
-        columns["stiff_error"], columns["sloppy_error"] = spectrum.errors(
-            away / problem.cube.training_widths()
-        )
+        widths = away / problem.cube.training_widths()
+        columns["stiff_error"], columns["sloppy_error"] = spectrum.errors(widths)
     columns["obs_error"] = outcome.obs_rmse[:, problem.error_channel]
+    # Every run of a comparison has the same columns, so that its rows fit into one table.
     nothing = np.full((k + 1, len(problem.channels)), np.nan)
     heldout = nothing if outcome.heldout_rmse is None else outcome.heldout_rmse
     columns["heldout_error"] = heldout[:, problem.error_channel]
     for i, channel in enumerate(problem.channels):
         columns[f"obs_error_{channel.name}"] = outcome.obs_rmse[:, i]
-        noise = problem.noise[i]
-        columns[f"obs_error_{channel.name}_in_noise"] = outcome.obs_rmse[:, i] / (
-            noise if noise > 0 else np.nan
-        )
+        # Without noise there is no such unit.
+        noise = problem.noise[i] if problem.noise[i] > 0 else np.nan
+        columns[f"obs_error_{channel.name}_in_noise"] = outcome.obs_rmse[:, i] / noise
         columns[f"heldout_error_{channel.name}"] = heldout[:, i]
     columns["tuner_seconds"] = _after_start(trace.tuner_seconds)
     columns["simulator_seconds"] = _after_start(trace.simulator_seconds)
@@ -90,6 +90,7 @@ def _parameter_columns(problem: Problem, target: Target, outcome: Outcome) -> di
     cube = problem.cube
     recommended = cube.physical(outcome.trace.recommendations)
     proposed = cube.physical(outcome.trace.proposals)
+    # A recording has no known truth: its errors of parameters are NaN throughout.
     truth = np.full(cube.dim, np.nan) if target.truth is None else target.truth
     errors = np.abs(recommended - truth)
     columns: dict[str, Any] = {"param_error": (errors / cube.training_widths()).mean(axis=1)}

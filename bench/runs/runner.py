@@ -151,14 +151,15 @@ def prepare(experiment: Experiment) -> Results:
         InputError: a fault in it.
     """
     if not experiment.tuners:
-        raise InputError(
-            f"experiment {experiment.name}: names no tuner; add a [tuners.NAME] table or choose some"
-        )
+        remedy = "add a [tuners.NAME] table or choose some"
+        raise InputError(f"experiment {experiment.name}: names no tuner; {remedy}")
+    # A limit that this system does not have would crash every single run.
     if experiment.memory:
         limits()
     results = Results(Problem(experiment), skipped=check(experiment))
     entries = [entry for entry in experiment.tuners if entry.label not in results.skipped]
     results.plan = list(_plan(experiment, entries, results.problem.targets()))
+    # Workers open their own; what is left to do here needs no simulator for a while.
     results.problem.close()
     return results
 
@@ -213,6 +214,7 @@ def _run(results: Results, pool: Pool, progress: Progress) -> None:
     failures = _train(pool, results, progress)
     step = progress("running", len(missing))
     ready: list[int] = []
+    # Runs of a tuner whose training failed stay in the table, as failures.
     for place in missing:
         order = results.plan[place].order
         if (failure := failures.get((order.entry.label, order.seed))) is not None:
@@ -220,6 +222,7 @@ def _run(results: Results, pool: Pool, progress: Progress) -> None:
             step()
         else:
             ready.append(place)
+    # Each outcome is kept before the next is waited for: a kill costs what is under way.
     calls = _Calls(results, ready)
     for i, outcome in pool.results(calls, results.problem.experiment.timeout):
         _file(results, ready[i], outcome)
@@ -227,15 +230,17 @@ def _run(results: Results, pool: Pool, progress: Progress) -> None:
 
 
 def _identify(results: Results, progress: Progress) -> None:
-    """Find what each target's data identify, which only the parent process can: it takes the truth."""
+    """Find what each target's data identify; only the parent process can: it takes the truth."""
     problem, targets = results.problem, {job.target.sealed.name: job.target for job in results.plan}
-    if any(target.truth is not None for target in targets.values()) and problem.identifiable:
-        step = progress("identifiability", len(targets))
-        for name, target in targets.items():
-            if (found := problem.spectrum(target)) is not None:
-                results.spectra[name] = found
-            step()
-        problem.close()
+    known = any(target.truth is not None for target in targets.values())
+    if not (known and problem.identifiable):
+        return
+    step = progress("identifiability", len(targets))
+    for name, target in targets.items():
+        if (spectrum := problem.spectrum(target)) is not None:
+            results.spectra[name] = spectrum
+        step()
+    problem.close()
 
 
 class _Calls(Sequence[Call]):
@@ -251,6 +256,7 @@ class _Calls(Sequence[Call]):
 
     def __getitem__(self, i: Any) -> Any:
         order = self._results.plan[self._places[i]].order
+        # The plan was made before the training, and ids do not depend on where weights lie.
         training = self._results.trainings.get((order.entry.label, order.seed))
         if training is not None:
             order = replace(order, weights=training.path)
@@ -292,6 +298,7 @@ def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, 
 def _file(results: Results, place: int, outcome: Outcome | Exception) -> None:
     """Keep what a worker gave back: an outcome, or the error that ended it."""
     problem, job = results.problem, results.plan[place]
+    # Whatever happened, the run gets its rows and its status: a failure is a result too.
     if isinstance(outcome, TimeoutError):
         reason = f"killed past its limit of {problem.experiment.timeout:g} s"
         outcome = unfinished(problem, job.target, "timeout", reason)

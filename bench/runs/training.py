@@ -3,8 +3,8 @@ tensors.
 
 The file's name is a hash of everything that went in: the code that makes runs, the tuner's and
 simulator's source and options, the training range and scenarios, budget, seed, the versions of the
-packages that compute and the device (`bench.runs.sources`). The file holds the same hash, so that one which was put in another's place is
-noticed. Nothing is ever unpickled.
+packages that compute and the device (`bench.runs.sources`). The file holds the same hash, so that
+one which was put in another's place is noticed. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -40,7 +40,11 @@ from sims.base import Array, InputError
 from sims.files import replacing
 
 _COUNTS = "__simulations_and_seconds__"
+"""Name of the array that says what the training cost."""
 _KEY = "__key__"
+"""Name of the array that holds the key of what was trained."""
+_REMEDY = "delete it to have it trained again"
+"""What to do with a file that cannot be used; it is never repaired silently."""
 
 
 class WeightsError(InputError):
@@ -68,6 +72,7 @@ def build(entry: Entry) -> Tuner:
     kind = tuners.get(entry.tuner)
     try:
         return kind(**entry.options)
+    # Python says the former of an option that is not there, tuners the latter of a value.
     except (TypeError, ValueError) as error:
         raise InputError(f"tuner {entry.label}: {error}") from None
 
@@ -154,6 +159,7 @@ def train(
     path = folder() / f"{name}.npz"
     if path.exists() and not anew:
         simulations, seconds = _checked(path, name)[_COUNTS]
+        # Weights that do not fit must show now, and not in every run.
         trained(entry, path)
         return Training(path, int(simulations), float(seconds), found=True)
     tuner = build(entry)
@@ -161,10 +167,12 @@ def train(
     problem = Problem(experiment)
     practice = problem.practice(experiment.training_budget)
     started = perf_counter()
+    # Tuners that train alike share a stream: a comparison of them has the same network.
     rng = rng_for(experiment.name, "fit", tuner.trains_as or entry.tuner, seed)
     tuner.fit(practice, rng, experiment.training_budget)
     seconds = perf_counter() - started
     problem.close()
+    # Beside the tensors, so that a file that was renamed or exchanged is noticed.
     about = {
         _COUNTS: np.array([practice.used, seconds]),
         _KEY: np.frombuffer(name.encode(), dtype=np.uint8),
@@ -196,9 +204,6 @@ def trained(entry: Entry, path: Path) -> Tuner:
             f"{path}: not the weights of {entry.label}: {error}; {_REMEDY}"
         ) from None
     return tuner
-
-
-_REMEDY = "delete it to have it trained again"
 
 
 def _checked(path: Path, name: str) -> dict[str, Array]:

@@ -69,6 +69,7 @@ class CheatError(RuntimeError):
 
 
 _problems: dict[int, tuple[Experiment, Problem]] = {}
+"""The last problem of this process; another would hold a second world open."""
 
 
 def problem_of(experiment: Experiment) -> Problem:
@@ -108,6 +109,7 @@ def perform(experiment: Experiment, order: Order) -> Outcome:
         scene=problem.scene(target.fitting.scenarios),
     )
     rng = rng_for(experiment.name, order.entry.tuner, target.name, order.seed)
+    # Scoring and what came before do not count.
     before = problem.simulated
     started = perf_counter()
     with memory_limit(experiment.memory):
@@ -120,6 +122,7 @@ def perform(experiment: Experiment, order: Order) -> Outcome:
     if trace.status == "crashed":
         # Nobody sees a worker's stderr; without workers the person who wrote the tuner does.
         sys.stderr.write(trace.reason)
+    # After the run, so that no tuner can have seen them.
     heldout = None
     if target.held_out.scenarios:
         heldout = Evaluator(problem, target.held_out).rmse(

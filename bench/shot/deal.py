@@ -49,12 +49,15 @@ def deal(experiment: Experiment, settings: Settings, kind: str, index: int) -> D
     numbers of shots.
     """
     rng = rng_for(experiment.name, "shot", kind, index)
+    # The order of the draws is part of the experiment: another order gives other shots.
     ball = ball_named(kind).one(rng)
     angle, x, drop = (
         float(rng.uniform(*pair)) for pair in (settings.angle, settings.hoop_x, settings.hoop_drop)
     )
     dx, dz = (settings.release * rng.standard_normal(2)).tolist()
-    scene = ShotScene(angle, x, ball.radius / math.cos(angle) - drop, settings.hoop_radius)
+    # A ball that touches the incline at x = 0 has its centre radius / cos(angle) above it.
+    touching = ball.radius / math.cos(angle)
+    scene = ShotScene(angle, x, touching - drop, settings.hoop_radius)
     return Deal(f"{kind}-{index:03d}", ball, scene, (dx, dz))
 
 
@@ -81,6 +84,7 @@ def record(experiment: Experiment, dealt: Deal, settings: Settings, path: Path) 
     """
     if path.exists() and path.with_suffix(".toml").exists():
         return
+    # One of the two without the other is what a kill left.
     for left in (path, path.with_suffix(".toml")):
         left.unlink(missing_ok=True)
     rng = rng_for(experiment.name, "drop", dealt.name)
@@ -94,6 +98,7 @@ def record(experiment: Experiment, dealt: Deal, settings: Settings, path: Path) 
         return
     noise = experiment.noise.get("z", 0.0)
     seen = z + noise * rng.standard_normal(z.shape)
+    # To a hundredth of a millimetre, far below any noise: the file stays short.
     run = Run("1", times, {"z": np.round(seen, 5)}, {}, {}, {}, False)
     known = {"radius": radius, "mass": dealt.ball.mass, "gravity": GRAVITY}
     recording = Recording(path, "ball", f"a drop of {dealt.name}", known, {"z": noise}, (run,))

@@ -18,10 +18,12 @@ from sims.camera.look import Look
 from sims.camera.render import Stage
 from sims.camera.video import write_video
 
-DISTANCE, HEIGHT, AIM = (2.8, 3.4), (0.8, 1.4), 0.9
-"""Ranges of the camera's distance and height, and the height at which it looks, m: the whole drop
-is in the picture.
-"""
+DISTANCE = (2.8, 3.4)
+"""Range of the camera's distance, m: the whole drop is in the picture."""
+HEIGHT = (0.8, 1.4)
+"""Range of its height, m."""
+AIM = 0.9
+"""Height at which it looks, m."""
 NARROW = 0.4
 """Width of the picture over its height: what falls needs no more."""
 
@@ -46,9 +48,11 @@ def filmed(
     azimuth, distance, height = (
         float(rng.uniform(*pair)) for pair in ((0.0, 2.0 * math.pi), DISTANCE, HEIGHT)
     )
+    # The codec halves the resolution of colour, so both sides must be even.
     size = (2 * round(NARROW * pixels / 2), pixels)
     camera, look = Camera(azimuth, distance, height, (0.0, 0.0, AIM), size=size), Look.drawn(rng)
     film = path.with_suffix(".mp4")
+    # Recordings and films are never overwritten, and a kill may have left some of them.
     for left in (
         film,
         beside(film),

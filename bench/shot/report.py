@@ -1,4 +1,4 @@
-"""Writes table.csv, shots.csv, status.csv and the figures of a bounce shot, and says what came out."""
+"""Writes tables and figures of a bounce shot, and says what came out."""
 
 from __future__ import annotations
 

@@ -20,6 +20,7 @@ from sims.recording.recording import Recording
 from sims.shot.balls import ball_named
 
 ROW = "v"
+"""The channel of the ball's row in the picture, pixels from above."""
 
 
 def before_a_camera(experiment: Experiment, settings: Settings) -> Experiment:
@@ -53,6 +54,7 @@ def rows_of(recording: Recording, experiment: Experiment, radius: float) -> Side
     """
     (run,) = recording.runs
     times: Array = np.arange(experiment.sampling.samples) / experiment.sampling.rate
+    # The recording may begin later or skip some; each row goes to the sample whose time it has.
     at = np.rint(run.times * experiment.sampling.rate).astype(np.intp)
     kept = at < times.size
     observed: Array = np.full((times.size, 2), np.nan)
@@ -60,5 +62,6 @@ def rows_of(recording: Recording, experiment: Experiment, radius: float) -> Side
     z = run.channels["z"]
     first = int(np.flatnonzero(np.isfinite(z))[0])
     gravity = recording.constants["gravity"]
+    # It was let go at rest at t = 0 and may have been seen later: z(t) = z(0) - g t^2 / 2.
     height = float(z[first] + 0.5 * gravity * run.times[first] ** 2)
     return Side((Scenario(times, {"z": height}, {}, {"radius": radius}),), observed)

@@ -1,4 +1,4 @@
-"""A bounce shot in its folder: drops are recorded, every method plans, the shots are made and kept."""
+"""A bounce shot in its folder: drops are recorded, every method plans, shots are made and kept."""
 
 from __future__ import annotations
 
@@ -108,6 +108,7 @@ class BounceShotStudy:
     def experiment(self) -> Experiment:
         """What is shot, with the tuners that can be used."""
         whole = self.configuration.experiment
+        # Their lines would be empty; finish says why they are not there.
         labels = [entry.label for entry in whole.tuners if entry.label not in self.skipped]
         return whole.with_tuners(labels)
 

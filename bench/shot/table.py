@@ -11,6 +11,7 @@ import pandas as pd
 from bench.store.status import FAILED
 
 ALL = "all"
+"""Stands for all kinds of balls together."""
 COLUMNS = [
     "method",
     "ball",
@@ -32,14 +33,18 @@ NO_SHOT = (*FAILED, "no plan", "no recording")
 
 
 def wilson(hits: int, shots: int, z: float = 1.959963984540054) -> tuple[float, float]:
-    """95 % score interval of a share (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927,
+    """95 % score interval of a share p of n shots (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927,
     doi:10.2307/2276774).
+
+        centre = (p + z^2 / 2n) / (1 + z^2 / n)                                  (1)
+        half = z / (1 + z^2 / n) sqrt(p (1 - p) / n + z^2 / 4n^2)                (2)
     """
     if shots < 1:
         return float("nan"), float("nan")
     share, n = hits / shots, float(shots)
-    centre = (share + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    centre = (share + z * z / (2 * n)) / (1 + z * z / n)  # (1)
+    half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))  # (2)
+    # Rounding may lead a hair beyond what a share can be.
     return max(0.0, centre - half), min(1.0, centre + half)
 
 
@@ -61,6 +66,7 @@ def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
     off = part["off"].abs().fillna(math.inf)
     errors = part["prediction_error"]
     failures = int(part["status"].isin(NO_SHOT).sum())
+    # Not interpolated: between a metre and infinity there is no number.
     near = off.quantile([0.5, 0.9], interpolation="higher").tolist()
     return [
         method,
@@ -79,7 +85,7 @@ def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
 
 
 def text(lines: pd.DataFrame) -> str:
-    """The table for the terminal: hits by ball, the share with its interval, the prediction error."""
+    """The table for the terminal: hits by ball, share with interval, prediction error."""
     balls = [ball for ball in lines["ball"].unique() if ball != ALL]
     width = max(len(m) for m in lines["method"])
     head = (

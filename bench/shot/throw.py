@@ -17,7 +17,10 @@ from sims.shot.planner import flights
 from sims.shot.scene import crossings
 from sims.shot.world import Ground, fly
 
-RATE, SECONDS = 240.0, 3.0
+RATE = 240.0
+"""Samples a second at which a shot is followed, Hz."""
+SECONDS = 3.0
+"""For so long a shot is followed, s."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +50,14 @@ class Throw:
 def throw(dealt: Deal, settings: Settings, model: TunedModel) -> Throw:
     """Make the planned shot, with the shot's release error."""
     times = np.arange(round(SECONDS * RATE) + 1) / RATE
+    # No plan, no shot; which is a miss.
     if not math.isfinite(model.height):
         nothing = np.full((times.size, 3), np.nan)
         return Throw(False, float("nan"), float("nan"), times, nothing, nothing)
     heights = np.array([model.height])
     known = constants_of(settings, dealt.ball.radius)
     planned = flights(simulator_of(model), theta_of(model), dealt.scene, known, heights, times)[0]
+    # From here on with what the planner did not know: the ball, the friction, the release.
     ground = Ground(dealt.scene.angle, settings.friction)
     start = (
         dealt.release[0],
@@ -63,6 +68,7 @@ def throw(dealt: Deal, settings: Settings, model: TunedModel) -> Throw:
     x, y = crossings(flown[None], dealt.scene)[0].tolist()
     off = x - dealt.scene.hoop_x
     hit = math.hypot(off, y) < dealt.scene.hoop_radius
+    # Behind the hoop's plane nothing was planned.
     last = min(_through(planned, dealt.scene.hoop_z), _through(flown, dealt.scene.hoop_z))
     error = float(np.linalg.norm(planned - flown, axis=1)[: last + 1].mean())
     return Throw(hit, off, error, times, planned, flown)
@@ -73,6 +79,7 @@ def _through(path: Array, height: float) -> int:
     if never.
     """
     z = path[:, 2]
+    # Before its bounce the ball falls through the same heights.
     risen = np.logical_or.accumulate(z[1:] > z[:-1])
     down = np.flatnonzero(risen & (z[:-1] > height) & (z[1:] <= height))
     return int(down[0]) if down.size else len(z) - 1

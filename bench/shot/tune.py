@@ -32,8 +32,12 @@ from sims.shot.scene import ShotScene
 from sims.shot.simulator import BounceShot
 from sims.shot.system import ShotSystem
 
-NOMINAL, EXPLAINED = "nominal", "explain"
+NOMINAL = "nominal"
+"""The method that tunes nothing."""
+EXPLAINED = "explain"
+"""The method that takes explain's own fit."""
 AFTER = " + explain"
+"""Behind the label of a tuner that tunes the simulator that explain extended."""
 Effects = Mapping[str, Sequence[float]]
 
 
@@ -66,7 +70,14 @@ class TunedModel:
 
 @dataclass(frozen=True)
 class Known:
-    """What a method gets of a shot: the recording, the incline and hoop, trained weights by tuner."""
+    """What a method gets of a shot.
+
+    Attributes:
+        name: of the shot.
+        recording: of the ball's drop.
+        scene: incline and hoop.
+        weights: files of trained weights, by tuner.
+    """
 
     name: str
     recording: Path
@@ -92,6 +103,7 @@ def models(experiment: Experiment, settings: Settings, known: Known) -> list[dic
     ]
     explained, acting = _explained(known.recording)
     made.append(explained)
+    # What explain could not extend cannot be tuned in its extension.
     if explained.status == "done":
         again = [
             _tuned(experiment, settings, entry, known, recording, acting)
@@ -162,10 +174,12 @@ def _side(recording: Recording, experiment: Experiment) -> Side:
     """
     (run,) = recording.runs
     scenario = scenario_of(run, BallSimulator(observe=["z"]), recording.constants)
+    # As if the ball had the experiment's radius: one network serves balls of all sizes.
     radius = experiment.fixed["radius"]
     shift = radius - _constants(recording)["radius"]
     z = run.channels["z"] + shift
     seen = run.channels["z"][np.isfinite(run.channels["z"])]
+    # Let go at rest at t = 0, it has the speed g t when it is seen first.
     fallen = scenario.constants.get("gravity", _constants(recording)["gravity"]) * float(
         run.times[0]
     )
@@ -216,6 +230,7 @@ def carry(effects: Effects, gravity: float) -> dict[str, tuple[float, ...]]:
     carried: dict[str, tuple[float, ...]] = {}
     for name, values in effects.items():
         kind = library.get(name)
+        # Per unit mass and along z: a force c is a change of gravity by -c / g.
         if name == "force.bias":
             carried["gravity.scale"] = (-values[0] / gravity,)
         elif kind.hook in ("force", "contact") and kind.fits(ShotSystem):

@@ -46,7 +46,13 @@ def free_folder(experiment: Experiment, out: Path | None, results: Path = RESULT
 
 
 class Configuration(NamedTuple):
-    """What a folder is for: the experiment, how it was started, and hashes of what must not change."""
+    """What a folder is for.
+
+    Attributes:
+        experiment: the exact configuration.
+        plugins: plugin files that it needs.
+        fingerprint: hashes of what must not change until it is complete.
+    """
 
     experiment: Experiment
     plugins: list[str]
@@ -76,6 +82,7 @@ def create(folder: Path, configuration: Configuration, jobs: int) -> None:
         "packages": dict(sorted({d.metadata["Name"]: d.version for d in distributions()}.items())),
     }
     try:
+        # What there is of a folder is never without what it is for.
         with fresh_folder(folder) as partial:
             write(partial / "experiment.toml", tomli_w.dumps(_plain(experiment.document())))
             write(partial / "environment.json", json.dumps(environment, indent=1) + "\n")
@@ -106,13 +113,11 @@ def configuration(folder: Path) -> Configuration:
         )
     environment = _environment(folder)
     plugins, fingerprint = environment.get("plugins", []), environment.get("fingerprint", {})
-    if (
-        not _texts(plugins)
-        or not isinstance(fingerprint, dict)
-        or not _texts(list(fingerprint.values()))
-    ):
+    hashed = isinstance(fingerprint, dict) and _texts(list(fingerprint.values()))
+    if not (hashed and _texts(plugins)):
+        path_of_it = folder / "environment.json"
         raise InputError(
-            f"{folder / 'environment.json'}: expected lists of plugins and hashes, found something else"
+            f"{path_of_it}: expected lists of plugins and hashes, found something else"
         )
     experiment = parse(str(environment["experiment"]), read_toml(path), path)
     return Configuration(experiment, plugins, fingerprint)
@@ -208,6 +213,7 @@ def read(folder: Path, columns: Sequence[str] | None = None) -> Stored:
 
     experiment = configuration(folder).experiment
     path = folder / "runs.parquet"
+    # Killed before its first results were written: nothing is wrong with it.
     if not path.exists() and (folder / FOLDER).exists():
         raise InputError(
             f"{folder}: not finished, and nothing written yet; resume it to make the rest"

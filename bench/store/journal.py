@@ -29,8 +29,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 FOLDER = "segments"
+"""Below a comparison's folder, while it is under way."""
 _HEAD = struct.Struct(">4sII")
+"""Of a record: mark, length of what follows, its checksum."""
 _MARK = b"run\n"
+"""With which a record begins."""
 PART_RUNS = 1000
 """Records that become a part together."""
 
@@ -63,6 +66,7 @@ class Journal:
             self._lock.close()
             raise
         self._number = 1 + max((int(p.stem) for p in self._index), default=0)
+        # A part holds all of its journal: killed between the two, the journal would double runs.
         for stale in self.folder.glob("*.journal"):
             if int(stale.stem) < self._number:
                 stale.unlink()
@@ -84,7 +88,9 @@ class Journal:
             for place, status, rows, end in records(path):  # noqa: B007 - the last end is where to go on
                 self._records.append((place, status, rows))
                 self.statuses[place] = status
+        # Without a buffer: what is written must survive this process.
         file = path.open("r+b" if path.exists() else "w+b", buffering=0)
+        # What was cut off by a kill goes, or the next record would stand behind half a one.
         file.truncate(end)
         file.seek(end)
         return file
@@ -95,6 +101,7 @@ class Journal:
 
         rows = pa.table(dict(columns))
         payload = _packed(place, status, rows)
+        # One write: a kill leaves a record whole or cut off, never two that are mixed.
         self._file.write(_HEAD.pack(_MARK, len(payload), zlib.crc32(payload)) + payload)
         self._records.append((place, status, rows))
         self.statuses[place] = status
@@ -106,6 +113,7 @@ class Journal:
         from pyarrow import parquet
 
         self._records.sort(key=lambda record: record[0])
+        # In the footer, where statuses are read without reading the rows.
         statuses = json.dumps([[place, asdict(status)] for place, status, _ in self._records])
         tables = [_placed(place, rows) for place, _, rows in self._records]
         whole = pa.concat_tables(tables).replace_schema_metadata({"statuses": statuses})
@@ -127,6 +135,7 @@ class Journal:
 
         pending = {place: rows for place, _, rows in self._records}
         places = sorted(self.statuses)
+        # By chunks: all rows of a million runs would fill memory.
         for first in range(0, len(places), runs):
             chunk = places[first : first + runs]
             low, high = chunk[0], chunk[-1]
@@ -151,6 +160,7 @@ class Journal:
         them is ever met.
         """
         self.close()
+        # Half a folder of segments would count as a comparison under way.
         gone = self.folder.with_name(f".{FOLDER}.gone")
         shutil.rmtree(gone, ignore_errors=True)
         self.folder.rename(gone)
@@ -215,8 +225,9 @@ def finished(folder: Path) -> dict[int, Status]:
     there.
     """
     found: dict[int, Status] = {}
+    # Journals first: one that becomes a part meanwhile is found among the parts.
     for path in sorted((folder / FOLDER).glob("*.journal")):
-        with suppress(FileNotFoundError):  # it became a part a moment ago, which is listed below
+        with suppress(FileNotFoundError):
             found |= {place: status for place, status, _, _ in records(path)}
     for path in sorted((folder / FOLDER).glob("*.parquet")):
         found |= part_statuses(path)

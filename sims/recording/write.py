@@ -90,6 +90,7 @@ def _table(runs: Sequence[Run], digits: int) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     extra = list(runs[0].extra)
+    # One table has one set of columns: the first run's, which the others must share.
     writer.writerow(["run", "t", *inputs, *channels, *extra])
     seen: set[str] = set()
     for run in runs:
@@ -128,6 +129,7 @@ def _signals(
 
 
 def _cells(values: Array, digits: int) -> list[str]:
+    # Python's shortest text that gives the same number back; a missing sample is an empty cell.
     shortest = repr if digits >= _EXACT else f"{{:.{digits}g}}".format
     return [shortest(v) if math.isfinite(v) else "" for v in values.tolist()]
 

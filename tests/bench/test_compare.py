@@ -157,8 +157,7 @@ def test_run_ids_change_with_everything_that_matters_and_nothing_else():
     assert all(len(run.split("/")) == 4 for run in plain.values())
     for change in (
         {"budget": 13}, {"timeout": 61}, {"memory": 99}, {"noise": {"x": 0.1}},
-        {"initial": {"x": [0.8, 1.3]}},
-        {"sampling": {"rate": 20.0, "samples": 61}},
+        {"initial": {"x": [0.8, 1.3]}}, {"sampling": {"rate": 20.0, "samples": 61}},
         {"parameters": {"rate": {"training": [2.0, 3.0]}}},
     ):  # fmt: skip
         assert not set(ids(**change).values()) & set(plain.values()), change
@@ -255,8 +254,8 @@ def test_failed_runs_make_the_exit_code_1_unless_allowed(tmp_path, capsys):
     assert main([*common, str(tmp_path / "a")]) == 1
     said = capsys.readouterr().out
     assert (
-        "failures\ntuner        runs  status   first reason\nchaos_raise     2  crashed  "
-        "RuntimeError: boom (" in said
+        "failures\ntuner        runs  status   first reason\n"
+        "chaos_raise     2  crashed  RuntimeError: boom (" in said
     )
     assert main([*common, str(tmp_path / "b"), "--allow-failures"]) == 0
     assert "chaos_raise     2  crashed" in capsys.readouterr().out
@@ -268,12 +267,12 @@ def test_first_line_says_what_and_where():
     from bench.report import first_line
 
     chained = (
-        'Traceback (most recent call last):\n  File "/a/b.py", line 3, in inner\n    x\nKeyError: '
-        "1\n\n"
-        "During handling of the above exception, another exception occurred:\n\nTraceback (most "
-        "recent call last):\n"
-        '  File "/a/run.py", line 9, in outer\n    y\n  File "/a/mine.py", line 12, in tune\n    '
-        "z\n"
+        "Traceback (most recent call last):\n"
+        '  File "/a/b.py", line 3, in inner\n    x\nKeyError: 1\n\n'
+        "During handling of the above exception, another exception occurred:\n\n"
+        "Traceback (most recent call last):\n"
+        '  File "/a/run.py", line 9, in outer\n    y\n'
+        '  File "/a/mine.py", line 12, in tune\n    z\n'
         "my.package.OddError: first words\nsecond line\nthird line\n"
     )
     assert first_line(chained) == "my.package.OddError: first words (mine.py, line 12, in tune)"

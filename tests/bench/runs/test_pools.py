@@ -133,7 +133,8 @@ def test_no_worker_outlives_its_parent(tmp_path):
     code = (
         "from bench.runs.pools import LocalPool\nfrom tests.bench.runs.test_pools import hang\n"
         "if __name__ == '__main__':\n"
-        f"    pool = LocalPool(1)\n    list(pool.results([(hang, ({str(tmp_path / 'pid')!r},))], 100.0))\n"
+        "    pool = LocalPool(1)\n"
+        f"    list(pool.results([(hang, ({str(tmp_path / 'pid')!r},))], 100.0))\n"
     )
     script = tmp_path / "parent.py"
     script.write_text(code)

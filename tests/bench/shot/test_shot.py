@@ -90,7 +90,8 @@ def test_table_counts_misses_that_never_met_the_plane():
 
 def test_what_belongs_to_the_camera_stays_there_and_a_vertical_force_becomes_gravity():
     found = {
-        "drag.quadratic": (0.1,), "restitution.speed": (-0.1,), "sensor.bias": (0.01,), "clock.skew": (0.01,),
+        "drag.quadratic": (0.1,), "restitution.speed": (-0.1,),
+        "sensor.bias": (0.01,), "clock.skew": (0.01,),
         "force.bias": (0.5,), "wind": (0.1, 1.0, 0.0),
     }  # fmt: skip
     carried = carry(found, 9.81)
@@ -330,9 +331,7 @@ def explained(_):
 
 @pytest.fixture
 def crashing(tmp_path, monkeypatch, fresh_registries):
-    """An experiment with a tuner that fails, and the options that name it; explain and pictures cost
-    nothing.
-    """
+    """An experiment with a tuner that fails, and its options; explain and pictures cost nothing."""
     monkeypatch.setattr(tune, "_explained", explained)
     monkeypatch.setattr("bench.shot.report.draw", lambda *_: [])
     monkeypatch.setattr("bench.shot.report.animate", lambda *_: "animation")
