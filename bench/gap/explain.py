@@ -181,7 +181,7 @@ class _Explainer:
         return Story(
             title,
             self.path,
-            verdict.document(),
+            verdict,
             channels,
             show.side(world, before, after),
             held_out,

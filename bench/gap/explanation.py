@@ -15,7 +15,7 @@ from bench.gap.report.elements import framed
 from bench.gap.report.page import page
 from bench.gap.report.pictures import Printed
 from bench.gap.report.story import Story
-from bench.gap.report.words import clean, estimate, joined, percent, with_unit
+from bench.gap.report.words import clean, estimated, joined, percent
 from bench.gap.verdict import Cause, Verdict
 from sims import extended as extending
 from sims.base import InputError
@@ -110,10 +110,10 @@ class Explanation:
 
     def _gain(self) -> str:
         """The share of the gap that is closed; empty where nothing was found or measured."""
-        held_out = self.story.verdict["heldout"]
-        if not self.causes or not closes(held_out):
+        held_out = self.story.verdict.heldout
+        if not self.causes or held_out is None or not closes(held_out):
             return ""
-        share = percent(held_out["gap_closed"])
+        share = percent(held_out.gap_closed)
         return f"{share} of the gap closed{interval(held_out)} on held-out runs"
 
     def _repr_html_(self) -> str:
@@ -125,8 +125,5 @@ class Explanation:
 def _in_words(cause: Cause) -> str:
     """``drag.linear or friction.coulomb: coefficient 2.2×10⁻⁴ (2.0×10⁻⁴ to 2.4×10⁻⁴) N·s/m``."""
     effects = joined([cause.effect, *cause.alternatives], "or")
-    numbers = [
-        f"{name} {with_unit(estimate(c.value, c.low, c.high), c.unit)}"
-        for name, c in cause.coefficients.items()
-    ]
+    numbers = [f"{name} {estimated(number)}" for name, number in cause.coefficients.items()]
     return f"{effects}: {joined(numbers)}"

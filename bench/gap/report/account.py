@@ -4,10 +4,9 @@ figures say too.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from math import isclose, isfinite
 from textwrap import wrap
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from bench.gap.report.story import Place, Side, Story, Tuned
 from bench.gap.report.words import (
     clean,
     estimate,
+    estimated,
     joined,
     noun,
     number,
@@ -24,6 +24,7 @@ from bench.gap.report.words import (
     sentence,
     with_unit,
 )
+from bench.gap.verdict import Cause, Heldout
 from sims.base import Array
 
 WIDTH = 100
@@ -57,11 +58,11 @@ def account(story: Story) -> list[str]:
 
 def details(story: Story) -> Iterator[str]:
     """Paragraphs below the headline, a sentence or a few each."""
-    verdict = story.verdict["verdict"]
+    verdict = story.verdict.verdict
     # What an effect does is said above the details already in these two.
     explained = verdict in ("named", "partial")
-    for cause in story.verdict["causes"]:
-        name = f"{sentence(noun(cause['effect']))[:-1]} ({clean(cause['effect'], 60)})"
+    for cause in story.verdict.causes:
+        name = f"{sentence(noun(cause.effect))[:-1]} ({clean(cause.effect, 60)})"
         says = "" if explained else f"{_says(cause)}; "
         yield f"{name}: {says}{coefficients(cause)}"
     if story.why:
@@ -80,42 +81,42 @@ def details(story: Story) -> Iterator[str]:
     yield effort(story)
 
 
-def _says(cause: Mapping[str, Any]) -> str:
+def _says(cause: Cause) -> str:
     """What an effect does, to stand within a sentence."""
-    return clean(cause["says"]).rstrip(".")
+    return clean(cause.says).rstrip(".")
 
 
 def headline(story: Story) -> str:
     """What is wrong with the simulator, in one sentence."""
-    verdict, causes = story.verdict["verdict"], story.verdict["causes"]
+    verdict, causes = story.verdict.verdict, story.verdict.causes
     if verdict == "adequate":
         return "Nothing is missing from the simulation that these data can show."
     if verdict == "unidentifiable":
         unknown = "what the simulation lacks cannot be told from them"
         return f"These data cannot fix {joined(unfixed(story))}: {unknown}."
     if verdict == "unknown" or not causes:
-        none = f"none of the {len(story.verdict['candidates'])} known causes explains it"
+        none = f"none of the {len(story.verdict.candidates)} known causes explains it"
         return f"Something is missing from the simulation, and {none}."
     if verdict == "ambiguous":
         return f"The simulation lacks {_sets(causes)}: these data cannot tell which."
     if verdict == "partial":
         more = "something else that no known cause explains"
         return f"The simulation lacks {_sets(causes)}, and {more}."
-    names = joined([noun(cause["effect"]) for cause in causes])
+    names = joined([noun(cause.effect) for cause in causes])
     # With several causes the sentence would not end: what they do follows it.
     says = f": {_says(causes[0])}" if len(causes) == 1 else ""
     return f"The simulation lacks {names}{says}."
 
 
-def _sets(causes: Sequence[Mapping[str, Any]]) -> str:
+def _sets(causes: Sequence[Cause]) -> str:
     """The causes, those that have alternatives last: ``wind, and linear drag or Coulomb
     friction``.
     """
-    sure = [noun(cause["effect"]) for cause in causes if not cause["alternatives"]]
+    sure = [noun(cause.effect) for cause in causes if not cause.alternatives]
     parts = [joined(sure)] if sure else []
     for cause in causes:
-        if cause["alternatives"]:
-            members = [noun(name) for name in (cause["effect"], *cause["alternatives"])]
+        if cause.alternatives:
+            members = [noun(name) for name in (cause.effect, *cause.alternatives)]
             parts.append(joined(members, "or"))
     return ", and ".join(parts)
 
@@ -132,14 +133,14 @@ def unfixed(story: Story) -> list[str]:
 
 def following(story: Story) -> Iterator[str]:
     """The sentences that follow the headline at once: the gain, and what the verdict owes."""
-    verdict = story.verdict["verdict"]
+    verdict = story.verdict.verdict
     if verdict == "adequate":
         yield looked_for(story)
         yield hiding(story)
     yield gain(story)
-    if verdict == "partial" or (verdict == "named" and len(story.verdict["causes"]) > 1):
-        causes = story.verdict["causes"]
-        yield sentence("; ".join(f"{noun(cause['effect'])}: {_says(cause)}" for cause in causes))
+    if verdict == "partial" or (verdict == "named" and len(story.verdict.causes) > 1):
+        causes = story.verdict.causes
+        yield sentence("; ".join(f"{noun(cause.effect)}: {_says(cause)}" for cause in causes))
     if verdict == "ambiguous":
         yield "To tell them apart: " + (experiment(story) or "no experiment is proposed.")
 
@@ -148,29 +149,29 @@ def gain(story: Story) -> str:
     """The held-out error before and after against the floor; that it was not measured where no run
     is held out.
     """
-    held_out = story.verdict["heldout"]
+    held_out = story.verdict.heldout
     if held_out is None:
         return _fitted_gain(story)
-    base = _error(story, held_out["rmse_base"])
-    extended = _error(story, held_out["rmse_extended"])
-    perfect = f"{PERFECT} {_error(story, held_out['noise_floor'])}"
-    if not story.verdict["causes"]:
+    base = _error(story, held_out.rmse_base)
+    extended = _error(story, held_out.rmse_extended)
+    perfect = f"{PERFECT} {_error(story, held_out.noise_floor)}"
+    if not story.verdict.causes:
         return f"On held-out runs the tuned simulation errs by {base} (RMSE); {perfect}."
     errors = f"the error on held-out runs (RMSE) is {base} before and {extended} after; {perfect}."
     if not closes(held_out):
         return errors[0].upper() + errors[1:]
-    share = f"{percent(held_out['gap_closed'])} of the gap{interval(held_out)}"
+    share = f"{percent(held_out.gap_closed)} of the gap{interval(held_out)}"
     return f"{_closer(story)} {share}: {errors}"
 
 
-def closes(found: Mapping[str, Any] | None) -> bool:
+def closes(held_out: Heldout) -> bool:
     """Whether a share of the gap is known."""
-    return found is not None and found["gap_closed"] is not None and isfinite(found["gap_closed"])
+    return held_out.gap_closed is not None and isfinite(held_out.gap_closed)
 
 
-def interval(found: Mapping[str, Any]) -> str:
+def interval(held_out: Heldout) -> str:
     """`` (85 to 94 %)``, the 95 % interval of the share closed; empty where there is none."""
-    low, high = found["low"], found["high"]
+    low, high = held_out.low, held_out.high
     if low is None or high is None:
         return ""
     return f" ({percent(low).removesuffix(' %')} to {percent(high)})"
@@ -178,21 +179,21 @@ def interval(found: Mapping[str, Any]) -> str:
 
 def _closer(story: Story) -> str:
     """The beginning of the sentence that says how much of the gap is closed."""
-    causes = story.verdict["causes"]
-    if story.verdict["verdict"] == "unknown":
-        names = joined([noun(cause["effect"]) for cause in causes])
+    causes = story.verdict.causes
+    if story.verdict.verdict == "unknown":
+        names = joined([noun(cause.effect) for cause in causes])
         return f"The best of them, {names}, {'closes' if len(causes) == 1 else 'close'} only"
     if len(causes) > 1:
         return "Together they close"
-    if story.verdict["verdict"] == "partial":
-        return sentence(f"{noun(causes[0]['effect'])} closes").rstrip(".")
-    return "Either closes" if story.verdict["verdict"] == "ambiguous" else "It closes"
+    if story.verdict.verdict == "partial":
+        return sentence(f"{noun(causes[0].effect)} closes").rstrip(".")
+    return "Either closes" if story.verdict.verdict == "ambiguous" else "It closes"
 
 
 def _fitted_gain(story: Story) -> str:
     before, after = (rms(story, story.fitting, which) for which in ("before", "after"))
     error = f"the tuned simulation's error is {number(before)} times the noise"
-    if story.verdict["causes"]:
+    if story.verdict.causes:
         error += f" before and {number(after)} times after"
     caution = "No run is held out, so the gain is not measured independently"
     return f"{caution}; on the fitted runs {error}."
@@ -202,11 +203,11 @@ def heldout_unit(story: Story) -> str:
     """The unit of the held-out errors: stated, or that of the channels whose noise together makes
     the floor.
     """
-    held_out = story.verdict["heldout"] or {}
-    if "unit" in held_out:
-        return str(held_out["unit"])
+    held_out = story.verdict.heldout
+    if held_out is not None and held_out.unit:
+        return held_out.unit
     # Where it is not stated: the floor is the RMS of the noise of the channels of one unit.
-    floor = held_out.get("noise_floor") or 0.0
+    floor = (held_out.noise_floor if held_out is not None else None) or 0.0
     units = list(dict.fromkeys(c.unit for c in story.channels))
     for unit in units:
         noises = [c.sigma for c in story.channels if c.unit == unit]
@@ -222,12 +223,12 @@ def _error(story: Story, value: float | None) -> str:
 
 def looked_for(story: Story) -> str:
     """What was looked for, and how close the best candidate comes."""
-    candidates = story.verdict["candidates"]
+    candidates = story.verdict.candidates
     if not candidates:
         return "No candidate causes were at hand."
     best = candidates[0]
     none = f"{len(candidates)} possible causes were looked for and none stands out from chance"
-    promising = f"{noun(best['effect'])} ({probability(best['p_value'])})"
+    promising = f"{noun(best.effect)} ({probability(best.p_value)})"
     return f"{none}; the most promising is {promising}."
 
 
@@ -293,19 +294,18 @@ def rms(story: Story, side: Side, which: str) -> float:
     return float(np.sqrt(np.nanmean(left**2))) if np.isfinite(left).any() else float("nan")
 
 
-def coefficients(cause: Mapping[str, Any]) -> str:
+def coefficients(cause: Cause) -> str:
     """A cause's coefficients with intervals, how unlikely it is by chance, and what would do as
     well.
     """
     parts = []
-    for name, c in cause["coefficients"].items():
-        value = estimate(c["value"], c["low"], c["high"])
-        parts.append(f"{clean(name, 60)} {with_unit(value, c['unit'])}")
+    for name, coefficient in cause.coefficients.items():
+        parts.append(f"{clean(name, 60)} {estimated(coefficient)}")
     others = ""
-    if cause["alternatives"]:
-        names = joined([noun(name) for name in cause["alternatives"]], "or")
+    if cause.alternatives:
+        names = joined([noun(name) for name in cause.alternatives], "or")
         others = f"; {names} instead would do as well"
-    return f"{joined(parts)}; {probability(cause['p_value'])}{others}."
+    return f"{joined(parts)}; {probability(cause.p_value)}{others}."
 
 
 def largest(story: Story, kind: str) -> str:
@@ -314,7 +314,7 @@ def largest(story: Story, kind: str) -> str:
     if len(there) < 2:
         return ""
     place: Place = max(there, key=lambda p: p.before)
-    after = f" before, {number(place.after, 2)} after" if story.verdict["causes"] else ""
+    after = f" before, {number(place.after, 2)} after" if story.verdict.causes else ""
     return f"{kind} {clean(place.label, 60)} ({number(place.before, 2)}{after})"
 
 
@@ -326,7 +326,7 @@ def moves(story: Story, p: Tuned) -> str:
     if not p.touched:
         nominal = f"its nominal {number(p.before[0])}{unit}"
         return f"{name} is not touched by these data and stays at {nominal}."
-    if not story.verdict["causes"]:
+    if not story.verdict.causes:
         return f"{name} = {estimate(*p.before)}{unit}."
     before, after = f"{estimate(*p.before)}{unit}", f"{estimate(*p.after)}{unit}"
     end = ": it had absorbed part of the gap." if absorbed(p) else "."
@@ -354,13 +354,14 @@ def absorbed(p: Tuned) -> bool:
 
 def experiment(story: Story) -> str:
     """What to do next, in words; empty where nothing is proposed."""
-    proposed = story.verdict["next_experiment"]
-    return sentence(proposed.get("says", "")) if proposed else ""
+    proposed = story.verdict.next_experiment
+    return sentence(proposed.says) if proposed is not None else ""
 
 
 def effort(story: Story) -> str:
     """What was simulated."""
-    v = story.verdict
-    system, engine = clean(v["system"], 60), clean(v["engine"], 60)
-    simulations = f"{v['simulations']:,} simulations of system {system} on engine {engine}"
-    return f"{simulations}, {number(v['seconds'], 2)} s."
+    verdict = story.verdict
+    system = clean(verdict.system, 60)
+    engine = clean(verdict.engine, 60)
+    simulations = f"{verdict.simulations:,} simulations of system {system} on engine {engine}"
+    return f"{simulations}, {number(verdict.seconds, 2)} s."

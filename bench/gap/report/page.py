@@ -91,7 +91,7 @@ def _head(story: Story) -> Iterator[str]:
 def _opening(story: Story) -> Iterator[str]:
     """The ten seconds."""
     yield "<header>\n" + paragraph(safe(story.title), "recording")
-    yield paragraph(f'<span class="badge">{_BADGES[story.verdict["verdict"]]}</span>')
+    yield paragraph(f'<span class="badge">{_BADGES[story.verdict.verdict]}</span>')
     yield f"<h1>{safe(headline(story))}</h1>"
     for text in following(story):
         yield paragraph(safe(text, 1000), "lead")
@@ -101,20 +101,20 @@ def _opening(story: Story) -> Iterator[str]:
 
 def _gain(story: Story) -> Iterator[str]:
     """Bars of the held-out error before, after and of the floor."""
-    held_out = story.verdict["heldout"]
+    held_out = story.verdict.heldout
     if held_out is None:
         return
-    extended = bool(story.verdict["causes"])
-    rows = [("before", "tuned simulation", held_out["rmse_base"])]
+    extended = bool(story.verdict.causes)
+    rows = [("before", "tuned simulation", held_out.rmse_base)]
     if extended:
         rows = [
-            ("before", "before: tuned simulation", held_out["rmse_base"]),
-            ("after", "after: with what was found", held_out["rmse_extended"]),
+            ("before", "before: tuned simulation", held_out.rmse_base),
+            ("after", "after: with what was found", held_out.rmse_extended),
         ]
-    rows.append(("floor", "noise floor", held_out["noise_floor"]))
+    rows.append(("floor", "noise floor", held_out.noise_floor))
     yield '<section class="gain" aria-label="error on held-out runs">'
     if extended and closes(held_out):
-        closed = strong(f"{percent(held_out['gap_closed'])} of the gap closed")
+        closed = strong(f"{percent(held_out.gap_closed)} of the gap closed")
         yield paragraph(closed + interval(held_out), "closed")
     note = "Error on held-out runs (RMSE): shorter is better, the noise floor is best."
     yield paragraph(note, "soft")
@@ -146,8 +146,8 @@ def _alternative(story: Story, name: str) -> str:
         sizes = [f"{p.kind} {clean(p.label, 30)} {number(p.before, 2)}" for p in worst]
         what = "Size of the residual in units of the noise, the largest before"
         return f"{what}: {'; '.join(sizes)}."
-    best = story.verdict["candidates"][:_FEW]
-    scores = [f"{name_of(c['effect'])} {number(c['score'])}" for c in best]
+    best = story.verdict.candidates[:_FEW]
+    scores = [f"{name_of(c.effect)} {number(c.score)}" for c in best]
     return f"Scores of the candidates, the best: {'; '.join(scores)}."
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from bench.figures.style import BAND, BLUE, CHANCE, INK, JOIN, SKY, VERMILION, ZERO
 from bench.gap.report.story import Place, Profile, Story
 from bench.gap.report.words import clean, labelled, name_of, number, probability
+from bench.gap.verdict import Candidate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,7 +64,7 @@ def label(name: object, unit: str = "1", most: int = 30) -> str:
 
 def changed(story: Story) -> bool:
     """Whether there is an extended model to show beside the base model."""
-    return bool(story.verdict["causes"])
+    return bool(story.verdict.causes)
 
 
 def chosen_places(places: Sequence[Place]) -> list[Place]:
@@ -180,43 +181,38 @@ def profile_panel(axis: Axes, profile: Profile, unit: str, extended: bool) -> No
     axis.locator_params(nbins=5)
 
 
-def ranked(story: Story) -> list[Mapping[str, Any]]:
+def ranked(story: Story) -> list[Candidate]:
     """The candidates to show, the highest score first; what is found is among them."""
-    ordered = sorted(story.verdict["candidates"], key=_size, reverse=True)
+    ordered = sorted(story.verdict.candidates, key=lambda c: c.score, reverse=True)
     # What is found stays, however low it scores beside what it made needless.
-    others = [c for c in ordered if standing(story, c["effect"]) == "not needed"]
+    others = [c for c in ordered if standing(story, c.effect) == "not needed"]
     beyond = others[max(0, MOST_CANDIDATES - len(ordered) + len(others)) :]
     return [c for c in ordered if c not in beyond]
 
 
-def _size(candidate: Mapping[str, Any]) -> float:
-    """The score; 0 where none was worked out."""
-    return float(candidate["score"] or 0.0)
-
-
-def scores_panel(axis: Axes, story: Story, found: Sequence[Mapping[str, Any]]) -> None:
+def scores_panel(axis: Axes, story: Story, shown: Sequence[Candidate]) -> None:
     """Bars of the candidates' scores, with their probabilities."""
-    rows = np.arange(len(found))
-    sizes = [max(_size(c), 0.0) for c in found]
-    for row, size, c in zip(rows, sizes, found, strict=True):
-        axis.barh(row, size, height=0.62, edgecolor="white", **_LOOKS[standing(story, c["effect"])])
-        text = f"{number(c['score'])}  ({probability(c['p_value'])})"
+    rows = np.arange(len(shown))
+    sizes = [max(c.score, 0.0) for c in shown]
+    for row, size, c in zip(rows, sizes, shown, strict=True):
+        axis.barh(row, size, height=0.62, edgecolor="white", **_LOOKS[standing(story, c.effect)])
+        text = f"{number(c.score)}  ({probability(c.p_value)})"
         axis.annotate(
             text, (size, row), (4, 0), textcoords="offset points", va="center", fontsize=8
         )
-    axis.set_yticks(rows, [label(name_of(c["effect"]), most=34) for c in found])
-    axis.set_ylim(len(found) - 0.4, -0.6)
+    axis.set_yticks(rows, [label(name_of(c.effect), most=34) for c in shown])
+    axis.set_ylim(len(shown) - 0.4, -0.6)
     axis.set_xlim(0, 1.35 * max(*sizes, 1e-9))
     axis.set_xlabel(
         "score: evidence that the simulation lacks it\n(twice the gain in log likelihood)"
     )
 
 
-def gains_panel(axis: Axes, story: Story, found: Sequence[Mapping[str, Any]]) -> None:
+def gains_panel(axis: Axes, story: Story, shown: Sequence[Candidate]) -> None:
     """The candidates' gains on held-out runs; none is drawn where none was measured."""
-    rows = np.arange(len(found))
-    gains = [np.nan if c["heldout_gain"] is None else c["heldout_gain"] for c in found]
-    colours = [_LOOKS[standing(story, c["effect"])]["facecolor"] for c in found]
+    rows = np.arange(len(shown))
+    gains = [np.nan if c.heldout_gain is None else c.heldout_gain for c in shown]
+    colours = [_LOOKS[standing(story, c.effect)]["facecolor"] for c in shown]
     axis.axvline(0, color=ZERO, linewidth=0.6)
     axis.hlines(rows, 0, gains, color=JOIN, linewidth=0.9)
     axis.scatter(gains, rows, c=colours, edgecolors=INK, s=36, zorder=3)
@@ -226,9 +222,9 @@ def gains_panel(axis: Axes, story: Story, found: Sequence[Mapping[str, Any]]) ->
 
 def standing(story: Story, effect: str) -> str:
     """Whether an effect is found, one of a set that cannot be told apart, or neither."""
-    for cause in story.verdict["causes"]:
-        if effect in (cause["effect"], *cause["alternatives"]):
-            return "found, but cannot be told apart" if cause["alternatives"] else "found"
+    for cause in story.verdict.causes:
+        if effect in (cause.effect, *cause.alternatives):
+            return "found, but cannot be told apart" if cause.alternatives else "found"
     return "not needed"
 
 
@@ -236,7 +232,7 @@ def standings(story: Story) -> tuple[list[Any], list[str]]:
     """Handles and labels of the candidates' legend."""
     from matplotlib.patches import Patch
 
-    there = {standing(story, c["effect"]) for c in story.verdict["candidates"]}
+    there = {standing(story, c.effect) for c in story.verdict.candidates}
     # Bars of one look need no legend where nothing is found.
     names = [name for name in _LOOKS if name in there] if there != {"not needed"} else []
     return [Patch(edgecolor="white", **_LOOKS[name]) for name in names], names

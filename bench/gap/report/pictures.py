@@ -148,7 +148,7 @@ def _overview(story: Story) -> Figure:
         _signal(axes[0][column], axes[1][column], story, shot, c)
     samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
     kind = "held-out run" if shot.held_out else "run"
-    how = "that fits worst" if story.verdict["verdict"] == "adequate" else "with the largest gap"
+    how = "that fits worst" if story.verdict.verdict == "adequate" else "with the largest gap"
     some = f"; {count} of {len(story.channels)} channels" if count < len(story.channels) else ""
     title = f"The {kind} {how}: {label(shot.side.names[shot.row])} ({samples} samples{some})"
     figure.suptitle(title, fontsize=11, y=0.985)
@@ -284,7 +284,7 @@ def _where(story: Story) -> Figure:
 
 def _candidates(story: Story) -> Figure:
     """Left the scores, right the gains on held-out runs."""
-    shown, total = ranked(story), len(story.verdict["candidates"])
+    shown, total = ranked(story), len(story.verdict.candidates)
     width, height = 9.4, 1.75 + 0.28 * len(shown)
     figure, axes = blank(1, 2, (width, height), layout=None, sharey=True, width_ratios=(3, 2))
     scores_panel(axes[0, 0], story, shown)

@@ -4,9 +4,8 @@ how to read it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from math import isfinite
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from bench.gap.report.panels import standing
 from bench.gap.report.story import Place, Side, Story, Tuned
 from bench.gap.report.words import (
     estimate,
+    estimated,
     joined,
     name_of,
     noun,
@@ -24,6 +24,7 @@ from bench.gap.report.words import (
     sentence,
     with_unit,
 )
+from bench.gap.verdict import Cause
 from sims.base import Array
 
 MOST_ROWS = 40
@@ -73,7 +74,7 @@ def where(story: Story, picture: str) -> Iterator[str]:
         some = f" The {len(shown)} worst of {count}." if len(shown) < count else ""
         note = f"RMS of the residual in units of the noise; 1 is the noise floor.{some}"
         yield paragraph(note, "soft")
-        yield _places(shown, bool(story.verdict["causes"]))
+        yield _places(shown, bool(story.verdict.causes))
     yield from _channels(story)
 
 
@@ -94,7 +95,7 @@ def worst_first(places: Sequence[Place]) -> list[Place]:
 
 def _channels(story: Story) -> Iterator[str]:
     """The channels with their noise and their errors in their own units."""
-    extended = bool(story.verdict["causes"])
+    extended = bool(story.verdict.causes)
     whens = (" before", " after") if extended else ("",)
     kinds = [("fitted", story.fitting), ("held-out", story.held_out)]
     there = [(name, side) for name, side in kinds if side is not None and len(side.names)]
@@ -126,40 +127,40 @@ def errors_of(side: Side) -> Array:
 def candidates(story: Story, picture: str) -> Iterator[str]:
     """The candidates with their evidence, what cannot be told apart, and what to do next."""
     yield heading("What could be the cause")
-    for cause in story.verdict["causes"]:
-        if cause["alternatives"]:
+    for cause in story.verdict.causes:
+        if cause.alternatives:
             members = safe(_set(story, cause), 1000)
             yield paragraph(f"{strong('Not to be told apart:')} {members}")
     if proposed := experiment(story):
         yield paragraph(f"{strong('Next experiment:')} {safe(proposed, 1000)}")
     yield picture
-    yield _ranking(story) if story.verdict["candidates"] else paragraph("No candidate was tried.")
+    yield _ranking(story) if story.verdict.candidates else paragraph("No candidate was tried.")
 
 
 def _ranking(story: Story) -> str:
     heads = ["candidate", "name", "-score", "-p", "-gain on held-out runs", "standing"]
     rows, marks = [], []
-    for c in story.verdict["candidates"]:
-        rank = standing(story, c["effect"])
+    for c in story.verdict.candidates:
+        rank = standing(story, c.effect)
         marks.append("" if rank == "not needed" else "found")
-        row = [safe(name_of(c["effect"])), code(safe(c["effect"], 80)), number(c["score"])]
-        row.append(probability(c["p_value"]).removeprefix("p = ").removeprefix("p "))
-        row.append(number(c["heldout_gain"]))
+        row = [safe(name_of(c.effect)), code(safe(c.effect, 80)), number(c.score)]
+        row.append(probability(c.p_value).removeprefix("p = ").removeprefix("p "))
+        row.append(number(c.heldout_gain))
         # Where nothing is found, nothing made the others needless.
-        row.append(rank if story.verdict["causes"] else "not convincing")
+        row.append(rank if story.verdict.causes else "not convincing")
         rows.append(row)
     return table(heads, rows, marks)
 
 
-def _set(story: Story, cause: Mapping[str, Any]) -> str:
+def _set(story: Story, cause: Cause) -> str:
     """The members of a set with their scores and gains: they are too close for these data."""
-    by_effect = {c["effect"]: c for c in story.verdict["candidates"]}
+    by_effect = {c.effect: c for c in story.verdict.candidates}
     members = []
-    for name in (cause["effect"], *cause["alternatives"]):
+    for name in (cause.effect, *cause.alternatives):
         evidence = ""
         if (c := by_effect.get(name)) is not None:
-            gain = number(c["heldout_gain"])
-            evidence = f" (score {number(c['score'])}, held-out gain {gain})"
+            gain = number(c.heldout_gain)
+            evidence = f" (score {number(c.score)}, held-out gain {gain})"
         members.append(noun(name) + evidence)
     alike = "change these runs so much alike that either explains them equally well."
     return f"{joined(members)} {alike}"
@@ -168,11 +169,11 @@ def _set(story: Story, cause: Mapping[str, Any]) -> str:
 def numbers(story: Story) -> Iterator[str]:
     """What was found in numbers, and how the parameters move."""
     rows = []
-    for cause in story.verdict["causes"]:
-        what = [safe(noun(cause["effect"])), safe(cause["says"])]
-        chance = probability(cause["p_value"])
-        for name, coefficient in cause["coefficients"].items():
-            rows.append([*what, safe(name, 60), _estimated(coefficient), chance])
+    for cause in story.verdict.causes:
+        what = [safe(noun(cause.effect)), safe(cause.says)]
+        chance = probability(cause.p_value)
+        for name, coefficient in cause.coefficients.items():
+            rows.append([*what, safe(name, 60), safe(estimated(coefficient)), chance])
     if rows:
         heads = ["cause", "what it does", "coefficient", "value (95 % interval)", "by chance"]
         yield heading("What was found, in numbers")
@@ -182,12 +183,8 @@ def numbers(story: Story) -> Iterator[str]:
         yield from _parameters(story)
 
 
-def _estimated(c: Mapping[str, Any]) -> str:
-    return safe(with_unit(estimate(c["value"], c["low"], c["high"]), c["unit"]))
-
-
 def _parameters(story: Story) -> Iterator[str]:
-    extended = bool(story.verdict["causes"])
+    extended = bool(story.verdict.causes)
     bent = [p for p in story.parameters if p.touched and absorbed(p)]
     if bent and extended:
         yield paragraph(
@@ -246,7 +243,7 @@ def remains(story: Story) -> Iterator[str]:
     # On held-out runs the residual owes nothing to the fit.
     side, name = (story.held_out, "held-out") if story.held_out else (story.fitting, "fitted")
     left = number(rms(story, side, "after"), 2)
-    what = _LEFT.get(story.verdict["verdict"], "Nothing that stands out")
+    what = _LEFT.get(story.verdict.verdict, "Nothing that stands out")
     yield paragraph(f"{what}: the residual of the {name} runs is {left} times the noise.")
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from bench.gap.verdict import Verdict
 from sims.base import Array
 
 
@@ -105,8 +104,8 @@ class Story:
     Attributes:
         title: of the recording.
         path: of the recording.
-        verdict: verdict.json, see DESIGN; its ``says`` and names are texts from files or plugins:
-            escape them.
+        verdict: the answer with its numbers; its ``says`` and names are texts from files or
+            plugins: escape them.
         channels: the recorded ones.
         fitting: runs for fitting.
         held_out: runs for measuring; None where there are none.
@@ -121,7 +120,7 @@ class Story:
 
     title: str
     path: Path
-    verdict: Mapping[str, Any]
+    verdict: Verdict
     channels: tuple[Shown, ...]
     fitting: Side
     held_out: Side | None

@@ -8,6 +8,7 @@ from math import floor, isfinite, log10
 
 from sims import effects
 from sims.base import InputError
+from sims.extended import Number
 
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 """Digits and the sign as they stand in a power."""
@@ -123,6 +124,11 @@ def estimate(value: float, low: float | None, high: float | None) -> str:
         _signed(f"{x / 10.0**exponent:.{decimals}f}") + _power(exponent) for x in (value, low, high)
     )
     return f"{middle} ({left} to {right})"
+
+
+def estimated(fitted: Number) -> str:
+    """A fitted number with its interval and its unit."""
+    return with_unit(estimate(fitted.value, fitted.low, fitted.high), fitted.unit)
 
 
 def percent(share: float | None) -> str:

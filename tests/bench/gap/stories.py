@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.gap.report.story import Place, Profile, Shown, Side, Story, Tuned
+from bench.gap.verdict import Verdict
 
 EVIL = "<script>alert(1)</script>"
 SIGMA = (0.01, 0.05)
@@ -108,18 +109,12 @@ def candidates():
     return [dict(zip(keys, row, strict=True)) for row in zip(names, scores, p, gains, strict=True)]
 
 
-def story(verdict="named", **changes):
-    """A story with this verdict; `changes` replace entries of the verdict or fields of the
-    story.
-    """
-    gap = verdict not in ("adequate", "unidentifiable")
-    fitting, held_out = sides(gap)
-    causes = {"named": [DRAG], "ambiguous": [EITHER], "partial": [DRAG]}.get(verdict, [])
-    if not causes:
-        fitting, held_out = (
-            replace(fitting, after=fitting.before),
-            replace(held_out, after=held_out.before),
-        )
+CAUSES = {"named": [DRAG], "ambiguous": [EITHER], "partial": [DRAG]}
+
+
+def answer(verdict="named", **changes):
+    """What verdict.json says with this verdict; `changes` replace its entries."""
+    causes = CAUSES.get(verdict, [])
     found = {
         "verdict": verdict,
         "system": "pendulum",
@@ -148,6 +143,21 @@ def story(verdict="named", **changes):
         found["candidates"] = [
             {**c, "score": c["score"] / 500, "p_value": 0.4} for c in candidates()
         ]
+    return {**found, **changes}
+
+
+def story(verdict="named", **changes):
+    """A story with this verdict; `changes` replace entries of the verdict or fields of the
+    story.
+    """
+    gap = verdict not in ("adequate", "unidentifiable")
+    fitting, held_out = sides(gap)
+    causes = CAUSES.get(verdict, [])
+    if not causes:
+        fitting, held_out = (
+            replace(fitting, after=fitting.before),
+            replace(held_out, after=held_out.before),
+        )
     bounded = (np.nan, np.nan) if verdict == "unidentifiable" else (0.00325, 0.00341)
     tuned = (
         Tuned(
@@ -159,11 +169,12 @@ def story(verdict="named", **changes):
         ),
         Tuned("restitution", "1", (0.7, np.nan, np.nan), (0.7, np.nan, np.nan), False),
     )
-    fields = {k: changes.pop(k) for k in list(changes) if k not in found}
+    entries = answer(verdict)
+    fields = {k: changes.pop(k) for k in list(changes) if k not in entries}
     made = Story(
         title="Free swing of a damped pendulum",
         path=Path("swing.csv"),
-        verdict={**found, **changes},
+        verdict=Verdict.of({**entries, **changes}),
         channels=CHANNELS,
         fitting=fitting,
         held_out=held_out,
@@ -189,11 +200,12 @@ def evil():
         "coefficients": {EVIL: {**DRAG["coefficients"]["coefficient"], "unit": EVIL}},
     }
     base = story("ambiguous")
+    document = base.verdict.document()
     bad = {
         "system": EVIL,
         "engine": EVIL,
         "causes": [cause],
-        "parameters": {EVIL: base.verdict["parameters"]["inertia"]},
+        "parameters": {EVIL: document["parameters"]["inertia"]},
         "candidates": [{**c, "effect": EVIL} for c in candidates()],
         "next_experiment": {"says": EVIL},
     }
@@ -201,7 +213,7 @@ def evil():
         base,
         title=EVIL + "\x1b[31m $\\frac{$",
         path=Path(EVIL),
-        verdict={**base.verdict, **bad},
+        verdict=Verdict.of({**document, **bad}),
         channels=tuple(replace(c, name=EVIL, unit=EVIL) for c in base.channels),
         fitting=replace(base.fitting, names=("$x_{$", EVIL, "\x00", "日本")),
         held_out=replace(base.held_out, names=("$\\frac{1}$" + EVIL, "$")),

@@ -31,7 +31,7 @@ def explained(path, **options):
     found = explain(path, **options)
     document = found.answer.document()
     schema.check(json.dumps(document, allow_nan=False))
-    assert found.story.verdict == document
+    assert found.story.verdict == found.answer
     assert Verdict.of(document) == found.answer
     return found
 

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 from bench.gap.explanation import Explanation
 from bench.gap.report.pictures import DPI
-from bench.gap.verdict import Verdict
 from sims.base import InputError
 from sims.extended import Extended, Number
 from tests.bench.gap.stories import DRAG, EVIL, TILT, evil, story
@@ -31,7 +30,7 @@ EXTENDED = Extended(
 
 
 def explanation_of(story):
-    return Explanation(Verdict.of(story.verdict), story, EXTENDED)
+    return Explanation(story.verdict, story, EXTENDED)
 
 
 @pytest.fixture

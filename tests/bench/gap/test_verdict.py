@@ -10,7 +10,7 @@ from bench.gap.propose import Experiment
 from bench.gap.verdict import Candidate, Cause, Heldout, Verdict, finite
 from sims.extended import Number
 from tests.bench.gap import schema
-from tests.bench.gap.stories import HELD_OUT, story
+from tests.bench.gap.stories import HELD_OUT, answer
 
 DRAG = Cause(
     "drag.linear",
@@ -52,7 +52,7 @@ def test_the_document_is_that_of_verdict_json_in_its_order():
 
 @pytest.mark.parametrize("word", MEANING)
 def test_it_is_read_back_from_the_document(word):
-    document = story(word, heldout={**HELD_OUT, "unit": "rad"}).verdict
+    document = answer(word, heldout={**HELD_OUT, "unit": "rad"})
     verdict = Verdict.of(json.loads(json.dumps(document)))
     assert verdict.verdict == word
     assert verdict.document() == document

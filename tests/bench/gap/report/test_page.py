@@ -204,7 +204,7 @@ def test_gaps_in_what_is_known_do_not_break_the_page():
         candidates=[],
         places=(),
         profiles=(),
-        parameters=(),
+        parameters={},
         why=(),
     )
     reader = Reader(page(bare, {}))

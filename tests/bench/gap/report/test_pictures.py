@@ -152,7 +152,7 @@ def test_what_is_found_is_among_the_candidates_shown_although_it_scores_low():
             for i, n in enumerate(names)
         ]
     )
-    shown = [c["effect"] for c in ranked(told)]
+    shown = [c.effect for c in ranked(told)]
     assert len(shown) == MOST_CANDIDATES
     assert shown[0] == "e0"
     assert shown[-1] == "drag.linear"
