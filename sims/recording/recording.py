@@ -30,7 +30,7 @@ from sims.recording.units import SAME, Scale
 __all__ = ["Declared", "Recording", "Run", "read_recording", "system_of"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Run:
     """One run of a recording.
 
@@ -55,8 +55,14 @@ class Run:
     held_out: bool
     extra: Mapping[str, Array] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        # A cell of a notebook that ends in a run would print all of its samples.
+        seconds = self.times[-1] - self.times[0] if self.times.size else 0.0
+        use = "held out" if self.held_out else "for fitting"
+        return f"<run {self.name}: {self.times.size} samples, {seconds:.4g} s, {use}>"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Recording:
     """A recording: the system it is of, its constants, each channel's noise where stated (1 sigma),
     its runs.
@@ -72,6 +78,12 @@ class Recording:
     noise: Mapping[str, float]
     runs: tuple[Run, ...]
     extra: Mapping[str, str] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        first = self.runs[0] if self.runs else None
+        channels = ", ".join(first.channels) if first else "none"
+        runs = f"{len(self.runs)} runs, {len(self.held_out())} of them held out"
+        return f"<recording {self.path.name}: {self.system}, {runs}, channels {channels}>"
 
     def training(self) -> tuple[Run, ...]:
         """Runs for fitting."""

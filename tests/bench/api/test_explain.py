@@ -34,12 +34,23 @@ def test_a_single_run_in_memory_is_divided_as_one_that_is_read():
     assert "held" in json.dumps(found.extended.title) or found.story.held_out is not None
 
 
+def test_what_a_cell_shows_is_one_line(swing):
+    assert repr(swing.recording) == (
+        "<recording pendulum-simulated.csv: pendulum, 3 runs, 1 of them held out, channels q, qd>"
+    )
+    assert repr(swing.recording.runs[0]) == "<run 1: 90 samples, 1.483 s, for fitting>"
+    assert "\n" not in repr(swing)
+    assert len(repr(swing)) < 200
+
+
 def test_the_extended_simulator_scores_and_simulates(swing, tmp_path):
     found = simgap.explain(swing)
     found.write(tmp_path / "out")
     swing.write(tmp_path / "swing.csv")
     errors = simgap.score(tmp_path / "out" / "extended.toml", tmp_path / "swing.csv")
     assert errors["normalised_rmse"] == pytest.approx(1.0, abs=0.1)
+    simulator = found.extended.simulator()
+    assert [p.name for p in simulator.parameters] == ["inertia", "drag.linear"]
 
 
 def test_faults_speak_python():
