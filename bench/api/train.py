@@ -57,7 +57,7 @@ def _only(simulator: str) -> str:
     there = "none of the project's fits; give a TOML file"
     if fitting:
         there = f"there are: {', '.join(fitting)}"
-    raise InputError(f"expected --experiment with simulator {simulator}; {there}")
+    raise InputError(f"simulator {simulator}: expected an experiment with it; {there}")
 
 
 @dataclass

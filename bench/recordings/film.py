@@ -28,7 +28,7 @@ def write(recording: Path, out: Path, run: str | None, pixels: int, seed: int) -
     # Before the work: a film takes a while.
     refuse_existing([out, beside(out)])
     if pixels < 16 or pixels % 2:
-        raise InputError(f"--size {pixels}: expected an even number of at least 16 pixels")
+        raise InputError(f"size {pixels}: expected an even number of at least 16 pixels")
     if (system := system_of(recording)) != BallSystem.name:
         raise InputError(f"{recording}: expected a recording of system ball, found {system}")
     data = read_recording(recording, BallSystem, whole=True)

@@ -100,7 +100,7 @@ def by_scale(track: Track, diameter: float | None, scale: str | None) -> Heights
         if fallen is None:
             raise InputError(
                 "the scale is unknown: no flight of this film shows gravity clearly; "
-                "give --ball-diameter METRES"
+                "give the ball's diameter"
             )
         factor = fallen
         how = f"scaled by the fall (gravity {GRAVITY:g} m/s^2; a drag would be taken for scale)"
@@ -112,7 +112,7 @@ def by_scale(track: Track, diameter: float | None, scale: str | None) -> Heights
         if fallen is not None and abs(fallen / factor - 1) > _DIFFER:
             notes.append(
                 f"the fall says {fallen / factor - 1:+.0%} for all heights: the camera looks down "
-                "or up, or gravity is not 9.81 m/s^2; --scale fall uses the fall"
+                "or up, or gravity is not 9.81 m/s^2; the scale 'fall' uses the fall"
             )
     return Heights(ball + factor * (ground - q), ball, how, tuple(notes))  # (2)
 

@@ -54,12 +54,12 @@ def write(
         InputError: anything that cannot be, in one line.
     """
     if out.suffix != ".csv":
-        raise InputError(f"--out {out}: expected a name that ends in .csv")
+        raise InputError(f"{out}: expected a name that ends in .csv")
     pictures = [out.with_suffix(".png"), out.with_suffix(".pdf")]
     # Before the work: tracking a film takes a while.
     refuse_existing([out, out.with_suffix(".toml"), *pictures])
     if diameter is not None and not (np.isfinite(diameter) and diameter > 0):
-        raise InputError(f"--ball-diameter {diameter:g}: expected more than 0 m")
+        raise InputError(f"ball diameter {diameter:g}: expected more than 0 m")
 
     film = Video(video, fps)
     try:
@@ -108,7 +108,7 @@ def _heights(seen: Track, video: Path, diameter: float | None, scale: str | None
     if scale == "camera" or (scale is None and known.is_file()):
         return metres.by_camera(seen, read_filmed(known))
     if scale == "diameter" and diameter is None:
-        raise InputError("--scale diameter: expected --ball-diameter METRES")
+        raise InputError("scale diameter: expected the ball's diameter in metres")
     return metres.by_scale(seen, diameter, scale)
 
 

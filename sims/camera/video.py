@@ -123,7 +123,7 @@ class Video:
         if not path.is_file():
             raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
         if fps is not None and not (np.isfinite(fps) and fps > 0):
-            raise InputError(f"--fps {fps:g}: expected more than 0")
+            raise InputError(f"frames a second, {fps:g}: expected more than 0")
         self.path, self.fps = path, fps
         self.notes: list[str] = []
         with self._open():

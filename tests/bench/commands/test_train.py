@@ -215,7 +215,7 @@ def test_broken_weights_are_refused_with_one_line(experiment, cache, capsys, spo
         ),
         (
             ["tunenet", "ball"],
-            "expected --experiment with simulator ball; there are: ball-crossengine, ball-drop",
+            "simulator ball: expected an experiment with it; there are: ball-crossengine",
         ),
     ],
 )
