@@ -12,24 +12,21 @@ import numpy as np
 
 from bench.gap.assess import Assessor
 from bench.gap.causes.name import Finding, name
-from bench.gap.causes.rules import CHANCE
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import Hat
 from bench.gap.explanation import Explanation
 from bench.gap.measure import HeldOutRuns
-from bench.gap.model.base_fit import Base, fit_base
+from bench.gap.model.base_fit import fit_base
 from bench.gap.model.floor import Floor, noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
-from bench.gap.report import show
-from bench.gap.report.story import Shown, Story, Tuned
-from bench.gap.verdict import Verdict
+from bench.gap.tell import Teller
 from bench.problem.seeds import rng_for
 from bench.recordings.inspection import load
 from sims import effects as library
 from sims import extended as extend
 from sims.base import Array, InputError
-from sims.extended import Extended, Number
+from sims.extended import Extended
 from sims.own import OwnSimulator
 from sims.recording.recording import Recording
 from sims.simulated import Simulated
@@ -80,16 +77,18 @@ class _Explainer:
         tuner: str | None,
         say: Say,
     ) -> None:
-        self.started, self.seed, self.tuner, self.say = time.perf_counter(), seed, tuner, say
+        self.started = time.perf_counter()
+        self.seed = seed
+        self.tuner = tuner
+        self.say = say
         self.recording, kind = load(source, system)
         self.path = self.recording.path
         if not issubclass(kind, Simulated):
-            raise InputError(
-                f"{self.path}: simulator {self.recording.system} takes no effects, "
-                "so nothing can be missing from it"
-            )
+            raise self._takes_no_effects()
+        # The effects that it holds already could not be chosen again.
         extend.refuse_extended(kind)
         self.kind: type[Simulated] = kind
+        # A simulator that steps itself has no engine to choose.
         self.engine = None if issubclass(kind, OwnSimulator) else engine
         self.fitting = World(
             kind, self.recording, self.recording.training(), self.engine, [Hat], free
@@ -100,14 +99,22 @@ class _Explainer:
             World(kind, self.recording, held_out, self.engine, [Hat], free) if held_out else None
         )
         self.floor: Floor = noise_floor(self.fitting, self.recording)
+        # White to begin with: each likelihood finds the memory of the noise for itself.
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
         self.assessor = Assessor(
             self.recording, self.fitting, self.measuring, self.floor, self.engine
         )
         self._check()
 
+    def _takes_no_effects(self) -> InputError:
+        return InputError(
+            f"{self.path}: simulator {self.recording.system} takes no effects, "
+            "so nothing can be missing from it"
+        )
+
     def _check(self) -> None:
         world = self.fitting
+        # Fewer samples than unknowns are followed exactly, whatever the model: no gap would show.
         samples = int(np.isfinite(world.observed).sum())
         unknowns = world.base.size + int((~world.known).sum())
         if samples < LEAST * unknowns + SPARE:
@@ -129,6 +136,7 @@ class _Explainer:
     def run(self) -> Explanation:
         self.say("fitting the base model")
         base = fit_base(self.fitting, self.noise, self._given())
+        # One stream for surrogates and bootstrap: the same seed tells the same story.
         rng = rng_for("explain", self.recording.system, self.seed)
         search = Search(self.fitting, self.noise, base.untouched, rng, self.floor.stated)
         search.enter(base.fit)
@@ -137,8 +145,9 @@ class _Explainer:
         finding = name(search, held_out)
         self.say("measuring the gain")
         verdict = self.assessor.verdict(search, finding, rng, self.started)
-        story = self._story(search, base, finding, verdict)
+        story = Teller(self.assessor, search, base, finding).story(verdict)
         extended = self._extended(search, finding)
+        # Not earlier: an experiment is proposed by simulating further.
         for world in (self.fitting, self.measuring):
             if world is not None:
                 world.close()
@@ -148,113 +157,27 @@ class _Explainer:
         """Where a registered tuner would begin; None without one."""
         if self.tuner is None:
             return None
+        # Loaded here alone: few ask for a tuner, and what drives one is much to load.
         from bench.gap.model.tuner_start import tuned
 
         return tuned(self.tuner, self.fitting, self.noise, self.seed)
 
-    def _story(self, search: Search, base: Base, finding: Finding, verdict: Verdict) -> Story:
-        world, sigma = self.fitting, self.assessor.sigma(finding)
-        before, after = finding.base.fit.simulated, finding.model.fit.simulated
-        places = show.places(world, before, after, sigma)
-        held_out = None
-        if (
-            self.measuring is not None
-            and finding.measured is not None
-            and finding.model.names in finding.measured
-        ):
-            first, last = (finding.measured[names].simulated for names in ((), finding.model.names))
-            held_out = show.side(self.measuring, first, last)
-            there = show.places(self.measuring, first, last, sigma, " (held out)")
-            # Channels and phases are told of the fitted runs alone; of held-out ones, each run.
-            places += [place for place in there if place.kind == "run"]
-        channels = tuple(
-            Shown(
-                c.name,
-                c.unit,
-                float(sigma[i]),
-                bool(self.floor.stated[i]),
-                float(self.floor.step[i]),
-            )
-            for i, c in enumerate(world.simulator.channels)
-        )
-        title = self.recording.title or self.path.stem
-        return Story(
-            title,
-            self.path,
-            verdict,
-            channels,
-            show.side(world, before, after),
-            held_out,
-            tuple(places),
-            tuple(show.profiles(world, before, after, sigma)),
-            self._tuned(search, base, finding),
-            tuple(self._remains(base, finding)),
-            tuple(self._why(finding)),
-            finding.vague,
-        )
-
-    def _tuned(self, search: Search, base: Base, finding: Finding) -> tuple[Tuned, ...]:
-        sides = [self.assessor.numbers(search, model) for model in (finding.base, finding.model)]
-        result = []
-        for i in self.fitting.base.tolist():
-            before, after = (_triple(side[i]) for side in sides)
-            parameter = self.fitting.parameters[i]
-            result.append(
-                Tuned(parameter.name, parameter.unit, before, after, i not in base.untouched)
-            )
-        return tuple(result)
-
-    def _remains(self, base: Base, finding: Finding) -> list[str]:
-        lines = []
-        for channel in finding.remains.loud:
-            times = finding.remains.excess[self.fitting.channels.index(channel)]
-            lines.append(f"channel {channel} still misses by {times:.3g} times its noise")
-        if finding.remains.structure and finding.remains.where:
-            lines.append(
-                f"what is left behaves like a force that depends on {finding.remains.where}"
-            )
-        untouched = [self.fitting.parameters[i].name for i in sorted(base.untouched)]
-        if untouched:
-            lines.append(
-                f"the recording does not touch {', '.join(untouched)}: kept at the nominal value"
-            )
-        return lines
-
-    def _why(self, finding: Finding) -> list[str]:
-        lines = []
-        if finding.verdict == "unknown" and finding.causes:
-            lines.append(
-                "the effects that help most do not close enough of the gap to be its explanation"
-            )
-        if finding.verdict in ("partial", "unknown") and finding.remains.structure:
-            chance = finding.remains.p_value
-            left = "what is left over exceeds the stated noise of the sensors"
-            if chance < CHANCE:
-                left = (
-                    f"structure is left over (chance {chance:.2g}) "
-                    "that the sensor's noise does not have"
-                )
-            lines.append(left)
-        for cause in finding.causes:
-            if cause.alternatives:
-                others = ", ".join(cause.alternatives)
-                lines.append(
-                    f"{cause.effect} and {others} make the same difference in these runs, "
-                    "once parameters and initial states are fitted with each: "
-                    "their likelihoods differ by odds of less than 33 to 1"
-                )
-        return lines
-
     def _extended(self, search: Search, finding: Finding) -> Extended:
         world, numbers = self.fitting, self.assessor.numbers(search, finding.model)
-        own = {world.parameters[i].name: numbers[i] for i in range(world.own)}
+        own = {p.name: numbers[i] for i, p in enumerate(world.parameters[: world.own])}
         # A freed constant is a constant of the extended simulator, with the value that was fitted.
         freed = {p.name: numbers[world.own + i].value for i, p in enumerate(world.freed)}
         added = {}
-        for effect in (n for n in world.slots if n in finding.model.names):
-            places = range(*world.slots[effect].indices(len(world.parameters)))
-            names = [c.name for c in library.get(effect).on(world.simulator.system)]
-            added[effect] = {n: numbers[i] for n, i in zip(names, places, strict=True)}
+        # In the simulator's order, so that the file does not hang on how the search went.
+        for effect, slot in world.slots.items():
+            if effect not in finding.model.names:
+                continue
+            coefficients = library.get(effect).on(world.simulator.system)
+            places = range(*slot.indices(len(world.parameters)))
+            added[effect] = {
+                coefficient.name: numbers[place]
+                for coefficient, place in zip(coefficients, places, strict=True)
+            }
         return Extended(
             f"{self.recording.system}_extended",
             self.recording.system,
@@ -266,8 +189,3 @@ class _Explainer:
             world.channels,
             self.kind,
         )
-
-
-def _triple(number: Number) -> tuple[float, float, float]:
-    low, high = (np.nan if bound is None else bound for bound in (number.low, number.high))
-    return number.value, low, high

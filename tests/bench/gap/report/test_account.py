@@ -78,7 +78,10 @@ def test_several_causes_are_named_together():
 
 def test_an_ambiguous_cause_beside_a_certain_one():
     told = story("ambiguous", causes=[EITHER, TILT])
-    expected = "The simulation lacks a tilt of gravity, and linear drag or Coulomb friction: these data cannot tell which."
+    expected = (
+        "The simulation lacks a tilt of gravity, and linear drag or Coulomb friction: "
+        "these data cannot tell which."
+    )
     assert headline(told) == expected
 
 
@@ -174,8 +177,8 @@ def test_the_unit_of_the_gain_is_that_of_the_channels_whose_noise_is_its_floor()
 def test_parameters_tell_what_they_had_absorbed():
     said = text(story())
     assert (
-        "inertia 0.00333 (0.00325 to 0.00341) kg·m² before, 0.00351 (0.00345 to 0.00357) kg·m² after (+5.4 %)"
-        in said
+        "inertia 0.00333 (0.00325 to 0.00341) kg·m² before, "
+        "0.00351 (0.00345 to 0.00357) kg·m² after (+5.4 %)" in said
     )
     assert "it had absorbed part of the gap" in said
     assert "restitution is not touched by these data and stays at its nominal 0.7." in said
@@ -193,8 +196,8 @@ def test_a_move_within_both_intervals_is_no_absorption():
 def test_the_largest_gap_is_located():
     said = text(story())
     assert (
-        "run 4 (13 before, 1.1 after); channel qd (11 before, 1.1 after); phase last third (16 before, 1.2 after)"
-        in said
+        "run 4 (13 before, 1.1 after); channel qd (11 before, 1.1 after); "
+        "phase last third (16 before, 1.2 after)" in said
     )
     assert "gap is largest" not in text(story("adequate"))
 

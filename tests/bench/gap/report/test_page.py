@@ -163,8 +163,8 @@ def test_errors_of_channels_are_recomputed_from_the_runs(figures):
 def test_sets_that_cannot_be_told_apart_come_with_reason_and_experiment(figures):
     text = Reader(page(story("ambiguous"), figures)).text
     assert (
-        "linear drag (score 812, held-out gain 0.9) and Coulomb friction (score 807, held-out gain 0.89)"
-        in text
+        "linear drag (score 812, held-out gain 0.9) and Coulomb friction "
+        "(score 807, held-out gain 0.89)" in text
     )
     assert text.count("Release it from 1.5 rad instead of 0.5 rad") >= 2
 

@@ -1,0 +1,151 @@
+"""Tells a finding: gathers what account, figures and page say of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.gap.assess import Assessor
+from bench.gap.causes.name import Finding
+from bench.gap.causes.rules import CHANCE
+from bench.gap.causes.search import Search
+from bench.gap.model.base_fit import Base
+from bench.gap.report import show
+from bench.gap.report.story import Place, Shown, Side, Story, Tuned
+from bench.gap.verdict import Verdict
+from sims.base import Array
+from sims.extended import Number
+
+
+@dataclass(frozen=True)
+class Teller:
+    """Tells what was found.
+
+    Attributes:
+        assessor: puts it into numbers; it knows the recording, the worlds and the noise.
+        search: that has found it.
+        base: the fit of the base model.
+        finding: what was found.
+    """
+
+    assessor: Assessor
+    search: Search
+    base: Base
+    finding: Finding
+
+    def story(self, verdict: Verdict) -> Story:
+        """The story of a verdict on the finding."""
+        world = self.assessor.fitting
+        recording = self.assessor.recording
+        before = self.finding.base.fit.simulated
+        after = self.finding.model.fit.simulated
+        # Of the finding, not of the recording: a good model knows the noise better.
+        sigma = self.assessor.sigma(self.finding)
+        held_out, held_out_places = self._held_out(sigma)
+        return Story(
+            # A recording without a description is known by its file.
+            recording.title or recording.path.stem,
+            recording.path,
+            verdict,
+            self._channels(sigma),
+            show.side(world, before, after),
+            held_out,
+            (*show.places(world, before, after, sigma), *held_out_places),
+            tuple(show.profiles(world, before, after, sigma)),
+            tuple(self._parameters()),
+            tuple(self._remains()),
+            tuple(self._why()),
+            self.finding.vague,
+        )
+
+    def _held_out(self, sigma: Array) -> tuple[Side | None, list[Place]]:
+        """The held-out runs and where their gap is; None and nothing where none was measured."""
+        world = self.assessor.measuring
+        measured = self.finding.measured
+        names = self.finding.model.names
+        # Where the data do not fix the base model, nothing is tried on held-out runs.
+        if world is None or measured is None or names not in measured:
+            return None, []
+        before = measured[()].simulated
+        after = measured[names].simulated
+        places = show.places(world, before, after, sigma, " (held out)")
+        # Channels and phases are told of the fitted runs alone; of held-out ones, each run.
+        runs = [place for place in places if place.kind == "run"]
+        return show.side(world, before, after), runs
+
+    def _channels(self, sigma: Array) -> tuple[Shown, ...]:
+        floor = self.assessor.floor
+        rows = zip(
+            self.assessor.fitting.simulator.channels,
+            sigma.tolist(),
+            floor.stated.tolist(),
+            floor.step.tolist(),
+            strict=True,
+        )
+        return tuple(Shown(c.name, c.unit, size, stated, step) for c, size, stated, step in rows)
+
+    def _parameters(self) -> Iterator[Tuned]:
+        """The base parameters before and after; those that the data do not touch are marked."""
+        world = self.assessor.fitting
+        before = self.assessor.numbers(self.search, self.finding.base)
+        after = self.assessor.numbers(self.search, self.finding.model)
+        for i in world.base.tolist():
+            parameter = world.parameters[i]
+            touched = i not in self.base.untouched
+            yield Tuned(
+                parameter.name,
+                parameter.unit,
+                _triple(before[i]),
+                _triple(after[i]),
+                touched,
+            )
+
+    def _remains(self) -> Iterator[str]:
+        """What the extended model leaves unexplained, and what to bear in mind."""
+        world = self.assessor.fitting
+        remains = self.finding.remains
+        for channel in remains.loud:
+            times = remains.excess[world.channels.index(channel)]
+            yield f"channel {channel} still misses by {times:.3g} times its noise"
+        # Where the test for a force of any shape does not apply, there is nothing to name.
+        if remains.structure and remains.where:
+            yield f"what is left behaves like a force that depends on {remains.where}"
+        untouched = [world.parameters[i].name for i in sorted(self.base.untouched)]
+        if untouched:
+            names = ", ".join(untouched)
+            yield f"the recording does not touch {names}: kept at the nominal value"
+
+    def _why(self) -> Iterator[str]:
+        """Why the verdict is what it is, the most important first."""
+        finding = self.finding
+        if finding.verdict == "unknown" and finding.causes:
+            yield "the effects that help most do not close enough of the gap to be its explanation"
+        if finding.verdict in ("partial", "unknown") and finding.remains.structure:
+            yield self._structure()
+        for cause in finding.causes:
+            if cause.alternatives:
+                others = ", ".join(cause.alternatives)
+                yield (
+                    f"{cause.effect} and {others} make the same difference in these runs, "
+                    "once parameters and initial states are fitted with each: "
+                    "their likelihoods differ by odds of less than 33 to 1"
+                )
+
+    def _structure(self) -> str:
+        chance = self.finding.remains.p_value
+        # Both count as structure: a residual with a pattern, and one that is merely too large.
+        if chance < CHANCE:
+            return (
+                f"structure is left over (chance {chance:.2g}) "
+                "that the sensor's noise does not have"
+            )
+        return "what is left over exceeds the stated noise of the sensors"
+
+
+def _triple(number: Number) -> tuple[float, float, float]:
+    """Value and interval as figures have them: NaN where the data give no bound."""
+    low = np.nan if number.low is None else number.low
+    high = np.nan if number.high is None else number.high
+    return number.value, low, high
