@@ -21,10 +21,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.gap.model.fit import RESPONSE, Fit, Fitter, Start, prior_of
+from bench.gap.model.arrow import schur_complement
+from bench.gap.model.fit import Fit, Fitter, Start, difference_steps, prior_of
 from bench.gap.model.models import Model, Models, freedom
-from bench.gap.model.noise import Noise, likelihood, whitened
-from bench.gap.model.world import Mask, World
+from bench.gap.model.noise import Mask, Noise, likelihood, whitened
+from bench.gap.model.world import World
 from sims.base import Array
 
 Z95 = 1.959964
@@ -117,33 +118,46 @@ def central(world: World, fit: Fit, noise: Noise) -> Fit:
     One-sided ones are good enough to descend by, but their curvature makes parameters look
     different that are not.
     """
-    q, runs, size = fit.free.size, *fit.states.shape
+    q = fit.free.size
+    runs, size = fit.states.shape
     bounds = _bounds_around(world, fit)
-    steps = _steps(fit, noise, bounds)
-    # Two sides, and on each side one row for each number that is moved.
-    theta = np.tile(fit.theta, (2, q + size, 1))
-    states = np.tile(fit.states, (2, q + size, 1, 1))
-    for side, sign in enumerate((-1.0, 1.0)):
-        for j, place in enumerate(fit.free):
-            moved = theta[side, j, place] + sign * steps[j]
-            # At a bound the step is one-sided; what it comes to is divided by below.
-            theta[side, j, place] = np.clip(moved, *bounds[j])
-        for j in range(size):
-            states[side, q + j, :, j] += sign * steps[q + j]
+    ranges = bounds[:, 1] - bounds[:, 0]
+    steps = difference_steps(fit.jacobian, noise, ranges)
+    theta, states = _both_sides(fit, steps, bounds)
+
     # One call for both sides and all runs: the engine steps its lanes at once.
-    rows = np.repeat(theta.reshape(-1, theta.shape[2]), runs, axis=0)
-    lanes = np.tile(np.arange(runs), 2 * (q + size))
+    vectors = theta.reshape(-1, fit.theta.size)
+    rows = np.repeat(vectors, runs, axis=0)
+    lanes = np.tile(np.arange(runs), len(vectors))
     simulated = world.simulate(rows, lanes, states.reshape(-1, size))
-    simulated = simulated.reshape(2, q + size, *fit.simulated.shape)
-    below, above = theta[0][:q], theta[1][:q]
+    below, above = simulated.reshape(2, q + size, *fit.simulated.shape)
+
     # Row j has moved parameter j, so its widths stand on the diagonal.
-    moved = np.diagonal(above[:, fit.free] - below[:, fit.free])
+    lower, upper = theta[:, :q, fit.free]
+    moved = np.diagonal(upper - lower)
     widths = np.concatenate([moved, 2.0 * steps[q:]])
-    change = simulated[1] - simulated[0]
-    jacobian = np.moveaxis(change, 0, -1) / widths
+    jacobian = np.moveaxis(above - below, 0, -1) / widths
     # A simulation that failed on one side tells nothing of the slope.
     jacobian = np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
     return replace(fit, jacobian=jacobian)
+
+
+def _both_sides(fit: Fit, steps: Array, bounds: Array) -> tuple[Array, Array]:
+    """Parameters (2, q + s, P) and initial states (2, q + s, R, s): on the side below and on that
+    above, each row has one number moved by its step.
+    """
+    q = fit.free.size
+    theta = np.tile(fit.theta, (2, len(steps), 1))
+    states = np.tile(fit.states, (2, len(steps), 1, 1))
+    for side, sign in enumerate((-1.0, 1.0)):
+        shifts = sign * steps
+        for j, place in enumerate(fit.free):
+            moved = fit.theta[place] + shifts[j]
+            # At a bound the step is one-sided, so what it comes to must be what is divided by.
+            theta[side, j, place] = np.clip(moved, *bounds[j])
+        for j, shift in enumerate(shifts[q:]):
+            states[side, q + j, :, j] += shift
+    return theta, states
 
 
 def _bounds_around(world: World, fit: Fit) -> Array:
@@ -158,40 +172,14 @@ def _bounds_around(world: World, fit: Fit) -> Array:
     return np.stack([lowest, highest], 1)
 
 
-def _steps(fit: Fit, noise: Noise, bounds: Array) -> Array:
-    """(q + s,) steps that move the runs by as much as the fit's own differences do."""
-    size = fit.states.shape[1]
-    in_sigmas = fit.jacobian / noise.sigma[:, None]
-    moved = np.sqrt(np.mean(np.square(in_sigmas), axis=(0, 1, 2)))
-    widths = bounds[:, 1] - bounds[:, 0]
-    largest = np.concatenate([1e-2 * widths, np.full(size, 1e-2)])
-    wanted = RESPONSE / np.maximum(moved, 1e-300)
-    # Below the least step rounding would be the difference, above the largest one curvature.
-    steps: Array = np.clip(wanted, 1e-5 * largest, largest)
-    return steps
-
-
 def covariance(models: Models, model: Model) -> Array:
-    """(q, q) of the fitted parameters, from the curvature, with the noise's own correlation."""
-    world, q = models.world, model.fit.free.size
-    fit = central(world, model.fit, models.noise)
-    # What the model leaves is the noise, whatever the recording states of it.
-    sigma = np.maximum(model.likelihood.sigma, 1e-300)
-    noise = Noise(sigma, model.likelihood.phi)
-    jacobian = np.where(models.seen[..., None], fit.jacobian, 0.0)
-    jacobian = whitened(jacobian, models.seen, noise)
-    j = jacobian.reshape(len(jacobian), -1, jacobian.shape[3])
-    normal = np.matmul(j.transpose(0, 2, 1), j)
-    inner = normal[:, q:, q:] + np.diag(1.0 / prior_of(world) ** 2)
-    # An initial state that is known is not fitted, so it takes nothing away.
-    cross = np.where(world.known[:, None, :], 0.0, normal[:, :q, q:])
-    own = normal[:, :q, :q].sum(axis=0)
-    solved = np.linalg.solve(inner, cross.transpose(0, 2, 1))
-    absorbed = np.matmul(cross, solved).sum(0)
-    schur = own - absorbed  # what eq. (2) inverts
+    """(q, q) of the fitted parameters, (2), with the noise's own correlation."""
+    own, left = _curvatures(models, model)
     # Parameters of any unit on one scale, so that the cut-off below means the same for each.
-    scale = np.sqrt(np.maximum(np.diagonal(own), 1e-300))
-    scaled = schur / np.outer(scale, scale)
+    powers = np.diagonal(own)
+    scale = np.sqrt(np.maximum(powers, 1e-300))
+    units = np.outer(scale, scale)
+    scaled = left / units
     inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
     values, vectors = np.linalg.eigh(scaled)
     lost = values < 1e-12
@@ -199,8 +187,32 @@ def covariance(models: Models, model: Model) -> Array:
     if lost.any():
         free = vectors[:, lost]
         inverse = inverse + (free * 1e12) @ free.T
-    result: Array = inverse / np.outer(scale, scale)
+    result: Array = inverse / units  # (2)
     return result
+
+
+def _curvatures(models: Models, model: Model) -> tuple[Array, Array]:
+    """(q, q) the first sum of (2), and both together, which (2) inverts."""
+    world = models.world
+    q = model.fit.free.size
+    fit = central(world, model.fit, models.noise)
+    # What the model leaves is the noise, whatever the recording states of it.
+    sigma = np.maximum(model.likelihood.sigma, 1e-300)
+    noise = Noise(sigma, model.likelihood.phi)
+    jacobian = np.where(models.seen[..., None], fit.jacobian, 0.0)
+    jacobian = whitened(jacobian, models.seen, noise)
+    runs, *_, size = jacobian.shape
+    j = jacobian.reshape(runs, -1, size)
+    normal = np.matmul(j.transpose(0, 2, 1), j)
+    own = normal[:, :q, :q].sum(axis=0)
+    # An initial state that is known is not fitted, so it takes nothing away.
+    known = world.known[:, None, :]
+    cross = np.where(known, 0.0, normal[:, :q, q:])
+    precision = 1.0 / prior_of(world) ** 2
+    inner = normal[:, q:, q:] + np.diag(precision)
+    # The theorem by which a step of the fit is solved eliminates them here, too.
+    left, _ = schur_complement(own, cross, inner)
+    return own, left
 
 
 def intervals(models: Models, model: Model) -> dict[int, tuple[float, float, float]]:

@@ -46,7 +46,9 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
     data = replace(data, constants={**extended.constants, **data.constants})
     runs = data.held_out() if held_out else data.runs
     if not runs:
-        raise InputError(f"{recording}: --held-out: no run is marked held_out")
+        raise InputError(
+            f"{recording}: no run is marked held_out, and only such runs were to count"
+        )
     for channel in extended.observe:
         if channel not in runs[0].channels:
             raise unknown(f"channel of {recording}", channel, list(runs[0].channels))

@@ -32,7 +32,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.gap.model.world import Mask
+from bench.gap.model.noise import Mask
 from sims.base import Array
 
 LEAST_POWER = 1e-12
@@ -73,15 +73,12 @@ class _Arrow:
 
     def solved(self, stuck: Mask) -> tuple[Array, Array]:
         """The steps (q,) and (R, s), by (4) and (5); stuck parameters (q,) do not move."""
-        # V⁻¹ Wᵀ and V⁻¹ b of every run
-        transposed = self.cross.transpose(0, 2, 1)
-        inverse_cross = np.linalg.solve(self.inner, transposed)
+        schur, inverse_cross = schur_complement(self.shared, self.cross, self.inner)
+        # V⁻¹ b of every run
         columns = self.pull[:, :, None]
         inverse_pull = np.linalg.solve(self.inner, columns)[:, :, 0]
 
-        # (4), its two sides
-        products = np.matmul(self.cross, inverse_cross)
-        schur = self.shared - products.sum(axis=0)
+        # (4), its right side
         right = self.gradient - np.einsum("rqs,rs->q", self.cross, inverse_pull)
 
         # least squares takes the shortest step where parameters act alike
@@ -94,6 +91,23 @@ class _Arrow:
 
         own = inverse_pull - np.einsum("rsq,q->rs", inverse_cross, shared)  # (5)
         return shared, own
+
+
+def schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, Array]:
+    """What the shared parameters keep when the initial states of every run are eliminated.
+
+    Args:
+        shared: (q, q) U.
+        cross: (R, q, s) every W_i.
+        inner: (R, s, s) every V_i.
+
+    Returns:
+        The matrix (q, q) of (4), and every V_i⁻¹ W_iᵀ (R, s, q).
+    """
+    transposed = cross.transpose(0, 2, 1)
+    inverse_cross = np.linalg.solve(inner, transposed)
+    products = np.matmul(cross, inverse_cross)
+    return shared - products.sum(axis=0), inverse_cross  # (4)
 
 
 def arrow_step(

@@ -25,8 +25,8 @@ import numpy as np
 
 from bench.gap.model.arrow import arrow_step
 from bench.gap.model.bounds import coefficient_bounds
-from bench.gap.model.noise import Noise, whitened
-from bench.gap.model.world import Indices, Mask, World
+from bench.gap.model.noise import Mask, Noise, whitened
+from bench.gap.model.world import Indices, World
 from sims.base import Array
 
 RESPONSE = 0.1
@@ -306,14 +306,7 @@ class Fitter:
     def _take(self, problem: _Problem, point: _Point) -> None:
         """Go on from a point, with differences that suit what it responds to."""
         problem.point = point
-        squares = np.square(point.jacobian / self.noise.sigma[:, None])
-        responses = np.sqrt(np.mean(squares, axis=(0, 1, 2)))
-        states = np.full(point.start.states.shape[1], LARGEST_STEP)
-        largest = np.concatenate([LARGEST_STEP * problem.widths, states])
-        # an unknown without any response is moved as far as may be
-        with np.errstate(divide="ignore"):
-            steps = RESPONSE / np.where(responses > 0, responses, 1e-300)
-        problem.steps = np.clip(steps, SMALLEST_STEP * largest, largest)
+        problem.steps = difference_steps(point.jacobian, self.noise, problem.widths)
 
     def _residual(self, simulated: Array, seen: Mask) -> Array:
         """(R, T, C) observed less simulated, zero where nothing counts."""
@@ -410,6 +403,26 @@ def _moved(start: Start, free: Indices, steps: Array) -> tuple[Array, Array]:
     for j in range(size):
         states[1 + q + j, :, j] += steps[q + j]
     return theta, states
+
+
+def difference_steps(jacobian: Array, noise: Noise, widths: Array) -> Array:
+    """(q + s,) steps of finite differences that move the runs by `RESPONSE` of the noise.
+
+    Args:
+        jacobian: (R, T, C, q + s) by an earlier difference.
+        noise: of each channel.
+        widths: (q,) the ranges of the parameters' bounds.
+    """
+    squares = np.square(jacobian / noise.sigma[:, None])
+    responses = np.sqrt(np.mean(squares, axis=(0, 1, 2)))
+    states = np.full(len(responses) - len(widths), LARGEST_STEP)
+    largest = np.concatenate([LARGEST_STEP * widths, states])
+    # an unknown without any response is moved as far as may be
+    with np.errstate(divide="ignore"):
+        wanted = RESPONSE / np.where(responses > 0, responses, 1e-300)
+    # below the least step rounding would be the difference, above the largest one curvature
+    steps: Array = np.clip(wanted, SMALLEST_STEP * largest, largest)
+    return steps
 
 
 def prior_of(world: World) -> Array:

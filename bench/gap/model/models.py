@@ -19,8 +19,8 @@ import numpy as np
 
 from bench.gap.model.base_fit import HORIZONS
 from bench.gap.model.fit import Fit, Fitter, Start, prior_of
-from bench.gap.model.noise import Likelihood, Noise, likelihood
-from bench.gap.model.world import Mask, World
+from bench.gap.model.noise import Likelihood, Mask, Noise, likelihood
+from bench.gap.model.world import World
 from sims.base import Array
 
 Names = tuple[str, ...]

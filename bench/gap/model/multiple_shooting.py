@@ -21,7 +21,8 @@ from itertools import pairwise
 import numpy as np
 
 from bench.gap.model.fit import Fit, Start
-from bench.gap.model.world import Mask, World
+from bench.gap.model.noise import Mask
+from bench.gap.model.world import World
 from sims.recording.recording import Run
 
 PIECES = 4

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.gap.model.noise import Mask
 from bench.gap.model.tracks import Track, first_of, tracked
 from sims import effects as library
 from sims.base import Array, InputError, Parameter, Scenario, unknown
@@ -19,7 +20,6 @@ from sims.simulated import Simulated
 from sims.system import Effect, Input, Sensor
 
 Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 LANE_SAMPLES = 400_000
 """Samples simulated in one call of the engine: beyond it more lanes cost memory and gain nothing.
@@ -299,7 +299,7 @@ def _freed(name: str, simulator: Simulated, recording: Recording) -> Parameter:
     # its range is a multiple of its value, and a run's own value would overrule what is fitted
     if value == 0 or any(name in run.constants for run in recording.runs):
         raise InputError(
-            f"--free {name}: expected a constant that is not zero and the same in every run"
+            f"free constant {name}: expected one that is not zero and the same in every run"
         )
     # sorted, as a constant may be negative
     low, high = sorted((value / FREED, value * FREED))

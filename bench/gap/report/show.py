@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bench.gap.model.world import Mask, World
+from bench.gap.model.noise import Mask
+from bench.gap.model.world import World
 from bench.gap.report.story import Place, Profile, Side
 from sims.base import Array
 

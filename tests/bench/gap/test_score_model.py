@@ -71,7 +71,7 @@ def test_held_out_runs_alone(files):
     assert (found["runs"], found["samples"]) == (1, 90)
     text = recording.with_suffix(".toml").read_text()
     recording.with_suffix(".toml").write_text(text.replace("held_out = true", "held_out = false"))
-    with pytest.raises(InputError, match=r"swing.csv: --held-out: no run is marked held_out"):
+    with pytest.raises(InputError, match=r"swing.csv: no run is marked held_out"):
         scored(model, recording, held_out=True)
 
 

@@ -102,7 +102,7 @@ def test_effects_may_grow_beyond_what_is_plausible_but_not_change_their_meaning(
         ),
         (
             ["gravity"],
-            "--free gravity: expected a constant that is not zero and the same in every run",
+            "free constant gravity: expected one that is not zero and the same in every run",
         ),
     ],
 )
