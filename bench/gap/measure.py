@@ -11,6 +11,11 @@ generalised least squares). With the whitened Jacobian J_r = [A_r B_r], of param
 states, and what was known of these beforehand, sigma_0,
 
     covariance = (sum_r A_r' A_r - A_r' B_r (B_r' B_r + diag sigma_0^-2)^-1 B_r' A_r)^-1       (2)
+
+On held-out runs of n samples, where nothing but initial states is fitted, f of which the data fix,
+the merit is that of G. Schwarz (Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136):
+
+    M = 2 log L - f log n                                                                      (3)
 """
 
 from __future__ import annotations
@@ -67,7 +72,8 @@ class HeldOutRuns:
     """
 
     def __init__(self, world: World, noise: Noise) -> None:
-        self.world, self.noise = world, noise
+        self.world = world
+        self.noise = noise
         self.seen: Mask = np.isfinite(world.observed)
 
     def measure(self, thetas: Sequence[Array]) -> list[Measured]:
@@ -78,7 +84,8 @@ class HeldOutRuns:
         one, and the better fit counts.
         """
         guess = self.world.guess
-        fits = self._fitted([Start((), theta, guess) for theta in thetas], STAGES)
+        begun = [Start((), theta, guess) for theta in thetas]
+        fits = self._fitted(begun, STAGES)
         nearest = min(fits, key=lambda fit: fit.cost)
         # Asked this way round, since a fit that failed has a cost that is no number.
         limit = TWICE * nearest.cost
@@ -103,12 +110,16 @@ class HeldOutRuns:
 
     def _measured(self, fit: Fit) -> Measured:
         if not np.isfinite(fit.cost):
-            return Measured(np.full_like(self.world.observed, np.nan), -np.inf)
-        residual = np.where(self.seen, self.world.observed - fit.simulated, 0.0)
+            nothing = np.full_like(self.world.observed, np.nan)
+            return Measured(nothing, -np.inf)
+        left = self.world.observed - fit.simulated
+        residual = np.where(self.seen, left, 0.0)
         # Only initial states were fitted here, so they alone cost merit.
         free = freedom(self.world, fit, self.noise)
-        price = float(np.log(max(int(self.seen.sum()), 2)))
-        merit = likelihood(residual, self.seen, free).value - free * price
+        count = int(self.seen.sum())
+        price = float(np.log(max(count, 2)))
+        likeliest = likelihood(residual, self.seen, free)
+        merit = likeliest.value - free * price  # (3)
         return Measured(fit.simulated, merit)
 
 
@@ -167,8 +178,10 @@ def _bounds_around(world: World, fit: Fit) -> Array:
     values = fit.theta[fit.free]
     bounds = [world.parameters[i].bounds for i in fit.free]
     # Shaped by hand, since there may be no parameter at all.
-    low, high = np.array(bounds).reshape(-1, 2).T
-    lowest, highest = np.minimum(low, values), np.maximum(high, values)
+    table = np.array(bounds).reshape(-1, 2)
+    low, high = table.T
+    lowest = np.minimum(low, values)
+    highest = np.maximum(high, values)
     return np.stack([lowest, highest], 1)
 
 
@@ -222,14 +235,20 @@ def intervals(models: Models, model: Model) -> dict[int, tuple[float, float, flo
     variances = np.diagonal(covariance(models, model))
     # Rounding may leave a variance below zero.
     spread = np.sqrt(np.maximum(variances, 0.0))
+    places = model.fit.free.tolist()
     result = {}
-    for place, sd in zip(model.fit.free.tolist(), spread.tolist(), strict=True):
+    for place, sd in zip(places, spread.tolist(), strict=True):
         value = float(model.fit.theta[place])
         low, high = models.world.parameters[place].bounds
-        widest = UNBOUNDED * max(high - low, abs(value))
-        known = np.isfinite(sd) and 2.0 * Z95 * sd < widest
+        # A value may lie far beyond its plausible bounds, and is then the scale itself.
+        size = max(high - low, abs(value))
+        known = np.isfinite(sd) and 2.0 * Z95 * sd < UNBOUNDED * size
         reach = Z95 * sd if known else np.nan
-        result[place] = (value, value - reach, value + reach)
+        result[place] = (
+            value,
+            value - reach,
+            value + reach,
+        )
     return result
 
 
@@ -270,15 +289,18 @@ def gain(
     """
     sums = _sums(world, before, after, channels)
     whole = sums.sum(axis=0)
-    base = float(np.sqrt(whole[0] / whole[2]))
-    extended = float(np.sqrt(whole[1] / whole[2]))
+    before_sum, after_sum, count = whole
+    base = float(np.sqrt(before_sum / count))
+    extended = float(np.sqrt(after_sum / count))
     # Runs are drawn whole: samples of one run depend on each other.
-    rows = rng.integers(len(sums), size=(RESAMPLES, len(sums)))
-    shares = _closed(sums[rows].sum(axis=1), floor)
-    low, high = np.nan, np.nan
+    parts = len(sums)
+    rows = rng.integers(parts, size=(RESAMPLES, parts))
+    resampled = sums[rows].sum(axis=1)
+    shares = _closed(resampled, floor)
+    low = high = np.nan
     # Of one stretch every resample is the same, and would look certain.
-    if len(sums) > 1:
-        low, high = (float(v) for v in np.quantile(shares, [0.025, 0.975]))
+    if parts > 1:
+        low, high = np.quantile(shares, [0.025, 0.975]).tolist()
     closed = float(_closed(whole[None], floor)[0])
     return Gain(base, extended, floor, closed, low, high)
 
@@ -287,30 +309,44 @@ def _sums(world: World, before: Array, after: Array, channels: Sequence[int]) ->
     """(n, 3): sums of squares before and after, and samples, of each run, or of the stretches of a
     single one.
     """
-    parts: list[tuple[int, slice]] = [(r, slice(None)) for r in range(len(world.tracks))]
-    if len(parts) == 1:
-        edges = np.linspace(0, world.lengths[0], STRETCHES + 1).astype(int).tolist()
-        parts = [(0, slice(a, b)) for a, b in pairwise(edges) if b > a]
     rows = []
-    for run, part in parts:
+    for run, part in _parts(world):
         observed = world.observed[run, part][:, channels]
         seen = np.isfinite(observed)
+        # A part without samples would be a row of zeros, and its error a quotient of them.
         if not seen.any():
             continue
-        squares = []
+        row = []
         for simulated in (before, after):
-            error = (observed - simulated[run, part][:, channels])[seen]
-            squares.append(float(error @ error))
-        rows.append([*squares, float(seen.sum())])
+            there = simulated[run, part][:, channels]
+            error = (observed - there)[seen]
+            row.append(float(error @ error))
+        row.append(float(seen.sum()))
+        rows.append(row)
     return np.array(rows)
+
+
+def _parts(world: World) -> list[tuple[int, slice]]:
+    """What is resampled: whole runs, or stretches of a single one."""
+    count = len(world.tracks)
+    if count > 1:
+        return [(run, slice(None)) for run in range(count)]
+    edges = np.linspace(0, world.lengths[0], STRETCHES + 1)
+    samples = edges.astype(int).tolist()
+    # A run of few samples has stretches without any.
+    return [(0, slice(a, b)) for a, b in pairwise(samples) if b > a]
 
 
 def _closed(sums: Array, floor: float) -> Array:
     """Shares of the gap closed of rows (n, 3); 0 where there is no gap above the floor."""
     before, after, counts = sums.T
-    base, extended = np.sqrt(before / counts), np.sqrt(after / counts)
+    base = np.sqrt(before / counts)
+    extended = np.sqrt(after / counts)
     gap = base - floor
+    # Below the floor there is nothing that a model could close.
+    reached = np.maximum(extended, floor)
     with np.errstate(all="ignore"):
-        share = (base - np.maximum(extended, floor)) / gap  # (1)
+        share = (base - reached) / gap  # (1)
     # A gap of less than rounding would make any share of it, and a resample may have none.
-    return np.clip(np.where(gap > 1e-3 * floor, share, 0.0), WORST, 1.0)
+    shares = np.where(gap > 1e-3 * floor, share, 0.0)
+    return np.clip(shares, WORST, 1.0)

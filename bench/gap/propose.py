@@ -75,15 +75,19 @@ def next_experiment(models: Models, model: Model, rival: Model) -> Experiment:
         rival: what would explain the same.
     """
     world = models.world
-    says, change, largest = "", {}, 0.0
+    says = ""
+    change: dict[str, float] = {}
+    largest = 0.0
     for run in _runs(world):
         apart = _apart(world, run, model, rival, models.noise.sigma)
         # A run on which one of the simulations fails proposes nothing.
         if np.isfinite(apart) and apart > largest:
             says, change, largest = run.says, run.change, apart
     # Effects that both have are no matter of dispute.
-    mine = " and ".join(sorted({*model.names} - {*rival.names}))
-    other = " and ".join(sorted({*rival.names} - {*model.names}))
+    names = set(model.names)
+    rivals = set(rival.names)
+    mine = " and ".join(sorted(names - rivals))
+    other = " and ".join(sorted(rivals - names))
     if largest < TELLING:
         return Experiment(_no_run(world, mine, other), {}, largest)
     says = f"{says}: there {mine} and {other} differ by {largest:.3g} times the noise"
@@ -92,8 +96,12 @@ def next_experiment(models: Models, model: Model, rival: Model) -> Experiment:
 
 def _no_run(world: World, mine: str, other: str) -> str:
     """What to do where no run of this kind would tell."""
-    unseen = ", ".join(c.name for c in world.kind.channels if c.name not in world.channels)
-    instead = f"record {unseen} besides" if unseen else "measure one of the causes directly"
+    channels = [channel.name for channel in world.kind.channels]
+    unseen = ", ".join(name for name in channels if name not in world.channels)
+    instead = "measure one of the causes directly"
+    # What another sensor sees may differ where these agree.
+    if unseen:
+        instead = f"record {unseen} besides"
     return (
         f"No run of this kind would tell {mine} from {other}: "
         f"their predictions agree within the noise; {instead}"
@@ -111,11 +119,15 @@ def _runs(world: World) -> Iterator[_Run]:
 
 def _longer(track: Track) -> _Run:
     times = track.scenario.times
-    twice = np.concatenate([times, times[-1] + (times[1:] - times[0])])
-    # The inputs are given once more from the beginning.
-    inputs = {n: np.concatenate([u, u[1:]]) for n, u in track.scenario.inputs.items()}
+    later = times[1:] - times[0]
+    twice = np.concatenate([times, times[-1] + later])
+    inputs = {}
+    for name, signal in track.scenario.inputs.items():
+        # The inputs are given once more from the beginning.
+        inputs[name] = np.concatenate([signal, signal[1:]])
     scenario = replace(track.scenario, times=twice, inputs=inputs)
-    change = {"seconds": float(twice[-1] - twice[0])}
+    seconds = float(twice[-1] - twice[0])
+    change = {"seconds": seconds}
     return _Run("Record twice as long", change, scenario, track.guess)
 
 
@@ -123,19 +135,22 @@ def _elsewhere(world: World, track: Track) -> Iterator[_Run]:
     """Started from elsewhere, one state at a time."""
     system = world.simulator.system
     height = len(system.coordinates) - 1
-    for place, (name, unit) in enumerate(zip(world.states, _units(world), strict=True)):
+    named = zip(world.states, _units(world), strict=True)
+    for place, (name, unit) in enumerate(named):
         above_ground = system.bounces and place == height
         for share in STARTS:
             # Nothing is let go below the ground.
             if above_ground and share < 0:
                 continue
             states = track.guess.copy()
-            moving = abs(states[place]) > AT_REST
-            states[place] = share * states[place] if moving else share
+            value = float(states[place])
+            moving = abs(value) > AT_REST
+            value = share * value if moving else share
             if above_ground:
-                states[place] = max(states[place], LOWEST)
-            says = f"Start with {name} = {states[place]:.3g} {unit}"
-            yield _Run(says, {name: float(states[place])}, track.scenario, states)
+                value = max(value, LOWEST)
+            states[place] = value
+            says = f"Start with {name} = {value:.3g} {unit}"
+            yield _Run(says, {name: value}, track.scenario, states)
 
 
 def _driven(track: Track) -> Iterator[_Run]:
@@ -155,26 +170,31 @@ def _units(world: World) -> list[str]:
     units = {channel.name: channel.unit for channel in world.kind.channels}
     lengths = [units.get(name, "m") for name in system.coordinates]
     rates = [f"{unit}/s" for unit in lengths]
-    rates += [units.get(name, "SI") for name in system.rates[len(lengths) :]]
-    return [*lengths, *rates]
+    # Behind the rates an own system may have more, in any unit.
+    further = system.rates[len(lengths) :]
+    others = [units.get(name, "SI") for name in further]
+    return [*lengths, *rates, *others]
 
 
 def _apart(world: World, run: _Run, model: Model, rival: Model, sigma: Array) -> float:
     """How far apart two models are on a run, (1)."""
     both = [model.fit.theta, rival.fit.theta]
     # Freed constants are fitted with the parameters, and reach the simulator as constants.
-    theta = np.delete(np.stack(both), world.base[world.own :], axis=1)
+    places = world.base[world.own :]
+    theta = np.delete(np.stack(both), places, axis=1)
+    names = [parameter.name for parameter in world.freed]
     scenarios = []
     for fitted in both:
-        values = fitted[world.own : world.base.size].tolist()
-        freed = dict(zip((p.name for p in world.freed), values, strict=True))
+        values = fitted[places].tolist()
+        freed = dict(zip(names, values, strict=True))
         constants = {**run.scenario.constants, **freed}
         scenarios.append(replace(run.scenario, constants=constants))
-    initial = {
-        name: np.full(2, value)
-        for name, value in zip(world.states, run.states.tolist(), strict=True)
-    }
-    # One lane of a call for each model.
-    seen = world.simulator.simulate_lanes(theta, scenarios, initial)
+
+    # One lane of a call for each model, both from the same initial states.
+    initial = {}
+    for name, value in zip(world.states, run.states.tolist(), strict=True):
+        initial[name] = np.full(2, value)
+    mine, other = world.simulator.simulate_lanes(theta, scenarios, initial)
     world.simulations += 2
-    return float(np.sqrt(np.square((seen[0] - seen[1]) / sigma).mean()))  # (1)
+    apart = (mine - other) / sigma
+    return float(np.sqrt(np.square(apart).mean()))  # (1)

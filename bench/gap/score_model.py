@@ -49,14 +49,24 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
         raise InputError(
             f"{recording}: no run is marked held_out, and only such runs were to count"
         )
+    recorded = runs[0].channels
     for channel in extended.observe:
-        if channel not in runs[0].channels:
-            raise unknown(f"channel of {recording}", channel, list(runs[0].channels))
+        # Without it the error would be one over fewer channels than the model was fitted to.
+        if channel not in recorded:
+            raise unknown(f"channel of {recording}", channel, list(recorded))
     engine = None if issubclass(kind, OwnSimulator) else extended.engine
-    world = World(kind, data, runs, engine, candidates=list(extended.effects))
+    # Effects that the file does not name are not in the model, so they need not be at hand.
+    world = World(
+        kind,
+        data,
+        runs,
+        engine,
+        candidates=list(extended.effects),
+    )
     floor = noise_floor(world, data)
-    noise = Noise(floor.sigma, np.zeros(len(floor.sigma)))
-    measured = HeldOutRuns(world, noise).measure([_theta(world, extended)])[0]
+    white = np.zeros(len(floor.sigma))
+    counted = HeldOutRuns(world, Noise(floor.sigma, white))
+    (measured,) = counted.measure([_theta(world, extended)])
     world.close()
     squares = _squares(world, measured.simulated)
     if not np.isfinite(squares).all():
@@ -68,20 +78,25 @@ def _theta(world: World, extended: Extended) -> Array:
     """(P,) the numbers of an extended simulator, nominal where it has none."""
     # Parameters that the file does not state are nominal, coefficients that it does not are off.
     theta = world.nominal()
-    for place, parameter in enumerate(world.parameters[: world.own]):
+    own = world.parameters[: world.own]
+    for place, parameter in enumerate(own):
         if parameter.name in extended.parameters:
-            theta[place] = extended.parameters[parameter.name].value
+            number = extended.parameters[parameter.name]
+            theta[place] = number.value
     for name, numbers in extended.effects.items():
         coefficients = world.effects[name].on(world.simulator.system)
-        values = [numbers[c.name].value if c.name in numbers else 0.0 for c in coefficients]
-        theta[world.slots[name]] = values
+        places = world.places(name)
+        for place, coefficient in zip(places, coefficients, strict=True):
+            if coefficient.name in numbers:
+                theta[place] = numbers[coefficient.name].value
     return theta
 
 
 def _squares(world: World, simulated: Array) -> Array:
     """(R, T, C) squared errors; zero where nothing was seen."""
     seen = np.isfinite(world.observed)
-    squares: Array = np.where(seen, np.square(world.observed - simulated), 0.0)
+    errors = world.observed - simulated
+    squares: Array = np.where(seen, np.square(errors), 0.0)
     return squares
 
 
@@ -93,12 +108,16 @@ def _errors(world: World, squares: Array, sigma: Array) -> dict[str, Any]:
     for c, name in enumerate(world.channels):
         # A channel without samples here has no error.
         if counts[c]:
-            rmse[name] = float(np.sqrt(squares[:, :, c].sum() / counts[c]))
-    normalised = np.sqrt((squares / np.square(sigma)).sum() / counts.sum())
+            total = squares[:, :, c].sum()
+            rmse[name] = float(np.sqrt(total / counts[c]))
+    # Each channel in units of its noise, so that all of them may be added.
+    in_noise = squares / np.square(sigma)
+    normalised = np.sqrt(in_noise.sum() / counts.sum())
+    channels = world.simulator.channels
     return {
         "rmse": rmse,
         "normalised_rmse": float(normalised),
         "runs": len(world.runs),
         "samples": int(seen.any(axis=2).sum()),
-        "units": {channel.name: channel.unit for channel in world.simulator.channels},
+        "units": {channel.name: channel.unit for channel in channels},
     }

@@ -91,10 +91,12 @@ def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
     # Only the first answers say which coefficients modify, and only of effects that act at all.
     modified = list(_modified(world, probes, acting))
     places = np.flatnonzero(acting)
-    probes, values = [probes[i] for i in places], values[..., places]
+    probes = [probes[i] for i in places]
+    values = values[..., places]
     if modified:
         more = _responses(world, at, modified)
-        probes, values = [*probes, *modified], np.concatenate([values, more], axis=3)
+        probes += modified
+        values = np.concatenate([values, more], axis=3)
     return Directions(tuple(probes), values)
 
 
@@ -103,20 +105,29 @@ def _first(world: World, name: str) -> Iterator[Probe]:
     parameters = _parameters(world, name)
     # A coefficient that cannot be zero does not scale: it says where or how the others act.
     shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
-    scaling = [i for i in range(len(parameters)) if i not in shaping]
+    count = len(parameters)
+    scaling = [i for i in range(count) if i not in shaping]
     grids = [_grid(world, parameters[i]) for i in shaping]
     group = 0
     # Coefficients that scale at one point of the grid act together: a sine with its cosine.
     for point in product(*grids):
         for place in scaling:
             low, high = parameters[place].bounds
-            c = np.zeros(len(parameters))
+            c = np.zeros(count)
             c[shaping] = point
             c[place] = SMALL * high
-            yield Probe(name, group, place, c, low < 0)
+            yield Probe(
+                effect=name,
+                group=group,
+                place=place,
+                c=c,
+                signed=low < 0,
+            )
         group += 1
-    of_input = world.effects[name].coefficients[0].of == "input"
-    if of_input and parameters[0].bounds[0] == 0:
+    leading = world.effects[name].coefficients[0]
+    least, _ = parameters[0].bounds
+    # Of a limit no small size is like a large one: it is tried where the input reaches it.
+    if leading.of == "input" and least == 0:
         yield from _limits(world, name, group)
 
 
@@ -126,20 +137,29 @@ def _limits(world: World, name: str, group: int) -> Iterator[Probe]:
     if not largest > 0:
         return
     for number, level in enumerate(LEVELS, start=group):
-        c = np.array([level * largest])
-        yield Probe(name, number, 0, c, signed=False, fixed=True)
+        yield Probe(
+            effect=name,
+            group=number,
+            place=0,
+            c=np.array([level * largest]),
+            signed=False,
+            fixed=True,
+        )
 
 
 def _largest_input(world: World) -> Iterator[float]:
     """Of each run, of its first input."""
     for track in world.tracks:
-        signal = next(iter(track.scenario.inputs.values()), np.zeros(1))
-        yield float(np.abs(signal).max())
+        signals = track.scenario.inputs.values()
+        first = next(iter(signals), np.zeros(1))
+        yield float(np.abs(first).max())
 
 
 def _parameters(world: World, name: str) -> Sequence[Parameter]:
     """The coefficients of an effect, with their units and plausible ranges."""
-    return effect_parameters(world.effects[name], world.simulator.system, world.channels)
+    effect = world.effects[name]
+    system = world.simulator.system
+    return effect_parameters(effect, system, world.channels)
 
 
 def _grid(world: World, parameter: Parameter) -> Array:
@@ -147,10 +167,12 @@ def _grid(world: World, parameter: Parameter) -> Array:
     low, high = parameter.bounds
     if parameter.unit == "Hz":
         # What comes and goes must do so once in a run, or any slow change would be periodic.
-        slowest = min(max(low, CYCLES / world.longest), high / 2.0)
+        seldom = max(low, CYCLES / world.longest)
+        slowest = min(seldom, high / 2.0)
         return _frequencies(slowest, high, world.longest)
     if _is_period(world, parameter):
-        return 1.0 / _frequencies(1.0 / high, 1.0 / low, world.travel)
+        frequencies = _frequencies(1.0 / high, 1.0 / low, world.travel)
+        return 1.0 / frequencies
     return np.geomspace(low, high, SHAPES)
 
 
@@ -164,8 +186,7 @@ def neighbours(world: World, fit: Fit) -> Iterator[Start]:
     nearest such minimum.
     """
     for name in fit.effects:
-        places = range(*world.slots[name].indices(len(world.parameters)))
-        for place in places:
+        for place in world.places(name):
             parameter = world.parameters[place]
             value = float(fit.theta[place])
             for moved in _shifted(world, parameter, value):
@@ -182,12 +203,14 @@ def _shifted(world: World, parameter: Parameter, value: float) -> Iterator[float
         elif _is_period(world, parameter) and value > 0:
             frequency = 1.0 / value + cycles / world.travel
             # Slower than the longest period it might turn its sign.
-            yield 1.0 / max(frequency, 1.0 / parameter.bounds[1])
+            lowest = 1.0 / parameter.bounds[1]
+            yield 1.0 / max(frequency, lowest)
 
 
 def _frequencies(low: float, high: float, extent: float) -> Array:
     """Frequencies from low to high, half a cycle over the extent apart where they lie closest."""
-    count = int(np.clip(2.0 * (high - low) * extent, 4, FREQUENCIES))
+    halves = 2.0 * (high - low) * extent
+    count = int(np.clip(halves, 4, FREQUENCIES))
     # Slow ones lie closer: as periods they would else be far apart.
     shares = np.linspace(0.0, 1.0, count) ** SPREAD
     frequencies: Array = low + (high - low) * shares
@@ -207,7 +230,11 @@ def _acting(world: World, probes: Sequence[Probe], values: Array) -> Mask:
 
 def _sizes(probes: Sequence[Probe]) -> Array:
     """(K,) of the coefficient that scales; one where the direction is the whole change."""
-    return np.array([1.0 if p.fixed else p.c[p.place] for p in probes])
+    sizes = []
+    for probe in probes:
+        size = 1.0 if probe.fixed else probe.c[probe.place]
+        sizes.append(size)
+    return np.array(sizes)
 
 
 def _modified(world: World, probes: Sequence[Probe], acting: Mask) -> Iterator[Probe]:
@@ -215,23 +242,41 @@ def _modified(world: World, probes: Sequence[Probe], acting: Mask) -> Iterator[P
     acts.
     """
     leading: dict[str, Probe] = {}
+    idle: list[Probe] = []
     for probe, acts in zip(probes, acting, strict=True):
         if acts:
             leading.setdefault(probe.effect, probe)
+        # At its first shape a coefficient has shown already whether it acts by itself.
+        elif probe.group == 0 and not probe.fixed:
+            idle.append(probe)
     modifiers: dict[str, list[Probe]] = {}
-    for probe, acts in zip(probes, acting, strict=True):
-        if not acts and probe.effect in leading and not probe.fixed and probe.group == 0:
+    for probe in idle:
+        # Nothing of an effect that does not act at all can be modified.
+        if probe.effect in leading:
             modifiers.setdefault(probe.effect, []).append(probe)
-    for name, idle in modifiers.items():
-        first, parameters = leading[name], _parameters(world, name)
-        for group, point in enumerate(product(MODIFIED, repeat=len(idle)), start=1):
-            # All at zero is the effect as it was tried first.
-            if not any(point):
-                continue
-            c = first.c.copy()
-            for modifier, share in zip(idle, point, strict=True):
-                c[modifier.place] = share * parameters[modifier.place].bounds[1]
-            yield Probe(name, group, first.place, c, first.signed)
+    for name, members in modifiers.items():
+        yield from _grid_points(world, leading[name], members)
+
+
+def _grid_points(world: World, first: Probe, modifiers: Sequence[Probe]) -> Iterator[Probe]:
+    """An effect's first probe that acts, with its modifiers at every combination of sizes."""
+    parameters = _parameters(world, first.effect)
+    points = product(MODIFIED, repeat=len(modifiers))
+    for group, point in enumerate(points, start=1):
+        # All at zero is the effect as it was tried first.
+        if not any(point):
+            continue
+        c = first.c.copy()
+        for modifier, share in zip(modifiers, point, strict=True):
+            _, high = parameters[modifier.place].bounds
+            c[modifier.place] = share * high
+        yield Probe(
+            effect=first.effect,
+            group=group,
+            place=first.place,
+            c=c,
+            signed=first.signed,
+        )
 
 
 def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
@@ -256,9 +301,10 @@ def simulate_with(world: World, at: Fit, added: Sequence[tuple[str, Array]]) -> 
     for row, (name, c) in zip(theta, added, strict=True):
         row[world.slots[name]] = c
     # All candidates of all runs in one call: the engine steps its lanes at once.
-    seen = world.simulate(
-        np.repeat(theta, runs, axis=0),
-        np.tile(np.arange(runs), len(added)),
-        np.tile(at.states, (len(added), 1)),
+    count = len(added)
+    simulated = world.simulate(
+        theta=np.repeat(theta, runs, axis=0),
+        runs=np.tile(np.arange(runs), count),
+        states=np.tile(at.states, (count, 1)),
     )
-    return seen.reshape(len(added), runs, *seen.shape[1:])
+    return simulated.reshape(count, runs, *simulated.shape[1:])

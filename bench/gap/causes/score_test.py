@@ -37,7 +37,7 @@ For effects k and surrogates s, with chance_k the 90 % quantile of score_k over 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
@@ -155,15 +155,22 @@ class Products:
     def __init__(
         self, at: Fit, residuals: Array, directions: Array, seen: Mask, sigma: Array
     ) -> None:
-        self._own, self._states = at.free.size, at.jacobian.shape[3] - at.free.size
+        self._own = at.free.size
+        self._states = at.jacobian.shape[3] - at.free.size
         self._runs: list[_Run] = []
         # Behind a gap noise starts anew: what it remembers of before is not known.
         follows = np.zeros_like(seen)
         follows[:, 1:] = seen[:, 1:] & seen[:, :-1]
+        units = sigma[:, None]
         for r in range(len(seen)):
-            columns = np.concatenate([at.jacobian[r], directions[r]], axis=2) / sigma[:, None]
-            scaled = residuals[r] / sigma[:, None]
-            self._runs.append(_products(columns, scaled, seen[r], follows[r]))
+            columns = np.concatenate([at.jacobian[r], directions[r]], axis=2)
+            run = _products(
+                columns / units,
+                residuals[r] / units,
+                seen[r],
+                follows[r],
+            )
+            self._runs.append(run)
 
     def projected(self, phi: float) -> tuple[Array, Array, Array]:
         """Products of eq. (2) after whitening by a correlation.
@@ -175,33 +182,47 @@ class Products:
         total, cross, normal, whole = self._without_states(phi)
         # (2) once more, for the parameters that all runs share.
         inverse = _inverse(normal[:q, :q])
-        shared, mixed = cross[:q], normal[q:, :q]
-        total = total - np.einsum("ks,kl,ls->s", shared, inverse, shared)
+        shared = cross[:q]
+        mixed = normal[q:, :q]
+        absorbed = np.einsum("ks,kl,ls->s", shared, inverse, shared)
+        left = total - absorbed
         gram = normal[q:, q:] - mixed @ inverse @ normal[:q, q:]
         both = cross[q:] - mixed @ (inverse @ shared)
+
         # Of directions that are absorbed only rounding is left, which would explain at random.
         acting = np.diagonal(gram) > ABSORBED * whole
-        gram = np.where(acting[:, None] & acting, (gram + gram.T) / 2.0, 0.0)
-        return np.maximum(total, 0.0), gram, np.where(acting[:, None], both, 0.0)
+        rows = acting[:, None]
+        # Rounding has made the two halves differ, and an eigensolver reads one of them.
+        symmetric = (gram + gram.T) / 2.0
+        gram = np.where(rows & acting, symmetric, 0.0)
+        both = np.where(rows, both, 0.0)
+        return np.maximum(left, 0.0), gram, both
 
     def _without_states(self, phi: float) -> tuple[Array, Array, Array, Array]:
         """Sums over runs of what each run's initial states leave: of residuals, of both, of
         parameters and directions; and the squares of directions before anything is taken out.
         """
-        q, s = self._own, self._states
-        own = slice(q, q + s)
+        q = self._own
+        last = q + self._states
+        own = slice(q, last)
         total: Array = np.zeros(())
-        cross, normal, whole = total, total, total
+        cross = normal = whole = total
         for run in self._runs:
-            n, c, t = run.columns.at(phi), run.cross.at(phi), run.squares.at(phi)
-            whole = whole + np.diagonal(n)[q + s :]
-            rest = np.r_[0:q, q + s : len(n)]
+            n = run.columns.at(phi)
+            c = run.cross.at(phi)
+            t = run.squares.at(phi)
+            whole = whole + np.diagonal(n)[last:]
+
             # (2) with the initial states of this run for J.
+            rest = np.r_[0:q, last : len(n)]
             inverse = _inverse(n[own, own])
             mixed = n[rest][:, own]
-            total = total + t - np.einsum("ks,kl,ls->s", c[own], inverse, c[own])
-            cross = cross + c[rest] - mixed @ (inverse @ c[own])
-            normal = normal + n[np.ix_(rest, rest)] - mixed @ inverse @ n[own][:, rest]
+            states = c[own]
+            absorbed = np.einsum("ks,kl,ls->s", states, inverse, states)
+            total = total + t - absorbed
+            cross = cross + c[rest] - mixed @ (inverse @ states)
+            others = n[np.ix_(rest, rest)]
+            normal = normal + others - mixed @ inverse @ n[own][:, rest]
         return total, cross, normal, whole
 
 
@@ -214,45 +235,61 @@ def _products(columns: Array, residuals: Array, seen: Mask, follows: Mask) -> _R
         seen: (T, C) which samples there are.
         follows: (T, C) which of them have a forerunner.
     """
-    first, later = seen & ~follows, follows[1:]
-    x_first, e_first = (_rows(part, first) for part in (columns, residuals))
-    x_now, e_now = (_rows(part[1:], later) for part in (columns, residuals))
-    x_before, e_before = (_rows(part[:-1], later) for part in (columns, residuals))
-    mixed = x_now.T @ x_before
-    return _Run(
-        Parts(
-            np.square(e_first).sum(axis=0),
-            np.square(e_now).sum(axis=0),
-            2.0 * (e_now * e_before).sum(axis=0),
-            np.square(e_before).sum(axis=0),
-        ),
-        Parts(x_first.T @ x_first, x_now.T @ x_now, mixed + mixed.T, x_before.T @ x_before),
-        Parts(
-            x_first.T @ e_first,
-            x_now.T @ e_now,
-            x_now.T @ e_before + x_before.T @ e_now,
-            x_before.T @ e_before,
-        ),
+    first = seen & ~follows
+    later = follows[1:]
+    x_first = _rows(columns, first)
+    e_first = _rows(residuals, first)
+    x_now = _rows(columns[1:], later)
+    e_now = _rows(residuals[1:], later)
+    x_before = _rows(columns[:-1], later)
+    e_before = _rows(residuals[:-1], later)
+    # Of residuals only each with itself is asked for, never one surrogate with another.
+    squares = Parts(
+        first=np.square(e_first).sum(axis=0),
+        now=np.square(e_now).sum(axis=0),
+        mixed=2.0 * (e_now * e_before).sum(axis=0),
+        before=np.square(e_before).sum(axis=0),
     )
+    mixed = x_now.T @ x_before
+    products = Parts(
+        first=x_first.T @ x_first,
+        now=x_now.T @ x_now,
+        mixed=mixed + mixed.T,
+        before=x_before.T @ x_before,
+    )
+    cross = Parts(
+        first=x_first.T @ e_first,
+        now=x_now.T @ e_now,
+        mixed=x_now.T @ e_before + x_before.T @ e_now,
+        before=x_before.T @ e_before,
+    )
+    return _Run(squares, products, cross)
 
 
 def _rows(values: Array, mask: Mask) -> Array:
     """Values (T, C, M) where the mask (T, C) holds, (n, M)."""
-    return values.reshape(-1, values.shape[2]) if mask.all() else values[mask]
+    # Without gaps a view will do, and these are the largest arrays of the test.
+    if mask.all():
+        return values.reshape(-1, values.shape[2])
+    return values[mask]
 
 
 def _inverse(normal: Array) -> Array:
     """Of a positive semidefinite matrix; directions that hardly count are left out."""
     # Columns of any unit on one scale, so that the cut-off means the same for each.
-    scale = np.sqrt(np.maximum(np.diagonal(normal), 0.0))
+    powers = np.maximum(np.diagonal(normal), 0.0)
+    scale = np.sqrt(powers)
     # A row of zeros stays one: divided by infinity it has no part in any direction.
     scale = np.where(scale > 0, scale, np.inf)
     if not scale.size:
         return normal
-    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
-    counted = values > RANK * max(float(values[-1]), 1e-300)
+    units = np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(normal / units)
+    largest = max(float(values[-1]), 1e-300)
+    counted = values > RANK * largest
     some = vectors[:, counted]
-    result: Array = (some / values[counted]) @ some.T / np.outer(scale, scale)
+    weighted = some / values[counted]
+    result: Array = weighted @ some.T / units
     return result
 
 
@@ -260,10 +297,12 @@ def groups(directions: Directions) -> list[Group]:
     """The directions that act together."""
     places: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(directions.probes):
-        places.setdefault((probe.effect, probe.group), []).append(i)
+        key = probe.effect, probe.group
+        places.setdefault(key, []).append(i)
     members = []
     for (effect, _), columns in places.items():
-        positive = tuple(not directions.probes[i].signed for i in columns)
+        probes = [directions.probes[i] for i in columns]
+        positive = tuple(not probe.signed for probe in probes)
         members.append(Group(effect, tuple(columns), positive))
     return members
 
@@ -280,55 +319,73 @@ def explained(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
     if count > SMALL:
         return _jointly(gram, cross, group)
     samples = cross.shape[1]
-    best, coefficients = np.zeros(samples), np.zeros((count, samples))
+    best = np.zeros(samples)
+    coefficients = np.zeros((count, samples))
+    for chosen in _choices(count):
+        columns = [group.columns[i] for i in chosen]
+        solved = _solved(gram, cross, columns)
+        if solved is None:
+            continue
+        gain, c, scaled = solved
+        allowed = np.ones(samples, dtype=bool)
+        for i, row in zip(chosen, scaled, strict=True):
+            if group.positive[i]:
+                allowed &= row >= 0
+        # More columns must explain more than rounding: else the fewer stand.
+        more = gain > best * (1.0 + 1e-9)
+        better = allowed & more
+        best = np.where(better, gain, best)
+        # Columns that are not chosen have no part in it.
+        whole = np.zeros_like(coefficients)
+        whole[chosen] = c
+        coefficients = np.where(better, whole, coefficients)
+    return best, coefficients
+
+
+def _choices(count: int) -> Iterator[list[int]]:
+    """Every choice of at least one of so many columns, those of fewer first."""
     for size in range(1, count + 1):
         for chosen in combinations(range(count), size):
-            solved = _solved(gram, cross, [group.columns[i] for i in chosen])
-            if solved is None:
-                continue
-            gain, c, scaled = solved
-            allowed = np.ones(samples, dtype=bool)
-            for i, row in zip(chosen, scaled, strict=True):
-                if group.positive[i]:
-                    allowed &= row >= 0
-            # More columns must explain more than rounding: else the fewer stand.
-            better = allowed & (gain > best * (1.0 + 1e-9))
-            best = np.where(better, gain, best)
-            whole = np.zeros_like(coefficients)
-            whole[list(chosen)] = c
-            coefficients = np.where(better, whole, coefficients)
-    return best, coefficients
+            yield list(chosen)
 
 
 def _solved(gram: Array, cross: Array, columns: list[int]) -> tuple[Array, Array, Array] | None:
     """h'G^-1 h (S,) of some columns, G^-1 h (k, S), and that in units of the columns' lengths; None
     where columns are absorbed or alike.
     """
-    scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 0.0))
+    powers = np.diagonal(gram)[columns]
+    scale = np.sqrt(np.maximum(powers, 0.0))
     if not (scale > 0).all():
         return None
-    normal = gram[np.ix_(columns, columns)] / np.outer(scale, scale)
+    products = gram[np.ix_(columns, columns)]
+    normal = products / np.outer(scale, scale)
     # Columns that are alike share what they explain in any way: a choice with fewer has it.
     if np.linalg.eigvalsh(normal)[0] < RANK:
         return None
-    right = cross[columns] / scale[:, None]
+    lengths = scale[:, None]
+    right = cross[columns] / lengths
     scaled = np.linalg.solve(normal, right)
     gain = np.einsum("ks,ks->s", scaled, right)
-    return gain, scaled / scale[:, None], scaled
+    return gain, scaled / lengths, scaled
 
 
 def _jointly(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
     """The same for a group of many columns, none of them held."""
     columns = list(group.columns)
     # Of many columns some nearly repeat others, as hats that overlap do: what they add is rounding.
-    scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 1e-300))
-    scaled = gram[np.ix_(columns, columns)] / np.outer(scale, scale)
+    powers = np.diagonal(gram)[columns]
+    scale = np.sqrt(np.maximum(powers, 1e-300))
+    products = gram[np.ix_(columns, columns)]
+    scaled = products / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(scaled)
     counted = values > RANK * values[-1]
-    some, weights = vectors[:, counted], values[counted, None]
-    right = some.T @ (cross[columns] / scale[:, None])
-    gain: Array = np.einsum("ks,ks->s", right, right / weights)
-    return gain, (some @ (right / weights)) / scale[:, None]
+    some = vectors[:, counted]
+    lengths = scale[:, None]
+    # Along eigenvectors G is diagonal, and h'G^-1 h a sum of one term for each.
+    right = some.T @ (cross[columns] / lengths)
+    solved = right / values[counted, None]
+    gain: Array = np.einsum("ks,ks->s", right, solved)
+    return gain, (some @ solved) / lengths
 
 
 def score(
@@ -352,14 +409,24 @@ def score(
     # One column for the residual and one for each surrogate: all are scored in the same products.
     everything = residual[..., None]
     if surrogate is not None:
-        everything = np.concatenate([everything, np.moveaxis(surrogate, 0, -1)], axis=3)
-    table = _Table(groups(directions), everything.shape[3], int(seen.sum()))
-    products = Products(at, everything, directions.values, seen, noise.sigma)
+        drawn = np.moveaxis(surrogate, 0, -1)
+        everything = np.concatenate([everything, drawn], axis=3)
+    columns = everything.shape[3]
+    table = _Table(groups(directions), columns, int(seen.sum()))
+    products = Products(
+        at,
+        everything,
+        directions.values,
+        seen,
+        noise.sigma,
+    )
     # A grid: the products of one pass over the samples serve every correlation.
     for phi in GRID:
-        determinant = 2.0 * log_determinant(seen, np.full(seen.shape[2], phi))
+        common = np.full(seen.shape[2], phi)
+        determinant = 2.0 * log_determinant(seen, common)
         table.enter(phi, determinant, *products.projected(phi))
-    return _ranked(table.names, table.best - table.without, table.hypotheses, table.white)  # (4)
+    gains = table.best - table.without  # (4)
+    return _ranked(table.names, gains, table.hypotheses, table.white)
 
 
 class _Table:
@@ -373,14 +440,15 @@ class _Table:
 
     def __init__(self, members: Sequence[Group], columns: int, count: int) -> None:
         self._count = count
-        self.names = list(dict.fromkeys(group.effect for group in members))
-        self.best = np.full((len(self.names), columns), -np.inf)
-        self.without = np.full(columns, -np.inf)
-        self.white = np.zeros(len(self.names))
-        self.hypotheses: dict[str, list[_Hypothesis]] = {name: [] for name in self.names}
+        self.hypotheses: dict[str, list[_Hypothesis]] = {}
         for group in members:
             unknown = _Hypothesis(-np.inf, group, np.zeros(0), 0.0)
-            self.hypotheses[group.effect].append(unknown)
+            self.hypotheses.setdefault(group.effect, []).append(unknown)
+        self.names = list(self.hypotheses)
+        count = len(self.names)
+        self.best = np.full((count, columns), -np.inf)
+        self.without = np.full(columns, -np.inf)
+        self.white = np.zeros(count)
 
     def enter(
         self, phi: float, determinant: float, total: Array, gram: Array, cross: Array
@@ -408,10 +476,12 @@ class _Table:
                 value = determinant - self._count * np.log(left)  # (3)
                 self.best[row] = np.maximum(self.best[row], value)
                 # The first column is the residual; only its coefficients begin fits.
-                if value[0] > hypothesis.value:
-                    hypotheses[i] = _Hypothesis(float(value[0]), group, c[:, 0], phi)
+                own = float(value[0])
+                if own > hypothesis.value:
+                    hypotheses[i] = _Hypothesis(own, group, c[:, 0], phi)
+                # White noise is the one of the grid that leaves sums of squares as they are.
                 if phi == 0:
-                    ratio = float(np.log(total[0] / max(total[0] - gain[0], floor[0])))
+                    ratio = float(np.log(total[0] / left[0]))
                     self.white[row] = max(self.white[row], self._count * ratio)
 
 
@@ -434,10 +504,13 @@ def _peaks(hypotheses: Sequence[_Hypothesis]) -> tuple[Peak, ...]:
     if several:
         # Neighbours of the best are the same answer once more, so only local maxima count.
         around = np.concatenate([[-np.inf], values, [-np.inf]])
-        peaks = (values >= around[:-2]) & (values >= around[2:])
-    order = [i for i in np.argsort(-values, kind="stable") if peaks[i]]
-    chosen = order[: PEAKS if several else 1]
-    return tuple((hypotheses[i].group, hypotheses[i].c) for i in chosen)
+        above_former = values >= around[:-2]
+        above_latter = values >= around[2:]
+        peaks = above_former & above_latter
+    order = np.argsort(-values, kind="stable")
+    most = PEAKS if several else 1
+    chosen = [hypotheses[i] for i in order if peaks[i]][:most]
+    return tuple((hypothesis.group, hypothesis.c) for hypothesis in chosen)
 
 
 def _ranked(
@@ -451,26 +524,31 @@ def _ranked(
         hypotheses: the likeliest of each effect's groups.
         white: (E,) scores without correlation.
     """
-    observed, drawn = gains[:, 0], gains[:, 1:]
-    chance, p_value = np.zeros(len(names)), 1.0
+    observed = gains[:, 0]
+    drawn = gains[:, 1:]
+    chance = np.zeros(len(names))
+    p_value = 1.0
     if drawn.shape[1]:
         # An effect with many shapes gains more by chance, and must not set the level for the rest.
         chance = np.quantile(drawn, LUCK, axis=1)
         p_value = tail(drawn - chance[:, None], observed - chance)  # (5)
+    by_chance = drawn - chance[:, None]
     order = np.argsort(-observed, kind="stable")
     ranked = [names[i] for i in order]
     phi = 0.0
     if ranked:
-        phi = max(hypotheses[ranked[0]], key=lambda hypothesis: hypothesis.value).phi
+        best = hypotheses[ranked[0]]
+        phi = max(best, key=lambda hypothesis: hypothesis.value).phi
+    peaks = [_peaks(hypotheses[name]) for name in ranked]
     return Scores(
-        tuple(ranked),
-        observed[order],
-        chance[order],
-        tuple(_peaks(hypotheses[name]) for name in ranked),
-        p_value,
-        phi,
-        (drawn - chance[:, None])[order],
-        white[order],
+        effects=tuple(ranked),
+        score=observed[order],
+        chance=chance[order],
+        peaks=tuple(peaks),
+        p_value=p_value,
+        phi=phi,
+        by_chance=by_chance[order],
+        white=white[order],
     )
 
 
@@ -483,14 +561,19 @@ def tail(by_chance: Array, observed: Array) -> float:
     """
     if not observed.size:
         return 1.0
-    largest, value = np.sort(by_chance.max(axis=0)), float(observed.max())
+    largest = np.sort(by_chance.max(axis=0))
+    value = float(observed.max())
     count = largest.size
     above = int((largest >= value).sum())
     # Counting ends at one in the number of surrogates; smaller chances are extrapolated.
-    extreme = largest[int(EXTREME * count) :]
+    first = int(EXTREME * count)
+    extreme = largest[first:]
     begin = extreme[0]
     if value <= begin or count < FEWEST:
         # The residual counts among its surrogates, so that no p value is zero.
         return (1.0 + above) / (1.0 + count)
-    mean = max(float((extreme - begin).mean()), 1e-9)
-    return float(BEYOND * np.exp(-(value - begin) / mean))
+    # The scale of an exponential is the mean of what lies beyond its beginning.
+    beyond = extreme - begin
+    mean = max(float(beyond.mean()), 1e-9)
+    chance = BEYOND * np.exp(-(value - begin) / mean)
+    return float(chance)

@@ -107,7 +107,8 @@ def schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, 
     transposed = cross.transpose(0, 2, 1)
     inverse_cross = np.linalg.solve(inner, transposed)
     products = np.matmul(cross, inverse_cross)
-    return shared - products.sum(axis=0), inverse_cross  # (4)
+    schur: Array = shared - products.sum(axis=0)  # (4), its left side
+    return schur, inverse_cross
 
 
 def arrow_step(
