@@ -49,11 +49,7 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
         raise InputError(
             f"{recording}: no run is marked held_out, and only such runs were to count"
         )
-    recorded = runs[0].channels
-    for channel in extended.observe:
-        # Without it the error would be one over fewer channels than the model was fitted to.
-        if channel not in recorded:
-            raise unknown(f"channel of {recording}", channel, list(recorded))
+    _check_channels(recording, extended, list(runs[0].channels))
     engine = None if issubclass(kind, OwnSimulator) else extended.engine
     # Effects that the file does not name are not in the model, so they need not be at hand.
     world = World(
@@ -63,15 +59,20 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
         engine,
         candidates=list(extended.effects),
     )
-    floor = noise_floor(world, data)
-    white = np.zeros(len(floor.sigma))
-    counted = HeldOutRuns(world, Noise(floor.sigma, white))
-    (measured,) = counted.measure([_theta(world, extended)])
+    sigma = noise_floor(world, data).sigma
+    squares = _squares(world, _simulated(world, extended, sigma))
     world.close()
-    squares = _squares(world, measured.simulated)
     if not np.isfinite(squares).all():
         raise InputError(f"{recording}: the simulation failed with the parameters of {model}")
-    return _errors(world, squares, floor.sigma)
+    return _errors(world, squares, sigma)
+
+
+def _check_channels(recording: Path, extended: Extended, recorded: list[str]) -> None:
+    """Refuse a recording that lacks a channel of the model."""
+    for channel in extended.observe:
+        # Without it the error would be one over fewer channels than the model was fitted to.
+        if channel not in recorded:
+            raise unknown(f"channel of {recording}", channel, recorded)
 
 
 def _theta(world: World, extended: Extended) -> Array:
@@ -90,6 +91,14 @@ def _theta(world: World, extended: Extended) -> Array:
             if coefficient.name in numbers:
                 theta[place] = numbers[coefficient.name].value
     return theta
+
+
+def _simulated(world: World, extended: Extended, sigma: Array) -> Array:
+    """(R, T, C) the runs with the model's numbers, from initial states that are fitted to them."""
+    white = np.zeros(len(sigma))
+    runs = HeldOutRuns(world, Noise(sigma, white))
+    (measured,) = runs.measure([_theta(world, extended)])
+    return measured.simulated
 
 
 def _squares(world: World, simulated: Array) -> Array:

@@ -70,17 +70,23 @@ class Alternatives:
         # Alike is not as likely where structure is left, so there the effect found stands.
         preferred = effect if self.structure else ordered[0]
         return Evidence(
-            effect, alternatives, float(np.clip(p_value, 0.0, 1.0)), float(gain), preferred
+            effect=effect,
+            alternatives=alternatives,
+            p_value=float(np.clip(p_value, 0.0, 1.0)),
+            gain=float(gain),
+            preferred=preferred,
         )
 
     def _p_value(self, rest: Model, effect: str, gain: float) -> float:
         """Chance of such a gain, or of the best score of all, about the model without it."""
-        search, key = self.search, frozenset(rest.names)
+        search = self.search
+        key = frozenset(rest.names)
         known = search.scanned.get(key)
         scores = search.scan(rest) if known is None else known.scores
         chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         # The score is linear and the gain of a fit is not; either may see more.
-        by_refit = tail(scores.by_chance, np.array([gain - chances.get(effect, 0.0)]))
+        excess = gain - chances.get(effect, 0.0)
+        by_refit = tail(scores.by_chance, np.array([excess]))
         by_score = search.tests.get(key, 1.0)
         return min(by_score, by_refit)
 
@@ -90,7 +96,9 @@ class Alternatives:
         rivals = [(0.0, effect)]
         for other in list(self.search.models.values()):
             names = set(other.names)
-            if len(names) != len(model.names) or not shared < names:
+            same_size = len(names) == len(model.names)
+            # Only a model that differs in this one effect says what would do in its place.
+            if not same_size or not shared < names:
                 continue
             (added,) = names - shared
             # The model itself, and other fits of its effects.
@@ -108,16 +116,22 @@ class Alternatives:
         it; then what counts is how much of the gap is left.
         """
         trial = self.trial
-        both = trial is not None and other.names in trial.measured and model.names in trial.measured
+        # Only where both were tried do held-out runs compare them.
+        if trial is not None and not {model.names, other.names} <= trial.measured.keys():
+            trial = None
         if self.structure:
-            ratios = [ratio_of(self.search.excess(other), self.search.excess(model))]
-            if both and trial is not None:
-                ratios.append(ratio_of(trial.excess(other.names), trial.excess(model.names)))
+            left = self.search.excess(other)
+            ratios = [ratio_of(left, self.search.excess(model))]
+            if trial is not None:
+                left = trial.excess(other.names)
+                ratios.append(ratio_of(left, trial.excess(model.names)))
             return behind_in_excess(ratios)
         behind = model.merit - other.merit
         # Held-out runs are further data, so their likelihoods multiply.
-        if both and trial is not None:
-            behind += trial.measured[model.names].merit - trial.measured[other.names].merit
+        if trial is not None:
+            mine = trial.measured[model.names]
+            others = trial.measured[other.names]
+            behind += mine.merit - others.merit
         return behind
 
     def _is_plausible(self, effect: str) -> bool:
@@ -130,6 +144,8 @@ class Alternatives:
         system = world.simulator.system
         parameters = effect_parameters(world.effects[effect], system, world.channels)
         values = best.fit.theta[world.slots[effect]]
-        return all(
-            p.bounds[0] <= value <= p.bounds[1] for p, value in zip(parameters, values, strict=True)
-        )
+        for parameter, value in zip(parameters, values, strict=True):
+            low, high = parameter.bounds
+            if not low <= value <= high:
+                return False
+        return True

@@ -83,13 +83,21 @@ def name(search: Search, held_out: HeldOutRuns | None) -> Finding:
     )
     measured = trial.measured if trial is not None else None
     # The base is the one that was asked first, whatever better fit of it the search came upon.
-    return Finding(verdict_of(state), model, base, causes, left, (), measured)
+    return Finding(
+        verdict=verdict_of(state),
+        model=model,
+        base=base,
+        causes=causes,
+        remains=left,
+        measured=measured,
+    )
 
 
 def shows_nothing(search: Search) -> bool:
     """Whether nothing moves in the recording, and nothing should."""
     observed = search.world.observed
-    largest, smallest = np.nanmax(observed, axis=(0, 1)), np.nanmin(observed, axis=(0, 1))
+    largest = np.nanmax(observed, axis=(0, 1))
+    smallest = np.nanmin(observed, axis=(0, 1))
     ranges = largest - smallest
     # Parameters that the simulated runs do not show were frozen by the base fit.
     touched = len(search.frozen) != search.world.base.size
@@ -111,11 +119,12 @@ def unfixed(search: Search, base: Model) -> tuple[str, ...]:
     variances = np.diagonal(covariance(search, base))
     spread = np.sqrt(np.maximum(variances, 0.0))
     parameters = [search.world.parameters[place] for place in base.fit.free]
-    return tuple(
-        parameter.name
-        for parameter, sd in zip(parameters, spread.tolist(), strict=True)
-        if not rules.is_fixed(sd, *parameter.bounds)
-    )
+    vague = []
+    for parameter, sd in zip(parameters, spread.tolist(), strict=True):
+        low, high = parameter.bounds
+        if not rules.is_fixed(sd, low, high):
+            vague.append(parameter.name)
+    return tuple(vague)
 
 
 def _trial(search: Search, model: Model, held_out: HeldOutRuns | None) -> Trial | None:
@@ -126,8 +135,10 @@ def _trial(search: Search, model: Model, held_out: HeldOutRuns | None) -> Trial 
         return None
     models = search.models.values()
     # Parts of the model, since an effect without which held-out runs are as good will go.
-    parts = [m for m in models if set(m.names) < set(model.names)]
-    singles = sorted((m for m in models if len(m.names) == 1), key=lambda m: -m.merit)
+    names = set(model.names)
+    parts = [m for m in models if set(m.names) < names]
+    singles = [m for m in models if len(m.names) == 1]
+    singles.sort(key=lambda m: -m.merit)
     near = rivals(search, model)
     trial = Trial(held_out)
     # All at once: initial states are begun again from those of the nearest model.
@@ -175,4 +186,5 @@ def closed(search: Search, model: Model, left: Remains) -> float:
 def _loudness(search: Search, model: Model, noise: Array) -> float:
     """RMS of what a model leaves, in units of the noise."""
     left = search.residual(model.fit) / noise
-    return float(np.sqrt(np.square(left[search.seen]).mean()))
+    squares = np.square(left[search.seen])
+    return float(np.sqrt(squares.mean()))

@@ -48,9 +48,10 @@ def nominated(
         # The peaks of an effect are fitted apart: each may end in a minimum of its own.
         for peak, (group, scored) in enumerate(scores.peaks[i]):
             for c in _sizes(world, found, group, scored, name):
-                numbered.append((peak, _with(world, model, name, c)))
+                start = _with(world, model, name, c)
+                numbered.append((peak, start))
     # In patience the fit begins with the first part of the runs, so the nearest is asked there.
-    share = HORIZONS[0][0] if patient else 1.0
+    share = HORIZONS[0].share if patient else 1.0
     return _nearest(world, noise, numbered, share)
 
 
@@ -60,15 +61,19 @@ def _promising(scores: Scores, most: int, patient: bool) -> list[int]:
     order: list[int] = np.argsort(-promise, kind="stable").tolist()
     if patient:
         return order
-    good = [i for i in order if promise[i] >= PROMISING * promise[order[0]]][:most]
-    by_squares = np.argsort(-scores.white, kind="stable")[:WHITE].tolist()
-    return good + [i for i in by_squares if i not in good]
+    good = [i for i in order if promise[i] >= PROMISING * promise[order[0]]]
+    good = good[:most]
+    by_squares = np.argsort(-scores.white, kind="stable")
+    besides = by_squares[:WHITE].tolist()
+    return good + [i for i in besides if i not in good]
 
 
 def _with(world: World, model: Model, name: str, c: Array) -> Start:
     """The model with one more effect, which takes the place of those that it contains."""
-    theta, contained = model.fit.theta.copy(), world.effects[name].contains
+    contained = world.effects[name].contains
+    theta = model.fit.theta.copy()
     theta[world.slots[name]] = c
+    # Both at once would share what they explain in any way.
     for part in set(contained) & set(model.names):
         theta[world.slots[part]] = 0.0
     rest = [n for n in model.names if n not in contained]
@@ -96,9 +101,12 @@ def _sizes(
     # Of several coefficients the range says nothing about how they go together.
     if len(group.columns) > 1:
         return
-    reach = world.parameters[world.slots[name].start + first.place].bounds[1]
-    negative = tuple(-share for share in REACHES) if first.signed else ()
-    for share in (*REACHES, *negative):
+    place = world.slots[name].start + first.place
+    _, reach = world.parameters[place].bounds
+    shares = list(REACHES)
+    if first.signed:
+        shares += [-share for share in REACHES]
+    for share in shares:
         c = first.c.copy()
         c[first.place] = share * reach
         yield c
@@ -114,14 +122,18 @@ def _nearest(
         return []
     starts = [start for _, start in numbered]
     runs = len(world.tracks)
+    count = len(starts)
     theta = np.repeat([s.theta for s in starts], runs, axis=0)
     states = np.concatenate([s.states for s in starts])
-    seen = world.simulate(theta, np.tile(np.arange(runs), len(starts)), states, share)
-    seen = seen.reshape(len(starts), runs, *seen.shape[1:])
+    lanes = np.tile(np.arange(runs), count)
+    # All starts in one call: the engine steps its lanes at once.
+    seen = world.simulate(theta, lanes, states, share)
+    seen = seen.reshape(count, runs, *seen.shape[1:])
     counted = world.counted(share)
     best: dict[tuple[int, Names], tuple[float, Start]] = {}
     for (number, start), simulated in zip(numbered, seen, strict=True):
-        left = np.where(counted, world.observed - simulated, 0.0) / noise.sigma
+        residual = world.observed - simulated
+        left = np.where(counted, residual, 0.0) / noise.sigma
         cost = float(np.square(left).sum())
         key = (number, start.effects)
         nearest = best[key][0] if key in best else np.inf

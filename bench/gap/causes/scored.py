@@ -78,7 +78,14 @@ class Scored(Models):
         # The colour of noise is best known from a model that leaves less structure.
         meaningless = residual if against is None else against
         surrogate = surrogates(meaningless, self.seen, SURROGATES, self.rng)
-        scores = score(model.fit, residual, candidates, self.seen, self.weights(model), surrogate)
+        scores = score(
+            model.fit,
+            residual,
+            candidates,
+            self.seen,
+            self.weights(model),
+            surrogate,
+        )
         self.scanned[key] = Scanned(candidates, scores)
         self.tests[key] = scores.p_value
         # Kept from the first scan, so that merits stay comparable when a better base fit turns up.
@@ -108,9 +115,16 @@ class Scored(Models):
             candidates, scores = self.scanned[key]
             # The model may have been fitted better since it was put into the beam.
             newest = self.models[key]
-            for start in nominated(
-                self.world, self.noise, newest, candidates, scores, most, patient
-            ):
+            further = nominated(
+                self.world,
+                self.noise,
+                newest,
+                candidates,
+                scores,
+                most,
+                patient,
+            )
+            for start in further:
                 if patient or frozenset(start.effects) not in self.models:
                     starts.append(start)
         if starts:
@@ -138,8 +152,10 @@ class Scored(Models):
         """
         chance = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         # Of several effects the one that gains most by chance counts.
-        lucky = max((chance.get(name, 0.0) for name in larger.names), default=0.0)
-        return tail(scores.by_chance, np.array([gain - lucky]))
+        chances = [chance.get(name, 0.0) for name in larger.names]
+        lucky = max(chances, default=0.0)
+        excess = np.array([gain - lucky])
+        return tail(scores.by_chance, excess)
 
     def plain(self, model: Model, doubt: float) -> bool:
         """Whether nothing suggests that the model lacks something: neither a score nor the size of
@@ -161,4 +177,6 @@ class Scored(Models):
         # Stated noise is known, so more than it is no noise, whatever its colour.
         if (loud & self.stated).any():
             return False
-        return forgets(self.residual(model.fit), self.seen, model.likelihood) > FORGOT
+        # The test of Ljung and Box, eq. (5) of `bench.gap.model.noise`.
+        residual = self.residual(model.fit)
+        return forgets(residual, self.seen, model.likelihood) > FORGOT

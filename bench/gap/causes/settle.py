@@ -40,7 +40,8 @@ def settle(search: Search, model: Model) -> Model:
     # Where structure is left merits only compare how each model mimics it, so none takes its place.
     if noise is not None:
         judged = [m for m in near if abs(model.merit - m.merit) < NEAR] or [model]
-    starts = [m.fit.start() for m in (*near, *parts)]
+    starts = [m.fit.start() for m in near]
+    starts += [m.fit.start() for m in parts]
     search.refit([*starts, *around], noise)
     # A refit that ends worse than before is not kept, so the table holds the best of each.
     refitted = [search.models[frozenset(m.names)] for m in judged]
@@ -49,11 +50,18 @@ def settle(search: Search, model: Model) -> Model:
 
 def _among_all(search: Search, model: Model) -> Model:
     """The best of a model and those that have any other effect of the library in place of one."""
-    size, known = len(model.names), set(search.models)
+    size = len(model.names)
+    known = set(search.models)
     smaller = [search.without(model, name) for name in model.names]
     search.extend(smaller, len(search.world.library))
-    asked = [other for key, other in search.models.items() if key not in known and len(key) == size]
-    return max([model, *asked], key=lambda m: m.merit)
+    best = model
+    for key, other in search.models.items():
+        # Those that were known have been compared with it by the search.
+        if key in known or len(key) != size:
+            continue
+        if other.merit > best.merit:
+            best = other
+    return best
 
 
 def rivals(search: Search, model: Model) -> list[Model]:
@@ -75,12 +83,13 @@ def _is_near(search: Search, other: Model, model: Model) -> bool:
 
 def _smaller(search: Search, model: Model) -> list[Model]:
     """The models without one of the effects: the gain of each is measured against them."""
-    size, names = len(model.names) - 1, set(model.names)
-    return [
-        other
-        for other in search.models.values()
-        if len(other.names) == size and set(other.names) < names
-    ]
+    names = set(model.names)
+    size = len(names) - 1
+    smaller = []
+    for other in search.models.values():
+        if len(other.names) == size and set(other.names) < names:
+            smaller.append(other)
+    return smaller
 
 
 def _noise_of(search: Search, model: Model) -> Noise | None:

@@ -79,7 +79,10 @@ class Hat(Force):
         time = np.broadcast_to(moment.t, moment.speed.shape)
         variables = np.concatenate([time, moment.speed, moment.x], axis=1)
         value = np.take_along_axis(variables, variable.astype(np.intp), axis=1)
-        height = np.maximum(1.0 - np.abs(value - centre) / np.maximum(width, 1e-12), 0.0)  # (1)
+        # Off, a hat has no width either, and must not divide by it.
+        reach = np.maximum(width, 1e-12)
+        distance = np.abs(value - centre) / reach
+        height = np.maximum(1.0 - distance, 0.0)  # (1)
         # Smooth in the speed, so that no step has to be shortened where the motion turns.
         dry = -moment.v / (moment.speed + np.maximum(slow, 1e-9))
         axes = moment.x.shape[1]
@@ -123,13 +126,16 @@ def remains(models: Models, model: Model) -> Remains:
         model: the model.
     """
     world, stated = models.world, models.stated
-    left = np.where(np.isfinite(model.likelihood.sigma), model.likelihood.sigma, 0.0)
+    sigma = model.likelihood.sigma
+    # A channel without samples has no sigma, and leaves nothing.
+    left = np.where(np.isfinite(sigma), sigma, 0.0)
     excess = left / models.noise.sigma
-    loud = tuple(
-        name
-        for c, name in enumerate(world.channels)
-        if is_loud(excess[c], _error(models, model, c), stated[c])
-    )
+    channels = []
+    for c, name in enumerate(world.channels):
+        error = _error(models, model, c)
+        if is_loud(excess[c], error, stated[c]):
+            channels.append(name)
+    loud = tuple(channels)
     if Hat.name not in world.slots:
         return Remains(1.0, "", excess, loud)
     directions = hats(world, model)
@@ -138,10 +144,18 @@ def remains(models: Models, model: Model) -> Remains:
     residual = models.residual(model.fit)
     surrogate = surrogates(residual, models.seen, SURROGATES, models.rng)
     weights = models.weights(model)
-    scores = score(model.fit, residual, directions, models.seen, weights, surrogate)
+    scores = score(
+        model.fit,
+        residual,
+        directions,
+        models.seen,
+        weights,
+        surrogate,
+    )
     promise = scores.score - scores.chance
     where = scores.effects[int(np.argmax(promise))]
-    return Remains(scores.p_value, where, excess, loud, level_of(bool(stated.all())))
+    level = level_of(bool(stated.all()))
+    return Remains(scores.p_value, where, excess, loud, level)
 
 
 def _error(models: Models, model: Model, channel: int) -> float:
@@ -151,7 +165,9 @@ def _error(models: Models, model: Model, channel: int) -> float:
     # At a correlation of one the formula knows nothing, and every channel would be quiet.
     phi = min(abs(float(model.likelihood.phi[channel])), 0.99)
     count = max(int(models.seen[:, :, channel].sum()), 2)
-    return float(np.sqrt((1.0 + phi * phi) / (1.0 - phi * phi) / (2.0 * count)))  # (2)
+    square = phi * phi
+    variance = (1.0 + square) / (1.0 - square) / (2.0 * count)
+    return float(np.sqrt(variance))  # (2)
 
 
 def hats(world: World, model: Model) -> Directions:
@@ -164,8 +180,15 @@ def hats(world: World, model: Model) -> Directions:
         width = (family.high - family.low) / (BINS - 1)
         for centre in np.linspace(family.low, family.high, BINS):
             labels.append(family.label)
-            c = np.array([size, family.variable, centre, width, family.direction, slow])
-            added.append((Hat.name, c))
+            coefficients = [
+                size,
+                family.variable,
+                centre,
+                width,
+                family.direction,
+                slow,
+            ]
+            added.append((Hat.name, np.array(coefficients)))
     if not added:
         return Directions((), np.zeros((*world.observed.shape, 0)))
     changed = simulate_with(world, model.fit, added) - model.fit.simulated
@@ -173,8 +196,11 @@ def hats(world: World, model: Model) -> Directions:
     # A hat where no run ever is changes nothing, and would be a column of zeros.
     acting = np.flatnonzero(np.abs(values).max(axis=(0, 1, 2)) > 0)
     # One label for a family: its hats are one hypothesis, and act together.
-    probes = tuple(Probe(labels[i], 0, 0, added[i][1], True) for i in acting)
-    return Directions(probes, values[..., acting])
+    probes = []
+    for i in acting:
+        _, c = added[i]
+        probes.append(Probe(labels[i], group=0, place=0, c=c, signed=True))
+    return Directions(tuple(probes), values[..., acting])
 
 
 class _Family(NamedTuple):
@@ -195,7 +221,11 @@ def _families(world: World) -> Iterator[_Family]:
 
 
 def _over_time(world: World) -> Iterator[_Family]:
-    longest = max(float(t.scenario.times[-1] - t.scenario.times[0]) for t in world.tracks)
+    durations = []
+    for track in world.tracks:
+        times = track.scenario.times
+        durations.append(float(times[-1] - times[0]))
+    longest = max(durations)
     for axis, name in enumerate(world.simulator.system.coordinates):
         if name in world.channels:
             yield _Family(f"time, along {name}", TIME, ALONG + axis, 0.0, longest)
@@ -244,4 +274,8 @@ def _fastest(world: World) -> float:
                 step = np.diff(track.scenario.times[::3])
                 rates.append(np.diff(track.observed[::3, c]) / step)
         squares.append(np.square(np.concatenate(rates)))
-    return float(np.sqrt(np.nanquantile(sum(squares), 0.98))) if squares else 0.0
+    # A system whose coordinates are not recorded has no speed to lay hats over.
+    if not squares:
+        return 0.0
+    speed = np.nanquantile(sum(squares), 0.98)
+    return float(np.sqrt(speed))

@@ -48,8 +48,9 @@ class Trial:
         runs = self.runs
         noise = runs.noise.sigma if sigma is None else sigma
         residual = runs.world.observed - self.measured[names].simulated
-        left = (residual / noise)[runs.seen]
-        return float(np.sqrt(np.square(left).mean())) - 1.0
+        scaled = residual / noise
+        squares = np.square(scaled[runs.seen])
+        return float(np.sqrt(squares.mean())) - 1.0
 
     def without_idle(self, search: Search, model: Model) -> Model:
         """The model without effects that make held-out runs worse, or hardly better while much is
@@ -66,19 +67,25 @@ class Trial:
 
     def _smaller(self, search: Search, model: Model) -> list[Model]:
         """Models that were tried and lack one of the model's effects."""
-        size, names = len(model.names) - 1, set(model.names)
-        return [
-            m
-            for m in search.models.values()
-            if len(m.names) == size and set(m.names) < names and m.names in self.measured
-        ]
+        names = set(model.names)
+        size = len(names) - 1
+        smaller = []
+        for other in search.models.values():
+            # What was not tried on held-out runs has no voice there.
+            if other.names not in self.measured:
+                continue
+            if len(other.names) == size and set(other.names) < names:
+                smaller.append(other)
+        return smaller
 
     def _helps(self, without: Model, having: Model) -> bool:
         """Whether the effect by which two models differ makes held-out runs better."""
-        pair = without.names, having.names
-        before, after = (self.measured[names].merit for names in pair)
-        excess, rest = (self.excess(names) for names in pair)
-        return helps((before, after), (excess, rest))
+        before = self.measured[without.names].merit
+        after = self.measured[having.names].merit
+        # Both are asked: far from the noise a merit alone may be mimicry.
+        excess = self.excess(without.names)
+        left = self.excess(having.names)
+        return helps((before, after), (excess, left))
 
     def misses(self, model: Model, left: Remains) -> bool:
         """Whether held-out runs show a gap that the model does not close: something acts there that

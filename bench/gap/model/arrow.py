@@ -105,7 +105,8 @@ def schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, 
         The matrix (q, q) of (4), and every V_i⁻¹ W_iᵀ (R, s, q).
     """
     transposed = cross.transpose(0, 2, 1)
-    inverse_cross: Array = np.linalg.solve(inner, transposed)
+    solved = np.linalg.solve(inner, transposed)
+    inverse_cross = np.asarray(solved, dtype=np.float64)
     products = np.matmul(cross, inverse_cross)
     schur: Array = shared - products.sum(axis=0)  # (4), its left side
     return schur, inverse_cross

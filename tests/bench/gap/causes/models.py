@@ -1,0 +1,43 @@
+"""Models that nothing was fitted for: effects, a merit, and what they leave."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from bench.gap.measure import Measured
+from bench.gap.model.models import Model
+from bench.gap.model.noise import Likelihood
+from tests.bench.gap.made import linear_fit
+
+
+def model(*names, merit=0.0):
+    """A model with these effects; its likelihood is its merit."""
+    fit = linear_fit(np.zeros((1, 1, 1, 1)), 1)
+    fit = type(fit)(names, *list(vars(fit).values())[1:])
+    return Model(fit, Likelihood(merit, np.ones(1), np.zeros(1)), merit)
+
+
+def search_of(*models, excess=None):
+    """What stands for a search that has fitted them; `excess` by the effects of each."""
+    table = {frozenset(m.names): m for m in models}
+    excesses = excess or {}
+    return SimpleNamespace(
+        models=table,
+        excess=lambda m: excesses.get(m.names, 0.0),
+        without=lambda m, name: table[frozenset(m.names) - {name}],
+    )
+
+
+def held_out(left):
+    """Held-out runs of one channel with sigma 1 where models leave this RMS, by their effects; and
+    what was measured there: a model that leaves less has more merit.
+    """
+    runs = SimpleNamespace(
+        world=SimpleNamespace(observed=np.zeros((1, 4, 1))),
+        noise=SimpleNamespace(sigma=np.ones(1)),
+        seen=np.ones((1, 4, 1), dtype=bool),
+    )
+    measured = {
+        names: Measured(np.full((1, 4, 1), float(rms)), -100.0 * rms) for names, rms in left.items()
+    }
+    return runs, measured

@@ -1,0 +1,49 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench.gap.causes.alternatives import Alternatives
+from bench.gap.causes.rules import SWITCH
+from bench.gap.causes.trial import Trial
+from tests.bench.gap.causes.models import held_out, model, search_of
+
+BEST = model("a", merit=100.0)
+ALIKE = model("b", merit=100.0 - 0.5 * SWITCH)
+BEHIND = model("c", merit=100.0 - 2.0 * SWITCH)
+
+
+def evidence(monkeypatch, trial=None, structure=False, plausible="abc", **excess):
+    scores = SimpleNamespace(
+        effects=("a", "b", "c"), chance=np.zeros(3), by_chance=np.zeros((3, 40))
+    )
+    search = search_of(model(), BEST, ALIKE, BEHIND, excess={(n,): e for n, e in excess.items()})
+    search.scanned = {frozenset(): SimpleNamespace(scores=scores)}
+    search.tests = {frozenset(): 1e-5}
+    monkeypatch.setattr(Alternatives, "_is_plausible", lambda self, effect: effect in plausible)
+    (found,) = Alternatives(search, trial, structure).evidence(BEST)
+    return found
+
+
+def test_what_is_not_behind_by_the_odds_is_an_alternative(monkeypatch):
+    found = evidence(monkeypatch)
+    assert (found.effect, found.alternatives, found.preferred) == ("a", ("b",), "a")
+    assert found.gain == pytest.approx(100.0)
+    assert found.p_value <= 1e-5
+
+
+def test_a_rival_with_plausible_coefficients_is_preferred(monkeypatch):
+    assert evidence(monkeypatch, plausible="bc").preferred == "b"
+
+
+def test_held_out_runs_have_a_voice(monkeypatch):
+    left = {("a",): 1.0, ("b",): 1.2, ("c",): 0.8}
+    found = evidence(monkeypatch, Trial(*held_out(left)))
+    assert found.alternatives == ("c",), "merits of both add up"
+    assert found.preferred == "c"
+
+
+def test_where_structure_is_left_what_it_leaves_decides_and_the_effect_stands(monkeypatch):
+    found = evidence(monkeypatch, structure=True, a=1.0, b=1.5, c=0.9, plausible="bc")
+    assert found.alternatives == ("c",)
+    assert found.preferred == "a"

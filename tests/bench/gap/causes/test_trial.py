@@ -1,0 +1,39 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench.gap.causes.trial import Trial
+from tests.bench.gap.causes.models import held_out, model, search_of
+
+BASE, A, B, BOTH = model(), model("a"), model("b"), model("a", "b")
+
+
+def test_excess_is_what_is_left_over_the_noise():
+    trial = Trial(*held_out({(): 3.0}))
+    assert trial.excess(()) == pytest.approx(2.0)
+    assert trial.excess((), np.array([1.5])) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("left", "stands"),
+    [
+        ({(): 5.0, ("a",): 3.0, ("b",): 3.0, ("a", "b"): 1.0}, ("a", "b")),
+        ({(): 5.0, ("a",): 1.0, ("b",): 3.0, ("a", "b"): 1.1}, ("a",)),
+        # far from the noise a gain of less than a tenth is none, and then neither helps
+        ({(): 5.0, ("a",): 4.9, ("b",): 4.8, ("a", "b"): 4.7}, ()),
+        # a model that was not tried there has no voice
+        ({(): 5.0, ("b",): 3.0, ("a", "b"): 1.0}, ("a", "b")),
+    ],
+)
+def test_effects_that_do_not_help_go(left, stands):
+    trial = Trial(*held_out(left))
+    assert trial.without_idle(search_of(BASE, A, B, BOTH), BOTH).names == stands
+
+
+@pytest.mark.parametrize(("structure", "missed"), [(True, True), (False, False)])
+def test_what_is_left_is_noise_where_it_has_no_structure(structure, missed):
+    trial = Trial(*held_out({(): 9.0, ("a",): 2.0}))
+    loud = model("a")
+    loud.likelihood.sigma[:] = 2.0
+    assert trial.misses(loud, SimpleNamespace(structure=structure)) is missed
