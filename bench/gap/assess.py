@@ -58,7 +58,9 @@ class Assessor:
         causes = tuple(self._cause(cause, numbers) for cause in finding.causes)
         parameters = {world.parameters[i].name: numbers[i] for i in world.base.tolist()}
         # Counted before an experiment is proposed: what that simulates is not part of the answer.
-        simulations = world.simulations + (self.measuring.simulations if self.measuring else 0)
+        simulations = world.simulations
+        if self.measuring is not None:
+            simulations += self.measuring.simulations
         heldout = self._heldout(finding, rng)
         candidates = self._candidates(search, finding)
         proposed = self._next(search, finding)
@@ -137,7 +139,8 @@ class Assessor:
         scanned = search.scanned.get(frozenset())
         if scanned is None:
             return ()
-        scores, base = scanned.scores, search.base.likelihood.value
+        scores = scanned.scores
+        base = search.base.likelihood.value
         rows = []
         for i, effect in enumerate(scores.effects):
             score = float(scores.score[i])
@@ -145,8 +148,8 @@ class Assessor:
             alone = search.models.get(frozenset({effect}))
             if alone is not None:
                 score = max(score, float(alone.likelihood.value - base))
-            p_value = tail(scores.by_chance, np.array([score - scores.chance[i]]))
-            p_value = float(np.clip(p_value, 0.0, 1.0))
+            beyond_chance = np.array([score - scores.chance[i]])
+            p_value = float(np.clip(tail(scores.by_chance, beyond_chance), 0.0, 1.0))
             share = self._share(finding, (effect,))
             rows.append(Candidate(effect, max(score, 0.0), p_value, share))
         return tuple(sorted(rows, key=lambda row: -row.score))
@@ -161,7 +164,10 @@ class Assessor:
         # As the gain of the whole model is counted: nothing below the floor is a gain.
         before = _rmse(runs, measured[()].simulated, counted)
         after = _rmse(runs, measured[names].simulated, counted)
-        share = (before - max(after, floor)) / (before - floor) if before > floor * 1.001 else 0.0
+        share = 0.0
+        # At the floor there is no gap to have a share of: the quotient would be one of rounding.
+        if before > floor * 1.001:
+            share = (before - max(after, floor)) / (before - floor)
         return float(np.clip(share, WORST, 1.0)) if np.isfinite(share) else None
 
     def _next(self, search: Search, finding: Finding) -> Experiment | None:

@@ -87,6 +87,7 @@ class Explanation:
             contents[folder / f"{name}.png"] = figure.png
             contents[folder / f"{name}.pdf"] = figure.pdf
         contents[folder / "report.html"] = self._page(figures, for_print=True)
+        # All is drawn before the first file is made: what fails until here leaves no trace.
         try:
             folder.mkdir(parents=True, exist_ok=True)
             write_all(contents)
@@ -103,6 +104,7 @@ class Explanation:
 
     def __repr__(self) -> str:
         lines = [f"{self.verdict}: {self.story.title}", self._causes_in_words(), self._gain()]
+        # Titles and names are from files: a long one must not fill the cell.
         return "\n".join(clean(line, WIDEST) for line in lines if line)
 
     def _causes_in_words(self) -> str:

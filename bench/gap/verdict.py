@@ -205,6 +205,7 @@ class Verdict:
 
 def finite(value: float) -> float | None:
     """A number as JSON has it: None where the data gave none."""
+    # NaN is no JSON: strict readers refuse the whole file for it.
     return value if np.isfinite(value) else None
 
 

@@ -48,6 +48,7 @@ def account(story: Story) -> list[str]:
     """The lines that a terminal shows: the verdict in a sentence, the gain, where, what moved, what
     remains.
     """
+    # The title comes from a file: it must not break the line, nor command the terminal.
     lines = [clean(story.title, WIDTH), ""]
     for text in (headline(story), *following(story)):
         lines += wrap(text, WIDTH)
@@ -65,14 +66,18 @@ def details(story: Story) -> Iterator[str]:
         name = f"{sentence(noun(cause.effect))[:-1]} ({clean(cause.effect, 60)})"
         says = "" if explained else f"{_says(cause)}; "
         yield f"{name}: {says}{coefficients(cause)}"
+    # The most important reasons come first; the page has all of them.
     if story.why:
         yield "Why: " + " ".join(sentence(text) for text in story.why[:2])
-    places = [text for kind in ("run", "channel", "phase") if (text := largest(story, kind))]
+    largest_places = [largest(story, kind) for kind in ("run", "channel", "phase")]
+    places = [text for text in largest_places if text]
+    # Without a gap the largest of its parts is one of chance.
     if places and verdict != "adequate":
         unit = "RMS in units of the noise (1 is the noise floor)"
         yield f"Where the gap is largest, {unit}: {'; '.join(places)}."
     if story.parameters:
-        yield "Parameters: " + " ".join(moves(story, p) for p in story.parameters)
+        sentences = [moves(story, p) for p in story.parameters]
+        yield "Parameters: " + " ".join(sentences)
     if story.remains:
         yield "What remains: " + " ".join(sentence(text) for text in story.remains)
     # Where causes cannot be told apart the experiment stands right below the headline.
@@ -89,6 +94,7 @@ def _says(cause: Cause) -> str:
 def headline(story: Story) -> str:
     """What is wrong with the simulator, in one sentence."""
     verdict, causes = story.verdict.verdict, story.verdict.causes
+    # No cause is said to be lacking where the verdict does not vouch for it.
     if verdict == "adequate":
         return "Nothing is missing from the simulation that these data can show."
     if verdict == "unidentifiable":
@@ -112,6 +118,7 @@ def _sets(causes: Sequence[Cause]) -> str:
     """The causes, those that have alternatives last: ``wind, and linear drag or Coulomb
     friction``.
     """
+    # Causes that are certain share one list; each open one is a list with "or" of its own.
     sure = [noun(cause.effect) for cause in causes if not cause.alternatives]
     parts = [joined(sure)] if sure else []
     for cause in causes:
@@ -125,6 +132,7 @@ def unfixed(story: Story) -> list[str]:
     """Parameters that the recording cannot fix: those named so, else without interval, else not
     touched, else all.
     """
+    # Each list is the fallback of the one before: some parameter must be named.
     unbounded = [p.name for p in story.parameters if p.touched and not np.isfinite(p.before).all()]
     untouched = [p.name for p in story.parameters if not p.touched]
     names = list(story.vague) or unbounded or untouched or [p.name for p in story.parameters]
@@ -134,13 +142,15 @@ def unfixed(story: Story) -> list[str]:
 def following(story: Story) -> Iterator[str]:
     """The sentences that follow the headline at once: the gain, and what the verdict owes."""
     verdict = story.verdict.verdict
+    # To find nothing says little without what was looked for, and what could not have been seen.
     if verdict == "adequate":
         yield looked_for(story)
         yield hiding(story)
     yield gain(story)
     if verdict == "partial" or (verdict == "named" and len(story.verdict.causes) > 1):
-        causes = story.verdict.causes
-        yield sentence("; ".join(f"{noun(cause.effect)}: {_says(cause)}" for cause in causes))
+        # The headline says what a single named cause does; here the others have their turn.
+        sayings = [f"{noun(cause.effect)}: {_says(cause)}" for cause in story.verdict.causes]
+        yield sentence("; ".join(sayings))
     if verdict == "ambiguous":
         yield "To tell them apart: " + (experiment(story) or "no experiment is proposed.")
 
@@ -155,6 +165,7 @@ def gain(story: Story) -> str:
     base = _error(story, held_out.rmse_base)
     extended = _error(story, held_out.rmse_extended)
     perfect = f"{PERFECT} {_error(story, held_out.noise_floor)}"
+    # Without a cause the extended model is the base model: there is no after.
     if not story.verdict.causes:
         return f"On held-out runs the tuned simulation errs by {base} (RMSE); {perfect}."
     errors = f"the error on held-out runs (RMSE) is {base} before and {extended} after; {perfect}."
@@ -207,12 +218,12 @@ def heldout_unit(story: Story) -> str:
     if held_out is not None and held_out.unit:
         return held_out.unit
     # Where it is not stated: the floor is the RMS of the noise of the channels of one unit.
-    floor = (held_out.noise_floor if held_out is not None else None) or 0.0
+    floor = held_out.noise_floor if held_out is not None else None
     units = list(dict.fromkeys(c.unit for c in story.channels))
     for unit in units:
         noises = [c.sigma for c in story.channels if c.unit == unit]
         together = float(np.sqrt(np.mean([sigma**2 for sigma in noises])))
-        if isclose(together, floor, rel_tol=0.02):
+        if isclose(together, floor or 0.0, rel_tol=0.02):
             return unit
     return units[0] if len(units) == 1 else "1"
 
@@ -236,6 +247,7 @@ def hiding(story: Story) -> str:
     """How large a gap the noise could hide, channel by channel."""
     parts = []
     for channel, size in zip(story.channels, hidden(story).tolist(), strict=True):
+        # A channel that was hardly recorded says nothing about what it hides.
         if isfinite(size):
             amount = with_unit(number(size, 2), channel.unit)
             share = f"{number(size / channel.sigma, 2)} of its noise"
@@ -263,6 +275,7 @@ def hidden(story: Story) -> Array:
         for side in sides(story):
             rows += [*((side.observed - side.before)[:, :, c] / channel.sigma)]
         residuals = np.concatenate([row[np.isfinite(row)] for row in rows])
+        # A single sample has no neighbour, and its square is no variance.
         if residuals.size < 2:
             sizes.append(np.nan)
             continue
@@ -290,7 +303,9 @@ def rms(story: Story, side: Side, which: str) -> float:
     """RMS of a side's residual over all channels in units of the noise; ``which`` is before or
     after.
     """
-    left = (side.observed - getattr(side, which)) / np.array([c.sigma for c in story.channels])
+    sigma = np.array([c.sigma for c in story.channels])
+    left = (side.observed - getattr(side, which)) / sigma
+    # The mean of nothing would warn.
     return float(np.sqrt(np.nanmean(left**2))) if np.isfinite(left).any() else float("nan")
 
 
@@ -311,6 +326,7 @@ def coefficients(cause: Cause) -> str:
 def largest(story: Story, kind: str) -> str:
     """The run, channel or phase with the largest gap, where there is a choice."""
     there = [place for place in story.places if place.kind == kind and isfinite(place.before)]
+    # Of one alone it goes without saying that its gap is the largest.
     if len(there) < 2:
         return ""
     place: Place = max(there, key=lambda p: p.before)
@@ -322,7 +338,8 @@ def moves(story: Story, p: Tuned) -> str:
     """How far a parameter moves once the cause is in: what the base model had bent to absorb of the
     gap.
     """
-    unit, name = f" {pretty(p.unit)}" if pretty(p.unit) else "", clean(p.name, 60)
+    name = clean(p.name, 60)
+    unit = f" {pretty(p.unit)}" if pretty(p.unit) else ""
     if not p.touched:
         nominal = f"its nominal {number(p.before[0])}{unit}"
         return f"{name} is not touched by these data and stays at {nominal}."
@@ -337,6 +354,7 @@ def shift(p: Tuned) -> str:
     """The move of a parameter as a signed percentage, or a number where it began at zero."""
     move = p.after[0] - p.before[0]
     sign = "+" if move > 0 else ""
+    # Of zero there is no share, and "+4000 %" says less than the number.
     if not p.before[0] or abs(move / p.before[0]) > FAR:
         return sign + with_unit(number(move, 2), p.unit)
     return sign + percent(move / abs(p.before[0]))
@@ -346,6 +364,7 @@ def absorbed(p: Tuned) -> bool:
     """Whether a parameter moves out of the interval that the base model gives, or that the extended
     one does.
     """
+    # Without intervals a move of some size has to do.
     if not np.isfinite([*p.before, *p.after]).all():
         return abs(p.after[0] - p.before[0]) > MOVED * abs(p.before[0])
     (before, low, high), (after, low_after, high_after) = p.before, p.after

@@ -54,6 +54,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], marks: Sequence[s
     kinds = ["number" if head.startswith(NUMBERS) else "" for head in heads]
     top = []
     for head, kind in zip(heads, kinds, strict=True):
+        # The scope ties cells to their heads for those who have the table read to them.
         top.append(f'<th scope="col"{_of_class(kind)}>{head.removeprefix(NUMBERS)}</th>')
     body = []
     for row, mark in zip(rows, marks or [""] * len(rows), strict=True):
@@ -80,6 +81,7 @@ def figure(png: bytes, alternative: str, caption: str) -> str:
         alternative: what it shows, for those who do not see it; safe.
         caption: safe.
     """
+    # Within the page: a report that is sent to somebody stays one file.
     data = b64encode(png).decode("ascii")
     image = f'<img src="data:image/png;base64,{data}" alt="{alternative}">'
     return f"<figure>\n{image}\n<figcaption>{caption}</figcaption>\n</figure>"
@@ -93,6 +95,7 @@ def bar(kind: str, share: float) -> str:
 
 def framed(html: str) -> str:
     """A page as an element of another one: neither's styles reach the other, and no script runs."""
+    # Quotes too: a bare one would end the attribute, and the rest would be the cell's markup.
     source = escape(html, quote=True)
     style = "width: 100%; height: 46rem; border: 0"
     return f'<iframe title="report" sandbox="" style="{style}" srcdoc="{source}"></iframe>'

@@ -76,6 +76,7 @@ def page(story: Story, drawn: Mapping[str, bytes], for_print: bool = True) -> st
         *reading(),
         f"</main>\n{_footer(story)}\n</body>\n</html>\n",
     ]
+    # A figure that was not drawn leaves no empty line.
     return "\n".join(part for part in parts if part)
 
 
@@ -94,6 +95,7 @@ def _opening(story: Story) -> Iterator[str]:
     yield paragraph(f'<span class="badge">{_BADGES[story.verdict.verdict]}</span>')
     yield f"<h1>{safe(headline(story))}</h1>"
     for text in following(story):
+        # Longer than other texts may be: a sentence here lists causes and their numbers.
         yield paragraph(safe(text, 1000), "lead")
     yield "</header>"
     yield from _gain(story)
@@ -104,6 +106,7 @@ def _gain(story: Story) -> Iterator[str]:
     held_out = story.verdict.heldout
     if held_out is None:
         return
+    # Without a cause both errors are the same: a second bar would be a false comparison.
     extended = bool(story.verdict.causes)
     rows = [("before", "tuned simulation", held_out.rmse_base)]
     if extended:
@@ -118,6 +121,7 @@ def _gain(story: Story) -> Iterator[str]:
         yield paragraph(closed + interval(held_out), "closed")
     note = "Error on held-out runs (RMSE): shorter is better, the noise floor is best."
     yield paragraph(note, "soft")
+    # Bars are shares of the longest: a simulation that failed has no error, and no bar.
     known = [value for _, _, value in rows if value is not None and isfinite(value)]
     longest = max(known, default=0.0)
     for kind, name, value in rows:
@@ -141,6 +145,7 @@ def _alternative(story: Story, name: str) -> str:
         names = joined([clean(c.name, 30) for c in story.channels])
         what = f"Measured and simulated {names} of the run that fits worst, with the residual."
         return f"{what} {headline(story)}"
+    # Read aloud a few of the largest are enough: the tables below have all.
     if name == "where":
         worst = worst_first(story.places)[:_FEW]
         sizes = [f"{p.kind} {clean(p.label, 30)} {number(p.before, 2)}" for p in worst]

@@ -70,10 +70,13 @@ def changed(story: Story) -> bool:
 def chosen_places(places: Sequence[Place]) -> list[Place]:
     """Runs, channels and phases to show: the worst of each, in the order in which they were."""
     result: list[Place] = []
+    # A part that nothing was recorded in has no size.
+    usable = [p for p in places if np.isfinite(p.before) and p.samples > 0]
     for kind, most in (("run", MOST_RUNS), ("channel", MOST_PLACES), ("phase", MOST_PLACES)):
-        there = [p for p in places if p.kind == kind and np.isfinite(p.before) and p.samples > 0]
-        worst_first = sorted(there, key=lambda p: -p.before)[:most]
-        result += [p for p in there if p in worst_first]
+        there = [p for p in usable if p.kind == kind]
+        worst = sorted(there, key=lambda p: -p.before)[:most]
+        # Not sorted by size: a reader looks for the third run behind the second.
+        result += [p for p in there if p in worst]
     return result
 
 
@@ -85,14 +88,18 @@ def places_panel(axis: Axes, places: Sequence[Place], story: Story) -> None:
     ones = np.ones(len(rows))
     axis.errorbar(ones, rows, xerr=noise, fmt="none", ecolor=CHANCE, elinewidth=7, label=_ALONE)
     axis.axvline(1.0, color=INK, linewidth=1.0, linestyle=":", label=_FLOOR)
-    squares, dots = [p.before for p in places], [p.after for p in places]
+    squares = [p.before for p in places]
+    dots = [p.after for p in places]
     if changed(story):
         axis.hlines(rows, dots, squares, color=JOIN, linewidth=0.9)
         axis.plot(dots, rows, linestyle="", label="after", **FILLED)
     name = "before" if changed(story) else "simulated (tuned)"
     axis.plot(squares, rows, linestyle="", label=name, **OPEN)
-    _decades(axis, [*squares, *(dots if changed(story) else []), 1.0])
-    axis.set_yticks(rows, [f"{label(p.label, most=18)} ({p.samples})" for p in places])
+    drawn = [*squares, *dots] if changed(story) else squares
+    # The noise floor belongs into view, whatever the sizes.
+    _decades(axis, [*drawn, 1.0])
+    names = [f"{label(p.label, most=18)} ({p.samples})" for p in places]
+    axis.set_yticks(rows, names)
     axis.set_ylim(rows[-1] + 0.7, -0.1)
     axis.set_xlabel("RMS of the residual, in units of the noise")
 
@@ -122,10 +129,11 @@ def _rows_of(axis: Axes, places: Sequence[Place]) -> list[float]:
 
 def in_order(axis: Axes) -> tuple[list[Any], list[str]]:
     """Handles and labels of a legend in the order in which a reader meets them."""
-    handles = dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    handles, labels = axis.get_legend_handles_labels()
+    by_label = dict(zip(labels, handles, strict=True))
     order = ("before", "simulated (tuned)", "after", _FLOOR, _ALONE)
-    labels = [name for name in order if name in handles]
-    return [handles[name] for name in labels], labels
+    present = [name for name in order if name in by_label]
+    return [by_label[name] for name in present], present
 
 
 def _decades(axis: Axes, values: Sequence[float]) -> None:
@@ -135,14 +143,30 @@ def _decades(axis: Axes, values: Sequence[float]) -> None:
         axis.set_xlim(left=0)
         return
     axis.set_xscale("log")
-    low, high = there.min() / 1.4, there.max() * 1.4
-    # The more decades, the fewer numbers in each: labels must not touch.
-    steps = (1, 2, 5) if high / low < 200 else (1, 3) if high / low < 1000 else (1,)
-    numbers = [step * 10.0**exponent for exponent in range(-6, 10) for step in steps]
-    ticks = [number for number in numbers if low <= number <= high]
-    axis.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    low = there.min() / 1.4
+    high = there.max() * 1.4
+    ticks = _ticks(low, high)
+    axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    # Minor ticks of a short axis would be labelled too, in powers of ten.
     axis.set_xticks([], minor=True)
     axis.set_xlim(low, high)
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Round numbers between two others, on a log axis."""
+    # The more decades, the fewer numbers in each: labels must not touch.
+    steps: tuple[int, ...] = (1,)
+    if high / low < 200:
+        steps = (1, 2, 5)
+    elif high / low < 1000:
+        steps = (1, 3)
+    ticks = []
+    for exponent in range(-6, 10):
+        for step in steps:
+            tick = step * 10.0**exponent
+            if low <= tick <= high:
+                ticks.append(tick)
+    return ticks
 
 
 def telling(profiles: Sequence[Profile]) -> list[Profile]:
@@ -168,14 +192,16 @@ def _standing(profile: Profile) -> float:
 
 def profile_panel(axis: Axes, profile: Profile, unit: str, extended: bool) -> None:
     """The mean residual of a channel, with its unit, against a variable."""
+    # Bins without a sample have no mean.
     there = np.isfinite(profile.before)
-    x, bars = profile.centres[there], 2 * profile.error[there]
+    centres = profile.centres[there]
+    bars = 2 * profile.error[there]
     axis.axhline(0, color=ZERO, linewidth=0.6)
     looks = [(profile.before, {**BEFORE, **OPEN, "markersize": 4.5, "linewidth": 1.0})]
     if extended:
         looks.append((profile.after, {**AFTER, **FILLED, "markersize": 3.5, "linewidth": 1.2}))
     for values, look in looks:
-        axis.errorbar(x, values[there], yerr=bars, elinewidth=1.0, **look)
+        axis.errorbar(centres, values[there], yerr=bars, elinewidth=1.0, **look)
     axis.set_xlabel(label(profile.variable, profile.unit, 16))
     axis.set_ylabel(label(f"residual of {clean(profile.channel, 9)}", clean(unit, 9)))
     axis.locator_params(nbins=5)
@@ -193,16 +219,25 @@ def ranked(story: Story) -> list[Candidate]:
 def scores_panel(axis: Axes, story: Story, shown: Sequence[Candidate]) -> None:
     """Bars of the candidates' scores, with their probabilities."""
     rows = np.arange(len(shown))
+    # A fit that has failed to gain has no evidence, not evidence against.
     sizes = [max(c.score, 0.0) for c in shown]
     for row, size, c in zip(rows, sizes, shown, strict=True):
-        axis.barh(row, size, height=0.62, edgecolor="white", **_LOOKS[standing(story, c.effect)])
-        text = f"{number(c.score)}  ({probability(c.p_value)})"
+        look = _LOOKS[standing(story, c.effect)]
+        axis.barh(row, size, height=0.62, edgecolor="white", **look)
         axis.annotate(
-            text, (size, row), (4, 0), textcoords="offset points", va="center", fontsize=8
+            f"{number(c.score)}  ({probability(c.p_value)})",
+            (size, row),
+            (4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
         )
-    axis.set_yticks(rows, [label(name_of(c.effect), most=34) for c in shown])
+    names = [label(name_of(c.effect), most=34) for c in shown]
+    axis.set_yticks(rows, names)
     axis.set_ylim(len(shown) - 0.4, -0.6)
-    axis.set_xlim(0, 1.35 * max(*sizes, 1e-9))
+    # The number behind the longest bar needs room; without any evidence there is an axis still.
+    longest = max(*sizes, 1e-9)
+    axis.set_xlim(0, 1.35 * longest)
     axis.set_xlabel(
         "score: evidence that the simulation lacks it\n(twice the gain in log likelihood)"
     )

@@ -99,6 +99,7 @@ class Printed(NamedTuple):
 def printed(story: Story) -> dict[str, Printed]:
     """Every figure that there is, by name."""
     with _styled():
+        # Within the settings: text is laid out once more when a figure is written.
         figures = {name: figure(story, name) for name in names(story)}
         return {n: Printed(style.png(f, DPI), style.pdf(f)) for n, f in figures.items()}
 
@@ -146,12 +147,14 @@ def _overview(story: Story) -> Figure:
     figure, axes = blank(2, count, size, layout=None, sharex=True, height_ratios=(3, 2))
     for column, c in enumerate(shot.channels):
         _signal(axes[0][column], axes[1][column], story, shot, c)
+    # A sample counts once, however many channels it has.
     samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
     kind = "held-out run" if shot.held_out else "run"
     how = "that fits worst" if story.verdict.verdict == "adequate" else "with the largest gap"
     some = f"; {count} of {len(story.channels)} channels" if count < len(story.channels) else ""
     title = f"The {kind} {how}: {label(shot.side.names[shot.row])} ({samples} samples{some})"
     figure.suptitle(title, fontsize=11, y=0.985)
+    # One legend for all: the columns differ in the channel alone.
     handles, labels = axes[0][0].get_legend_handles_labels()
     band, its_label = axes[1][0].get_legend_handles_labels()
     figure.legend([*handles, *band], [*labels, *its_label], loc="lower center", ncols=4, fontsize=9)
@@ -249,7 +252,8 @@ _PROFILES_FROM = 6.0
 def _where(story: Story) -> Figure:
     """Left the places, right the profiles that tell most."""
     places, profiles = chosen_places(story.places), telling(story.profiles)
-    columns, rows = -(-len(profiles) // 2), min(2, len(profiles))
+    rows = min(2, len(profiles))
+    columns = -(-len(profiles) // 2)
     # A single column of profiles gets more width than one of several.
     width = 5.2 + (3.1 * columns if columns != 1 else 4.4)
     height = max(2.6 + 0.27 * len(places), 1.5 + 1.9 * rows)
@@ -289,6 +293,7 @@ def _candidates(story: Story) -> Figure:
     figure, axes = blank(1, 2, (width, height), layout=None, sharey=True, width_ratios=(3, 2))
     scores_panel(axes[0, 0], story, shown)
     gains_panel(axes[0, 1], story, shown)
+    # Whoever misses a candidate must see that not all are shown.
     some = f", the best {len(shown)} of {total}" if len(shown) < total else ""
     y = 1 - _HEADING / height
     figure.text(0.015, y, f"Candidate causes{some}", fontsize=11, va="center")

@@ -83,8 +83,10 @@ def _places(places: Sequence[Place], extended: bool) -> str:
     heads += ["-RMS before", "-RMS after"] if extended else ["-RMS"]
     rows = []
     for p in places:
-        errors = [f"{p.before:.2f}", f"{p.after:.2f}"] if extended else [f"{p.before:.2f}"]
-        rows.append([safe(f"{p.kind} {p.label}", 80), str(p.samples), *errors])
+        row = [safe(f"{p.kind} {p.label}", 80), str(p.samples), f"{p.before:.2f}"]
+        if extended:
+            row.append(f"{p.after:.2f}")
+        rows.append(row)
     return table(heads, rows)
 
 
@@ -119,6 +121,7 @@ def errors_of(side: Side) -> Array:
     for column, simulated in enumerate((side.before, side.after)):
         for c in range(len(errors)):
             left = (side.observed - simulated)[:, :, c]
+            # The mean of nothing would warn.
             if np.isfinite(left).any():
                 errors[c, column] = np.sqrt(np.nanmean(left**2))
     return errors
@@ -139,11 +142,13 @@ def candidates(story: Story, picture: str) -> Iterator[str]:
 
 def _ranking(story: Story) -> str:
     heads = ["candidate", "name", "-score", "-p", "-gain on held-out runs", "standing"]
-    rows, marks = [], []
+    rows = []
+    marks = []
     for c in story.verdict.candidates:
         rank = standing(story, c.effect)
         marks.append("" if rank == "not needed" else "found")
         row = [safe(name_of(c.effect)), code(safe(c.effect, 80)), number(c.score)]
+        # The column's head says p already.
         row.append(probability(c.p_value).removeprefix("p = ").removeprefix("p "))
         row.append(number(c.heldout_gain))
         # Where nothing is found, nothing made the others needless.
@@ -185,6 +190,7 @@ def numbers(story: Story) -> Iterator[str]:
 
 def _parameters(story: Story) -> Iterator[str]:
     extended = bool(story.verdict.causes)
+    # Where nothing was found nothing could have been absorbed.
     bent = [p for p in story.parameters if p.touched and absorbed(p)]
     if bent and extended:
         yield paragraph(
@@ -221,7 +227,9 @@ def _intervals(p: Tuned) -> str:
     """The two intervals, one above the other: before dashed and open, after solid and filled."""
     if not np.isfinite([*p.before, *p.after]).all():
         return ""
-    low, high = min(p.before[1], p.after[1]), max(p.before[2], p.after[2])
+    # One scale for both, or they could not be compared.
+    low = min(p.before[1], p.after[1])
+    high = max(p.before[2], p.after[2])
     scale = _DRAWN / (high - low) if high > low else 0.0
     shapes = []
     for kind, y, values in (("before", 8, p.before), ("after", 22, p.after)):

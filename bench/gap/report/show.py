@@ -29,8 +29,9 @@ NEAR_IMPACT = 2
 
 def side(world: World, before: Array, after: Array) -> Side:
     """The runs of a world with two simulations of them."""
-    names = tuple(t.name for t in world.tracks)
-    return Side(names, tuple(t.scenario.times for t in world.tracks), world.observed, before, after)
+    names = tuple(track.name for track in world.tracks)
+    times = tuple(track.scenario.times for track in world.tracks)
+    return Side(names, times, world.observed, before, after)
 
 
 def places(world: World, before: Array, after: Array, sigma: Array, mark: str = "") -> list[Place]:
@@ -42,9 +43,14 @@ def places(world: World, before: Array, after: Array, sigma: Array, mark: str = 
     shown = []
     for kind, label, mask in parts:
         # A run or phase without a sample has no RMS.
-        if mask.any():
-            sizes = [float(np.sqrt(np.square(r[mask]).mean())) for r in residuals]
-            shown.append(Place(kind, label, int(mask.sum()), *sizes))
+        if not mask.any():
+            continue
+        sizes = []
+        for residual in residuals:
+            square = np.square(residual[mask]).mean()
+            sizes.append(float(np.sqrt(square)))
+        samples = int(mask.sum())
+        shown.append(Place(kind, label, samples, *sizes))
     return shown
 
 
@@ -54,10 +60,13 @@ def _parts(world: World, simulated: Array, mark: str) -> list[tuple[str, str, Ma
     runs, _, channels = seen.shape
     parts: list[tuple[str, str, Mask]] = []
     for r, track in enumerate(world.tracks):
-        of_run = (np.arange(runs) == r)[:, None, None]
-        parts.append(("run", track.name + mark, seen & of_run))
+        of_run = np.arange(runs) == r
+        mask = seen & of_run[:, None, None]
+        parts.append(("run", track.name + mark, mask))
     for c, name in enumerate(world.channels):
-        parts.append(("channel", name, seen & (np.arange(channels) == c)))
+        of_channel = np.arange(channels) == c
+        parts.append(("channel", name, seen & of_channel))
+    # Told from the simulation: the noise of a measured speed would make phases of its own.
     for phase, where in phases(world, simulated).items():
         parts.append(("phase", phase, seen & where[:, :, None]))
     return parts
@@ -71,6 +80,7 @@ def phases(world: World, simulated: Array) -> dict[str, Mask]:
     speed = speeds(world, simulated)
     if speed is None:
         return {}
+    # Where nothing moves all is at rest, and no share of zero.
     largest = max(float(np.nanmax(speed)), 1e-300)
     # A reversal is slow for a moment too: only what lasts is rest.
     still = _lasting(speed < QUIET * largest)
@@ -124,10 +134,13 @@ def _impacts(world: World, simulated: Array) -> Mask:
         return mask
     height = simulated[:, :, world.channels.index(name)]
     # Behind the end of a shorter run heights are NaN, and no lowest point.
+    before, here, behind = height[:, :-2], height[:, 1:-1], height[:, 2:]
     with np.errstate(invalid="ignore"):
-        low = (height[:, 1:-1] <= height[:, :-2]) & (height[:, 1:-1] < height[:, 2:])
+        # Of a level stretch the last sample counts: one impact is not many.
+        low = (here <= before) & (here < behind)
+    low = np.pad(low, ((0, 0), (1, 1)))
     for shift in range(-NEAR_IMPACT, NEAR_IMPACT + 1):
-        mask |= np.roll(np.pad(low, ((0, 0), (1, 1))), shift, axis=1)
+        mask |= np.roll(low, shift, axis=1)
     return mask
 
 
@@ -153,19 +166,20 @@ def profiles(world: World, before: Array, after: Array, sigma: Array) -> list[Pr
     shown = []
     for variable, unit, values in _variables(world, after):
         good = np.isfinite(world.observed[:, :, c]) & np.isfinite(values)
-        edges = _edges(values[good])
+        followed = values[good]
+        edges = _edges(followed)
         if edges is None:
             continue
         # What lies beyond the edges counts in the outermost bins.
-        places = np.searchsorted(edges, values[good], side="right") - 1
+        places = np.searchsorted(edges, followed, side="right") - 1
         bins = np.clip(places, 0, BINS - 1)
         counts = np.bincount(bins, minlength=BINS).astype(np.float64)
         # An empty bin has no mean: NaN, not drawn.
         with np.errstate(invalid="ignore", divide="ignore"):
-            means = [
-                np.bincount(bins, (world.observed - simulated)[:, :, c][good], BINS) / counts
-                for simulated in (before, after)
-            ]
+            means = []
+            for simulated in (before, after):
+                residual = (world.observed - simulated)[:, :, c][good]
+                means.append(np.bincount(bins, residual, BINS) / counts)
             error = sigma[c] / np.sqrt(counts)
         error[counts == 0] = np.nan
         centres = (edges[1:] + edges[:-1]) / 2.0
@@ -193,8 +207,10 @@ def _variables(world: World, simulated: Array) -> Iterator[tuple[str, str, Array
     system = world.simulator.system
     units = {channel.name: channel.unit for channel in world.kind.channels}
     primary = system.coordinates[system.primary] if system.coordinates else ""
+    # Simulated: the noise of a measured one is in the residual too, and would follow itself.
     if primary in world.channels:
-        yield "position", units[primary], simulated[:, :, world.channels.index(primary)]
+        position = simulated[:, :, world.channels.index(primary)]
+        yield "position", units[primary], position
     speed = speeds(world, simulated)
     if speed is not None:
         unit = f"{units.get(primary, 'm')}/s"
@@ -202,7 +218,8 @@ def _variables(world: World, simulated: Array) -> Iterator[tuple[str, str, Array
     for channel in world.kind.inputs:
         values = np.full(shape, np.nan)
         for r, track in enumerate(world.tracks):
-            if channel.name in track.scenario.inputs:
-                values[r, : len(track.observed)] = track.scenario.inputs[channel.name]
+            signal = track.scenario.inputs.get(channel.name)
+            if signal is not None:
+                values[r, : len(track.observed)] = signal
         if np.isfinite(values).any():
             yield channel.name, channel.unit, values

@@ -65,7 +65,10 @@ def name_of(effect: str) -> str:
 
 def joined(parts: Sequence[str], last: str = "and") -> str:
     """``a``, ``a and b``, ``a, b and c``."""
-    return f" {last} ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+    if len(parts) < 2:
+        return "".join(parts)
+    front = ", ".join(parts[:-1])
+    return f"{front} {last} {parts[-1]}"
 
 
 def sentence(text: object) -> str:
@@ -75,8 +78,9 @@ def sentence(text: object) -> str:
         return plain
     # A name with digits or underscores stays as it is.
     word = plain.split()[0].rstrip(",:;.").isalpha()
-    begin = plain[0].upper() if word else plain[0]
-    return begin + plain[1:] + ("" if plain[-1] in ".!?…" else ".")
+    first = plain[0].upper() if word else plain[0]
+    stop = "" if plain[-1] in ".!?…" else "."
+    return first + plain[1:] + stop
 
 
 def pretty(unit: str) -> str:
@@ -107,7 +111,10 @@ def number(value: float | None, digits: int = 3) -> str:
     exponent = _exponent(abs(rounded))
     decimals = max(0, digits - 1 - floor(log10(abs(rounded))) + exponent)
     text = f"{rounded / 10.0**exponent:.{decimals}f}"
-    return _signed(text.rstrip("0").rstrip(".") if "." in text else text) + _power(exponent)
+    # Zeros before the decimal point are digits, those behind it are none.
+    if "." in text:
+        text = text.rstrip("0").rstrip(".")
+    return _signed(text) + _power(exponent)
 
 
 def estimate(value: float, low: float | None, high: float | None) -> str:
@@ -120,9 +127,11 @@ def estimate(value: float, low: float | None, high: float | None) -> str:
     exponent = _exponent(max(abs(value), abs(low), abs(high)))
     half = log10((high - low) / 2) - exponent
     decimals = min(max(0, (half % 1 < _FEW) - floor(half)), 9)
-    middle, left, right = (
-        _signed(f"{x / 10.0**exponent:.{decimals}f}") + _power(exponent) for x in (value, low, high)
-    )
+    texts = []
+    for x in (value, low, high):
+        digits = f"{x / 10.0**exponent:.{decimals}f}"
+        texts.append(_signed(digits) + _power(exponent))
+    middle, left, right = texts
     return f"{middle} ({left} to {right})"
 
 
@@ -145,6 +154,7 @@ def probability(p: float | None) -> str:
     """``p = 0.03``."""
     if p is None or not isfinite(p):
         return "p unknown"
+    # Of a tail so far out the number itself means nothing.
     return f"p < {number(_LEAST, 1)}" if p < _LEAST else f"p = {number(p, 2)}"
 
 
