@@ -32,7 +32,11 @@ __all__ = [
 ]
 
 tuners: Registry[Tuner] = Registry("tuner", "simgap.tuners", Tuner)
-simulators: Registry[Simulator] = Registry("simulator", "simgap.simulators", Simulator)  # type: ignore[type-abstract]
+simulators: Registry[Simulator] = Registry(
+    "simulator",
+    "simgap.simulators",
+    Simulator,  # type: ignore[type-abstract]
+)
 
 REGISTRIES: tuple[Registry[Any], ...] = (tuners, simulators, effects)
 """Of each kind of part, in the order in which a plugin's class is tried."""

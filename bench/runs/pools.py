@@ -106,7 +106,11 @@ class InProcessPool:
         # A notebook may define a simulator anew under its old name before the next comparison.
         release()
 
-    def results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:  # noqa: ARG002 - there is nobody who could end a call past its limit
+    def results(
+        self,
+        calls: Sequence[Call],
+        seconds: float,  # noqa: ARG002 - there is nobody who could end a call past its limit
+    ) -> Iterator[tuple[int, Any]]:
         """Place and result (or exception) of each call, in their order.
 
         What a call raises is said on stderr too, while the person who wrote it is looking.

@@ -85,7 +85,8 @@ class Journal:
         """The journal, its whole records read and a cut-off one dropped, ready to append."""
         end = 0
         if path.exists():
-            for place, status, rows, end in records(path):  # noqa: B007 - the last end is where to go on
+            # The last end is where to go on.
+            for place, status, rows, end in records(path):  # noqa: B007
                 self._records.append((place, status, rows))
                 self.statuses[place] = status
         # Without a buffer: what is written must survive this process.

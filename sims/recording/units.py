@@ -19,7 +19,8 @@ _ROUNDING = 1e-9
 # All that a unit needs, and nothing that could make the parser behind compute for long: names, 1,
 # small powers.
 _TOKEN = re.compile(
-    r"\s*(?:(?P<power>(?:\*\*|\^)\s*[+-]?\d{1,2}(?!\d)|⁻?[¹²³⁴])|(?P<operator>[*/·⋅])|(?P<bracket>[()])"
+    r"\s*(?:(?P<power>(?:\*\*|\^)\s*[+-]?\d{1,2}(?!\d)|⁻?[¹²³⁴])"
+    r"|(?P<operator>[*/·⋅])|(?P<bracket>[()])"
     r"|(?P<name>[^\W\d][\w°%]*|[°%Ω℃]\w*|1(?![\d.])))\s*"
 )
 

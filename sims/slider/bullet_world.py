@@ -19,7 +19,12 @@ def build(client: int, constants: Mapping[str, float]) -> int:  # noqa: ARG001
     )
 
 
-def load(client: int, body: int, inertia: float, constants: Mapping[str, float]) -> bool:  # noqa: ARG001
+def load(
+    client: int,
+    body: int,
+    inertia: float,
+    constants: Mapping[str, float],  # noqa: ARG001
+) -> bool:
     """Give the body this mass; False if there is no such mass."""
     if not inertia > 0.0:
         return False

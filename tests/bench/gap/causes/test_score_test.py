@@ -5,7 +5,8 @@ import pytest
 from scipy.optimize import nnls
 
 from bench.gap.causes.candidates import Directions, Probe
-from bench.gap.causes.score_test import Group, Products, explained, groups, score, tail
+from bench.gap.causes.products import Products
+from bench.gap.causes.score_test import Group, explained, groups, score, tail
 from bench.gap.model.noise import GRID, Noise, surrogates
 from tests.bench.gap.made import correlated, covariance_of, linear_fit
 
