@@ -1,5 +1,5 @@
-"""Inner products of residuals, directions and Jacobian, after whitening and after all that a model's
-own freedom absorbs is taken out.
+"""Inner products of residuals, directions and Jacobian, whitened, without what a model may absorb
+by itself.
 
 Residual e, directions D and Jacobian J are whitened by W(phi), a first-order autoregression, run by
 run, where phi is common to all channels. For a sample t that follows another, and a first one f,
