@@ -20,6 +20,7 @@ from bench.report import tables
 from bench.store.folder import Stored, read
 from methods.base import Tuner
 from sims.base import InputError, unknown
+from sims.files import first_line
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -215,9 +216,22 @@ class Compared:
         finally:
             problem.close()
 
+    def _csv(self, name: str) -> pd.DataFrame:
+        """A table of a bounce shot, as it was written."""
+        import pandas as pd
+
+        try:
+            return pd.read_csv(self.folder / f"{name}.csv", keep_default_na=name != "status")
+        except (OSError, ValueError) as error:
+            raise InputError(f"{self.folder}: {name}.csv: {first_line(error)}") from None
+
     @cached_property
     def tables(self) -> dict[str, pd.DataFrame]:
-        """The tables by name: table, ert, pairs, break_even, who_wins; see docs/results.md."""
+        """The tables by name: table, ert, pairs, break_even, who_wins; of a bounce shot table and
+        shots; see docs/results.md.
+        """
+        if self.experiment.shot:
+            return {name: self._csv(name) for name in ("table", "shots")}
         return tables(self._stored)
 
     @property
@@ -227,18 +241,18 @@ class Compared:
 
     @property
     def runs(self) -> pd.DataFrame:
-        """A row for each simulation, as runs.parquet."""
-        return self._stored.runs
+        """A row for each simulation, as runs.parquet; of a bounce shot a row for each shot."""
+        return self.tables["shots"] if self.experiment.shot else self._stored.runs
 
     @property
     def statuses(self) -> pd.DataFrame:
         """A row for each run, how it ended and why, as status.csv."""
-        return self._stored.statuses
+        return self._csv("status") if self.experiment.shot else self._stored.statuses
 
     @property
     def figures(self) -> list[str]:
-        """Names of the figures that there are."""
-        return comparison.names(self._stored)
+        """Names of the figures that there are; those of a bounce shot are files in its folder."""
+        return [] if self.experiment.shot else comparison.names(self._stored)
 
     def figure(self, name: str = "error") -> Figure:
         """One of the figures, made anew; a notebook shows it inline.
@@ -246,11 +260,15 @@ class Compared:
         Raises:
             InputError: there is none of that name.
         """
+        if self.experiment.shot:
+            raise InputError(f"figures of a bounce shot are files: {self.folder / 'figures'}")
         return comparison.figure(self._stored, self._labels, name)
 
     def summary(self) -> pd.DataFrame:
         """The last mean error of each tuner, the best first, with how many runs failed."""
         table = self.table
+        if self.experiment.shot:
+            return table
         last = table[table["simulations"] == table["simulations"].max()]
         first = last[last["metric"] == last["metric"].iloc[0]]
         columns = ["tuner", "range", "metric", "mean", "low", "high", "runs", "failures"]

@@ -9,6 +9,7 @@ import tomli_w
 import simgap
 from bench.cli import main
 from tests.conftest import PLUGINS
+from tests.docs.pages import ROOT
 from tests.experiments import SPRING
 
 
@@ -108,6 +109,17 @@ def test_what_cannot_be_is_one_line_in_the_callers_language(experiment, tmp_path
             simgap.compare(experiment, jobs=0, **given)
         assert "--" not in str(caught.value).replace("--resume", "")
         assert str(caught.value).isprintable()
+
+
+def test_a_bounce_shot_has_tables_too(tmp_path):
+    run = simgap.Compared(ROOT / "results" / "reference" / "bounce-shot")
+    assert len(run.runs) == len(run.statuses) == 300 * run.statuses["tuner"].nunique()
+    assert run.table.set_index(["method", "ball"]).loc[("nominal", "table-tennis"), "shots"] == 50
+    assert run.figures == []
+    with pytest.raises(simgap.InputError, match=r"figures of a bounce shot are files: .*figures"):
+        run.figure("error")
+    assert run.experiment.name in repr(run)
+    assert "<table" in run._repr_html_()
 
 
 def test_a_sweep_is_several_comparisons_on_the_same_targets(experiment, tmp_path, capsys):
