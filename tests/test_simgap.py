@@ -73,6 +73,20 @@ def test_a_folder_of_that_name_without_a_package_in_it_does_no_harm(tmp_path):
     assert python("import simgap; simgap.Tuner", tmp_path).returncode == 0
 
 
+def test_what_is_installed_exposes_neither_tests_nor_examples(tmp_path):
+    """An editable install offers what the wheel holds."""
+    if not (Path(sys.prefix) / "bin" / "simgap").exists():
+        pytest.skip("simgap is not installed in this environment")
+    code = (
+        "import importlib.util, simgap\n"
+        "found = [importlib.util.find_spec(name) for name in ('tests', 'examples')]\n"
+        "print([spec.origin for spec in found if spec])\n"
+    )
+    said = python(code, tmp_path, PYTHONPATH="")
+    assert said.returncode == 0, said.stderr
+    assert str(ROOT) not in said.stdout
+
+
 def test_main_is_the_command_line(capsys):
     with pytest.raises(SystemExit):
         simgap.main(["--version"])

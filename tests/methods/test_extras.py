@@ -12,10 +12,10 @@ from tests.methods.problems import START, TRUTH, decays, errors
 from tests.methods.test_tunenet import Toy, run
 
 needs_sbi = pytest.mark.skipif(
-    importlib.util.find_spec("sbi") is None, reason="sbi is not installed: simgap[npe]"
+    importlib.util.find_spec("sbi") is None, reason="sbi is not installed: extra npe"
 )
 needs_botorch = pytest.mark.skipif(
-    importlib.util.find_spec("botorch") is None, reason="botorch is not installed: simgap[turbo]"
+    importlib.util.find_spec("botorch") is None, reason="botorch is not installed: extra turbo"
 )
 
 
