@@ -58,16 +58,8 @@ class Comparison:
         folder: Path | None = None,
         jobs: int = 2,
     ) -> Comparison:
-        """A comparison in a new folder; the plan stands, and nothing has been run.
-
-        Args:
-            experiment: what is compared.
-            plugins: plugin files that it needs; the caller has loaded them.
-            folder: new or empty; one below results/ that is named for the time where None.
-            jobs: worker processes that it is meant to be made with; 0 for none.
-
-        Raises:
-            InputError: a fault in the experiment, or the folder is not free.
+        """A comparison in a new folder; the plan stands, and nothing has been run; see
+        `bench.study.Study.begin`.
         """
         from bench.runs.identity import fingerprint
         from bench.runs.runner import prepare, refuse_unreachable
@@ -85,15 +77,8 @@ class Comparison:
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Comparison:
-        """A comparison that was interrupted: what is finished is kept, what is missing remains.
-
-        Args:
-            folder: the comparison's.
-            plugins: plugin files beside those that it was begun with.
-
-        Raises:
-            InputError: it is no such folder, it is damaged, or something that matters has changed
-                since it was begun.
+        """A comparison that was interrupted: what is finished is kept, what is missing remains; see
+        `bench.study.Study.resume`.
         """
         from bench.runs.identity import unchanged
         from bench.runs.runner import prepare
@@ -155,15 +140,8 @@ class Comparison:
     def make(
         self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
     ) -> Made:
-        """Make what is missing and write the results.
-
-        Args:
-            jobs: worker processes; 0 for none, and everything in this one.
-            progress: told of every step.
-            pool: where to run instead, e.g. on a cluster.
-
-        Raises:
-            InputError: workers cannot be had; what was finished is kept.
+        """Make what is missing and write the results; see
+        `bench.study.Study.make`.
         """
         # All that the results need is imported before the work: an interrupt in the midst of a
         # first import leaves half a module behind, and writing what there is would die of it.

@@ -54,16 +54,8 @@ class BounceShotStudy:
         folder: Path | None = None,
         jobs: int = 2,
     ) -> BounceShotStudy:
-        """A bounce shot in a new folder; nothing has been dropped yet.
-
-        Args:
-            experiment: with a [shot] table.
-            plugins: plugin files that it needs; the caller has loaded them.
-            folder: new or empty; one below results/ that is named for the time where None.
-            jobs: worker processes that it is meant to be made with; 0 for none.
-
-        Raises:
-            InputError: a fault in the experiment, or the folder is not free.
+        """A bounce shot in a new folder; nothing has been dropped yet; see
+        `bench.study.Study.begin`.
         """
         from bench.runs.identity import fingerprint
 
@@ -84,14 +76,8 @@ class BounceShotStudy:
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> BounceShotStudy:
-        """A bounce shot that was interrupted: what is kept stays, what is missing remains.
-
-        Args:
-            folder: the study's.
-            plugins: plugin files beside those that it was begun with.
-
-        Raises:
-            InputError: it is damaged, or something that matters has changed since it was begun.
+        """A bounce shot that was interrupted: what is kept stays, what is missing remains; see
+        `bench.study.Study.resume`.
         """
         from bench.runs.identity import unchanged
 
@@ -125,16 +111,8 @@ class BounceShotStudy:
     def make(
         self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
     ) -> Made:
-        """Make what is missing.
-
-        Args:
-            jobs: worker processes; 0 for none, and everything in this one.
-            progress: told of every step.
-            pool: where tuners train and tune instead, e.g. on a cluster. Drops are recorded on
-                this machine, since who records them knows the balls.
-
-        Raises:
-            InputError: workers cannot be had; what was finished is kept.
+        """Make what is missing; see
+        `bench.study.Study.make`.
         """
         if reason := world.missing():
             return self._made(skipped=reason)

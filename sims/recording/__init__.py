@@ -6,3 +6,7 @@
 * `units`: how the file's units become SI
 * `write`: a recording written such that reading gives the same back
 """
+
+from sims.recording.recording import Recording, Run, read_recording, system_of
+
+__all__ = ["Recording", "Run", "read_recording", "system_of"]
