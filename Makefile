@@ -45,6 +45,7 @@ check: $(STAMP)
 	$(BIN)/lint-imports
 
 benchmark: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.air
 	$(BIN)/python -m tests.benchmarks.harness
 	$(BIN)/python -m tests.benchmarks.engines
 	$(BIN)/python -m tests.benchmarks.scale

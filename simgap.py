@@ -20,55 +20,6 @@ from importlib import import_module
 from importlib.machinery import PathFinder
 from os.path import abspath, dirname, realpath
 
-TYPE_CHECKING = False  # as typing.TYPE_CHECKING, whose module takes half of the time there is
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from typing import Any
-
-    from bench import __version__
-    from bench.api.compare import Compared, compare, sweep
-    from bench.api.explain import explain, score
-    from bench.api.recordings import read_recording, simulate
-    from bench.checks import parametrize
-    from bench.gap.explanation import Explanation
-    from bench.problem.experiment import Experiment
-    from bench.registry import effects, load_plugins, simulators, tuners
-    from methods.base import (
-        Ask,
-        BudgetExceededError,
-        Evaluation,
-        Practice,
-        Scene,
-        Steps,
-        Task,
-        Tuner,
-        from_callback,
-    )
-    from sims.base import (
-        Array,
-        Channel,
-        Constant,
-        InputError,
-        Parameter,
-        Scenario,
-        Simulator,
-    )
-    from sims.extended import Extended
-    from sims.own import BulletWorld, OwnSimulator
-    from sims.recording.recording import Recording, Run
-    from sims.system import (
-        Coefficient,
-        Contact,
-        Effect,
-        Force,
-        Friction,
-        Input,
-        Moment,
-        Sensor,
-        Signal,
-        System,
-    )
-
 _WHERE = {
     "bench": ("__version__",),
     "bench.api.compare": ("Compared", "compare", "sweep"),
@@ -114,57 +65,9 @@ _WHERE = {
         "System",
     ),
 }
-"""Where each public name lives; the block above says the same to type checkers, a test compares."""
+"""Where each public name lives; simgap.pyi says the same to type checkers, and a test compares."""
 _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
-__all__ = [
-    "Array",
-    "Ask",
-    "BudgetExceededError",
-    "BulletWorld",
-    "Channel",
-    "Coefficient",
-    "Compared",
-    "Constant",
-    "Contact",
-    "Effect",
-    "Evaluation",
-    "Experiment",
-    "Explanation",
-    "Extended",
-    "Force",
-    "Friction",
-    "Input",
-    "InputError",
-    "Moment",
-    "OwnSimulator",
-    "Parameter",
-    "Practice",
-    "Recording",
-    "Run",
-    "Scenario",
-    "Scene",
-    "Sensor",
-    "Signal",
-    "Simulator",
-    "Steps",
-    "System",
-    "Task",
-    "Tuner",
-    "__version__",
-    "compare",
-    "effects",
-    "explain",
-    "from_callback",
-    "load_plugins",
-    "main",
-    "parametrize",
-    "read_recording",
-    "score",
-    "simulate",
-    "simulators",
-    "sweep",
-    "tuners",
-]
+__all__ = sorted([*_MODULE_OF, "main"])
 
 
 def _refuse_namesakes() -> None:
@@ -193,14 +96,14 @@ def _refuse_namesakes() -> None:
 _refuse_namesakes()
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     from bench.cli import main as run
 
     return run(arguments)
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'simgap' has no attribute {name!r}")
     value = getattr(import_module(_MODULE_OF[name]), name)

@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 
@@ -25,20 +26,16 @@ def python(code, cwd, **environment):
 
 
 def test_every_name_is_there_and_means_what_type_checkers_are_told():
-    tree = ast.parse((ROOT / "simgap.py").read_text())
-    (block,) = (
-        n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"
-    )
-    told = {}
-    for statement in block.body:
-        for alias in statement.names:
-            told[alias.name] = statement.module
-    for standard in ("Sequence", "Any"):
-        del told[standard]
+    tree = ast.parse((ROOT / "simgap.pyi").read_text())
+    imports = [n for n in tree.body if isinstance(n, ast.ImportFrom)]
+    told = {alias.name: n.module for n in imports for alias in n.names}
+    del told["Sequence"]
     assert told == simgap._MODULE_OF
     assert sorted([*told, "main"]) == simgap.__all__ == dir(simgap)
     for name in simgap.__all__:
         assert getattr(simgap, name) is not None, name
+    (public,) = (ast.literal_eval(n.value) for n in tree.body if isinstance(n, ast.Assign))
+    assert public == simgap.__all__
     with pytest.raises(AttributeError, match="module 'simgap' has no attribute 'tune'"):
         _ = simgap.tune
 
@@ -85,6 +82,25 @@ def test_what_is_installed_exposes_neither_tests_nor_examples(tmp_path):
     said = python(code, tmp_path, PYTHONPATH="")
     assert said.returncode == 0, said.stderr
     assert str(ROOT) not in said.stdout
+
+
+@pytest.mark.slow
+def test_the_wheel_is_typed_for_who_installs_it(tmp_path):
+    """Of everything under the one name, in a user's strict checking."""
+    built = subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert built.returncode == 0, built.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    names = ZipFile(wheel).namelist()
+    typed = {f"{package}/py.typed" for package in ("bench", "methods", "sims")}
+    assert {"simgap.py", "simgap-stubs/__init__.pyi", *typed} <= set(names)
+    tops = {name.split("/")[0] for name in names if ".dist-info" not in name}
+    assert tops == {"bench", "methods", "sims", "simgap.py", "simgap-stubs"}
 
 
 def test_main_is_the_command_line(capsys):

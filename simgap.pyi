@@ -1,0 +1,98 @@
+# What type checkers know of simgap.py, which imports nothing before it is asked for.
+from collections.abc import Sequence
+
+from bench import __version__
+from bench.api.compare import Compared, compare, sweep
+from bench.api.explain import explain, score
+from bench.api.recordings import read_recording, simulate
+from bench.checks import parametrize
+from bench.gap.explanation import Explanation
+from bench.problem.experiment import Experiment
+from bench.registry import effects, load_plugins, simulators, tuners
+from methods.base import (
+    Ask,
+    BudgetExceededError,
+    Evaluation,
+    Practice,
+    Scene,
+    Steps,
+    Task,
+    Tuner,
+    from_callback,
+)
+from sims.base import (
+    Array,
+    Channel,
+    Constant,
+    InputError,
+    Parameter,
+    Scenario,
+    Simulator,
+)
+from sims.extended import Extended
+from sims.own import BulletWorld, OwnSimulator
+from sims.recording.recording import Recording, Run
+from sims.system import (
+    Coefficient,
+    Contact,
+    Effect,
+    Force,
+    Friction,
+    Input,
+    Moment,
+    Sensor,
+    Signal,
+    System,
+)
+
+__all__ = [
+    "Array",
+    "Ask",
+    "BudgetExceededError",
+    "BulletWorld",
+    "Channel",
+    "Coefficient",
+    "Compared",
+    "Constant",
+    "Contact",
+    "Effect",
+    "Evaluation",
+    "Experiment",
+    "Explanation",
+    "Extended",
+    "Force",
+    "Friction",
+    "Input",
+    "InputError",
+    "Moment",
+    "OwnSimulator",
+    "Parameter",
+    "Practice",
+    "Recording",
+    "Run",
+    "Scenario",
+    "Scene",
+    "Sensor",
+    "Signal",
+    "Simulator",
+    "Steps",
+    "System",
+    "Task",
+    "Tuner",
+    "__version__",
+    "compare",
+    "effects",
+    "explain",
+    "from_callback",
+    "load_plugins",
+    "main",
+    "parametrize",
+    "read_recording",
+    "score",
+    "simulate",
+    "simulators",
+    "sweep",
+    "tuners",
+]
+
+def main(arguments: Sequence[str] | None = None) -> int: ...
