@@ -15,6 +15,7 @@ from bench.problem.experiment import Entry, Experiment
 from bench.problem.targets import SealedTarget
 from bench.registry import SkippedError, load_plugins, simulators, tuners
 from bench.runs.sources import (
+    SHOT_ROOMS,
     digest,
     effect_sources,
     plugin_files,
@@ -55,7 +56,7 @@ def fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str
         "configuration": digest(experiment.name, experiment.document()),
         "recording": digest(recording_digest(experiment)),
         "plugins": plugin_files(plugins),
-        "code": rooms(),
+        "code": rooms(SHOT_ROOMS if experiment.shot else ()),
         "package versions": versions(),
         "simulator and tuners": digest(_classes(experiment)),
     }

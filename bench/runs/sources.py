@@ -30,6 +30,8 @@ ROOT = Path(__file__).resolve().parents[2]
 """Where this project's packages lie."""
 ROOMS = ("methods", "sims", "bench/problem", "bench/runs")
 """Folders whose code makes runs: methods, worlds, and what drives and scores them."""
+SHOT_ROOMS = (*ROOMS, "bench/shot", "bench/gap", "bench/recordings")
+"""Those whose code makes the shots of a bounce shot: its drops, films and explanations too."""
 PACKAGES = (
     "av",
     "botorch",
@@ -65,9 +67,9 @@ def _plainly(value: Any) -> Any:
 
 
 @cache
-def rooms() -> str:
-    """Hash of every file of the rooms whose code makes runs."""
-    return digest(__version__, [_contents(ROOT / room, ROOT) for room in ROOMS])
+def rooms(which: tuple[str, ...] = ()) -> str:
+    """Hash of every file of these rooms; of those whose code makes runs where none is named."""
+    return digest(__version__, [_contents(ROOT / room, ROOT) for room in which or ROOMS])
 
 
 def _contents(folder: Path, root: Path) -> list[tuple[str, bytes]]:

@@ -9,8 +9,9 @@ from importlib import import_module
 
 import pytest
 
-from bench.problem.experiment import Entry, Experiment, parse
+from bench.problem.experiment import Entry, Experiment, load, parse
 from bench.registry import REGISTRIES, load_plugins, tuners
+from bench.runs.identity import fingerprint
 from bench.runs.runner import prepare
 from bench.runs.sources import source
 from bench.runs.training import key
@@ -199,6 +200,25 @@ def test_any_file_of_the_rooms_that_make_runs_changes_keys_and_ids(tmp_path, mon
         monkeypatch.undo()
         sources.rooms.cache_clear()
     assert key(experiment, REGRESSOR, 0) == before
+
+
+def test_what_explains_a_drop_makes_its_shot_and_no_run_of_a_comparison(tmp_path, monkeypatch):
+    from bench.runs import sources
+
+    for room in sources.SHOT_ROOMS:
+        (tmp_path / room).mkdir(parents=True)
+    monkeypatch.setattr(sources, "ROOT", tmp_path)
+    sources.rooms.cache_clear()
+    try:
+        before = [fingerprint(load(name), [])["code"] for name in ("bounce-shot", "ball-drop")]
+        (tmp_path / "bench" / "gap" / "explain.py").write_text("changed")
+        sources.rooms.cache_clear()
+        after = [fingerprint(load(name), [])["code"] for name in ("bounce-shot", "ball-drop")]
+    finally:
+        monkeypatch.undo()
+        sources.rooms.cache_clear()
+    assert before[0] != after[0]
+    assert before[1] == after[1]
 
 
 def test_a_new_file_in_a_room_counts_and_what_python_compiles_does_not(tmp_path, monkeypatch):

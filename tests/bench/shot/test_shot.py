@@ -399,7 +399,7 @@ def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refu
     assert resumed("--budget", "5") == 2
     assert "leave out budget" in capsys.readouterr().err
     with monkeypatch.context() as patch:
-        patch.setattr("bench.runs.identity.rooms", lambda: "0123456789")
+        patch.setattr("bench.runs.identity.rooms", lambda *_: "0123456789")
         assert resumed() == 2
     assert "its code changed since it was begun" in capsys.readouterr().err
     for registry in REGISTRIES:
