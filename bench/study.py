@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from sims.files import refuse_full, stamped
+from bench.store.folder import CONFIGURATION, configuration, free_folder
 
 if TYPE_CHECKING:
     from bench.compare import Say
@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from bench.runs.runner import Progress
     from bench.store.folder import Configuration
     from bench.store.standing import Made, Standing
-
-
-CONFIGURATION = "experiment.toml"
-"""The file by which the folder of a study is known."""
 
 
 class Study(Protocol):
@@ -133,8 +129,7 @@ def begin_all(
     wanted = expand(experiment)
     if len(wanted) == 1:
         return [begin(wanted[0], plugins, folder, jobs)]
-    parent = folder or stamped(Path("results"), experiment.name)
-    refuse_full(parent)
+    parent = free_folder(experiment, folder)
     begun: list[Study] = []
     try:
         # All before the first is made: a fault in the last would show after hours.
@@ -185,6 +180,4 @@ def kind_of(experiment: Experiment) -> type[Study]:
 
 
 def _kind_in(folder: Path) -> type[Study]:
-    from bench.store.folder import configuration
-
     return kind_of(configuration(folder).experiment)

@@ -5,7 +5,7 @@ figures.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +17,7 @@ from bench.problem.problem import Problem
 from bench.registry import load_plugins
 from bench.registry import tuners as registered
 from bench.report import tables
+from bench.runs.runner import Progress
 from bench.store.folder import Stored, read
 from methods.base import Tuner
 from sims.base import InputError, unknown
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
 
     from bench.runs.pools import Pool
 
-Progress = Callable[[str, int], Callable[[], None]]
-"""Called with a title and a number of steps; gives the function to call after each step."""
 _ROWS = 200
 """Rows of a table that a notebook shows."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from bench.figures.training import draw
 from bench.problem.experiment import Entry, Experiment, load, names
 from bench.problem.problem import Problem
 from bench.registry import simulators, tuners
+from bench.runs.runner import Progress
 from methods.base import Practice
 from sims import files
 from sims.base import InputError
@@ -71,7 +71,7 @@ class Losses:
     """
 
     experiment: Experiment
-    start: Callable[[str, int], Callable[[], None]]
+    start: Progress
     rows: list[tuple[int, str, int, float, float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:

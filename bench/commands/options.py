@@ -20,23 +20,22 @@ def add_plugin(parser: argparse.ArgumentParser, more: str) -> None:
 
 def positive(text: str) -> int:
     """A whole number of at least 1."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, found '{text}'")
-    return value
+    return _whole(text, 1)
 
 
 def natural(text: str) -> int:
     """A whole number of at least 0."""
+    return _whole(text, 0)
+
+
+def _whole(text: str, least: int) -> int:
     try:
         value = int(text)
     except ValueError:
-        value = -1
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, found '{text}'")
+        value = least - 1
+    if value < least:
+        wanted = f"a whole number of at least {least}"
+        raise argparse.ArgumentTypeError(f"expected {wanted}, found '{text}'")
     return value
 
 

@@ -17,12 +17,13 @@ from bench.problem.seeds import rng_for
 from bench.problem.signals import signal
 from bench.registry import simulators
 from sims import effects as library
-from sims.base import Array, InputError, Scenario, Simulator, unknown
+from sims.base import Array, InputError, Scenario, Simulator
 from sims.own import OwnSimulator
 from sims.recording.recording import Recording, Run
 from sims.recording.write import refuse_existing, write_recording
 from sims.simulated import Simulated
 from sims.system import UsualRecording
+from sims.user_toml import known
 
 _DIGITS = 9
 """Significant digits of a number in the table: finer than any sensor, and files stay small."""
@@ -144,10 +145,10 @@ class _Maker:
             self.engine = "batch"
         self.simulator = self._simulator()
         self.noise = _noise(wish.noise, [c.name for c in self.simulator.channels])
-        _known("initial state", wish.initial, list(kind.states))
+        known("initial state", wish.initial, list(kind.states))
         given = {name: _range(name, value) for name, value in wish.initial.items()}
         self.ranges = {**self.usual.initial, **given}
-        _known("input", wish.inputs, [c.name for c in kind.inputs])
+        known("input", wish.inputs, [c.name for c in kind.inputs])
         inputs = {**self.usual.inputs, **wish.inputs}
         self.inputs = {name: _signal_text(name, value) for name, value in inputs.items()}
         self.times = _times(wish)
@@ -174,7 +175,7 @@ class _Maker:
         return SimulatedRecording(recording, truth, self.simulator)
 
     def _simulator(self) -> Simulator:
-        _known("constant", self.wish.constants, [c.name for c in self.kind.constants])
+        known("constant", self.wish.constants, [c.name for c in self.kind.constants])
         values = {n: _number("constant", n, value) for n, value in self.wish.constants.items()}
         observe = list(self.wish.observe) or list(self.usual.observe) or None
         if issubclass(self.kind, Simulated):
@@ -255,7 +256,7 @@ def _theta(given: Mapping[str, float] | Sequence[float], kind: type[Simulator]) 
                 f"parameters: expected {len(names)} values ({', '.join(names)}), found {len(given)}"
             )
         given = dict(zip(names, given, strict=True))
-    _known("parameter", given, names)
+    known("parameter", given, names)
     theta = {
         p.name: _number("parameter", p.name, given.get(p.name, p.nominal)) for p in kind.parameters
     }
@@ -273,7 +274,7 @@ def _coefficients(name: str, given: Coefficients, kind: type[Simulator]) -> list
     if isinstance(given, Mapping):
         of_system = library.get(name).on(kind.system) if issubclass(kind, Simulated) else ()
         names = [c.name for c in of_system]
-        _known(f"coefficient of effect {name}", given, names)
+        known(f"coefficient of effect {name}", given, names)
         return [_number(f"effect {name}:", c, given.get(c, 0.0)) for c in names]
     values = [given] if isinstance(given, int | float) else list(given)
     return [_number("effect", name, value) for value in values]
@@ -282,7 +283,7 @@ def _coefficients(name: str, given: Coefficients, kind: type[Simulator]) -> list
 def _noise(given: float | Mapping[str, float], channels: Sequence[str]) -> dict[str, float]:
     """1 sigma of every recorded channel."""
     named = given if isinstance(given, Mapping) else {EVERY: given}
-    _known("recorded channel", [name for name in named if name != EVERY], channels)
+    known("recorded channel", [name for name in named if name != EVERY], channels)
     rest = named.get(EVERY, 0.0)
     values = {name: _number("noise of", name, named.get(name, rest)) for name in channels}
     for name, value in values.items():
@@ -312,10 +313,3 @@ def _number(what: str, name: str, value: object) -> float:
     if not np.isfinite(value):
         raise InputError(f"{what} {name} = {value}: expected a finite number")
     return float(value)
-
-
-def _known(what: str, given: Mapping[str, Any] | Sequence[str], known: Sequence[str]) -> None:
-    """Refuse a name that is not known."""
-    for name in given:
-        if name not in known:
-            raise unknown(what, name, list(known) or ["none"])

@@ -26,6 +26,8 @@ from sims.user_toml import read_toml
 if TYPE_CHECKING:
     import pandas as pd
 
+CONFIGURATION = "experiment.toml"
+"""The file by which the folder of a study is known."""
 RESULTS = Path("results")
 """Below which new runs go that name no folder."""
 
@@ -84,7 +86,7 @@ def create(folder: Path, configuration: Configuration, jobs: int) -> None:
     try:
         # What there is of a folder is never without what it is for.
         with fresh_folder(folder) as partial:
-            write(partial / "experiment.toml", tomli_w.dumps(_plain(experiment.document())))
+            write(partial / CONFIGURATION, tomli_w.dumps(_plain(experiment.document())))
             write(partial / "environment.json", json.dumps(environment, indent=1) + "\n")
             (partial / FOLDER).mkdir()
     except OSError as error:
@@ -106,10 +108,10 @@ def configuration(folder: Path) -> Configuration:
     Raises:
         InputError: it is no such folder, or a file in it is damaged.
     """
-    path = folder / "experiment.toml"
+    path = folder / CONFIGURATION
     if not path.is_file():
         raise InputError(
-            f"{folder}: expected the folder of a comparison with experiment.toml in it, found none"
+            f"{folder}: expected the folder of a comparison with {CONFIGURATION} in it, found none"
         )
     environment = _environment(folder)
     plugins, fingerprint = environment.get("plugins", []), environment.get("fingerprint", {})
