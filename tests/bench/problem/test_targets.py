@@ -1,0 +1,88 @@
+"""Who meets which targets, and which simulator makes what of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.problem.experiment import parse
+from bench.problem.problem import Problem
+from bench.runs.runner import prepare, run
+from tests.experiments import spring_experiment
+
+TIMES = np.arange(60) / 20
+BIAS = 0.4
+"""N, a force that the world has and the tuned simulator lacks."""
+NARROW = 1e-6
+"""kg, how wide the range is in which start and truth lie, so that both are the mass of 1 kg."""
+
+
+def everything(target):
+    """All numbers of a target, one after another."""
+    sides = target.sealed.fitting, target.sealed.held_out
+    starts = [list(s.initial.values()) for side in sides for s in side.scenarios]
+    observed = [side.observed.ravel() for side in sides]
+    return np.concatenate([target.truth, target.sealed.start, *starts, *observed])
+
+
+def test_targets_of_another_experiment_are_met_whole(spring):
+    """Truth, start, scenario, noise and held-out scenarios, in each range."""
+    other = spring_experiment(noise={"x": 0.05}, held_out={"scenarios": 2}, targets=2)
+    met = replace(other, name="mine", same_targets_as="spring-test", budget=5, seeds=1)
+    own = replace(other, name="mine")
+    for theirs, mine, apart in zip(*(Problem(e).targets() for e in (other, met, own)), strict=True):
+        np.testing.assert_array_equal(everything(mine), everything(theirs))
+        assert not np.isin(everything(apart), everything(theirs)).any()
+
+
+def test_a_comparison_meets_the_targets_of_another_and_searches_them_in_its_own_way(spring):
+    other = spring_experiment(noise={"x": 0.05}, targets=2, seeds=1)
+    columns = []
+    for name, met in (("spring-test", ""), ("mine", "spring-test"), ("mine", "")):
+        results = prepare(replace(other, name=name, same_targets_as=met))
+        run(results, jobs=0)
+        columns.append(results.kept.columns)
+    theirs, mine, apart = columns
+    for place in theirs:
+        for name in ("true_rate", "true_decay"):
+            assert theirs[place][name][0] == mine[place][name][0] != apart[place][name][0]
+        # At the start only the target and its noise make the error.
+        assert theirs[place]["obs_error"][0] == mine[place]["obs_error"][0]
+        # Both simulate the start first, and what they like from then on.
+        assert theirs[place]["loss"][1] == mine[place]["loss"][1]
+        assert not np.isin(theirs[place]["loss"][2:], mine[place]["loss"][2:]).any()
+
+
+def slider(**changes):
+    """A mass at rest that nothing pushes, but for a constant force in the world alone."""
+    document = {
+        "simulator": "slider", "observe": ["x"], "targets": 1, "ranges": ["in"], "budget": 1,
+        "parameters": {"mass": {"training": [1.0, 1.0 + NARROW]}},
+        "settings": {"engine": "batch"},
+        "world": {"engine": "batch", "fixed": {"force.bias": BIAS}},
+        "sampling": {"rate": 20.0, "samples": 60},
+        "held_out": {"scenarios": 2, "initial": {"x": 0.3, "v": 0.5}},
+        "tuners": ["nelder_mead"], **changes,
+    }  # fmt: skip
+    return parse("pushed", document, "pushed.toml")
+
+
+def test_held_out_runs_are_the_worlds_and_not_the_tuned_simulators():
+    """The bias moves the mass by F t^2 / 2 m, in the fitted run and in those held out."""
+    results = prepare(slider())
+    held_out = results.plan[0].target.sealed.held_out
+    moved = 0.3 + 0.5 * TIMES + BIAS * TIMES**2 / 2
+    np.testing.assert_allclose(held_out.observed[:, 0], [*moved, *moved], atol=1e-5)
+    run(results, jobs=0)
+    missing = np.sqrt(np.mean((BIAS * TIMES**2 / 2) ** 2))
+    assert missing == pytest.approx(0.8, rel=0.05)
+    for metric in ("obs_error", "heldout_error"):
+        (columns,) = results.kept.columns.values()
+        assert columns[metric][0] == pytest.approx(missing, rel=1e-5), metric
+
+
+def test_held_out_runs_of_an_equal_world_are_predicted_at_the_truth():
+    results = prepare(slider(world={}))
+    run(results, jobs=0)
+    (columns,) = results.kept.columns.values()
+    assert columns["heldout_error"][0] < 1e-5
