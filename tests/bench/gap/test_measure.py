@@ -6,7 +6,7 @@ import pytest
 from bench.gap.causes.search import Search
 from bench.gap.measure import HeldOutRuns, central, covariance, gain, intervals
 from bench.gap.model.fit import Fitter, Start
-from bench.gap.model.noise import Noise
+from bench.gap.model.noise import Noise, likelihood
 from sims.pendulum.simulator import Pendulum
 from sims.slider.simulator import Slider
 from tests.bench.gap.made import correlated, marked, recorded, recording, searched, white, world
@@ -67,6 +67,29 @@ def test_a_gain_below_the_floor_counts_as_all_and_no_gap_as_nothing():
     assert worse.closed == pytest.approx(-2.0)
 
 
+def three_runs(sizes=(0.1, 0.15, 0.2)):
+    """A model that leaves so much of each run, where the base model leaves 0.3 of each."""
+    after = np.ones((3, 100, 1)) * np.reshape(sizes, (3, 1, 1))
+    return runs_of(np.zeros((3, 100, 1))), np.full((3, 100, 1), 0.3), after
+
+
+def test_the_gains_interval_is_one_of_95_percent_with_runs_put_back():
+    """Of three runs the worst is drawn three times in 1 of 27 resamples, more than 2.5 %."""
+    found = gain(*three_runs(), [0], 0.05, np.random.default_rng(0))
+    assert (found.low, found.high) == (
+        pytest.approx((0.3 - 0.2) / 0.25),
+        pytest.approx((0.3 - 0.1) / 0.25),
+    )
+    single = runs_of(np.full((1, 100, 1), np.nan))
+    single.observed[0, :10] = 0.0  # one stretch of ten has samples
+    found = gain(
+        single, *np.ones((2, 1, 100, 1)) * [[[[0.3]]], [[[0.1]]]], [0], 0.05,
+        np.random.default_rng(0),
+    )  # fmt: skip
+    assert found.closed == pytest.approx(0.8)
+    assert np.isnan([found.low, found.high]).all(), "there is nothing to resample"
+
+
 def test_missing_samples_do_not_count():
     observed = np.zeros((2, 100, 1))
     observed[0, :50] = np.nan
@@ -111,13 +134,20 @@ def test_the_covariance_is_that_of_all_unknowns_at_once():
     model = type(model)(
         model.fit, type(model.likelihood)(model.likelihood.value, sigma, flat.phi), model.merit
     )
-    jacobian = model.fit.jacobian / sigma[:, None]
+    jacobian = central(search.world, model.fit, search.noise).jacobian / sigma[:, None]
     rows = np.zeros((2, jacobian[0, ..., 0].size, 5))
     for r in range(2):
         flattened = jacobian[r].reshape(-1, 3)
         rows[r, :, 0], rows[r, :, 1 + 2 * r : 3 + 2 * r] = flattened[:, 0], flattened[:, 1:]
     normal = np.einsum("rnk,rnl->kl", rows, rows) + np.diag([0, *[1e-4] * 4])
-    assert covariance(search, model)[0, 0] == pytest.approx(np.linalg.inv(normal)[0, 0], rel=1e-6)
+    # Squared kg m^2 are far below any absolute tolerance, so the ratio is asked.
+    known = covariance(search, model)[0, 0]
+    assert known * 1e12 == pytest.approx(np.linalg.inv(normal)[0, 0] * 1e12, rel=1e-6)
+    assert known > 3.0 / normal[0, 0], "initial states take most of what is known of it"
+    value, low, high = intervals(search, model)[0]
+    assert value == model.fit.theta[0]
+    for reach in (value - low, high - value):
+        assert reach / np.sqrt(known) == pytest.approx(1.959964, rel=1e-6)
 
 
 def test_parameters_that_act_alike_have_no_interval():
@@ -146,6 +176,16 @@ def test_what_the_data_do_not_bound_has_no_interval():
     assert np.isnan(intervals(search, model)[1][1:]).all()
 
 
+def test_intervals_follow_what_is_left_and_not_what_was_stated():
+    made = recording(runs=2, seconds=0.8, rate=50, noise=["q=0.003", "qd=0.02"], seed=3)
+    widths = []
+    for factor in (1.0, 3.0):
+        search, model = searched(made, np.array([0.003, 0.02]) * factor, candidates=[])
+        _, low, high = intervals(search, model)[0]
+        widths.append(high - low)
+    assert widths[1] / widths[0] == pytest.approx(1.0, rel=0.1)
+
+
 def test_held_out_runs_estimate_initial_states_and_nothing_else():
     made = recording(
         theta=["4e-3"], runs=3, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"], held_out=0
@@ -159,5 +199,9 @@ def test_held_out_runs_estimate_initial_states_and_nothing_else():
     assert np.sqrt(np.square(left).mean()) == pytest.approx(1.0, abs=0.1)
     assert np.sqrt(np.square((there.observed - wrong.simulated) / [0.003, 0.02]).mean()) > 10
     assert right.merit > wrong.merit + 500
+    # Of six initial states each costs the logarithm of the samples.
+    residual, count = there.observed - right.simulated, there.observed.size
+    likeliest = likelihood(residual, np.ones(residual.shape, dtype=bool)).value
+    assert right.merit == pytest.approx(likeliest - 6 * np.log(count), abs=1.0)
     assert failed.merit == -np.inf
     assert np.isnan(failed.simulated).all()

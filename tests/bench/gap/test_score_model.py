@@ -88,6 +88,18 @@ def test_missing_samples_do_not_count(files):
     assert found["normalised_rmse"] == pytest.approx(1.0, abs=0.06)
 
 
+def test_the_error_of_a_channel_is_that_of_its_samples(files):
+    model, recording = files
+    lines = recording.read_text().splitlines()
+    half = [line if i % 2 else line.rpartition(",")[0] + "," for i, line in enumerate(lines[1:])]
+    recording.write_text("\n".join([lines[0], *half]) + "\n")
+    found = scored(model, recording)
+    assert found["rmse"]["q"] == pytest.approx(0.003, rel=0.1)
+    assert found["rmse"]["qd"] == pytest.approx(0.02, rel=0.15), "and not 0.02 by the root of two"
+    q, qd = found["rmse"]["q"] / 0.003, found["rmse"]["qd"] / 0.02
+    assert found["normalised_rmse"] == pytest.approx(np.sqrt((2 * q**2 + qd**2) / 3), rel=1e-9)
+
+
 def test_what_cannot_be_scored_is_one_line(files, tmp_path):
     model, recording = files
     simulate(Wish("slider", runs=1, seconds=0.5), tmp_path / "other.csv")

@@ -8,7 +8,7 @@ import pytest
 from bench.analysis.curves import primary
 from bench.compare import Comparison
 from bench.problem.experiment import load, parse
-from bench.problem.identifiability import STIFF, of_jacobian, spectrum
+from bench.problem.identifiability import STIFF, Spectrum, of_jacobian, spectrum
 from bench.problem.problem import Problem
 from bench.report import finish
 from bench.store.folder import read
@@ -56,6 +56,14 @@ def test_least_squares_estimates_scatter_as_the_bound_says():
     found = spectrum(line, np.array([0.2, -1.0]), LINE, np.array([sigma]))
     components = (estimates - [0.2, -1.0]) / [2.0, 8.0] @ found.vectors
     np.testing.assert_allclose(components.std(axis=0), found.sigmas, rtol=0.05)
+
+
+def test_a_direction_is_stiff_that_is_known_to_a_tenth_of_its_range():
+    found = Spectrum(np.array([101.0, 99.0, 25.0]), np.eye(3))
+    assert found.stiff.tolist() == [True, False, False]
+    stiff, sloppy = found.errors(np.array([[0.1, 0.3, 0.4], [0.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(stiff, [0.1, 0.0])
+    np.testing.assert_allclose(sloppy, [np.sqrt((0.09 + 0.16) / 2), 0.0])
 
 
 def test_only_the_product_of_two_factors_is_stiff():

@@ -32,6 +32,9 @@ def test_targets_of_another_experiment_are_met_whole(spring):
     own = replace(other, name="mine")
     for theirs, mine, apart in zip(*(Problem(e).targets() for e in (other, met, own)), strict=True):
         np.testing.assert_array_equal(everything(mine), everything(theirs))
+        assert len(np.unique(everything(mine))) == 2 + 2 + 3 + 3 * 60 - 2, (
+            "each its own draw; held-out runs, without noise, begin with their initial state"
+        )
         assert not np.isin(everything(apart), everything(theirs)).any()
 
 
@@ -53,6 +56,32 @@ def test_a_comparison_meets_the_targets_of_another_and_searches_them_in_its_own_
         assert not np.isin(theirs[place]["loss"][2:], mine[place]["loss"][2:]).any()
 
 
+@pytest.mark.parametrize(("kind", "low", "high"), [("in", 2.0, 4.0), ("wide", 1.0, 5.0)])
+def test_start_and_truth_are_drawn_evenly_from_their_range(kind, low, high, spring):
+    problem = Problem(spring_experiment())
+    drawn = [problem.target(kind, i) for i in range(200)]
+    for rates in (
+        np.array([target.truth[0] for target in drawn]),
+        np.array([1.0 + 4.0 * target.sealed.start[0] for target in drawn]),
+    ):
+        assert low <= rates.min() < low + 0.03 * (high - low)
+        assert high >= rates.max() > high - 0.03 * (high - low)
+        assert rates.mean() == pytest.approx(3.0, abs=0.25 * (high - low) / 2)
+
+
+def test_every_channel_has_noise_of_its_own_size(spring):
+    experiment = spring_experiment(observe=["x", "v"], noise={"x": 0.05, "v": 0.5})
+    problem = Problem(experiment)
+    assert problem.scale.tolist() == [0.05, 0.5]
+    left = []
+    for target in problem.targets():
+        (scene,), theta = target.sealed.fitting.scenarios, target.truth[None]
+        left.append(target.sealed.fitting.observed - problem.simulator.simulate(theta, scene)[0])
+    spread = np.concatenate(left).std(axis=0)
+    np.testing.assert_allclose(spread, [0.05, 0.5], rtol=0.1)
+    assert abs(np.corrcoef(np.concatenate(left).T)[0, 1]) < 0.15
+
+
 def slider(**changes):
     """A mass at rest that nothing pushes, but for a constant force in the world alone."""
     document = {
@@ -60,7 +89,7 @@ def slider(**changes):
         "parameters": {"mass": {"training": [1.0, 1.0 + NARROW]}},
         "settings": {"engine": "batch"},
         "world": {"engine": "batch", "fixed": {"force.bias": BIAS}},
-        "sampling": {"rate": 20.0, "samples": 60},
+        "sampling": {"rate": 20.0, "samples": 60}, "initial": {"x": 0.1},
         "held_out": {"scenarios": 2, "initial": {"x": 0.3, "v": 0.5}},
         "tuners": ["nelder_mead"], **changes,
     }  # fmt: skip
@@ -79,6 +108,9 @@ def test_held_out_runs_are_the_worlds_and_not_the_tuned_simulators():
     for metric in ("obs_error", "heldout_error"):
         (columns,) = results.kept.columns.values()
         assert columns[metric][0] == pytest.approx(missing, rel=1e-5), metric
+    away = np.abs(columns["recommendation_mass"] - columns["true_mass"])
+    np.testing.assert_array_equal(columns["param_abs_error"], away)
+    np.testing.assert_allclose(columns["param_error"], away / NARROW, rtol=1e-6)
 
 
 def test_held_out_runs_of_an_equal_world_are_predicted_at_the_truth():

@@ -65,6 +65,16 @@ def test_recommends_the_lowest_loss_by_default_even_inside_a_batch():
     assert trace.status == "converged"
 
 
+def test_of_equal_losses_the_first_is_recommended():
+    def tune(self, task, rng):
+        yield np.array([[0.3, 0.35], [0.3, 0.85]])
+        yield np.array([0.3, 0.35])
+
+    trace, _ = run(tune)
+    assert trace.losses.tolist() == [0.25, 0.25, 0.25]
+    assert trace.recommendations[1:, 1].tolist() == [0.35, 0.35, 0.35]
+
+
 def test_recommendation_of_an_ask_is_what_the_tuner_would_deliver_after_what_it_has_seen():
     def tune(self, task, rng):
         for guess in (0.1, 0.2, 0.3, 0.4):

@@ -1,13 +1,20 @@
-"""A comparison is not taken up again after a file that it was begun with has changed."""
+"""A comparison is not taken up again after something that it was begun with has changed."""
 
+import json
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 import simgap
 from bench.compare import Comparison
 from bench.problem.experiment import parse
+from bench.problem.problem import Problem
+from bench.problem.recorded import Side
 from bench.registry import load_plugins
+from bench.runs.identity import Identities
 from bench.store.folder import read
-from bench.store.journal import finished
+from bench.store.journal import Journal, finished, read_plan, write_plan
 from sims.base import InputError
 from tests.conftest import PLUGINS
 from tests.experiments import spring_experiment
@@ -59,10 +66,10 @@ def begun(experiment, plugins, folder):
     return folder
 
 
-def refused(folder, what):
+def refused(folder, what, words="its {} changed since it was begun"):
     """Resuming is refused for this, in one line, and nothing in the folder changes."""
     before = {p: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-    with pytest.raises(InputError, match=f"its {what} changed since it was begun") as caught:
+    with pytest.raises(InputError, match=words.format(what)) as caught:
         Comparison.resume(folder)
     assert "\n" not in str(caught.value)
     assert before == {p: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
@@ -129,3 +136,98 @@ def test_a_changed_recording_is_refused_and_the_same_one_goes_on(name, old, new,
     refused(folder, "recording")
     (tmp_path / name).write_text(text)
     goes_on(folder)
+
+
+@pytest.fixture
+def folder(tmp_path, spring):
+    from bench.registry import tuners
+
+    tuners.register(Interrupting)
+    experiment = spring_experiment(
+        targets=1, seeds=1, ranges=["in"], tuners=["random", "interrupting"]
+    )
+    return begun(experiment, [], tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("function", "what"), [("rooms", "code"), ("versions", "package versions")]
+)
+def test_changed_code_and_other_packages_are_refused(folder, monkeypatch, function, what):
+    monkeypatch.setattr(f"bench.runs.identity.{function}", lambda *_: "0123456789")
+    refused(folder, what)
+    monkeypatch.undo()
+    goes_on(folder)
+
+
+def test_a_changed_class_is_refused_that_is_in_no_plugin_file(folder, monkeypatch):
+    monkeypatch.setattr(Interrupting, "source_digest", "another")
+    refused(folder, "simulator and tuners")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("budget = 12", "budget = 13"), ("targets = 1", "targets = 2"), ("20.0", "21.0")],
+)
+def test_a_changed_configuration_is_refused(folder, old, new):
+    path = folder / "experiment.toml"
+    text = path.read_text()
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new))
+    refused(folder, "configuration")
+    path.write_text(text)
+    goes_on(folder)
+
+
+def test_what_was_begun_without_a_hash_is_refused(folder):
+    path = folder / "environment.json"
+    environment = json.loads(path.read_text())
+    for what in ("configuration", "recording", "plugins", "code", "package versions"):
+        hashes = {k: v for k, v in environment["fingerprint"].items() if k != what}
+        path.write_text(json.dumps({**environment, "fingerprint": hashes}))
+        refused(folder, what)
+    path.write_text(json.dumps({**environment, "fingerprint": {}}))
+    refused(folder, "", "written by an older simgap, which cannot be resumed")
+
+
+def test_another_plan_is_refused(folder):
+    ids = read_plan(folder)
+    write_plan(folder, [ids[0], ids[1] + "0"])
+    refused(folder, "", "its plan is not the one that its configuration gives")
+    write_plan(folder, ids)
+    goes_on(folder)
+
+
+def test_a_finished_run_of_another_plan_is_refused(folder):
+    journal = Journal(folder)
+    foreign = replace(journal.statuses[0], run="random/in-000/0/0123456789")
+    journal.add(1, {"run": [foreign.run], "k": np.zeros(1, dtype=int)}, foreign)
+    journal.close()
+    refused(folder, "", "its plan is not the one that its configuration gives")
+
+
+def test_a_run_is_called_by_all_that_its_target_has(spring):
+    experiment = spring_experiment(held_out={"scenarios": 1})
+    target = Problem(experiment).target("in", 0).sealed
+    (scenario,), observed = target.fitting
+
+    def with_side(name, **changes):
+        (scene,), seen = getattr(target, name)
+        return replace(target, **{name: Side((replace(scene, **changes),), seen)})
+
+    changed = [
+        target,
+        replace(target, start=target.start + 1e-9),
+        replace(target, fitting=Side((scenario,), observed + 1e-9)),
+        replace(target, held_out=Side(target.held_out.scenarios, target.held_out.observed + 1e-9)),
+    ]
+    for side in ("fitting", "held_out"):
+        changed += [
+            with_side(side, times=scenario.times * 2),
+            with_side(side, initial={"x": 0.5}),
+            with_side(side, inputs={"u": np.zeros(60)}),
+            with_side(side, inputs={"u": np.ones(60)}),
+            with_side(side, constants={"mass": 2.0}),
+        ]
+    ids = [Identities(experiment).run(experiment.tuners[0], each, 0, 12) for each in changed]
+    assert len(set(ids)) == len(changed)
+    assert ids[0] == Identities(experiment).run(experiment.tuners[0], target, 0, 12)

@@ -254,6 +254,18 @@ def test_units_convert_with_the_noise(tmp_path):
         read_recording(written(tmp_path, CSV.replace("0.1", "1e308"), toml), Cart)
 
 
+def test_a_unit_with_an_offset_moves_the_values_and_not_the_spread(tmp_path):
+    class Warm(Cart):
+        name = "cart"
+        channels = (Channel("x", "K"),)
+
+    toml = TOML.replace('unit = "m"', 'unit = "degF"').replace("noise = 0.01", "noise = 0.9")
+    recording = read_recording(written(tmp_path, toml=toml), Warm)
+    kelvin = [273.15 + (0.5 - 32) * 5 / 9, 273.15 + (0.6 - 32) * 5 / 9]
+    np.testing.assert_allclose(recording.runs[1].channels["x"], kelvin, rtol=1e-12)
+    assert recording.noise == {"x": pytest.approx(0.5, rel=1e-9)}
+
+
 def test_initial_states_and_constants_by_run(tmp_path):
     marks = "[runs.1]\nmass = 3\n[runs.1.initial]\nx = 0.25\n[runs.b.constants]\ndrift = -1\n"
     first, second = read_recording(written(tmp_path, toml=TOML + marks), Cart).runs

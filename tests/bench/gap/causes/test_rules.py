@@ -127,6 +127,7 @@ def test_held_out_runs_are_missed_by_what_is_left_or_by_what_is_not_gone():
     [
         (State(), "adequate"),
         (State(fixed=False), "unidentifiable"),
+        (State(fixed=False, causes=1, closed=0.9), "unidentifiable"),
         (State(unexplained=True), "unknown"),
         (State(missed=True), "unknown"),
         (State(causes=1, closed=0.71), "named"),

@@ -1,8 +1,10 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from bench.gap.causes.rules import CHANCE, SLOWEST
-from bench.gap.causes.structure import Hat, hats, remains
+from bench.gap.causes.rules import CHANCE, SLOWEST, UNSURE
+from bench.gap.causes.structure import Hat, _error, hats, remains
 from sims.pendulum.simulator import Pendulum
 from sims.slider.simulator import Slider
 from sims.system import Coefficient, Force
@@ -79,7 +81,17 @@ def test_noise_that_is_louder_than_stated_is_structure():
     assert found.structure
     assert found.excess[0] == pytest.approx(1.5, rel=0.08)
     loud[0].stated = np.array([False, True])
-    assert not remains(*loud).structure, "half as much again as an estimated noise is none"
+    found = remains(*loud)
+    assert not found.structure, "half as much again as an estimated noise is none"
+    assert (found.chance, remains(*quiet).chance) == (UNSURE, CHANCE), "one that is not stated"
+
+
+@pytest.mark.parametrize(("phi", "samples"), [(0.0, 1.0), (0.6, 0.64 / 1.36), (-0.6, 0.64 / 1.36)])
+def test_noise_that_remembers_is_known_less_well(phi, samples):
+    """As if there were so many times fewer samples; Bartlett's formula."""
+    models = SimpleNamespace(seen=np.ones((2, 100, 1), dtype=bool))
+    model = SimpleNamespace(likelihood=SimpleNamespace(phi=np.array([phi])))
+    assert _error(models, model, 0) == pytest.approx(1 / np.sqrt(2 * 200 * samples), rel=1e-12)
 
 
 def test_hats_cover_time_position_and_speed():

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from bench.gap.model.noise import Noise, forgets, likelihood, log_determinant, surrogates, whitened
 from tests.bench.gap.made import correlated, covariance_of
@@ -155,6 +156,13 @@ def test_surrogates_are_the_same_for_a_seed_and_zero_where_nothing_was_seen():
     assert (one[:, seen] != 0).all()
 
 
+def test_surrogates_have_no_offset_whatever_the_residual_has():
+    made = correlated(np.random.default_rng(15), 0.8, 1.0, (4, 300, 1)) + 2.0
+    like = surrogates(made, everything(made), 80, np.random.default_rng(0))
+    # of 80 x 4 x 300 samples that remember for about nine each
+    assert abs(like.mean()) < 4 * like.std() * 3 / np.sqrt(like.size)
+
+
 def test_surrogates_of_nothing_are_nothing():
     seen = np.ones((1, 30, 1), dtype=bool)
     nothing = np.zeros((1, 30, 1))
@@ -166,6 +174,26 @@ def test_surrogates_of_few_samples_are_those_samples():
     values = np.array([1.0, -2.0, 3.0]).reshape(1, 3, 1)
     few = surrogates(values, seen, 9, np.random.default_rng(0))
     assert set(np.abs(few).ravel()) <= {1.0, 2.0, 3.0}
+
+
+@pytest.mark.parametrize(("phi", "wave"), [(0.0, 0.5), (0.6, 2.0)])
+def test_the_portmanteau_test_is_that_of_ljung_and_box(phi, wave):
+    """One degree of freedom is lost to the correlation, and the least of C channels counts C
+    times.
+    """
+    structure = wave * np.sin(np.arange(400) / 15.0)[None, :, None]
+    made = correlated(np.random.default_rng(16), phi, 1.0, (1, 400, 1)) + structure
+    found = likelihood(made, everything(made))
+    white = whitened(made, everything(made), Noise(np.ones(1), found.phi))[0, :, 0]
+    lags = np.arange(1, 21)
+    correlations = np.array([white[k:] @ white[:-k] for k in lags]) / (white @ white)
+    statistic = 400 * 402 * (correlations**2 / (400 - lags)).sum()
+    chance = forgets(made, everything(made), found)
+    assert chance == pytest.approx(chi2.sf(statistic, 19), rel=1e-9, abs=0)
+    assert 1e-9 < chance < 0.45
+    twice = np.concatenate([made, 3.0 * made], axis=2)
+    both = forgets(twice, everything(twice), likelihood(twice, everything(twice)))
+    assert both == pytest.approx(2 * chance, rel=1e-6, abs=0)
 
 
 def test_first_order_noise_is_told_from_structure_that_is_as_large():
