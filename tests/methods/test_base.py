@@ -120,3 +120,13 @@ def test_optimiser_without_a_question_ends_at_once() -> None:
     with pytest.raises(StopIteration) as stop:
         next(from_callback(lambda loss: "nothing to do"))
     assert stop.value.value == "nothing to do"
+
+
+def test_residuals_are_in_units_of_the_scale_and_zero_where_nothing_was_seen() -> None:
+    observed = np.array([[1.0, 10.0], [np.nan, 20.0], [3.0, np.nan]])
+    corners = np.array([[0.0], [1.0]])
+    task = Task(1, np.array([0.5]), observed, np.array([0.1, 5.0]), corners, 1, (3,))
+    simulated = np.stack([observed, observed + np.array([0.2, -5.0])])
+    simulated[np.isnan(simulated)] = 7.0
+    expected = [[0.0] * 6, [2.0, -1.0, 0.0, -1.0, 2.0, 0.0]]
+    np.testing.assert_allclose(task.residuals(simulated), expected, atol=1e-12)

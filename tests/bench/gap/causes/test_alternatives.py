@@ -13,13 +13,15 @@ ALIKE = model("b", merit=100.0 - 0.5 * SWITCH)
 BEHIND = model("c", merit=100.0 - 2.0 * SWITCH)
 
 
-def evidence(monkeypatch, trial=None, structure=False, plausible="abc", **excess):
+def evidence(
+    monkeypatch, trial=None, structure=False, plausible="abc", luck=0.0, best=1e-5, **excess
+):
     scores = SimpleNamespace(
-        effects=("a", "b", "c"), chance=np.zeros(3), by_chance=np.zeros((3, 40))
+        effects=("a", "b", "c"), chance=np.full(3, luck), by_chance=np.zeros((3, 40))
     )
     search = search_of(model(), BEST, ALIKE, BEHIND, excess={(n,): e for n, e in excess.items()})
     search.scanned = {frozenset(): SimpleNamespace(scores=scores)}
-    search.tests = {frozenset(): 1e-5}
+    search.tests = {frozenset(): best}
     monkeypatch.setattr(Alternatives, "_is_plausible", lambda self, effect: effect in plausible)
     (found,) = Alternatives(search, trial, structure).evidence(BEST)
     return found
@@ -30,6 +32,14 @@ def test_what_is_not_behind_by_the_odds_is_an_alternative(monkeypatch):
     assert (found.effect, found.alternatives, found.preferred) == ("a", ("b",), "a")
     assert found.gain == pytest.approx(100.0)
     assert found.p_value <= 1e-5
+
+
+@pytest.mark.parametrize(
+    ("luck", "best", "p_value"), [(150.0, 1e-5, 1e-5), (0.0, 0.7, 0.0), (150.0, 1.0, 1.0)]
+)
+def test_the_refit_or_the_best_score_may_see_that_it_is_no_chance(monkeypatch, luck, best, p_value):
+    """The fit gains 100, more than any surrogate, or less than what luck gives the effect."""
+    assert evidence(monkeypatch, luck=luck, best=best).p_value == pytest.approx(p_value, abs=1e-12)
 
 
 def test_a_rival_with_plausible_coefficients_is_preferred(monkeypatch):
