@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bench.store.folder import (
     Configuration,
@@ -14,7 +14,19 @@ from bench.store.folder import (
     read,
     write_results,
 )
-from bench.store.journal import FOLDER, Journal, finished, read_plan, write_plan
+from bench.store.journal import Journal
+from bench.store.planned import check_plan
+from bench.store.rows import RunsFile
+from bench.store.segments import (
+    FOLDER,
+    PLAN,
+    PLAN_REMEDY,
+    REMEDY,
+    kept,
+    read_plan,
+    write_plan,
+)
+from bench.store.sound import check_alike, check_kept, check_runs
 from bench.store.standing import MISSING, End, Made, Standing
 from bench.store.status import STATUS_COLUMNS, Status
 from sims.base import InputError
@@ -97,33 +109,52 @@ class Comparison:
             return
         planned = read_plan(self.folder)
         journal = Journal(self.folder)
+        try:
+            if planned is not None and planned != ids:
+                raise InputError(
+                    f"{self.folder / FOLDER / PLAN}: expected the plan that the configuration "
+                    "gives, found another; start a new comparison"
+                )
+            self._check_kept(journal, ids)
+        except InputError:
+            journal.close()
+            raise
         # Killed between the folder and its plan: there are no runs that could contradict it.
         if planned is None:
             write_plan(self.folder, ids)
-        foreign = [
-            place
-            for place, status in journal.statuses.items()
-            if place >= len(ids) or ids[place] != status.run
-        ]
-        if foreign or (planned is not None and planned != ids):
-            journal.close()
-            raise InputError(
-                f"{self.folder}: its plan is not the one that its configuration gives; "
-                "start a new comparison"
-            )
         results.kept = journal
+
+    def _check_kept(self, journal: Journal, ids: list[str]) -> None:
+        """Check every row that is kept: what is damaged would spoil the results.
+
+        Raises:
+            InputError: something is damaged, or of another plan.
+        """
+        experiment = self.configuration.experiment
+        for path, held, records in journal.files():
+            file = RunsFile(path, REMEDY)
+            statuses = check_kept(path, held, experiment, ids, REMEDY)
+            runs = file.runs(experiment, records)
+            check_runs(runs, file, experiment)
+            check_alike(
+                runs,
+                file,
+                statuses,
+                lambda _, says, file=file: file.fault(None, says),
+                "its statuses",
+            )
 
     def _complete(self, ids: list[str]) -> dict[int, Status]:
         """The statuses of a folder that says it is finished.
 
         Raises:
-            InputError: it holds other runs than those planned.
+            InputError: it holds other runs than those planned, or is damaged.
         """
         statuses = self._stored()
         if [status.run for status in statuses] != ids:
             raise InputError(
-                f"{self.folder}: expected {len(ids)} runs, found {len(statuses)} or others; "
-                "start a new comparison"
+                f"{self.folder / 'status.csv'}: expected the {len(ids)} runs of the plan, found "
+                f"{len(statuses)} or others; start a new comparison"
             )
         return dict(enumerate(statuses))
 
@@ -131,11 +162,7 @@ class Comparison:
         """How the runs of a finished comparison ended, in the order of its plan."""
         statuses = read(self.folder, ["run", "tuner", "k"]).statuses
         made = statuses[statuses["status"] != "skipped"]
-        # Of a damaged table some columns may be missing; the run and its end are there.
-        rows: list[dict[str, Any]] = [
-            {name: row.get(name) for name in STATUS_COLUMNS} for row in made.to_dict("records")
-        ]
-        return [Status(**row) for row in rows]
+        return [Status(**row) for row in made[STATUS_COLUMNS].to_dict("records")]
 
     def make(
         self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
@@ -196,16 +223,27 @@ class Comparison:
         """
         held = self.configuration
         ends = tuple(self._ends())
-        return Standing(held.experiment.name, "runs finished", held.fingerprint, ends)
+        return Standing(
+            held.experiment.name, "runs finished", held.fingerprint, ends, self._under_way
+        )
 
     def _ends(self) -> list[End]:
-        if (self.folder / FOLDER).exists():
-            planned = read_plan(self.folder) or []
-            made = {status.run: status for status in finished(self.folder).values()}
-        else:
-            made = {status.run: status for status in self._stored()}
-            planned = list(made)
-        return [_end(name, made.get(name)) for name in planned]
+        if not self._under_way:
+            return [_end(status.run, status) for status in self._stored()]
+        planned, experiment = read_plan(self.folder), self.configuration.experiment
+        if planned is not None:
+            path = self.folder / FOLDER / PLAN
+            check_plan(planned, experiment, path, PLAN_REMEDY)
+        made: dict[str, Status] = {}
+        for path, held in kept(self.folder):
+            check_kept(path, held, experiment, planned, REMEDY)
+            made |= {status.run: status for status in held.values()}
+        return [_end(name, made.get(name)) for name in (made if planned is None else planned)]
+
+    @property
+    def _under_way(self) -> bool:
+        """Whether something remains to be made or written: segments go when all is."""
+        return (self.folder / FOLDER).exists()
 
     def finish(self, say: Say) -> int:
         """Write tables and figures of what there is, and say what came out.
@@ -222,6 +260,11 @@ class Comparison:
         results = self.results
         problem = results.problem if results else Problem(self.configuration.experiment)
         return finish(self.folder, problem, say)
+
+
+def _at_file(file: RunsFile, _row: int, says: str) -> InputError:
+    """The error for a status of a segment, which stands in none of its rows."""
+    return file.fault(None, says)
 
 
 def _end(name: str, status: Status | None) -> End:

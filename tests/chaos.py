@@ -20,7 +20,7 @@ import pandas as pd
 import psutil
 import tomli_w
 
-from bench.store.journal import finished
+from bench.store.segments import finished
 from tests.cluster import cluster, said
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING

@@ -18,18 +18,11 @@ from numpy.typing import NDArray
 
 from bench.analysis.curves import Curves, Rows, mean_over_seeds
 from bench.problem.seeds import rng_for
+from bench.store.schema import METRICS
 from sims.base import Array
 
 CHECKPOINTS = (0, 1, 2, 3, 5, 10, 20, 50, 100)
 """Numbers of simulations that tables and axes name."""
-METRICS = (
-    "param_abs_error",
-    "param_error",
-    "stiff_error",
-    "sloppy_error",
-    "obs_error",
-    "heldout_error",
-)
 COLUMNS = [
     "experiment",
     "tuner",

@@ -18,10 +18,11 @@ from bench.registry import load_plugins
 from bench.registry import tuners as registered
 from bench.report import tables
 from bench.runs.runner import Progress
+from bench.store.csvs import Csv
 from bench.store.folder import Stored, read
+from bench.store.schema import SHOT_STATUS, SHOT_TABLE, SHOTS
 from methods.base import Tuner
 from sims.base import InputError, unknown
-from sims.files import first_line
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
     from bench.runs.pools import Pool
 
+_OF_SHOTS = {"status": SHOT_STATUS, "shots": SHOTS, "table": SHOT_TABLE}
+"""Columns of the tables of a bounce shot."""
 _ROWS = 200
 """Rows of a table that a notebook shows."""
 
@@ -217,12 +220,10 @@ class Compared:
 
     def _csv(self, name: str) -> pd.DataFrame:
         """A table of a bounce shot, as it was written."""
-        import pandas as pd
-
-        try:
-            return pd.read_csv(self.folder / f"{name}.csv", keep_default_na=name != "status")
-        except (OSError, ValueError) as error:
-            raise InputError(f"{self.folder}: {name}.csv: {first_line(error)}") from None
+        remedy = f"simgap plot {self.folder} writes it again"
+        path = self.folder / f"{name}.csv"
+        table: pd.DataFrame = Csv(path, _OF_SHOTS[name], remedy).table.to_pandas()
+        return table
 
     @cached_property
     def tables(self) -> dict[str, pd.DataFrame]:

@@ -11,11 +11,16 @@ from typing import Any
 from bench.shot.deal import Deal
 from bench.shot.settings import Settings
 from bench.shot.throw import thrown
+from bench.store.cells import CellError, columns_of, of_python
+from bench.store.cells import check as check_cells
+from bench.store.schema import MODEL, Column, Columns
+from bench.store.schema import SHOTS as SHOT_COLUMNS
 from sims.base import InputError
 from sims.files import write
 
 SHOTS = "shots"
 """The folder of finished shots, in a study's."""
+_REMEDY = "damaged; delete it, and resume to make it again"
 _NUMBERS = ("height", "margin", "restitution", "seconds")
 """Of a model; each may be none."""
 
@@ -58,12 +63,60 @@ def read(folder: Path, dealt: Deal) -> dict[str, Any] | None:
         return None
     try:
         kept: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        for model in kept["models"]:
-            # JSON has no NaN, and null is no number to plan with.
-            model.update({name: math.nan for name in _NUMBERS if model[name] is None})
-        return kept
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: damaged; delete it, and resume to make it again") from None
+        _check(kept, "models", MODEL)
+        _check(kept, "rows", SHOT_COLUMNS)
+    except CellError as error:
+        place = "" if error.row is None else f", {error.row + 1}"
+        raise InputError(f"{path}{place}: {error.says}; {_REMEDY}") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise InputError(f"{path}: {_REMEDY}") from None
+    wanted = (dealt.name, [model["method"] for model in kept["models"]])
+    found = {row["shot"] for row in kept["rows"]}, [row["method"] for row in kept["rows"]]
+    if found != ({wanted[0]}, wanted[1]):
+        says = f"expected a row of {wanted[0]} for each model, found others"
+        raise InputError(f"{path}: {says}; {_REMEDY}")
+    for model in kept["models"]:
+        # JSON has no NaN, and null is no number to plan with.
+        model.update({name: math.nan for name in _NUMBERS if model[name] is None})
+    return kept
+
+
+def check(folder: Path, dealt: Sequence[Deal]) -> None:
+    """Check all that is kept of these shots.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    for one in dealt:
+        read(folder, one)
+
+
+def _check(kept: dict[str, Any], name: str, columns: Columns) -> None:
+    """Check the models or the rows of a shot.
+
+    Raises:
+        CellError: one is not what it is declared to be.
+        KeyError: there is none.
+        TypeError: they are no tables.
+    """
+    tables = kept[name]
+    for row, table in enumerate(tables):
+        columns_of(list(table), columns, row)
+        if name == "models":
+            _check_effects(row, table["effects"])
+    for column in columns:
+        check_cells(column, of_python(column, [table[column.name] for table in tables]))
+
+
+def _check_effects(row: int, effects: Any) -> None:
+    """Check the coefficients of a model's effects."""
+    coefficient = Column("effects", float)
+    for values in effects.values():
+        try:
+            check_cells(coefficient, of_python(coefficient, values))
+        except CellError as error:
+            error.row = row
+            raise
 
 
 def _plain(value: Any) -> Any:

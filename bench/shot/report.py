@@ -15,7 +15,7 @@ from bench.shot.kept import read
 from bench.shot.pictures import draw, examples
 from bench.shot.settings import Settings
 from bench.shot.table import NO_SHOT, table, text
-from bench.store.journal import FOLDER
+from bench.store.segments import FOLDER
 from bench.store.status import STATUS_COLUMNS
 from sims.files import write
 

@@ -16,6 +16,7 @@ from bench.runs.training import Training, train
 from bench.shot import tune
 from bench.shot.deal import RECORDINGS, Deal, deals, in_view, record
 from bench.shot.kept import SHOTS, keep, missing
+from bench.shot.kept import check as check_kept
 from bench.shot.settings import Settings, settings_of
 from bench.store.folder import Configuration, configuration, create, free_folder
 from bench.store.standing import MISSING, End, Made, Standing
@@ -83,6 +84,7 @@ class BounceShotStudy:
 
         study = cls(folder)
         study.plugins = unchanged(folder, study.configuration, plugins)
+        check_kept(folder, study.deals)
         return study
 
     @cached_property
@@ -136,7 +138,12 @@ class BounceShotStudy:
         """Let go of the folder; a shot's holds nothing open."""
 
     def status(self) -> Standing:
-        """Which shots the folder holds and which are missing."""
+        """Which shots the folder holds and which are missing.
+
+        Raises:
+            InputError: the file of a shot is damaged.
+        """
+        check_kept(self.folder, self.deals)
         left = {one.name for one in missing(self.folder, self.deals)}
         ends = tuple(
             End(one.name, one.ball.name, MISSING if one.name in left else "made")

@@ -17,11 +17,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench import __version__
 from bench.problem.experiment import Experiment, parse
-from bench.store.journal import FOLDER, Journal
+from bench.store.journal import Journal
+from bench.store.schema import ENVIRONMENT, OLDER, RUNS, STATUS, Columns
+from bench.store.segments import FOLDER, read_plan
+from bench.store.sound import check_table, checked_files
 from bench.store.status import STATUS_COLUMNS
 from sims.base import InputError
 from sims.files import first_line, fresh_folder, refuse_full, replacing, stamped, write
-from sims.user_toml import read_toml
+from sims.user_toml import entries, read_toml, shown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -114,34 +117,33 @@ def configuration(folder: Path) -> Configuration:
             f"{folder}: expected the folder of a comparison with {CONFIGURATION} in it, found none"
         )
     environment = _environment(folder)
-    plugins, fingerprint = environment.get("plugins", []), environment.get("fingerprint", {})
-    hashed = isinstance(fingerprint, dict) and _texts(list(fingerprint.values()))
-    if not (hashed and _texts(plugins)):
-        path_of_it = folder / "environment.json"
-        raise InputError(
-            f"{path_of_it}: expected lists of plugins and hashes, found something else"
-        )
     experiment = parse(str(environment["experiment"]), read_toml(path), path)
-    return Configuration(experiment, plugins, fingerprint)
-
-
-def _texts(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(item, str) for item in value)
+    return Configuration(
+        experiment, list(environment["plugins"]), dict(environment.get("fingerprint", {}))
+    )
 
 
 def _environment(folder: Path) -> dict[str, Any]:
+    """What environment.json says, checked; keys that are not declared are left out."""
     path = folder / "environment.json"
+    wrong, remedy = f"{path}: not a complete comparison", "restore it, or start a new comparison"
     try:
         environment = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"{folder}: not a complete comparison: {path.name}: {first_line(error)}"
-        ) from None
-    if not isinstance(environment, dict) or not isinstance(environment.get("experiment"), str):
-        raise InputError(
-            f"{folder}: not a complete comparison: {path.name} does not name the experiment"
-        )
-    return environment
+        raise InputError(f"{wrong}: {first_line(error)}; {remedy}") from None
+    if not isinstance(environment, dict):
+        raise InputError(f"{wrong}: expected a table, found {shown(environment)}; {remedy}")
+    for key in ENVIRONMENT:
+        if key not in environment and key not in OLDER:
+            raise InputError(f"{wrong}: expected a key {key}, found none; {remedy}")
+    given = {key: value for key, value in environment.items() if key in ENVIRONMENT}
+    # Some systems do not say how many there are.
+    if given["processors"] is None:
+        del given["processors"]
+    try:
+        return entries(path, "", given, ENVIRONMENT)
+    except InputError as error:
+        raise InputError(f"{error}; {remedy}") from None
 
 
 def write_results(
@@ -201,45 +203,63 @@ class Stored(NamedTuple):
 
 
 def read(folder: Path, columns: Sequence[str] | None = None) -> Stored:
-    """Read the folder of a comparison that was finished or interrupted.
+    """Read the folder of a comparison that was finished or interrupted; all of it is checked.
 
     Args:
         folder: the comparison's.
         columns: of the runs, where not all are wanted; those that there are not are left out.
 
     Raises:
-        InputError: the folder lacks a file of a comparison, or one is damaged.
+        InputError: the folder lacks a file of a comparison, or something in one is not what
+            `bench.store.schema` declares, or runs are missing.
     """
-    import pandas as pd
-    from pyarrow import ArrowException, parquet
+    from pyarrow import parquet
 
     experiment = configuration(folder).experiment
     path = folder / "runs.parquet"
+    under_way = (folder / FOLDER).exists()
     # Killed before its first results were written: nothing is wrong with it.
-    if not path.exists() and (folder / FOLDER).exists():
+    if not path.exists() and under_way:
         raise InputError(
             f"{folder}: not finished, and nothing written yet; resume it to make the rest"
         )
-    try:
-        there = parquet.read_schema(path).names
-        runs = parquet.read_table(
-            path, columns=[c for c in there if columns is None or c in columns]
-        ).to_pandas()
-        statuses = pd.read_csv(folder / "status.csv", keep_default_na=False)
-        training = pd.read_csv(folder / "training.csv")
-        missing = {"run", "tuner", "k"} - set(runs.columns) if len(runs.columns) else set()
-        missing |= {"run", "tuner", "status", "reason"} - set(statuses.columns)
-        if missing:
-            raise InputError(
-                f"{folder}: not a complete comparison: no column {', '.join(sorted(missing))}"
-            )
-        costs = _costs(training)
-        spectra = pd.read_csv(known) if (known := folder / "identifiability.csv").exists() else None
-    except (OSError, ValueError, KeyError, ArrowException) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{folder}: not a complete comparison: {first_line(error)}") from None
-    return Stored(experiment, runs, statuses, costs, spectra)
+    plan = read_plan(folder) if under_way else None
+    files = checked_files(folder, experiment, under_way=under_way, plan=plan)
+    there = parquet.read_schema(path).names
+    wanted = [name for name in there if columns is None or name in columns]
+    runs = parquet.read_table(path, columns=wanted).to_pandas()
+    return Stored(
+        experiment,
+        _with_defaults(runs, RUNS, columns) if there else runs,
+        _with_defaults(files.statuses, STATUS),
+        _costs(files.training),
+        files.spectra,
+    )
+
+
+def checked(folder: Path) -> Stored:
+    """As `read`, and the tables that `simgap plot` writes are checked too.
+
+    Raises:
+        InputError: something in the folder is damaged.
+    """
+    stored = read(folder)
+    check_table(folder)
+    return stored
+
+
+def _with_defaults(
+    frame: pd.DataFrame, declared: Columns, wanted: Sequence[str] | None = None
+) -> pd.DataFrame:
+    """The frame with columns that an older folder lacks and that have a default."""
+    missing = {
+        column.name: column.default
+        for column in declared
+        if column.default is not None
+        and column.name not in frame
+        and (wanted is None or column.name in wanted)
+    }
+    return frame.assign(**missing)
 
 
 def _costs(training: pd.DataFrame) -> dict[str, tuple[float, float]]:

@@ -13,27 +13,26 @@ from __future__ import annotations
 
 import json
 import shutil
-import struct
-import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from bench.store.segments import (
+    FOLDER,
+    part_statuses,
+    record,
+    records,
+    refuse_double,
+    segments,
+)
 from bench.store.status import Status
 from sims.base import InputError
-from sims.files import first_line, replacing, write
+from sims.files import replacing
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-FOLDER = "segments"
-"""Below a comparison's folder, while it is under way."""
-_HEAD = struct.Struct(">4sII")
-"""Of a record: mark, length of what follows, its checksum."""
-_MARK = b"run\n"
-"""With which a record begins."""
 PART_RUNS = 1000
 """Records that become a part together."""
 
@@ -51,7 +50,12 @@ class Journal:
 
     def __init__(self, folder: Path, part_runs: int = PART_RUNS) -> None:
         self.folder = folder / FOLDER
-        self.folder.mkdir(exist_ok=True)
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except FileExistsError:
+            raise InputError(
+                f"{self.folder}: expected a folder, found a file; move it elsewhere"
+            ) from None
         self._lock = _locked(self.folder / "lock")
         # Half a part, of a process that was killed while it wrote; its journal is still there.
         for half in self.folder.glob("*.partial"):
@@ -62,19 +66,22 @@ class Journal:
         self._records: list[tuple[int, Status, pa.Table]] = []
         try:
             self._read_parts()
+            self._number = 1 + max((int(p.stem) for p in self._index), default=0)
+            for path in segments(self.folder, "journal"):
+                # A part holds all of its journal: killed between the two, it would double runs.
+                if int(path.stem) < self._number:
+                    path.unlink()
+                else:  # beyond the next where a person deleted a damaged part
+                    self._number = int(path.stem)
+            self._file = self._reopened(self._path("journal"))
         except InputError:
             self._lock.close()
             raise
-        self._number = 1 + max((int(p.stem) for p in self._index), default=0)
-        # A part holds all of its journal: killed between the two, the journal would double runs.
-        for stale in self.folder.glob("*.journal"):
-            if int(stale.stem) < self._number:
-                stale.unlink()
-        self._file = self._reopened(self._path("journal"))
 
     def _read_parts(self) -> None:
-        for path in sorted(self.folder.glob("*.parquet")):
+        for path in segments(self.folder, "parquet"):
             statuses = part_statuses(path)
+            refuse_double(path, statuses, self.statuses)
             self.statuses |= statuses
             self._index[path] = sorted(statuses)
 
@@ -87,6 +94,7 @@ class Journal:
         if path.exists():
             # The last end is where to go on.
             for place, status, rows, end in records(path):  # noqa: B007
+                refuse_double(path, [place], self.statuses)
                 self._records.append((place, status, rows))
                 self.statuses[place] = status
         # Without a buffer: what is written must survive this process.
@@ -101,9 +109,8 @@ class Journal:
         import pyarrow as pa
 
         rows = pa.table(dict(columns))
-        payload = _packed(place, status, rows)
         # One write: a kill leaves a record whole or cut off, never two that are mixed.
-        self._file.write(_HEAD.pack(_MARK, len(payload), zlib.crc32(payload)) + payload)
+        self._file.write(record(place, status, rows))
         self._records.append((place, status, rows))
         self.statuses[place] = status
         if len(self._records) >= self._part_runs:
@@ -151,6 +158,16 @@ class Journal:
             )
             yield whole.take(order).drop_columns(["place"])
 
+    def files(self) -> Iterator[tuple[Path, dict[int, Status], list[pa.Table] | None]]:
+        """What each file holds: statuses by place, and the rows of the journal that is appended to;
+        those of a part are in its file.
+        """
+        for path, places in self._index.items():
+            yield path, {place: self.statuses[place] for place in places}, None
+        if self._records:
+            held = {place: status for place, status, _ in self._records}
+            yield self._path("journal"), held, [rows for _, _, rows in self._records]
+
     def close(self) -> None:
         """Let others work in the folder."""
         self._file.close()
@@ -173,86 +190,6 @@ def _placed(place: int, rows: pa.Table) -> pa.Table:
     import pyarrow as pa
 
     return rows.append_column("place", pa.array(np.full(len(rows), place)))
-
-
-def _packed(place: int, status: Status, rows: pa.Table) -> bytes:
-    import pyarrow as pa
-
-    sink = pa.BufferOutputStream()
-    head = json.dumps([place, asdict(status)])
-    rows = rows.replace_schema_metadata({"status": head})
-    with pa.ipc.new_stream(sink, rows.schema) as stream:
-        stream.write_table(rows)
-    packed: bytes = sink.getvalue().to_pybytes()
-    return packed
-
-
-def records(path: Path) -> Iterator[tuple[int, Status, pa.Table, int]]:
-    """Place, status, rows, and the offset behind it, of every whole record of a journal."""
-    import pyarrow as pa
-
-    data, end = path.read_bytes(), 0
-    while end + _HEAD.size <= len(data):
-        mark, length, checksum = _HEAD.unpack_from(data, end)
-        payload = data[end + _HEAD.size : end + _HEAD.size + length]
-        if mark != _MARK or len(payload) < length or zlib.crc32(payload) != checksum:
-            return
-        end += _HEAD.size + length
-        rows = pa.ipc.open_stream(payload).read_all()
-        place, status = json.loads(rows.schema.metadata[b"status"])
-        yield place, Status(**status), rows.replace_schema_metadata(), end
-
-
-def part_statuses(path: Path) -> dict[int, Status]:
-    """Statuses of a part, by place, from its footer alone.
-
-    Raises:
-        InputError: the file is damaged.
-    """
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    try:
-        held = json.loads(parquet.read_schema(path).metadata[b"statuses"])
-        return {int(place): Status(**status) for place, status in held}
-    except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
-        raise InputError(
-            f"{path}: expected a part of a comparison, found damage: {first_line(error)}"
-        ) from None
-
-
-def finished(folder: Path) -> dict[int, Status]:
-    """Statuses of the finished runs below `folder`, by place, while another process may be at work
-    there.
-    """
-    found: dict[int, Status] = {}
-    # Journals first: one that becomes a part meanwhile is found among the parts.
-    for path in sorted((folder / FOLDER).glob("*.journal")):
-        with suppress(FileNotFoundError):
-            found |= {place: status for place, status, _, _ in records(path)}
-    for path in sorted((folder / FOLDER).glob("*.parquet")):
-        found |= part_statuses(path)
-    return found
-
-
-def write_plan(folder: Path, ids: Sequence[str]) -> None:
-    """Write the id of every run, in the order of the plan."""
-    write(folder / FOLDER / "plan.txt", "".join(f"{name}\n" for name in ids))
-
-
-def read_plan(folder: Path) -> list[str] | None:
-    """The ids of the plan; None where there is none yet.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    path = folder / FOLDER / "plan.txt"
-    try:
-        return path.read_text(encoding="utf-8").splitlines() if path.is_file() else None
-    except ValueError:
-        raise InputError(
-            f"{path}: expected the ids of the runs as UTF-8 text, found other bytes"
-        ) from None
 
 
 def _locked(path: Path) -> IO[str]:

@@ -58,12 +58,14 @@ class Standing(NamedTuple):
         what: what is counted, e.g. ``runs finished``.
         hashes: of what must not change until it is complete, by what a person would call it.
         ends: of everything that is planned, in the order of the plan.
+        under_way: whether results remain to be written, though everything may have ended.
     """
 
     name: str
     what: str
     hashes: Mapping[str, str]
     ends: tuple[End, ...]
+    under_way: bool = False
 
     @property
     def finished(self) -> int:
@@ -73,4 +75,4 @@ class Standing(NamedTuple):
     @property
     def complete(self) -> bool:
         """Whether nothing is missing."""
-        return self.finished == len(self.ends)
+        return not self.under_way and self.finished == len(self.ends)

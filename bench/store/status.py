@@ -39,3 +39,5 @@ FAILED = ("crashed", "timeout", "diverged")
 """Ends of a run that was made and delivered nothing one could trust."""
 FAILURES = (*FAILED, "skipped")
 """And of one that was never made: the tables show what is missing."""
+STATUSES = ("done", "converged", *FAILURES)
+"""All words by which a run ends."""

@@ -12,7 +12,7 @@ import pytest
 import tomli_w
 
 from bench.cli import main
-from bench.store.journal import finished
+from bench.store.segments import finished
 from sims.base import InputError
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING

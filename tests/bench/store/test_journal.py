@@ -4,7 +4,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from bench.store.journal import FOLDER, Journal, finished, read_plan, records, write_plan
+from bench.store.journal import Journal
+from bench.store.segments import FOLDER, finished, read_plan, records, write_plan
 from bench.store.status import Status
 from sims.base import InputError
 

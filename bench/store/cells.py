@@ -1,0 +1,207 @@
+"""Cells of a table against what its columns are declared to hold; whole columns at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.store.schema import Column, Columns, Empty
+from sims.user_toml import shown
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Mask = NDArray[np.bool_]
+
+_TEXTS: Mapping[type, str] = {
+    bool: "True|False",
+    int: r"-?\d{1,18}",
+    float: r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?|-?inf|nan|",
+}
+"""How values of each type are written in a CSV file."""
+
+
+class CellError(Exception):
+    """A cell, or a whole column, is not what it is declared to be.
+
+    Attributes:
+        row: the first such, counted from 0; None where it is the column.
+        says: column, expected and found.
+    """
+
+    def __init__(self, row: int | None, column: str, wanted: str, found: str) -> None:
+        self.row = row
+        self.says = f"{column}: expected {wanted}, found {found}"
+        super().__init__(self.says)
+
+
+def columns_of(names: Sequence[str], columns: Columns, row: int | None = None) -> list[Column]:
+    """The declared columns that are there, in a table or in one row of a JSON file.
+
+    Raises:
+        CellError: a required one is missing, or one is there twice.
+    """
+    for name in names:
+        if names.count(name) > 1:
+            times = f"it {names.count(name)} times"
+            raise CellError(None, f"column {shown(name)}", "it once", times)
+    for column in columns:
+        if column.required and column.name not in names:
+            there = shown(", ".join(names))
+            raise CellError(row, "columns", f"one named {column.name}", there)
+    return [column for column in columns if column.name in names]
+
+
+def of_parquet(column: Column, values: pa.Array) -> pa.Array:
+    """A column of a Parquet file as text, int64, float64 or bool.
+
+    Raises:
+        CellError: it is of another type, or a cell that must not be empty is.
+    """
+    import pyarrow as pa
+    from pyarrow import compute
+
+    kind = values.type
+    if pa.types.is_dictionary(kind):
+        values = values.cast(kind.value_type)
+        kind = values.type
+    text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+    fits: Mapping[type, bool] = {
+        str: text,
+        int: pa.types.is_integer(kind),
+        float: pa.types.is_floating(kind) or pa.types.is_integer(kind),
+        bool: pa.types.is_boolean(kind),
+    }
+    if not fits[column.kind]:
+        raise CellError(None, column.name, column.wanted, f"a column of type {kind}")
+    if values.null_count:
+        if column.kind is not float:
+            row = compute.index(compute.is_null(values), True).as_py()
+            raise CellError(row, column.name, column.wanted, "nothing")
+        values = compute.fill_null(values, np.nan)
+    try:
+        return values.cast(_arrow(column))
+    except pa.ArrowInvalid:  # a number that is too large for the type
+        raise CellError(None, column.name, column.wanted, f"numbers beyond it ({kind})") from None
+
+
+def of_text(column: Column, values: pa.Array) -> pa.Array:
+    """A column of a CSV file as text, int64, float64 or bool.
+
+    Raises:
+        CellError: a cell is no such value.
+    """
+    from pyarrow import compute
+
+    if column.kind is str:
+        return values
+    sound = compute.match_substring_regex(values, f"^({_TEXTS[column.kind]})$")
+    _refuse(column, mask_of(compute.invert(sound)), lambda row: shown(values[row].as_py()))
+    if column.kind is float:
+        # What is empty is no number.
+        values = compute.if_else(compute.equal(values, ""), "nan", values)
+    return values.cast(_arrow(column))
+
+
+def of_python(column: Column, values: Sequence[Any]) -> pa.Array:
+    """Values of a JSON file as text, int64, float64 or bool.
+
+    Raises:
+        CellError: one is no such value.
+    """
+    import pyarrow as pa
+
+    kinds = (int, float) if column.kind is float else (column.kind,)
+    for row, value in enumerate(values):
+        none = value is None and column.kind is float  # JSON has no NaN
+        mistaken = isinstance(value, bool) and column.kind is not bool
+        if not none and (mistaken or not isinstance(value, kinds) or _beyond(value)):
+            raise CellError(row, column.name, column.wanted, shown(value))
+    given = [np.nan if v is None else v for v in values]
+    return pa.array(given, type=_arrow(column))
+
+
+def _beyond(value: Any) -> bool:
+    """Whether a whole number is too large for the type; JSON's have no end."""
+    return isinstance(value, int) and abs(value) >= 2**63
+
+
+def _arrow(column: Column) -> pa.DataType:
+    import pyarrow as pa
+
+    types = {str: pa.large_string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+    return types[column.kind]
+
+
+def check(
+    column: Column,
+    values: pa.Array,
+    at_start: Mask | None = None,
+    no_truth: Mask | None = None,
+) -> None:
+    """See that every cell is what the column is declared to hold.
+
+    Args:
+        column: as declared.
+        values: as `of_parquet`, `of_text` or `of_python` gives them.
+        at_start: rows with k = 0.
+        no_truth: rows of a recording.
+
+    Raises:
+        CellError: the first that is not.
+    """
+    if column.kind is bool:
+        return
+    if column.kind is str:
+        _check_texts(column, values)
+        return
+    numbers = values.to_numpy(zero_copy_only=False)
+    empty = np.isnan(numbers) if column.kind is float else np.zeros(len(numbers), dtype=bool)
+
+    def said(row: int) -> str:
+        return "nothing" if empty[row] else f"{numbers[row]}"
+
+    outside = ~empty & ~((numbers >= column.low) & (numbers <= column.high))
+    if not column.infinite:
+        outside |= np.isinf(numbers)
+    _refuse(column, outside, said)
+    wanted = {
+        Empty.NEVER: np.zeros(len(numbers), dtype=bool),
+        Empty.MAY: empty,
+        Empty.AT_START: at_start,
+        Empty.NO_TRUTH: no_truth,
+    }[column.empty]
+    if wanted is None:
+        return
+    _refuse(column, empty & ~wanted, said)
+    _refuse(column, wanted & ~empty, said, f"nothing {column.empty.value}")
+
+
+def _check_texts(column: Column, values: pa.Array) -> None:
+    import pyarrow as pa
+    from pyarrow import compute
+
+    if column.words:
+        known = compute.is_in(values, value_set=pa.array(column.words, type=values.type))
+        bad = compute.invert(known)
+    elif column.empty is Empty.NEVER:
+        bad = compute.equal(values, "")
+    else:
+        return
+    _refuse(column, mask_of(bad), lambda row: shown(values[row].as_py()))
+
+
+def mask_of(values: pa.Array) -> Mask:
+    """Bools as numpy has them."""
+    mask: Mask = values.to_numpy(zero_copy_only=False).astype(bool)
+    return mask
+
+
+def _refuse(column: Column, bad: Mask, said: Callable[[int], str], wanted: str = "") -> None:
+    """Raise for the first row that is bad."""
+    if bad.any():
+        row = int(bad.argmax())
+        raise CellError(row, column.name, wanted or column.wanted, said(row))

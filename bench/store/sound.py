@@ -1,0 +1,286 @@
+"""What must hold between the files of a comparison, and between them and its plan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from bench.problem.experiment import Experiment
+from bench.store.csvs import Csv
+from bench.store.faults import Fault, check_equal, check_known, refuse
+from bench.store.planned import check_complete, labels_of, targets_of
+from bench.store.rows import RunsFile
+from bench.store.schema import IDENTIFIABILITY, STATUS, TABLE, TRAINING, Column, spelled
+from bench.store.status import STATUS_COLUMNS, Status
+from sims.base import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class Files(NamedTuple):
+    """The files of a comparison whose runs have been written, checked cell by cell.
+
+    Attributes:
+        runs: a line a run; see `bench.store.rows.RunsFile.runs`.
+        statuses: rows of status.csv.
+        training: rows of training.csv.
+        spectra: rows of identifiability.csv; None where there is no such file.
+    """
+
+    runs: pd.DataFrame
+    statuses: pd.DataFrame
+    training: pd.DataFrame
+    spectra: pd.DataFrame | None
+
+
+def checked_files(
+    folder: Path, experiment: Experiment, *, under_way: bool, plan: list[str] | None = None
+) -> Files:
+    """Check runs.parquet, status.csv, training.csv and identifiability.csv, and that they tell of
+    the same.
+
+    Args:
+        folder: the comparison's.
+        experiment: what was compared.
+        under_way: whether runs may be missing.
+        plan: the id of every run, where it is known.
+
+    Raises:
+        InputError: something does not hold, in one line.
+    """
+    remedy = remedy_for(folder, under_way=under_way)
+    file = RunsFile(folder / "runs.parquet", remedy)
+    runs = file.runs(experiment)
+    status = Csv(folder / "status.csv", STATUS, remedy)
+    statuses = status.table.to_pandas()
+    check_statuses(statuses, experiment, status.fault)
+    check_runs(runs, file, experiment)
+    check_alike(runs, file, statuses, status.fault, "status.csv")
+    made = statuses[statuses["status"] != "skipped"]
+    if not under_way:
+        check_complete(made, experiment, status.fault)
+        gone = [e.label for e in experiment.tuners if e.label not in set(statuses["tuner"])]
+        if gone:
+            raise status.fault(None, f"tuner: expected runs of {gone[0]}, found none")
+    if plan is not None:
+        known = made["run"].isin(plan)
+        refuse(
+            ~known,
+            lambda i, says: status.fault(int(made.index[i]), says),
+            lambda i: f"run: expected one of segments/plan.txt, found {made['run'].iloc[i]}",
+        )
+    training = Csv(folder / "training.csv", TRAINING, remedy)
+    trainings = training.table.to_pandas()
+    check_known(trainings["tuner"], labels_of(experiment), "tuner", training.fault)
+    refuse(
+        trainings.duplicated(["tuner", "seed"]),
+        training.fault,
+        lambda _: "tuner and seed: expected every training once, found one again",
+    )
+    return Files(runs, statuses, trainings, _spectra(folder, experiment, remedy))
+
+
+def remedy_for(folder: Path, *, under_way: bool) -> str:
+    """What to do with a file of results that is damaged."""
+    if under_way:  # everything is in the segments
+        return f"simgap compare --resume {folder} writes it again"
+    return "restore the file, or start a new comparison"
+
+
+def check_table(folder: Path) -> None:
+    """Check table.csv, where there is one.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    path = folder / "table.csv"
+    if path.exists():
+        Csv(path, TABLE, f"simgap plot {folder} writes it again")
+
+
+def _spectra(folder: Path, experiment: Experiment, remedy: str) -> pd.DataFrame | None:
+    path = folder / "identifiability.csv"
+    if not path.exists():
+        return None
+    file = Csv(path, _directions, remedy)
+    spectra: pd.DataFrame = file.table.to_pandas()
+    check_known(spectra["target"], targets_of(experiment), "target", file.fault)
+    wanted = spectra.groupby("target").cumcount() + 1
+    refuse(
+        spectra["direction"] != wanted,
+        file.fault,
+        lambda row: f"direction: expected {wanted[row]}, found {spectra['direction'][row]}",
+    )
+    return spectra
+
+
+def _directions(names: list[str]) -> list[Column]:
+    """Columns of identifiability.csv: all that have no other name are parameters."""
+    fixed = [column.name for column in IDENTIFIABILITY]
+    return spelled(IDENTIFIABILITY, [name for name in names if name not in fixed], ())
+
+
+def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: Fault) -> None:
+    """Check how runs ended: each stands once, is of the experiment, and within its budget.
+
+    Args:
+        statuses: columns as `bench.store.schema.STATUS`, cells checked.
+        experiment: what was compared.
+        fault: makes the error for a row of them.
+
+    Raises:
+        InputError: something does not hold.
+    """
+    refuse(
+        statuses["run"].duplicated(),
+        fault,
+        lambda row: f"run: expected every run once, found {statuses['run'].iloc[row]} again",
+    )
+    check_known(statuses["tuner"], labels_of(experiment), "tuner", fault)
+    check_known(statuses["simulator"], [experiment.simulator], "simulator", fault)
+    skipped = statuses["status"] == "skipped"
+    begins = statuses["tuner"] + "/" + statuses["target"] + "/" + statuses["seed"].astype(str) + "/"
+    named = [
+        run == tuner if never else run.startswith(begin)
+        for run, tuner, begin, never in zip(
+            statuses["run"], statuses["tuner"], begins, skipped, strict=True
+        )
+    ]
+    refuse(
+        ~np.array(named, dtype=bool),
+        fault,
+        lambda row: (
+            f"run: expected one that begins with {begins.iloc[row]}, "
+            f"found {statuses['run'].iloc[row]}"
+        ),
+    )
+    check_known(
+        statuses["target"][~skipped],
+        targets_of(experiment),
+        "target",
+        lambda row, says: fault(int(np.flatnonzero(~skipped)[row]), says),
+    )
+    budgets = {entry.label: entry.budget or experiment.budget for entry in experiment.tuners}
+    budget = statuses["tuner"].map(budgets).astype(np.int64)  # also of none
+    used = statuses["simulations"]
+    refuse(
+        used > budget,
+        fault,
+        lambda row: (
+            f"simulations: expected at most {budget.iloc[row]}, "
+            f"the budget of {statuses['tuner'].iloc[row]}, found {used.iloc[row]}"
+        ),
+    )
+    # That is what the word says; whoever stops before has converged, or failed.
+    refuse(
+        (statuses["status"] == "done") & (used != budget),
+        fault,
+        lambda row: (
+            f"simulations: expected {budget.iloc[row]} of a run that is done, "
+            f"found {used.iloc[row]}"
+        ),
+    )
+
+
+def check_alike(
+    runs: pd.DataFrame, file: RunsFile, statuses: pd.DataFrame, fault: Fault, source: str
+) -> None:
+    """See that rows and statuses tell of the same runs, and the same of them.
+
+    Args:
+        runs: as `file` gives them.
+        file: of the rows.
+        statuses: how they ended; cells checked.
+        fault: makes the error for a row of them.
+        source: what a message calls where they stand.
+
+    Raises:
+        InputError: something does not hold.
+    """
+    import pandas as pd
+
+    places = pd.Index(statuses["run"]).get_indexer(runs["run"])
+    row_of = runs["row"].to_numpy()
+    names = runs["run"]
+
+    def at(i: int, says: str) -> InputError:
+        return file.fault(int(row_of[i]), says)
+
+    refuse(places < 0, at, lambda i: f"run: expected one of {source}, found {names[i]}")
+    made = (statuses["status"] != "skipped").to_numpy()
+    refuse(~made[places], at, lambda i: f"run: {names[i]} is skipped by {source}, and has rows")
+    held = np.zeros(len(statuses), dtype=bool)
+    held[places] = True
+    ids = statuses["run"]
+    refuse(made & ~held, fault, lambda row: f"run: {ids[row]} has no rows in {file.path.name}")
+    told, used = statuses.iloc[places].reset_index(drop=True), runs["used"]
+    refuse(
+        told["simulations"] != used,
+        lambda i, says: fault(int(places[i]), says),
+        lambda i: (
+            f"simulations: expected {used[i]}, the last k of {names[i]} in {file.path.name}, "
+            f"found {told['simulations'][i]}"
+        ),
+    )
+    for name in ("tuner", "simulator", "target", "seed"):
+        check_equal(runs[name], told[name], name, f"as in {source}", at)
+
+
+def check_runs(runs: pd.DataFrame, file: RunsFile, experiment: Experiment) -> None:
+    """See that the runs are those of one experiment, each target the same to all.
+
+    Raises:
+        InputError: something does not hold.
+    """
+
+    def at(i: int, says: str) -> InputError:
+        return file.fault(int(runs["row"][i]), says)
+
+    check_known(runs["experiment"], [experiment.name], "experiment", at)
+    check_equal(runs["range"], runs["target"].str.rpartition("-")[0], "range", "of its target", at)
+    for name in runs.columns:
+        if name.startswith("true_"):
+            first = runs.groupby("target")[name].transform("first")
+            check_equal(runs[name], first, name, "as in other runs on this target", at)
+
+
+def check_kept(
+    path: Path,
+    held: Mapping[int, Status],
+    experiment: Experiment,
+    plan: Sequence[str] | None,
+    remedy: str,
+) -> pd.DataFrame:
+    """Check the statuses that a part or a journal holds.
+
+    Args:
+        path: of it.
+        held: by place in the plan.
+        experiment: what is compared.
+        plan: the id of every run; None where it is not known.
+        remedy: what to do where it is damaged.
+
+    Returns:
+        Them, as rows of status.csv.
+
+    Raises:
+        InputError: something does not hold.
+    """
+    import pandas as pd
+
+    places = list(held)
+
+    def at(row: int | None, says: str) -> InputError:
+        place = "" if row is None else f", run {places[row]}"
+        return InputError(f"{path}{place}: {says}; {remedy}")
+
+    statuses = pd.DataFrame([vars(status) for status in held.values()], columns=STATUS_COLUMNS)
+    check_statuses(statuses, experiment, at)
+    if plan is not None:
+        wanted = [plan[place] if place < len(plan) else "none" for place in places]
+        check_equal(statuses["run"], pd.Series(wanted, dtype=object), "run", "by plan.txt", at)
+    return statuses
