@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bench.store.folder import (
     Configuration,
@@ -136,13 +137,7 @@ class Comparison:
             statuses = check_kept(path, held, experiment, ids, REMEDY)
             runs = file.runs(experiment, records)
             check_runs(runs, file, experiment)
-            check_alike(
-                runs,
-                file,
-                statuses,
-                lambda _, says, file=file: file.fault(None, says),
-                "its statuses",
-            )
+            check_alike(runs, file, statuses, partial(_at_file, file), "its statuses")
 
     def _complete(self, ids: list[str]) -> dict[int, Status]:
         """The statuses of a folder that says it is finished.
@@ -162,7 +157,11 @@ class Comparison:
         """How the runs of a finished comparison ended, in the order of its plan."""
         statuses = read(self.folder, ["run", "tuner", "k"]).statuses
         made = statuses[statuses["status"] != "skipped"]
-        return [Status(**row) for row in made[STATUS_COLUMNS].to_dict("records")]
+        rows: list[dict[str, Any]] = [
+            {str(name): value for name, value in row.items()}
+            for row in made[STATUS_COLUMNS].to_dict("records")
+        ]
+        return [Status(**row) for row in rows]
 
     def make(
         self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None

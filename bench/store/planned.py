@@ -84,7 +84,7 @@ def check_complete(made: pd.DataFrame, experiment: Experiment, fault: MaybeFault
             raise fault(None, says)
         if len(mine) > len(targets) * len(seeds):
             twice = mine.duplicated(["target", "seed"]) | (mine["seed"] >= len(seeds))
-            row = int(mine.index[twice.to_numpy().argmax()])
+            row = int(mine.index[int(twice.to_numpy().argmax())])
             raise fault(
                 row,
                 f"run: expected {len(targets)} targets with {len(seeds)} seeds, "

@@ -189,8 +189,9 @@ def _changes(values: pa.ChunkedArray) -> Mask:
     column = values.combine_chunks()
     if pa.types.is_floating(column.type):
         numbers = column.to_numpy()
-        differ: Mask = numbers[1:] != numbers[:-1]
-        return differ & ~(np.isnan(numbers[1:]) & np.isnan(numbers[:-1]))
+        nothing = np.isnan(numbers[1:]) & np.isnan(numbers[:-1])
+        differ: Mask = (numbers[1:] != numbers[:-1]) & ~nothing
+        return differ
     changed = compute.not_equal(column.slice(1), column.slice(0, max(len(column) - 1, 0)))
     return mask_of(changed)
 

@@ -151,9 +151,12 @@ def kept(folder: Path) -> Iterator[tuple[Path, dict[int, Status]]]:
     for path in segments(folder / FOLDER, "journal"):
         with suppress(FileNotFoundError):
             yield path, {place: status for place, status, _, _ in records(path)}
+    known: set[int] = set()
     for path in segments(folder / FOLDER, "parquet"):
-        with suppress(FileNotFoundError):
-            yield path, part_statuses(path)
+        statuses = part_statuses(path)
+        refuse_double(path, statuses, known)
+        known.update(statuses)
+        yield path, statuses
 
 
 def write_plan(folder: Path, ids: Sequence[str]) -> None:

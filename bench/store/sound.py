@@ -58,12 +58,11 @@ def checked_files(
     status = Csv(folder / "status.csv", STATUS, remedy)
     statuses = status.table.to_pandas()
     check_statuses(statuses, experiment, status.fault)
-    check_runs(runs, file, experiment)
-    check_alike(runs, file, statuses, status.fault, "status.csv")
     made = statuses[statuses["status"] != "skipped"]
     if not under_way:
         check_complete(made, experiment, status.fault)
-        gone = [e.label for e in experiment.tuners if e.label not in set(statuses["tuner"])]
+        there = set(statuses["tuner"])
+        gone = [label for label in labels_of(experiment) if label not in there]
         if gone:
             raise status.fault(None, f"tuner: expected runs of {gone[0]}, found none")
     if plan is not None:
@@ -73,6 +72,8 @@ def checked_files(
             lambda i, says: status.fault(int(made.index[i]), says),
             lambda i: f"run: expected one of segments/plan.txt, found {made['run'].iloc[i]}",
         )
+    check_runs(runs, file, experiment)
+    check_alike(runs, file, statuses, status.fault, "status.csv")
     training = Csv(folder / "training.csv", TRAINING, remedy)
     trainings = training.table.to_pandas()
     check_known(trainings["tuner"], labels_of(experiment), "tuner", training.fault)
@@ -241,11 +242,18 @@ def check_runs(runs: pd.DataFrame, file: RunsFile, experiment: Experiment) -> No
         return file.fault(int(runs["row"][i]), says)
 
     check_known(runs["experiment"], [experiment.name], "experiment", at)
-    check_equal(runs["range"], runs["target"].str.rpartition("-")[0], "range", "of its target", at)
+    check_equal(
+        runs["range"],
+        runs["target"].str.replace(r"-\d+$", "", regex=True),
+        "range",
+        "of its target",
+        at,
+    )
     for name in runs.columns:
         if name.startswith("true_"):
-            first = runs.groupby("target")[name].transform("first")
-            check_equal(runs[name], first, name, "as in other runs on this target", at)
+            first = runs.drop_duplicates("target").set_index("target")[name]
+            wanted = runs["target"].map(first)
+            check_equal(runs[name], wanted, name, "as in other runs on this target", at)
 
 
 def check_kept(

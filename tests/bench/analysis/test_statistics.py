@@ -199,41 +199,49 @@ def test_a_million_rows_are_read_for_the_table_within_five_seconds(tmp_path):
     from bench.registry import load_plugins
     from bench.report import NEEDED
     from bench.store.folder import read
-    from bench.store.journal import Journal
     from tests.conftest import PLUGINS
     from tests.experiments import spring_experiment
 
     load_plugins([PLUGINS / "spring.py"])
     folder = tmp_path / "out"
-    comparison = Comparison.begin(spring_experiment(targets=1), [], folder)
-    Journal.close(comparison.results.kept)
+    labels = list("abcdefghij")
+    entries = {label: {"tuner": "random"} for label in labels}
+    experiment = spring_experiment(
+        targets=200, seeds=5, budget=99, ranges=["in"], tuners=entries, noise={"x": 0.1}
+    )
+    comparison = Comparison.begin(experiment, [], folder)
+    comparison.results.kept.discard()
     runs, k = 10_000, np.arange(100)
-    names = np.char.add("random/in-", np.char.zfill(np.arange(runs).astype(str), 6))
+    tuners = np.repeat(labels, 1000)
+    targets = np.tile([f"in-{i:03d}" for i in range(200)], 50)
+    seeds = np.arange(runs) // 200 % 5
+    names = np.array([f"{t}/{on}/{s}/0" for t, on, s in zip(tuners, targets, seeds, strict=True)])
     rng = np.random.default_rng(0)
+    # Before the first simulation there is none that took any time.
+    start = np.tile(np.where(k == 0, np.nan, 0.0), runs)
     numbers = {
-        name: rng.exponential(size=runs * 100)
-        for name in (
-            "loss",
-            "param_error",
-            "obs_error",
-            "tuner_seconds",
-            "simulator_seconds",
-            "proposal_rate",
+        name: rng.exponential(size=runs * 100) + (start if after else 0.0)
+        for after, group in (
+            (True, ["loss", "tuner_seconds", "simulator_seconds"]),
+            (True, ["proposal_rate", "proposal_decay"]),
+            (False, ["recommendation_rate", "recommendation_decay", "param_error", "obs_error"]),
+            (False, ["obs_error_x", "obs_error_x_in_noise"]),
         )
+        for name in group
     }
     pd.DataFrame({
-        "run": np.repeat(names, 100), "experiment": "e",
-        "tuner": np.repeat(np.array(list("abcdefghij")), 100_000),
-        "simulator": "spring",
-        "target": np.repeat(np.tile(np.char.add("in-", np.arange(200).astype(str)), 50), 100),
-        "seed": np.repeat(np.arange(runs) // 200 % 5, 100), "range": "in", "k": np.tile(k, runs),
-        **numbers,
+        "run": np.repeat(names, 100), "experiment": experiment.name,
+        "tuner": np.repeat(tuners, 100), "simulator": "spring",
+        "target": np.repeat(targets, 100), "seed": np.repeat(seeds, 100), "range": "in",
+        "k": np.tile(k, runs), "outside": 0.0, "true_rate": 2.0, "true_decay": 0.5,
+        "heldout_error": np.nan, "heldout_error_x": np.nan, **numbers,
     }).to_parquet(folder / "runs.parquet")  # fmt: skip
-    pd.DataFrame({"run": names, "tuner": "a", "status": "done", "reason": ""}).to_csv(
-        folder / "status.csv"
-    )
+    pd.DataFrame({
+        "run": names, "tuner": tuners, "simulator": "spring", "target": targets, "seed": seeds,
+        "status": "done", "reason": "", "simulations": 99, "seconds": 1.0,
+    }).to_csv(folder / "status.csv", index=False)  # fmt: skip
     pd.DataFrame({"tuner": [], "seed": [], "simulations": [], "seconds": []}).to_csv(
-        folder / "training.csv"
+        folder / "training.csv", index=False
     )
     started = time.process_time()
     stored = read(folder, NEEDED)

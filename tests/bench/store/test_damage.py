@@ -1,0 +1,273 @@
+"""Damaged result folders: one line that names the file, whoever reads it; sound ones still read."""
+
+import shutil
+from contextlib import redirect_stderr
+from io import StringIO
+from pathlib import Path
+
+import pandas as pd
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from bench.analysis.table import COLUMNS
+from bench.api.compare import Compared
+from bench.cli import main
+from bench.compare import Comparison
+from bench.runs.runner import run
+from bench.shot.table import COLUMNS as OF_SHOTS
+from bench.store.folder import checked, read
+from bench.store.journal import Journal
+from bench.store.schema import (
+    IDENTIFIABILITY,
+    RUNS,
+    SHOT_TABLE,
+    STATUS,
+    TABLE,
+    TRAINING,
+    spelled,
+)
+from bench.store.segments import read_plan
+from sims.base import InputError
+from tests.bench.store.damages import (
+    BOTH,
+    DONE,
+    HALF,
+    PARQUET,
+    PLAN,
+    ROWS_OF_PARTS,
+    STATUS_CSV,
+    both,
+    cell,
+    column,
+    lines,
+    rows,
+    text,
+)
+from tests.conftest import PLUGINS
+from tests.experiments import spring_experiment
+
+SPRING_PLUGIN = str(PLUGINS / "spring.py")
+REFERENCE = Path(__file__).parents[3] / "results" / "reference"
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory, spring):
+    """A finished comparison, and one whose runs are all in its segments."""
+    experiment = spring_experiment(
+        targets=2, seeds=2, budget=3, tuners={"random": {}, "nelder_mead": {"seeds": 1}}
+    )
+    place = tmp_path_factory.mktemp("damage")
+    made = Comparison.begin(experiment, [SPRING_PLUGIN], place / "done", jobs=0)
+    made.make(jobs=0)
+    begun = Comparison.begin(experiment, [SPRING_PLUGIN], place / "half", jobs=0)
+    results = begun.results
+    results.kept.close()
+    results.kept = Journal(place / "half", part_runs=5)
+    run(results, [SPRING_PLUGIN], 0)
+    results.kept.close()
+    return place
+
+
+def by_api(folder):
+    """What a notebook does."""
+    try:
+        Compared(folder).runs  # noqa: B018
+    except InputError as error:
+        return 2, f"simgap: {error}\n"
+    return 0, ""
+
+
+def command(*arguments):
+    errors = StringIO()
+    with redirect_stderr(errors):
+        code = main(list(map(str, arguments)))
+    return code, errors.getvalue()
+
+
+COMMANDS = {
+    "status": lambda folder: command("status", folder),
+    "plot": lambda folder: command("plot", folder),
+    "across": lambda folder: command("plot", folder, folder, "--out", folder / "all"),
+    "resume": lambda folder: command("compare", "--resume", folder, "--jobs", 0),
+    "api": by_api,
+}
+
+
+def damaged(folders, kind, damage, tmp_path):
+    shutil.copytree(folders / kind, tmp_path / kind)
+    damage(tmp_path / kind)
+    return tmp_path / kind
+
+
+def is_one_line(code, told, folder, name):
+    assert code == 2, told
+    assert told.count("\n") == 1
+    assert told[:-1].isprintable(), told
+    assert 20 < len(told) < 900, told
+    assert str(folder / name) in told, told
+    assert not (folder / "figures").exists()
+    assert not (folder / "all").exists()
+
+
+@pytest.mark.parametrize("damage", [*DONE, *BOTH])
+def test_a_damaged_folder_is_one_line_that_names_the_file(damage, folders, tmp_path):
+    name, act = (DONE | BOTH)[damage]
+    folder = damaged(folders, "done", act, tmp_path)
+    before = sorted(path.name for path in folder.iterdir())
+    for who, does in COMMANDS.items():
+        # What was changed by hand is said as that where it would be resumed.
+        changed = who == "resume" and name in ("experiment.toml",)
+        is_one_line(*does(folder), folder, "" if changed else name)
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+@pytest.mark.parametrize("damage", [*HALF, *BOTH])
+def test_so_is_one_that_is_under_way(damage, folders, tmp_path):
+    name, act = (HALF | BOTH)[damage]
+    folder = damaged(folders, "half", act, tmp_path)
+    for who in ("status", "resume"):
+        is_one_line(*COMMANDS[who](folder), folder, name)
+
+
+@pytest.mark.parametrize("damage", ROWS_OF_PARTS)
+def test_rows_of_a_part_are_checked_before_more_are_made(damage, folders, tmp_path):
+    name, act = ROWS_OF_PARTS[damage]
+    folder = damaged(folders, "half", act, tmp_path)
+    is_one_line(*COMMANDS["resume"](folder), folder, name)
+    again = Journal(folder)  # nobody holds the folder
+    again.close()
+
+
+def test_what_is_said_names_file_row_expected_found_and_remedy(folders, tmp_path):
+    def told(act):
+        folder = damaged(folders, "done", act, tmp_path)
+        with pytest.raises(InputError) as caught:
+            read(folder)
+        shutil.rmtree(folder)
+        return str(caught.value).removeprefix(str(folder))
+
+    remedy = "; restore the file, or start a new comparison"
+    assert told(cell("loss", 1, -2.0)) == (
+        f"/runs.parquet, row 1: loss: expected a number of at least 0, found -2.0{remedy}"
+    )
+    assert told(cell("k", 5, 3)).startswith("/runs.parquet, row 5: k: expected 1, the next of ran")
+    assert told(rows(lambda f: f.drop(columns="loss"))).startswith(
+        "/runs.parquet: columns: expected one named loss, found 'run, experiment, tuner,"
+    )
+    quoted = lines(STATUS_CSV, lambda ls: [ls[0], ls[1].replace("done,", 'done,"a\n\nb"'), *ls[2:]])
+    assert told(both(quoted, text(STATUS_CSV, "done,,", "over,,"))) == (
+        "/status.csv, line 5: status: expected one of done, converged, crashed, timeout, diverged, "
+        f"skipped, found 'over'{remedy}"
+    )
+    short = both(quoted, lines(STATUS_CSV, lambda ls: [*ls[:-1], "random"]))
+    assert told(short) == f"/status.csv, line 15: expected 9 cells, found 1{remedy}"
+    assert told(lines(STATUS_CSV, lambda ls: ls[:-1])) == (
+        f"/status.csv: expected a run of nelder_mead on wide-001 with seed 0, found none{remedy}"
+    )
+
+
+def test_results_of_one_that_is_under_way_are_written_again_by_resuming(folders, tmp_path, capsys):
+    folder = damaged(folders, "half", lambda _: None, tmp_path)
+    for name in (PARQUET, STATUS_CSV, "training.csv"):
+        shutil.copy(folders / "done" / name, folder / name)
+    assert len(read(folder).statuses) == 12
+    (folder / STATUS_CSV).write_bytes(b"\xff")
+    code, told = COMMANDS["plot"](folder)
+    assert (code, told.count("\n")) == (2, 1)
+    assert f"simgap compare --resume {folder} writes it again" in told
+    assert main(["status", str(folder)]) == 1, "its results are not written"
+    assert "12 of 12 runs finished\n" in capsys.readouterr().out
+    comparison = Comparison.resume(folder)
+    assert comparison.make(jobs=0).complete
+    assert len(checked(folder).statuses) == 12
+
+
+def test_without_a_plan_nothing_is_complete(folders, tmp_path, capsys):
+    folder = damaged(folders, "half", lambda f: (f / PLAN).unlink(), tmp_path)
+    assert main(["status", str(folder)]) == 1
+    assert "complete" not in capsys.readouterr().out
+    begun = Comparison.resume(folder)
+    begun.close()
+    assert len(read_plan(folder)) == 12
+
+
+def test_a_damaged_part_that_was_deleted_is_made_again(folders, tmp_path):
+    folder = damaged(folders, "half", lambda f: (f / "segments/000002.parquet").unlink(), tmp_path)
+    assert main(["status", str(folder)]) == 1
+    comparison = Comparison.resume(folder)
+    assert len(comparison.results.kept.statuses) == 7
+    assert comparison.make(jobs=0).complete
+    assert len(read(folder).statuses) == 12
+
+
+def test_tuners_that_were_skipped_have_no_rows(folders, tmp_path):
+    folder = damaged(folders, "done", lambda _: None, tmp_path)
+    rows(lambda f: f[f["tuner"] != "nelder_mead"])(folder)
+    skipped = "nelder_mead,nelder_mead,spring,,0,skipped,no such package,0,0.0"
+    made = [line for line in (folder / STATUS_CSV).read_text().splitlines() if "nelder" not in line]
+    (folder / STATUS_CSV).write_text("\n".join([*made, skipped]) + "\n")
+    assert read(folder).statuses["status"].tolist() == ["done"] * 8 + ["skipped"]
+    (folder / STATUS_CSV).write_text(
+        f"{made[0]}\n{skipped}\n{skipped.replace('nelder_mead', 'random')}"
+    )
+    parquet.write_table(pa.table({}), folder / PARQUET)
+    assert read(folder).runs.empty
+    assert main(["status", str(folder)]) == 0
+
+
+def test_a_column_that_older_folders_lack_has_its_default(folders, tmp_path):
+    folder = damaged(folders, "done", lambda _: None, tmp_path)
+    assert not read(folder).runs["trusted"].any()
+    assert not read(folder).statuses["trusted"].any()
+    assert "trusted" not in read(folder, ["run", "k"]).runs
+    column("trusted", True)(folder)
+    assert read(folder).runs["trusted"].all()
+    cell("trusted", 1, False)(folder)
+    with pytest.raises(InputError, match="row 1: trusted: expected True as in the row before"):
+        read(folder)
+    column("trusted", "yes")(folder)
+    with pytest.raises(InputError, match="trusted: expected True or False, found a column of type"):
+        read(folder)
+
+
+def test_a_damaged_table_is_found_where_all_is_checked(folders, tmp_path):
+    folder = damaged(folders, "done", lambda _: None, tmp_path)
+    (folder / "table.csv").write_text("experiment,tuner\nx,y\n")
+    assert len(read(folder).statuses) == 12, "plot writes it again"
+    with pytest.raises(InputError, match=r"table.csv: columns: .* simgap plot .* writes it again"):
+        checked(folder)
+
+
+def test_what_is_written_is_what_is_declared(folders):
+    folder, names = folders / "done", (["rate", "decay"], ["x"])
+    runs = parquet.read_schema(folder / PARQUET).names
+    optional = {column.name for column in RUNS if not column.required}
+    wanted = {column.name for column in spelled(RUNS, *names)}
+    assert set(runs) <= wanted
+    assert wanted - set(runs) <= optional
+    for name, declared in (
+        ("status", STATUS),
+        ("training", TRAINING),
+        ("identifiability", IDENTIFIABILITY),
+    ):
+        written = list(pd.read_csv(folder / f"{name}.csv", nrows=0).columns)
+        assert written == [c.name for c in spelled(declared, *names) if c.required]
+
+
+def test_tables_are_declared_as_they_are_written():
+    assert [column.name for column in TABLE if column.required] == COLUMNS
+    assert [column.name for column in SHOT_TABLE] == OF_SHOTS
+
+
+@pytest.mark.parametrize(
+    "folder", [path.parent.relative_to(REFERENCE) for path in sorted(REFERENCE.rglob(PARQUET))]
+)
+def test_published_results_are_sound(folder):
+    assert not checked(REFERENCE / folder).runs.empty
+
+
+def test_a_published_bounce_shot_is_sound():
+    shots = Compared(REFERENCE / "bounce-shot")
+    assert len(shots.statuses) == len(shots.runs) == 3600
+    assert shots.table["rate"].between(0, 1).all()
