@@ -113,8 +113,8 @@ class Comparison:
         try:
             if planned is not None and planned != ids:
                 raise InputError(
-                    f"{self.folder / FOLDER / PLAN}: expected the plan that the configuration "
-                    "gives, found another; start a new comparison"
+                    f"{self.folder / FOLDER / PLAN}: its plan is not the one that its "
+                    "configuration gives; start a new comparison"
                 )
             self._check_kept(journal, ids)
         except InputError:

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from bench.cli import main
-from bench.store.journal import finished
+from bench.store.segments import finished
 from tests.bench.test_compare import CHAOS, SPRING_PLUGIN, same, simgap, write
 from tests.cluster import cluster
 

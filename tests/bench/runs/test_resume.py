@@ -14,7 +14,8 @@ from bench.problem.recorded import Side
 from bench.registry import load_plugins
 from bench.runs.identity import Identities
 from bench.store.folder import read
-from bench.store.journal import Journal, finished, read_plan, write_plan
+from bench.store.journal import Journal
+from bench.store.segments import finished, read_plan, write_plan
 from sims.base import InputError
 from tests.conftest import PLUGINS
 from tests.experiments import spring_experiment
@@ -202,7 +203,8 @@ def test_a_finished_run_of_another_plan_is_refused(folder):
     foreign = replace(journal.statuses[0], run="random/in-000/0/0123456789")
     journal.add(1, {"run": [foreign.run], "k": np.zeros(1, dtype=int)}, foreign)
     journal.close()
-    refused(folder, "", "its plan is not the one that its configuration gives")
+    words = r"000001.journal, run 1: run: expected interrupting/in-000/0/\w+ by plan.txt, found"
+    refused(folder, "", words)
 
 
 def test_a_run_is_called_by_all_that_its_target_has(spring):

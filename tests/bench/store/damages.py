@@ -122,6 +122,7 @@ DONE = {
     "huge k": (PARQUET, cell("k", 1, 2**62)),
     "k beyond a double": (PARQUET, rows(lambda f: f.assign(k=np.uint64(2**64 - 1)))),
     "k twice": (PARQUET, cell("k", 2, 1)),
+    "k goes on from a double": (PARQUET, both(cell("k", 2, 1), cell("k", 3, 2))),
     "k left out": (PARQUET, rows(lambda f: f.drop(index=1))),
     "no start": (PARQUET, rows(lambda f: f.drop(index=0))),
     "no end": (STATUS_CSV, rows(lambda f: f.drop(index=3))),
