@@ -66,8 +66,7 @@ def read(folder: Path, dealt: Deal) -> dict[str, Any] | None:
         _check(kept, "models", MODEL)
         _check(kept, "rows", SHOT_COLUMNS)
     except CellError as error:
-        place = "" if error.row is None else f", {error.row + 1}"
-        raise InputError(f"{path}{place}: {error.says}; {_REMEDY}") from None
+        raise InputError(f"{path}, {error.says}; {_REMEDY}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(f"{path}: {_REMEDY}") from None
     wanted = (dealt.name, [model["method"] for model in kept["models"]])
@@ -100,12 +99,16 @@ def _check(kept: dict[str, Any], name: str, columns: Columns) -> None:
         TypeError: they are no tables.
     """
     tables = kept[name]
-    for row, table in enumerate(tables):
-        columns_of(list(table), columns, row)
-        if name == "models":
-            _check_effects(row, table["effects"])
-    for column in columns:
-        check_cells(column, of_python(column, [table[column.name] for table in tables]))
+    try:
+        for row, table in enumerate(tables):
+            columns_of(list(table), columns, row)
+            if name == "models":
+                _check_effects(row, table["effects"])
+        for column in columns:
+            check_cells(column, of_python(column, [table[column.name] for table in tables]))
+    except CellError as error:
+        error.says = f"{name}, {(error.row or 0) + 1}: {error.says}"
+        raise
 
 
 def _check_effects(row: int, effects: Any) -> None:

@@ -75,12 +75,14 @@ class Column:
             (False, False): "",
             (True, False): f" of at least {self.low:g}",
             (True, True): f" from {self.low:g} to {self.high:g}",
-        }[self.low > -math.inf, self.high < math.inf]
+        }[self.low > -math.inf, self.high < _LARGEST]
         number = "a whole number" if self.kind is int else "a number"
         return f"{number}{ends}"
 
 
 Columns = Sequence[Column]
+_LARGEST = 2.0**53
+"""Of the whole numbers that a float can count."""
 
 
 def _size(name: str, empty: Empty = Empty.NEVER, **options: Any) -> Column:
@@ -90,7 +92,7 @@ def _size(name: str, empty: Empty = Empty.NEVER, **options: Any) -> Column:
 
 def _count(name: str, low: int = 0, **options: Any) -> Column:
     """A whole number that is not negative."""
-    return Column(name, int, low=low, high=2.0**53, **options)
+    return Column(name, int, low=low, high=_LARGEST, **options)
 
 
 _TRUSTED = Column("trusted", bool, required=False, default=False)

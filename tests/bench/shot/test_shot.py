@@ -13,6 +13,7 @@ import pytest
 from scipy.stats import binomtest
 
 from bench import cli
+from bench.api.compare import Compared
 from bench.problem.experiment import load, names
 from bench.registry import REGISTRIES
 from bench.runs.pools import LostError
@@ -367,6 +368,49 @@ def test_without_workers_failures_count_unless_allowed_and_it_is_plotted_again(
     assert f"{out}: expected the folder of a comparison, found a bounce shot" in said
     assert cli.main(["compare", *crashing, "--out", str(out)]) == 2
     assert f"simgap: --out {out}: exists and is not empty" in capsys.readouterr().err
+
+
+def test_a_damaged_shot_is_one_line_whoever_reads_it(crashing, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert cli.main(["compare", *crashing, "--out", str(out)]) == 1
+    path = out / "shots" / "golf-000.json"
+    sound = path.read_text()
+
+    def spoilt(where, row, key, value):
+        held = json.loads(sound)
+        held[where][row][key] = value
+        return json.dumps(held)
+
+    for text, says in (
+        ("[]", "damaged; delete it"),
+        ('{"models": [], "rows": 3}', "damaged; delete it"),
+        (sound.replace('"hit"', '"hot"', 1), ", 1: columns: expected one named hit"),
+        (spoilt("models", 1, "status", "perfect"), ", 2: status: expected one of done, conv"),
+        (spoilt("models", 0, "height", "high"), ", 1: height: expected a number of at least 0"),
+        (spoilt("models", 0, "effects", {"drag": ["x"]}), ", 1: effects: expected a number, fo"),
+        (spoilt("rows", 2, "simulations", -1), ", 3: simulations: expected a whole number of at"),
+        (spoilt("rows", 0, "seen", 1.5), ", 1: seen: expected a number from 0 to 1, found 1.5"),
+        (spoilt("rows", 0, "hit", 1), ", 1: hit: expected True or False, found 1"),
+        (spoilt("rows", 0, "shot", "golf-001"), "expected a row of golf-000 for each model"),
+    ):
+        path.write_text(text)
+        capsys.readouterr()
+        for arguments in (["status"], ["plot"], ["compare", "--resume"]):
+            assert cli.main([*arguments, str(out)]) == 2
+            said = capsys.readouterr().err
+            assert str(path) in said
+            assert says in said
+            assert said.count("\n") == 1
+    path.write_text(sound)
+    assert cli.main(["status", str(out)]) == 0
+    for name in ("shots", "table", "status"):
+        table = out / f"{name}.csv"
+        kept = table.read_text()
+        table.write_text(kept.replace(",", ";"))
+        with pytest.raises(InputError, match=rf"{name}.csv: columns: expected one named"):
+            _ = [Compared(out).runs, Compared(out).table, Compared(out).statuses]
+        table.write_text(kept)
+    assert Compared(out).runs["hit"].dtype == bool
 
 
 def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refused(
