@@ -137,13 +137,19 @@ def survey(mutants: Sequence[Mutant], jobs: int = 1, limit: float = LIMIT) -> li
 
         def work(mutant: Mutant) -> End:
             root = copies.get()
-            end = tried(mutant, root, limit)
-            copies.put(root)
+            try:
+                end = tried(mutant, root, limit)
+            finally:
+                copies.put(root)
             print(f"{end.what:9}{end.seconds:6.1f} s  {mutant!s:{width}}  {end.why}", flush=True)
             return end
 
-        with ThreadPoolExecutor(jobs) as pool:
+        pool = ThreadPoolExecutor(jobs)
+        try:
             return list(pool.map(work, mutants))
+        finally:
+            # Interrupted, it ends with what is under way.
+            pool.shutdown(cancel_futures=True)
 
 
 def main() -> int:
