@@ -54,6 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"simgap: {error}", file=sys.stderr)
         return 2
+    except MemoryError as error:  # whoever insisted
+        print(f"simgap: not enough memory: {error}", file=sys.stderr)
+        return 2
     except BrokenPipeError:  # `simgap list ... | head`
         sys.stderr.close()
         return 0

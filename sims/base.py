@@ -15,6 +15,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sims.limits import LARGEST, MESSAGE, cut
+
 Array = NDArray[np.float64]
 
 
@@ -26,13 +28,13 @@ class InputError(ValueError):
     def __init__(self, message: str) -> None:
         # Names and cells from a user's file may hold anything; what would break the line or a
         # terminal is escaped.
-        escaped = [c if c.isprintable() else ascii(c)[1:-1] for c in message]
+        escaped = [c if c.isprintable() else ascii(c)[1:-1] for c in cut(message, MESSAGE)]
         super().__init__("".join(escaped))
 
 
 def unknown(kind: str, name: str, known: Sequence[str]) -> InputError:
     """The error for a name that does not exist, listing the names that do."""
-    return InputError(f"unknown {kind} '{name}'; there are: {', '.join(sorted(known))}")
+    return InputError(f"unknown {kind} '{cut(name)}'; there are: {', '.join(sorted(known))}")
 
 
 def frozen(values: ArrayLike) -> Array:
@@ -71,6 +73,10 @@ class Parameter:
         if not (np.isfinite([low, high]).all() and low < high):
             raise InputError(
                 f"parameter {self.name}: bounds must be finite and increasing, found {self.bounds}"
+            )
+        if max(-low, high) > LARGEST:
+            raise InputError(
+                f"parameter {self.name}: bounds must lie within ±{LARGEST:g}, found {self.bounds}"
             )
         if self.log and low <= 0:
             raise InputError(
@@ -115,8 +121,15 @@ class Channel:
 
 @dataclass(frozen=True)
 class Constant:
-    """A number of a system that is known, not tuned: name, unit, default, one sentence, whether it
-    must be > 0.
+    """A number of a system that is known, not tuned.
+
+    Attributes:
+        name: its standard name.
+        unit: SI unit, ``1`` for a pure number.
+        value: the default.
+        says: one sentence a person understands.
+        positive: whether it must be > 0.
+        limits: the lowest and the highest value that can be meant, in its unit.
     """
 
     name: str
@@ -124,6 +137,14 @@ class Constant:
     value: float
     says: str = ""
     positive: bool = False
+    limits: tuple[float, float] = (-LARGEST, LARGEST)
+
+    def wanted(self, value: float) -> str:
+        """What is expected in place of `value`; empty where it can be."""
+        if self.positive and value <= 0:
+            return f"more than 0 {self.unit}"
+        low, high = self.limits
+        return "" if low <= value <= high else f"{low:g} to {high:g} {self.unit}"
 
 
 @dataclass(frozen=True)
@@ -272,7 +293,7 @@ class Simulator(ABC):
         if not chosen or len(set(chosen)) < len(chosen):
             raise InputError(
                 f"simulator {self.name}: observe needs one or more different channels, found"
-                f" {chosen}"
+                f" {cut(str(chosen))}"
             )
         self.columns = [names.index(name) for name in chosen]
         self.channels = tuple(self.channels[i] for i in self.columns)
@@ -311,11 +332,15 @@ class Simulator(ABC):
     ) -> dict[str, float]:
         values = self._checked("constant", known, given)
         for c in self.constants:
-            if c.positive and values[c.name] <= 0:
-                raise InputError(
-                    f"constant '{c.name}' of simulator {self.name} must be > 0, found"
-                    f" {values[c.name]}"
-                )
+            value = values[c.name]
+            if c.positive and value <= 0:
+                wanted = "be > 0"
+            elif not c.limits[0] <= value <= c.limits[1]:
+                wanted = f"lie in {c.wanted(value)}"
+            else:
+                continue
+            who = f"constant '{c.name}' of simulator {self.name}"
+            raise InputError(f"{who} must {wanted}, found {value}")
         return values
 
     def _checked(
@@ -325,9 +350,8 @@ class Simulator(ABC):
             if name not in known:
                 raise unknown(f"{kind} of simulator {self.name}", name, list(known) or ["none"])
             if not np.isfinite(value).all():
-                raise InputError(
-                    f"{kind} '{name}' of simulator {self.name} must be finite, found {value}"
-                )
+                who = f"{kind} '{name}' of simulator {self.name}"
+                raise InputError(f"{who} must be finite, found {cut(str(value))}")
         return {**known, **given}
 
 
@@ -353,5 +377,11 @@ def adjusted(
     for p in parameters:
         change = changes.get(p.name, {})
         new: dict[str, Any] = {k: tuple(v) if k in pairs else v for k, v in change.items()}
-        result.append(replace(p, **new))  # which checks the parameter anew
+        changed = replace(p, **new)  # which checks the parameter anew
+        # What is positive by its nature, as a mass, is so whatever an experiment makes of it.
+        low, lowest = p.bounds[0], changed.bounds[0]
+        if low >= 0 and (lowest < 0 or (low > 0 and lowest == 0)):
+            wanted = "more than 0" if low > 0 else "at least 0"
+            raise InputError(f"parameter {p.name}: bounds must be {wanted}, found {changed.bounds}")
+        result.append(changed)
     return tuple(result)

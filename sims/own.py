@@ -18,6 +18,7 @@ import numpy as np
 
 from sims.base import Array, Channel, InputError, Parameter
 from sims.bullet import engine
+from sims.limits import cut, is_number
 from sims.own_engine import OwnEngine
 from sims.simulated import Simulated
 from sims.system import Contact, Effect, Engine, Force, Friction, Kind, Moment, System
@@ -189,9 +190,9 @@ class OwnSimulator(Simulated):
             raise InputError(
                 f"simulator {self.name} has no setting '{extra[0]}'; there is: time_step"
             )
-        # To Python, True is the number 1.
-        if isinstance(step, bool) or not isinstance(step, int | float) or not 0 < step < np.inf:
-            raise InputError(f"time_step must be a positive number of seconds, found {step}")
+        if not (is_number(step) and step > 0):
+            found = cut(str(step))
+            raise InputError(f"time_step must be a positive number of seconds, found {found}")
         return OwnEngine(self, step)
 
     def close(self) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sims import effects as library
 from sims.base import Array, InputError, Parameter, Scenario, Simulator
 from sims.engines import engine_named
+from sims.limits import is_number
 from sims.plan import Plan, acts, felt_inputs, make_plan, make_runs
 from sims.system import (
     Acting,
@@ -26,6 +27,10 @@ from sims.system import (
     Signal,
     System,
 )
+from sims.user_toml import shown
+
+BEYOND = 1e6
+"""Times its largest plausible value, a coefficient is a slip of the pen."""
 
 
 class Simulated(Simulator):
@@ -61,6 +66,7 @@ class Simulated(Simulator):
         super().__init__(constants, observe)
         self._declared = self.system()
         self.engine = self._engine(engine, settings)
+        _check_given(effects, fixed)
         self.effects = [self._effect(effect) for effect in effects]
         self.fixed = [
             (self._effect(name), _row(name, value)) for name, value in (fixed or {}).items()
@@ -74,8 +80,9 @@ class Simulated(Simulator):
             if not 1 <= len(values) <= len(names):
                 raise InputError(
                     f"effect {effect.name}: expected up to {len(names)} values"
-                    f" ({', '.join(names)}), found {values}"
+                    f" ({', '.join(names)}), found {shown(values)}"
                 )
+            _check_sizes(effect, self.system, values)
         observed = [c.name for c in self.channels]
         extra: list[Parameter] = []
         for effect in self.effects:
@@ -279,11 +286,45 @@ def _stacked(states: Mapping[str, Array], names: Sequence[str], count: int) -> A
     return result
 
 
-def _row(name: str, value: float | Sequence[float]) -> tuple[float, ...]:
-    values = tuple(float(v) for v in value) if isinstance(value, Sequence) else (float(value),)
-    if not np.isfinite(values).all():
-        raise InputError(f"effect {name}: expected finite coefficients, found {value}")
-    return values
+def _check_given(effects: object, fixed: object) -> None:
+    """Refuse what an experiment's file may hold in place of names and a table.
+
+    Raises:
+        InputError: it does.
+    """
+    if not isinstance(effects, list | tuple) or not all(map(_names_effect, effects)):
+        raise InputError(f"effects: expected a list of names, found {shown(effects)}")
+    if fixed is not None and not isinstance(fixed, Mapping):
+        wanted = "a table of coefficients by effect"
+        raise InputError(f"fixed: expected {wanted}, found {shown(fixed)}")
+
+
+def _names_effect(value: object) -> bool:
+    return isinstance(value, str) or (isinstance(value, type) and issubclass(value, Effect))
+
+
+def _row(name: str, value: Any) -> tuple[float, ...]:
+    """The coefficients of a fixed effect, one or several."""
+    several = isinstance(value, list | tuple)
+    values = tuple(value) if several else (value,)
+    if not all(map(is_number, values)):
+        raise InputError(f"effect {name}: expected finite coefficients, found {shown(value)}")
+    return tuple(float(v) for v in values)
+
+
+def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) -> None:
+    """Refuse coefficients beyond all that can be meant.
+
+    Raises:
+        InputError: one is.
+    """
+    for coefficient, value in zip(effect.on(system), values, strict=False):
+        largest = max(map(abs, coefficient.range(system.kind)))
+        if abs(value) > BEYOND * largest:
+            wanted = f"within ±{BEYOND * largest:g} {coefficient.unit_on(system) or ''}".rstrip()
+            raise InputError(
+                f"effect {effect.name}: expected {coefficient.name} {wanted}, found {value:g}"
+            )
 
 
 def _coefficients(effect: Effect, rows: Array) -> Array:

@@ -17,6 +17,7 @@ from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from sims.base import InputError, unknown
+from sims.limits import LARGEST, LINE, MOST, cut
 
 if sys.version_info >= (3, 11):
     import tomllib as tomllib  # others have it from here
@@ -70,13 +71,12 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def shown(value: object) -> str:
     """A value from a user's file as a message quotes it: short."""
-    text = repr(value)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+    return cut(repr(value), _LONGEST)
 
 
 def fault(source: Source, where: str, wanted: str, value: object) -> InputError:
     """The error for a value that is not what is wanted; `where` may be empty."""
-    place = f"{where}: " if where else ""  # a whole file has no place in itself
+    place = f"{cut(where, LINE)}: " if where else ""  # a whole file has no place in itself
     return InputError(f"{source}: {place}expected {wanted}, found {shown(value)}")
 
 
@@ -105,6 +105,9 @@ def checked(source: Source, where: str, value: Any, wanted: type, words: str = "
     mistaken = isinstance(value, bool) and wanted is not bool
     if mistaken or not isinstance(value, kinds):
         raise fault(source, where, words or _WORDS[wanted], value)
+    size: Any = value
+    if wanted is int and not -MOST <= size <= MOST:  # TOML's whole numbers have no end
+        raise fault(source, where, f"{words or _WORDS[int]} within ±{MOST:.0e}", value)
     return value
 
 
@@ -113,9 +116,12 @@ def table(source: Source, where: str, value: Any, words: str = "") -> dict[str, 
     return dict(checked(source, where, value, dict, words))
 
 
-def text(source: Source, where: str, value: Any, words: str = "") -> str:
-    """`value` as text."""
-    return str(checked(source, where, value, str, words))
+def text(source: Source, where: str, value: Any, words: str = "", most: int = LINE) -> str:
+    """`value` as text of at most so many characters."""
+    read = str(checked(source, where, value, str, words))
+    if len(read) > most:
+        raise fault(source, where, f"at most {most} characters, not {len(read)}", value)
+    return read
 
 
 def names(
@@ -136,10 +142,12 @@ def number(source: Source, where: str, value: Any, words: str = "") -> float:
 
 
 def finite(source: Source, where: str, value: Any, words: str = "") -> float:
-    """`value` as a number that is finite."""
+    """`value` as a number that is finite, and of a size that can be meant."""
     result = number(source, where, value, words)
     if not math.isfinite(result):
         raise fault(source, where, words or _WORDS[float], value)
+    if abs(result) > LARGEST:
+        raise fault(source, where, f"{words or _WORDS[float]} within ±{LARGEST:g}", value)
     return result
 
 
@@ -149,7 +157,7 @@ def numbers(
     """`value` as a list of so many numbers."""
     if not isinstance(value, list | tuple) or len(value) != count:
         raise fault(source, where, words or f"{count} numbers", value)
-    return tuple(number(source, where, entry) for entry in value)
+    return tuple(finite(source, where, entry) for entry in value)
 
 
 def ends(source: Source, where: str, value: Any) -> Pair:

@@ -51,6 +51,7 @@ def compare(
     plugins: Sequence[str | Path] = (),
     cluster: str | None = None,
     progress: Progress | None = None,
+    force: bool = False,
 ) -> Compared:
     """Run an experiment: tuners x targets x seeds; returns its tables and figures.
 
@@ -69,6 +70,7 @@ def compare(
         plugins: Python files with more tuners, simulators and effects.
         cluster: address of a Dask scheduler to run on instead.
         progress: told of every step.
+        force: begin although it needs more than this machine has.
 
     Raises:
         InputError: a fault in what was asked for, in one line; nothing has been run then.
@@ -86,8 +88,10 @@ def compare(
     )
     if chosen.sweep:
         raise InputError(f"experiment {chosen.name} sweeps over values: use simgap.sweep")
+    folder = None if out is None else Path(out)
+    study.refuse_hopeless(chosen, folder, jobs, cluster is not None, force)
     pool = _cluster(cluster)
-    begun = study.begin(chosen, files, None if out is None else Path(out), jobs)
+    begun = study.begin(chosen, files, folder, jobs)
     return _made(begun, jobs, progress, pool)
 
 
@@ -98,6 +102,7 @@ def sweep(
     out: str | Path | None = None,
     plugins: Sequence[str | Path] = (),
     progress: Progress | None = None,
+    force: bool = False,
 ) -> list[Compared]:
     """Run every experiment that one with a ``[sweep]`` stands for, one after another.
 
@@ -107,6 +112,7 @@ def sweep(
         out: folder in which each gets its own, named as the experiment is.
         plugins: as in `compare`.
         progress: told of every step.
+        force: as in `compare`.
 
     Returns:
         Their results, in the order of the file's values.
@@ -115,7 +121,9 @@ def sweep(
         InputError: a fault in what was asked for, in one line; nothing has been run then.
     """
     files = _loaded(plugins)
-    begun = study.begin_all(choose(experiment), files, None if out is None else Path(out), jobs)
+    chosen, folder = choose(experiment), None if out is None else Path(out)
+    study.refuse_hopeless(chosen, folder, jobs, force=force)
+    begun = study.begin_all(chosen, files, folder, jobs)
     return [_made(one, jobs, progress, None) for one in begun]
 
 

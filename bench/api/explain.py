@@ -21,6 +21,7 @@ def explain(
     free: Sequence[str] = (),
     tuner: str | None = None,
     seed: int = 0,
+    force: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> Explanation:
     """Show what the simulation of a recording gets wrong, name the cause, extend the simulator.
@@ -32,6 +33,7 @@ def explain(
         free: constants to estimate with the parameters.
         tuner: a registered tuner that finds where the fit of the base parameters begins.
         seed: of the surrogates and the bootstrap.
+        force: explain what needs more than this machine has, or has stamps that cannot be seconds.
         say: told what is being done.
 
     Raises:
@@ -39,10 +41,12 @@ def explain(
     """
     if isinstance(recording, SimulatedRecording):
         recording = recording.recording
-    return explaining.explain(recording, system, engine, seed, free, tuner, say)
+    return explaining.explain(recording, system, engine, seed, free, tuner, say, force)
 
 
-def score(model: str | Path, recording: str | Path, *, held_out: bool = False) -> dict[str, Any]:
+def score(
+    model: str | Path, recording: str | Path, *, held_out: bool = False, force: bool = False
+) -> dict[str, Any]:
     """The error of an extended simulator on another recording; initial states are estimated there,
     nothing else.
 
@@ -50,6 +54,7 @@ def score(model: str | Path, recording: str | Path, *, held_out: bool = False) -
         model: extended.toml.
         recording: the path of ``NAME.csv``.
         held_out: count only runs that are marked so.
+        force: as in `explain`.
 
     Returns:
         rmse by channel in its unit, normalised_rmse in units of the noise, runs, samples, units.
@@ -57,4 +62,4 @@ def score(model: str | Path, recording: str | Path, *, held_out: bool = False) -
     Raises:
         InputError: a file cannot be read, or the recording is of another system.
     """
-    return scored(Path(model), Path(recording), held_out)
+    return scored(Path(model), Path(recording), held_out, force)

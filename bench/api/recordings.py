@@ -26,6 +26,7 @@ def simulate(
     engine: str | None = None,
     seed: int = 0,
     held_out: int | None = None,
+    force: bool = False,
 ) -> SimulatedRecording:
     """Simulate a recording whose truth is known; nothing is written before `write` is called.
 
@@ -44,6 +45,7 @@ def simulate(
         engine: pybullet, mujoco or batch.
         seed: of all that is drawn.
         held_out: how many of the last runs are marked as held out; a third where None.
+        force: make it although it needs more than this machine has.
 
     Raises:
         InputError: something that cannot be, in one line.
@@ -64,6 +66,7 @@ def simulate(
             engine=engine,
             seed=seed,
             held_out=held_out,
+            force=force,
         )
     )
 

@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.commands.options import add_plugin, names, natural, positive, said_as, seconds
+from bench.commands.options import add_force, add_plugin, names, natural, positive, said_as, seconds
 
 if TYPE_CHECKING:
     from bench.problem.experiment import Experiment
@@ -79,6 +79,7 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
     compare.add_argument(
         "--allow-failures", action="store_true", help="exit with 0 although runs failed"
     )
+    add_force(compare)
     compare.set_defaults(command=_compare)
 
 
@@ -139,13 +140,15 @@ def _refuse_beside_resume(options: argparse.Namespace) -> None:
 
 def _begun(options: argparse.Namespace) -> list[Study]:
     """The study that is begun or resumed; several of a sweep."""
-    from bench.study import begin_all, parts_of, resume
+    from bench.study import begin_all, parts_of, refuse_hopeless, resume
 
     if options.resume:
         _refuse_beside_resume(options)
         return [resume(part, options.plugin) for part in parts_of(options.resume)]
+    chosen, cluster = _chosen(options), options.cluster is not None
+    refuse_hopeless(chosen, options.out, options.jobs, cluster, options.force)
     with said_as("--out", options.out):
-        return begin_all(_chosen(options), options.plugin, options.out, options.jobs)
+        return begin_all(chosen, options.plugin, options.out, options.jobs)
 
 
 def _cluster(address: str | None) -> Pool | None:

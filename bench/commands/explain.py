@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from bench.commands.options import add_plugin, names
+from bench.commands.options import add_force, add_plugin, names
 
 
 def add_explain(parser: argparse.ArgumentParser) -> None:
@@ -44,6 +44,7 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
         help="a tuner that finds where the base fit begins (default: a grid)",
     )
     add_plugin(parser, "systems")
+    add_force(parser)
     parser.set_defaults(command=_explain)
 
 
@@ -63,6 +64,7 @@ def add_score(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_plugin(parser, "systems")
+    add_force(parser)
     parser.set_defaults(command=_score)
 
 
@@ -85,6 +87,7 @@ def _explain(options: argparse.Namespace) -> int:
         free=names(options.free),
         tuner=options.tuner,
         seed=options.seed,
+        force=options.force,
         say=narrator(),
     )
     folder = options.out or stamped(Path("results"), f"explain-{options.recording.stem}")
@@ -103,7 +106,7 @@ def _score(options: argparse.Namespace) -> int:
     from bench.registry import load_plugins
 
     load_plugins(options.plugin)
-    result = score(options.model, options.recording, held_out=options.held_out)
+    result = score(options.model, options.recording, held_out=options.held_out, force=options.force)
     units = result.pop("units")
     if options.json:
         print(json.dumps(result, allow_nan=False))

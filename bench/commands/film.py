@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from bench.commands.options import add_force
+
 
 def add_film(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap film`."""
@@ -29,6 +31,7 @@ def add_film(parser: argparse.ArgumentParser) -> None:
         default=0,
         help="camera, light, colours (default: 0)",
     )
+    add_force(parser)
     parser.set_defaults(command=film)
 
 
@@ -63,7 +66,12 @@ def film(options: argparse.Namespace) -> int:
     from bench.recordings.film import write
 
     frames, seconds = write(
-        options.recording, options.out, options.run, options.size, options.camera_seed
+        options.recording,
+        options.out,
+        options.run,
+        options.size,
+        options.camera_seed,
+        options.force,
     )
     print(f"{options.out}: {frames} frames, {seconds:.4g} s, {options.size} x {options.size} px")
     print(f"{options.out.with_suffix('.camera.toml')}: the camera")

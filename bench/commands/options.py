@@ -18,6 +18,15 @@ def add_plugin(parser: argparse.ArgumentParser, more: str) -> None:
     )
 
 
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """The option ``--force``."""
+    parser.add_argument(
+        "--force",
+        action="store_true",
+        help="begin although it needs more than this machine has, or cannot be sound",
+    )
+
+
 def positive(text: str) -> int:
     """A whole number of at least 1."""
     return _whole(text, 1)
@@ -29,13 +38,15 @@ def natural(text: str) -> int:
 
 
 def _whole(text: str, least: int) -> int:
+    from sims.limits import MOST, cut
+
     try:
         value = int(text)
     except ValueError:
         value = least - 1
-    if value < least:
-        wanted = f"a whole number of at least {least}"
-        raise argparse.ArgumentTypeError(f"expected {wanted}, found '{text}'")
+    if not least <= value <= MOST:
+        wanted = f"a whole number of at least {least} and at most {MOST:.0e}"
+        raise argparse.ArgumentTypeError(f"expected {wanted}, found '{cut(text)}'")
     return value
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.commands.options import add_plugin, names, positive
+from bench.commands.options import add_force, add_plugin, names, positive
 
 
 def add_simulate(simulate: argparse.ArgumentParser) -> None:
@@ -55,6 +55,7 @@ def add_simulate(simulate: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="FILE.csv", required=True, help="file to write, a new one"
     )
     add_plugin(simulate, "systems")
+    add_force(simulate)
     simulate.set_defaults(command=_simulate)
 
 
@@ -90,6 +91,7 @@ def _simulate(options: argparse.Namespace) -> int:
         engine=options.engine,
         seed=options.seed,
         held_out=options.held_out,
+        force=options.force,
         **wish(
             options.theta,
             options.effect,
@@ -113,12 +115,15 @@ def _simulate(options: argparse.Namespace) -> int:
 def _inspect(options: argparse.Namespace) -> int:
     from bench.figures.recording import draw
     from bench.recordings.inspection import load, summary
+    from bench.recordings.stamps import oddities
     from bench.registry import load_plugins
 
     load_plugins(options.plugin)
     recording, kind = load(options.recording, options.system)
     for line in summary(recording, kind):
         print(line)
+    for odd in oddities(recording, kind):
+        print(f"odd: {odd.text}")
     for path in draw(
         recording,
         kind,

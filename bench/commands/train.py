@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.commands.options import add_plugin, positive
+from bench.commands.options import add_force, add_plugin, positive
 
 
 def add_train(parser: argparse.ArgumentParser) -> None:
@@ -37,6 +37,7 @@ def add_train(parser: argparse.ArgumentParser) -> None:
         "--out", metavar="DIR", type=Path, help="folder of losses (default: below results/train)"
     )
     add_plugin(parser, "of them")
+    add_force(parser)
     parser.set_defaults(command=_train)
 
 
@@ -45,15 +46,23 @@ def _train(options: argparse.Namespace) -> int:
     from bench.commands.progress import Bars
     from bench.registry import load_plugins
     from bench.runs.runner import seeds_of
+    from bench.runs.size import check_training
     from bench.runs.training import train
+    from methods.learning.rehearsal import TooFewError
+    from sims.base import InputError
 
     load_plugins(options.plugin)
     experiment, entry = choose(options.tuner, options.simulator, options.experiment, options.budget)
+    seeds = options.seeds or seeds_of(experiment, entry)
+    check_training(experiment, entry, seeds, options.force)
     with Bars("epoch") as bars:
         losses = Losses(experiment, bars.start)
-        for seed in range(options.seeds or seeds_of(experiment, entry)):
+        for seed in range(seeds):
             losses.begin(f"{entry.label} seed {seed}", seed)
-            training = train(experiment, entry, seed, losses, options.again)
+            try:
+                training = train(experiment, entry, seed, losses, options.again)
+            except TooFewError as error:
+                raise InputError(f"tuner {entry.label}: {error}; give a larger --budget") from None
             how = "trained earlier with" if training.found else "trained with"
             cost = f"{training.simulations} simulations in {training.seconds:.1f} s"
             print(f"{training.path}: {how} {cost}")

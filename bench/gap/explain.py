@@ -23,6 +23,8 @@ from bench.gap.model.world import World
 from bench.gap.tell import Teller
 from bench.problem.seeds import rng_for
 from bench.recordings.inspection import load
+from bench.recordings.size import check_recording
+from bench.recordings.stamps import refuse_odd
 from sims import effects as library
 from sims import extended as extend
 from sims.base import Array, InputError
@@ -48,6 +50,7 @@ def explain(
     free: Sequence[str] = (),
     tuner: str | None = None,
     say: Say = lambda _: None,
+    force: bool = False,
 ) -> Explanation:
     """Explain a recording.
 
@@ -59,11 +62,12 @@ def explain(
         free: constants to estimate with the parameters.
         tuner: a registered tuner that finds where the fit of the base parameters begins.
         say: told what is being done.
+        force: whether the user insists on a recording that is refused otherwise.
 
     Raises:
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects.
     """
-    return _Explainer(recording, system, engine, seed, tuple(free), tuner, say).run()
+    return _Explainer(recording, system, engine, seed, tuple(free), tuner, say, force).run()
 
 
 class _Explainer:
@@ -76,6 +80,7 @@ class _Explainer:
         free: tuple[str, ...],
         tuner: str | None,
         say: Say,
+        force: bool,
     ) -> None:
         self.started = time.perf_counter()
         self.seed = seed
@@ -90,6 +95,10 @@ class _Explainer:
         self.kind: type[Simulated] = kind
         # A simulator that steps itself has no engine to choose.
         self.engine = None if issubclass(kind, OwnSimulator) else engine
+        # Before the worlds, which plan every step of every run.
+        for odd in refuse_odd(self.recording, kind, force):
+            say(f"{self.path}: {odd}")
+        check_recording(self.recording, kind(engine=self.engine), force)
         self.fitting = World(
             kind, self.recording, self.recording.training(), self.engine, [Hat], free
         )
@@ -136,6 +145,11 @@ class _Explainer:
     def run(self) -> Explanation:
         self.say("fitting the base model")
         base = fit_base(self.fitting, self.noise, self._given())
+        if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
+            raise InputError(
+                f"{self.path}: the simulation fails wherever a fit begins; "
+                "check constants, units, inputs and initial states"
+            )
         # One stream for surrogates and bootstrap: the same seed tells the same story.
         rng = rng_for("explain", self.recording.system, self.seed)
         search = Search(self.fitting, self.noise, base.untouched, rng, self.floor.stated)

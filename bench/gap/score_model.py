@@ -14,6 +14,9 @@ from bench.gap.measure import HeldOutRuns
 from bench.gap.model.floor import noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
+from bench.recordings.inspection import refuse_huge
+from bench.recordings.size import check_recording
+from bench.recordings.stamps import refuse_odd
 from bench.registry import simulators
 from sims.base import Array, InputError, unknown
 from sims.extended import Extended, opened
@@ -21,7 +24,9 @@ from sims.own import OwnSimulator
 from sims.recording.recording import read_recording, system_of
 
 
-def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, Any]:
+def scored(
+    model: Path, recording: Path, held_out: bool = False, force: bool = False
+) -> dict[str, Any]:
     """RMSE by channel in its unit, in units of the noise over all channels, runs and samples
     counted.
 
@@ -29,6 +34,7 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
         model: extended.toml.
         recording: the table.
         held_out: count only runs that are marked so.
+        force: whether the user insists on a recording that is refused otherwise.
 
     Raises:
         InputError: a file cannot be read, or the recording is of another system.
@@ -51,6 +57,9 @@ def scored(model: Path, recording: Path, held_out: bool = False) -> dict[str, An
         )
     _check_channels(recording, extended, list(runs[0].channels))
     engine = None if issubclass(kind, OwnSimulator) else extended.engine
+    refuse_huge(data)
+    refuse_odd(data, kind, force)
+    check_recording(data, kind(engine=engine), force)
     # Effects that the file does not name are not in the model, so they need not be at hand.
     world = World(
         kind,

@@ -7,6 +7,7 @@ a run stores.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
@@ -17,7 +18,8 @@ from bench.problem import sweep
 from bench.problem.entries import Entry, entries_of
 from bench.problem.recorded import beside
 from sims.base import InputError, unknown
-from sims.user_toml import Pair, entries, hints_of, known, read_toml
+from sims.limits import FASTEST, NAME, WORDS
+from sims.user_toml import Pair, entries, fault, finite, hints_of, known, read_toml, text
 
 __all__ = [
     "Entry",
@@ -33,6 +35,11 @@ __all__ = [
 
 RANGES = ("in", "wide", "real")
 """Where targets come from: the training range, the bounds, a recording."""
+
+_LONGEST = 1e9
+"""Seconds of a limit beyond which waiting for it overflows; infinity is none."""
+_MOST_MEMORY = 10**9
+"""MiB of a limit beyond which no machine has them."""
 
 Drawn = float | Pair
 """A number, or the range from which each scenario draws one uniformly."""
@@ -158,9 +165,18 @@ class Experiment:
             count = getattr(self, what)
             if count < 1:
                 raise InputError(f"{who}: {what} must be at least 1, found {count}")
+        if self.training_budget < 0:
+            raise fault(who, "training_budget", "at least 0", self.training_budget)
+        self._check_words(who)
+        self._check_numbers(who)
         if self.memory < 0 or not self.timeout > 0:  # so that NaN is refused too
             raise InputError(f"{who}: expected timeout > 0 and memory >= 0")
+        if self.memory > _MOST_MEMORY or _LONGEST < self.timeout < math.inf:
+            wanted = f"timeout of at most {_LONGEST:g} s and memory of at most {_MOST_MEMORY:g} MiB"
+            raise InputError(f"{who}: expected {wanted}")
         known("range", self.ranges, RANGES)
+        if not self.ranges or len(set(self.ranges)) < len(self.ranges):
+            raise fault(who, "ranges", "one or more, each once", list(self.ranges))
         # A recording has no range to draw from, and ranges have no recording.
         real = "real" in self.ranges
         if real != (self.recording is not None) or (real and len(self.ranges) != 1):
@@ -168,6 +184,34 @@ class Experiment:
         if self.held_out and (self.recording or self.held_out.scenarios < 1):
             wanted = "simulated targets and scenarios of at least 1"
             raise InputError(f"{who}: [held_out] needs {wanted}")
+
+    def _check_words(self, who: str) -> None:
+        """Refuse texts that no figure, table or path could hold."""
+        text(who, "title", self.title)
+        text(who, "says", self.says, most=WORDS)
+        text(who, "same_targets_as", self.same_targets_as)
+        text(who, "tags", ", ".join(self.tags), most=WORDS)
+        for entry in self.tuners:
+            text(who, "tuners: label", entry.label, most=NAME)
+
+    def _check_numbers(self, who: str) -> None:
+        """Refuse numbers that are none, or beyond all that can be meant."""
+        rate = finite(who, "sampling.rate", self.sampling.rate)
+        if not 0 < rate <= FASTEST or self.sampling.samples < 1:
+            wanted = f"a rate above 0 Hz and up to {FASTEST:g} Hz, and at least 1 of samples"
+            raise fault(who, "sampling", wanted, asdict(self.sampling))
+        for name, sigma in self.noise.items():
+            if finite(who, f"noise.{name}", sigma) < 0:
+                raise fault(who, f"noise.{name}", "at least 0", sigma)
+        held = self.held_out.initial if self.held_out else {}
+        for where, given in (
+            ("initial", self.initial),
+            ("constants", self.constants),
+            ("held_out.initial", held),
+        ):
+            for name, value in given.items():
+                for end in value if isinstance(value, tuple) else (value,):
+                    finite(who, f"{where}.{name}", end)
 
     def document(self) -> dict[str, Any]:
         """The whole configuration as TOML tables; `parse` of it gives an equal experiment."""

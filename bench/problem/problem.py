@@ -56,6 +56,7 @@ class Problem:
         if experiment.world:
             self.world = self._simulator(kind, observe, experiment.world)
 
+        self._check_constants()
         self.cube = UnitCube(adjusted(self.simulator.parameters, experiment.parameters))
         self.channels = self.simulator.channels
         self.error_channel = self._channel(experiment.error_channel or self.channels[0].name)
@@ -82,6 +83,14 @@ class Problem:
         except TypeError as error:  # a setting that its constructor does not take
             who = f"experiment {experiment.name}: simulator {experiment.simulator}"
             raise InputError(f"{who}: {error}") from None
+
+    def _check_constants(self) -> None:
+        """Refuse constants that scenarios would draw and no simulator could have."""
+        constants = self.experiment.constants.items()
+        ranges = {name: ends for name, ends in constants if isinstance(ends, tuple)}
+        for end in range(2):
+            drawn = {name: ends[end] for name, ends in ranges.items()}
+            self.simulator.run_constants(Scenario(np.zeros(1), constants=drawn))
 
     def close(self) -> None:
         """Give back what the simulators hold."""

@@ -7,9 +7,13 @@ from collections.abc import Callable
 import numpy as np
 
 from sims.base import Array, InputError, unknown
+from sims.limits import LARGEST, cut
 
 _TAU = 2 * np.pi
 """Radians of one period."""
+
+_MOST_CHANGES = 1e8
+"""Periods or levels of a signal beyond which its frequency is a slip of the pen."""
 
 _EDGE = 1e-9
 """Share of a step by which a sample may come early and still belong to the new level: times are
@@ -100,5 +104,10 @@ def signal(text: str, times: Array, rng: np.random.Generator) -> Array:
     # All behind the first are frequencies or durations.
     if not complete or min([1.0, *numbers[1:]]) <= 0:
         wanted = f"{name}:{form} with numbers, all but the first > 0"
-        raise InputError(f"signal '{text}': expected {wanted}")
+        raise InputError(f"signal '{cut(text)}': expected {wanted}")
+    span = float(times[-1])
+    changes = [span / n if make is _steps else span * n for n in numbers[1:]]
+    if max(map(abs, numbers)) > LARGEST or max([0.0, *changes]) > _MOST_CHANGES:
+        wanted = f"numbers within {LARGEST:g}, and at most {_MOST_CHANGES:g} periods or levels"
+        raise InputError(f"signal '{cut(text)}': expected {wanted} in its {span:g} s")
     return make(times, rng, *numbers)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from itertools import product
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from sims.user_toml import fault
 
 _UNFIT = re.compile(r"[^\w.+-]+")
 """What a folder's name, and a command line without quotes, could not hold."""
+MOST = 10_000
+"""Experiments of one file; each has a folder of its own, and all are checked before the first."""
 
 
 def documents(
@@ -32,6 +35,12 @@ def documents(
     Raises:
         InputError: a key without values, or values that one label would stand for.
     """
+    count = prod(len(values) for values in swept.values())
+    if count > MOST:
+        raise InputError(
+            f"{path}: sweep: expected at most {MOST:,} experiments, found {count:.3g} combinations;"
+            " sweep over fewer values, or divide the file"
+        )
     for key, values in swept.items():
         _check(path, f"sweep.{key}", values)
     for values in product(*swept.values()):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.problem.seeds import rng_for
+from bench.recordings.size import check_film
 from sims.ball.system import BallSystem
 from sims.base import InputError, unknown
 from sims.camera.camera import Camera
@@ -18,7 +19,9 @@ from sims.recording.recording import read_recording, system_of
 from sims.recording.write import refuse_existing
 
 
-def write(recording: Path, out: Path, run: str | None, pixels: int, seed: int) -> tuple[int, float]:
+def write(
+    recording: Path, out: Path, run: str | None, pixels: int, seed: int, force: bool = False
+) -> tuple[int, float]:
     """Film one run with a published camera of this seed; returns the number of frames and the
     seconds.
 
@@ -44,6 +47,7 @@ def write(recording: Path, out: Path, run: str | None, pixels: int, seed: int) -
     if not np.isfinite(positions).all():
         missing = "has missing samples; a film shows the ball in every frame"
         raise InputError(f"{recording}: run {chosen.name}: {missing}")
+    check_film(recording, len(positions), pixels, force)
     radius = {**data.constants, **chosen.constants}.get("radius", _default("radius"))
     rng = rng_for("film", seed)
     camera, look = Camera.published(rng, pixels), Look.drawn(rng)

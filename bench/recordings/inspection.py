@@ -10,6 +10,7 @@ import numpy as np
 from bench.recordings.noise import NoiseEstimate, estimated, gaps
 from bench.registry import simulators
 from sims.base import Array, Channel, InputError, Simulator
+from sims.limits import LARGEST
 from sims.recording.recording import Recording, Run, divided, read_recording, system_of
 
 _MOST_RUNS = 40
@@ -53,9 +54,23 @@ def load(
         kind = simulators.get(name)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    if isinstance(source, Recording):
-        return divided(source), kind
-    return read_recording(path, kind), kind
+    recording = divided(source) if isinstance(source, Recording) else read_recording(path, kind)
+    refuse_huge(recording)
+    return recording, kind
+
+
+def refuse_huge(recording: Recording) -> None:
+    """Refuse values of which no square is a number any more.
+
+    Raises:
+        InputError: there is one, in one line.
+    """
+    for run in recording.runs:
+        for name, values in (*run.channels.items(), *run.inputs.items()):
+            largest = float(np.nanmax(np.abs(values), initial=0.0))
+            if largest > LARGEST:
+                what = f"expected values within ±{LARGEST:g}, found {largest:.3g}"
+                raise InputError(f"{recording.path}: run {run.name}, column {name}: {what}")
 
 
 def summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]:

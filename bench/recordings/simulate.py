@@ -15,9 +15,11 @@ import numpy as np
 
 from bench.problem.seeds import rng_for
 from bench.problem.signals import signal
+from bench.recordings.size import check_simulated
 from bench.registry import simulators
 from sims import effects as library
 from sims.base import Array, InputError, Scenario, Simulator
+from sims.limits import BRIEFEST, FASTEST, LARGEST, cut, is_number
 from sims.own import OwnSimulator
 from sims.recording.recording import Recording, Run
 from sims.recording.write import refuse_existing, write_recording
@@ -56,6 +58,7 @@ class Wish:
         seed: of all that is drawn.
         held_out: how many of the last runs are marked; None for a third of them, at least one of
             several.
+        force: whether to make it although it needs more than this machine has.
     """
 
     system: str
@@ -72,6 +75,7 @@ class Wish:
     engine: str | None = None
     seed: int = 0
     held_out: int | None = None
+    force: bool = False
 
 
 @dataclass(frozen=True)
@@ -151,7 +155,9 @@ class _Maker:
         known("input", wish.inputs, [c.name for c in kind.inputs])
         inputs = {**self.usual.inputs, **wish.inputs}
         self.inputs = {name: _signal_text(name, value) for name, value in inputs.items()}
-        self.times = _times(wish)
+        samples = _samples(wish)
+        check_simulated(wish.runs, samples, wish.seconds, self.simulator, wish.force)
+        self.times = _times(samples, wish.rate)
 
     def make(self) -> SimulatedRecording:
         scenarios = {str(number): self._scenario(number) for number in range(1, self.wish.runs + 1)}
@@ -235,16 +241,20 @@ def _held_out(wish: Wish) -> int:
     return wish.held_out
 
 
-def _times(wish: Wish) -> Array:
+def _samples(wish: Wish) -> int:
     product = wish.seconds * wish.rate
     samples = round(product) if 0 < product < _MOST_SAMPLES else 0
-    if samples < 2:
+    if samples < 2 or wish.seconds < BRIEFEST or wish.rate > FASTEST:
         raise InputError(
             f"seconds = {wish.seconds:g}, rate = {wish.rate:g}: expected at least 2 samples "
             f"and below {_MOST_SAMPLES:g}"
         )
+    return samples
+
+
+def _times(samples: int, rate: float) -> Array:
     # Rounded as they will stand in the table, so that what is read back is what was simulated.
-    return np.array([float(f"{t:.{_DIGITS}g}") for t in (np.arange(samples) / wish.rate).tolist()])
+    return np.array([float(f"{t:.{_DIGITS}g}") for t in (np.arange(samples) / rate).tolist()])
 
 
 def _theta(given: Mapping[str, float] | Sequence[float], kind: type[Simulator]) -> dict[str, float]:
@@ -310,6 +320,8 @@ def _signal_text(name: str, given: float | str) -> str:
 def _number(what: str, name: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise InputError(f"{what} {name}: expected a number, found {value!r:.60}")
-    if not np.isfinite(value):
-        raise InputError(f"{what} {name} = {value}: expected a finite number")
+    if not is_number(value):
+        raise InputError(
+            f"{what} {name} = {cut(str(value))}: expected a finite number within ±{LARGEST:g}"
+        )
     return float(value)

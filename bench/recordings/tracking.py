@@ -14,6 +14,7 @@ from sims.base import InputError, frozen
 from sims.camera.files import beside, read_filmed
 from sims.camera.track import Track, rough, track
 from sims.camera.video import Video
+from sims.limits import LENGTH
 from sims.recording.recording import Recording, Run
 from sims.recording.write import refuse_existing, write_recording
 
@@ -58,8 +59,9 @@ def write(
     pictures = [out.with_suffix(".png"), out.with_suffix(".pdf")]
     # Before the work: tracking a film takes a while.
     refuse_existing([out, out.with_suffix(".toml"), *pictures])
-    if diameter is not None and not (np.isfinite(diameter) and diameter > 0):
-        raise InputError(f"ball diameter {diameter:g}: expected more than 0 m")
+    if diameter is not None and not LENGTH[0] <= diameter <= LENGTH[1]:
+        wanted = f"more than 0 m, from {LENGTH[0]:g} to {LENGTH[1]:g} m"
+        raise InputError(f"ball diameter {diameter:g}: expected {wanted}")
 
     film = Video(video, fps)
     try:

@@ -46,6 +46,10 @@ class Rehearsal(NamedTuple):
         return self._replace(observations=self.observations + errors, unspoilt=self.pure)
 
 
+class TooFewError(ValueError):
+    """A training budget that does not last for what is learned from it."""
+
+
 def rehearse(
     simulator: Practice, rng: np.random.Generator, budget: int, scenarios: int, each: int
 ) -> Rehearsal:
@@ -53,12 +57,12 @@ def rehearse(
     the budget is small.
 
     Raises:
-        ValueError: the budget does not last for two scenarios.
+        TooFewError: the budget does not last for two scenarios.
     """
     # whole scenarios only: pairs are made within one
     count = min(scenarios, budget // each)
     if count < _LEAST:
-        raise ValueError(
+        raise TooFewError(
             f"{budget} training simulations are fewer than two scenarios of {each} need"
         )
     parameters = []

@@ -30,6 +30,7 @@ from typing import Any
 
 from sims.base import Channel, Constant, Parameter
 from sims.bullet import NO_LIMIT
+from sims.limits import GRAVITY, INERTIA, LENGTH
 from sims.own import BulletWorld, OwnSimulator
 
 _HERE = (0.0, 0.0, 0.0, 1.0)
@@ -86,10 +87,10 @@ class Arm(OwnSimulator):
         *_of_link("friction", "N*m", 0.1, (0.0, 0.5), (0.0, 0.2), says="dry friction of joint"),
     )
     constants = (
-        Constant("length", "m", 0.4, "of link 1, from joint to joint", positive=True),
-        Constant("inertia1", "kg*m^2", 0.012, "of link 1 about its centre of mass", positive=True),
-        Constant("inertia2", "kg*m^2", 0.012, "of link 2 about its centre of mass", positive=True),
-        Constant("gravity", "m/s^2", 9.81, "downward"),
+        Constant("length", "m", 0.4, "of link 1, from joint to joint", True, LENGTH),
+        Constant("inertia1", "kg*m^2", 0.012, "of link 1 about its centre of mass", True, INERTIA),
+        Constant("inertia2", "kg*m^2", 0.012, "of link 2 about its centre of mass", True, INERTIA),
+        Constant("gravity", "m/s^2", 9.81, "downward", limits=GRAVITY),
     )
     inputs = (
         Channel("u1", "N*m", says="torque at joint 1"),

@@ -9,6 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.base import Array, Channel, Constant, Parameter
+from sims.limits import GRAVITY, LENGTH, MASS
 from sims.system import Kind, Moment, System, UsualRecording
 
 
@@ -34,9 +35,9 @@ class BallSystem(System):
         ),
     )
     constants = (
-        Constant("mass", "kg", 1.0, positive=True),
-        Constant("radius", "m", 0.5, positive=True),
-        Constant("gravity", "m/s^2", 9.81, "downward"),
+        Constant("mass", "kg", 1.0, positive=True, limits=MASS),
+        Constant("radius", "m", 0.5, positive=True, limits=LENGTH),
+        Constant("gravity", "m/s^2", 9.81, "downward", limits=GRAVITY),
     )
     channels = (
         Channel("x", "m", says="centre, along the ground"),

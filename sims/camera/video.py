@@ -19,6 +19,8 @@ from sims.camera.render import Image
 from sims.files import replacing
 from sims.recording.write import publish, refuse_existing
 
+_FRAMES = (1e-3, 1e7)
+"""Frames a second that a film of a drop can have."""
 _TICKS = 90_000
 """Time stamps a second in files written here; common for video, and a whole number for the usual
 rates.
@@ -122,8 +124,9 @@ class Video:
     def __init__(self, path: Path, fps: float | None = None) -> None:
         if not path.is_file():
             raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
-        if fps is not None and not (np.isfinite(fps) and fps > 0):
-            raise InputError(f"frames a second, {fps:g}: expected more than 0")
+        if fps is not None and not _FRAMES[0] <= fps <= _FRAMES[1]:
+            wanted = f"more than 0, from {_FRAMES[0]:g} to {_FRAMES[1]:g}"
+            raise InputError(f"frames a second, {fps:g}: expected {wanted}")
         self.path, self.fps = path, fps
         self.notes: list[str] = []
         with self._open():

@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.base import Array, InputError
+from sims.limits import cut, is_number
 from sims.system import Acting, Contact, Force, Friction, Lanes, Moment, Motion, System
 
 TIME_TOLERANCE = 1e-6
@@ -302,10 +303,7 @@ def checked_time_step(time_step: float | None, system: type[System]) -> float:
     """
     if time_step is None:
         return DEFAULT_STEPS[system.kind]
-    if (
-        isinstance(time_step, bool)
-        or not isinstance(time_step, (int, float))
-        or not 0 < time_step < math.inf
-    ):
-        raise InputError(f"time_step must be a positive number of seconds, found {time_step}")
+    if not (is_number(time_step) and time_step > 0):
+        found = cut(str(time_step))
+        raise InputError(f"time_step must be a positive number of seconds, found {found}")
     return float(time_step)

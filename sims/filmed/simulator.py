@@ -15,6 +15,7 @@ from sims.ball.system import BallSystem
 from sims.base import Array, Channel, Constant, InputError, Scenario, Simulator
 from sims.camera import packages
 from sims.camera.camera import Camera
+from sims.limits import LENGTH, PIXELS, TURN
 
 FILMS = ("projected", "tracked")
 """How a film is made: computed through the camera, or rendered and tracked."""
@@ -51,13 +52,19 @@ class FilmedBall(Simulator):
     )
     constants = (
         *BallSystem.constants,
-        Constant("camera_azimuth", "rad", 0.0, "where the camera stands around the vertical"),
-        Constant("camera_distance", "m", 7.5, "of the camera from the vertical", positive=True),
-        Constant("camera_height", "m", 6.5, "of the camera above the ground"),
         Constant(
-            "camera_aim", "m", 2.0, "height of the point on the vertical at which the camera looks"
+            "camera_azimuth", "rad", 0.0, "where the camera stands around the vertical", limits=TURN
         ),
-        Constant("pixels", "px", 100.0, "width and height of the picture", positive=True),
+        Constant("camera_distance", "m", 7.5, "of the camera from the vertical", True, LENGTH),
+        Constant("camera_height", "m", 6.5, "of the camera above the ground", limits=(-1e6, 1e6)),
+        Constant(
+            "camera_aim",
+            "m",
+            2.0,
+            "height of the point on the vertical at which the camera looks",
+            limits=(-1e6, 1e6),
+        ),
+        Constant("pixels", "px", 100.0, "width and height of the picture", True, PIXELS),
     )
     states = BallSystem.states
 

@@ -9,6 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.base import Array, Channel, Constant, Parameter
+from sims.limits import GRAVITY, LENGTH, MASS
 from sims.system import Kind, Moment, System, UsualRecording
 
 
@@ -36,9 +37,16 @@ class PendulumSystem(System):
         Channel("qd", "rad/s", 10.0, "rate of the angle"),
     )
     constants = (
-        Constant("mass", "kg", 0.15, positive=True),
-        Constant("length", "m", 0.15, "from the hinge to the centre of mass", positive=True),
-        Constant("gravity", "m/s^2", 9.81, "downward"),
+        Constant("mass", "kg", 0.15, positive=True, limits=MASS),
+        Constant(
+            "length",
+            "m",
+            0.15,
+            "from the hinge to the centre of mass",
+            positive=True,
+            limits=LENGTH,
+        ),
+        Constant("gravity", "m/s^2", 9.81, "downward", limits=GRAVITY),
     )
     inputs = (Channel("u", "N*m", says="torque at the hinge"),)
     coordinates = ("q",)

@@ -20,6 +20,9 @@ Declared: TypeAlias = type[Simulator] | type[System]
 _KEYS = ("system", "title", "channels", "inputs", "constants", "runs", "extra")
 """What may stand in the file."""
 
+_NEVER = 1e12
+"""Times the usual size of a channel, and that part of it, which no sensor's noise is."""
+
 
 class _Column(NamedTuple):
     """How a column becomes SI, and the table that says so."""
@@ -100,7 +103,7 @@ def read_description(path: Path, declared: Declared) -> Description:
     if not channels:
         raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
     constants = _constants(path, "constants", meta.get("constants", {}), declared)
-    _positive(path, "constants", constants, declared)
+    _possible(path, "constants", constants, declared)
     # Whether the table has these runs is known only when it has been read (`check_names`).
     marks = table(path, "runs", meta.get("runs", {}))
     runs = {name: _run(path, name, own, declared) for name, own in marks.items()}
@@ -109,7 +112,7 @@ def read_description(path: Path, declared: Declared) -> Description:
         title=title,
         channels={name: column.scale for name, column in channels.items()},
         inputs={name: column.scale for name, column in inputs.items()},
-        noise=_noises(path, channels),
+        noise=_noises(path, channels, declared),
         constants=constants,
         runs=runs,
         extra=_extra(path, meta, declared),
@@ -160,13 +163,18 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
         raise InputError(f"{path}: {where}: {error}") from None
 
 
-def _noises(path: Path, channels: Mapping[str, _Column]) -> dict[str, float]:
+def _noises(path: Path, channels: Mapping[str, _Column], declared: Declared) -> dict[str, float]:
     """Each channel's noise where stated, SI units."""
+    sizes = {channel.name: channel.scale for channel in declared.channels}
     noises = {}
     for name, column in channels.items():
-        if "noise" in column.table:
-            # A spread knows no offset, and no sign.
-            noises[name] = abs(column.scale.gain) * _noise(path, name, column.table["noise"])
+        if "noise" not in column.table:
+            continue
+        # A spread knows no offset, and no sign.
+        noises[name] = abs(column.scale.gain) * _noise(path, name, column.table["noise"])
+        if not 1 / _NEVER < noises[name] / sizes[name] < _NEVER:
+            wanted = f"that of values of about {sizes[name]:g} in SI units"
+            raise fault(path, f"channels.{name}.noise", wanted, column.table["noise"])
     return noises
 
 
@@ -209,7 +217,7 @@ def _run(path: Path, name: str, value: Any, declared: Declared) -> RunMarks:
     for twice in constants.keys() & direct.keys():
         raise InputError(f"{path}: {where}: constant {twice} stands twice")
     constants |= _constants(path, where, direct, declared)
-    _positive(path, where, constants, declared)
+    _possible(path, where, constants, declared)
     initial = _numbers(path, f"{where}.initial", own.get("initial", {}), declared.states)
     return RunMarks(constants, initial, held_out)
 
@@ -224,9 +232,8 @@ def _numbers(path: Path, where: str, value: Any, allowed: Collection[str]) -> di
     return {name: finite(path, f"{where}.{name}", number) for name, number in given.items()}
 
 
-def _positive(path: Path, where: str, constants: Mapping[str, float], declared: Declared) -> None:
+def _possible(path: Path, where: str, constants: Mapping[str, float], declared: Declared) -> None:
     for c in declared.constants:
-        value = constants.get(c.name, 1.0)
-        if c.positive and value <= 0:
-            wanted = f"more than 0 {c.unit}"
+        if c.name in constants and (wanted := c.wanted(constants[c.name])):
+            value = constants[c.name]
             raise InputError(f"{path}: {where}.{c.name}: expected {wanted}, found {value:g}")

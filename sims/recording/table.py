@@ -9,6 +9,7 @@ import csv
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import NamedTuple, NoReturn
@@ -16,11 +17,14 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from sims.base import Array, InputError, frozen
+from sims.limits import BRIEFEST, LATEST, NAME
 from sims.recording.fast import WORTHWHILE, read_fast
 from sims.user_toml import shown
 
 _CHUNK = 1 << 13
 """Rows that are turned into numbers at once; memory for text is what they cost."""
+_YEAR = 365.25 * 86400
+"""Seconds."""
 _NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
 """A number as instruments write it; what float() takes besides, `inf` or `1_000`, is a mistake."""
 
@@ -193,6 +197,9 @@ class _Table:
             name = names[begin]
             if not name:
                 self._fault(begin, "run", "expected the name of a run, found none")
+            if len(name) > NAME:
+                wanted = f"a name of at most {NAME} characters"
+                self._fault(begin, "run", f"expected {wanted}, found {shown(name)}")
             if name in runs:
                 self._fault(
                     begin,
@@ -206,8 +213,21 @@ class _Table:
                 self._fault(
                     begin, self.channels[0], f"run {shown(name)} has no sample of any channel"
                 )
+            self._seconds(columns["t"], begin, end - 1)
             runs[name] = TableRun(name, frozen(columns["t"][begin:end]), part)
         return list(runs.values())
+
+    def _seconds(self, t: Array, first: int, last: int) -> None:
+        """Check that a run's stamps can be seconds: those of a clock in milliseconds cannot."""
+        latest = max(-t[first], t[last])
+        if latest > LATEST:
+            years = f"{latest:.4g}, which would be {latest / _YEAR:.2g} years"
+            self._fault(
+                last, "t", f"expected seconds, found {years}; are these milliseconds or less?"
+            )
+        lasts = t[last] - t[first]
+        if lasts < BRIEFEST:
+            self._fault(last, "t", f"expected seconds, found a run of {lasts:.3g} s")
 
     def _increasing(self, t: Array, edges: list[int]) -> None:
         """Check the times between edges."""
@@ -226,7 +246,8 @@ class _Table:
         """The line on which row `record` (from 0) ends: read again, as only a fault asks for it."""
         with self.path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True, skipinitialspace=True)
-            next(islice((row for row in reader if row), record + 1, None))
+            with suppress(csv.Error):  # what the fast reader took, such as an endless cell
+                next(islice((row for row in reader if row), record + 1, None))
             return reader.line_num
 
 

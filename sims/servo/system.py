@@ -9,6 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.base import Array, Channel, Constant, Parameter
+from sims.limits import GAIN, GRAVITY, LENGTH, MASS, VOLTAGE
 from sims.system import Kind, Moment, System, UsualRecording
 
 _KT = slice(0, 1)
@@ -60,12 +61,18 @@ class ServoSystem(System):
         ),
     )
     constants = (
-        Constant("mass", "kg", 0.49, "load", positive=True),
-        Constant("length", "m", 0.1, "from the joint to the load", positive=True),
-        Constant("gravity", "m/s^2", 9.81, "downward"),
-        Constant("voltage", "V", 7.4, "supply", positive=True),
-        Constant("error_gain", "1/rad", 0.00287738, "duty per radian of error and unit of kp"),
-        Constant("kp", "1", 200.0, "firmware gain"),
+        Constant("mass", "kg", 0.49, "load", positive=True, limits=MASS),
+        Constant("length", "m", 0.1, "from the joint to the load", positive=True, limits=LENGTH),
+        Constant("gravity", "m/s^2", 9.81, "downward", limits=GRAVITY),
+        Constant("voltage", "V", 7.4, "supply", positive=True, limits=VOLTAGE),
+        Constant(
+            "error_gain",
+            "1/rad",
+            0.00287738,
+            "duty per radian of error and unit of kp",
+            limits=GAIN,
+        ),
+        Constant("kp", "1", 200.0, "firmware gain", limits=GAIN),
     )
     inputs = (
         Channel("goal", "rad", says="commanded angle"),

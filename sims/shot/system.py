@@ -21,6 +21,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.base import Array, Channel, Constant, Parameter
+from sims.limits import GRAVITY, LENGTH, MASS, RATIO, TURN
 from sims.system import Effect, Kind, Moment, System
 
 _LEVEL_ONLY = ("force.bias", "force.periodic", "lift.magnus")
@@ -56,23 +57,32 @@ class ShotSystem(System):
             1.5,
             "how far the centre falls until the ball touches the incline",
             positive=True,
+            limits=LENGTH,
         ),
         Constant(
             "incline_angle",
             "rad",
             0.35,
             "between the incline and the horizontal, falling towards x",
+            limits=TURN,
         ),
-        Constant("mass", "kg", 0.05, positive=True),
-        Constant("radius", "m", 0.03, positive=True),
-        Constant("gravity", "m/s^2", 9.81, "downward"),
-        Constant("friction", "1", 0.2, "of ball and incline; 0 keeps the tangential speed"),
+        Constant("mass", "kg", 0.05, positive=True, limits=MASS),
+        Constant("radius", "m", 0.03, positive=True, limits=LENGTH),
+        Constant("gravity", "m/s^2", 9.81, "downward", limits=GRAVITY),
+        Constant(
+            "friction",
+            "1",
+            0.2,
+            "of ball and incline; 0 keeps the tangential speed",
+            limits=RATIO,
+        ),
         Constant(
             "inertia_ratio",
             "1",
             0.4,
             "moment of inertia over mass x radius^2; 0.4 for a solid sphere",
             True,
+            RATIO,
         ),
     )
     channels = (

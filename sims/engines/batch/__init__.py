@@ -17,6 +17,7 @@ from sims.engines.batch.pace import TURN, divisions
 from sims.engines.batch.parabola import fly
 from sims.engines.batch.stepping import Stepping
 from sims.engines.ground import Ground, Indices, Mask
+from sims.limits import cut, is_number
 from sims.system import Force, Friction, Lanes, Motion, System
 
 REQUIRES: tuple[str, ...] = ()
@@ -47,13 +48,16 @@ class Batch:
     def __init__(
         self, time_step: float = TIME_STEP, turn: float = TURN, patience: float = np.inf
     ) -> None:
-        if not (np.isfinite(time_step) and time_step > 0):
+        if not (is_number(time_step) and time_step > 0):
             raise InputError(
-                f"engine batch: time_step must be a positive number of seconds, found {time_step}"
+                "engine batch: time_step must be a positive number of seconds, found"
+                f" {cut(str(time_step))}"
             )
         for name, value in (("turn", turn), ("patience", patience)):
-            if not value > 0:
-                raise InputError(f"engine batch: {name} must be a positive number, found {value}")
+            if value != np.inf and not (is_number(value) and value > 0):
+                raise InputError(
+                    f"engine batch: {name} must be a positive number, found {cut(str(value))}"
+                )
         self.largest_step = float(time_step)
         self._turn = float(turn)
         self._patience = float(patience)

@@ -1,0 +1,204 @@
+"""What a comparison or a training would need, from its experiment alone; see `bench.sizes`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from bench.problem.experiment import Entry, Experiment
+from bench.problem.problem import Problem
+from bench.problem.recorded import find_recording
+from bench.recordings.stamps import refuse_odd
+from bench.registry import simulators, tuners
+from bench.runs.runner import check, seeds_of
+from bench.sizes import (
+    NUMBER,
+    SIMULATION,
+    STEP,
+    STEP_BYTES,
+    Need,
+    largest_step,
+    machine,
+    refuse,
+)
+from sims.recording.recording import read_recording
+
+_ROW_DISK = 50
+"""Bytes of a row on disk; 70 were measured."""
+_ROW_MEMORY = 80
+"""Bytes of a row while table and figures are made; 110 were measured."""
+_ROW_SECONDS = 1e-6
+"""Seconds to write and read a row."""
+_RUN_MEMORY = 500
+"""Bytes of a planned run: its order, its id, its status."""
+_RUN_SECONDS = 5e-4
+"""Seconds to score and keep a run."""
+_PER_PART = 1000
+"""Runs that share a file while a comparison is under way."""
+_WORKER = 30e6
+"""Bytes of a worker process that it shares with no other."""
+_CLUSTER = 10_000
+"""Workers that a cluster may have."""
+_TRAINING = 0.1
+"""Seconds that a training takes at the least."""
+_USUAL: Mapping[str, float] = {
+    "targets": 100,
+    "seeds": 5,
+    "budget": 100,
+    "training_budget": 1600,
+    "held_out.scenarios": 3,
+    "sampling.samples": 400,
+    "steps": 2000,
+    "jobs": 8,
+}
+"""What experiments have."""
+
+
+class _Experiment:
+    """The sizes that an experiment's needs are made of."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        problem = Problem(experiment)
+        self.channels = len(problem.channels)
+        self.dim = problem.cube.dim
+        self.samples, self.steps = _simulation(problem)
+        problem.close()
+        skipped = check(experiment)
+        self.tuners = [e for e in experiment.tuners if e.label not in skipped]
+        self.learned = any(tuners.get(e.tuner).learned for e in self.tuners)
+
+    @property
+    def observation(self) -> float:
+        """Bytes of an observation."""
+        return float(self.samples) * self.channels * NUMBER
+
+    @property
+    def simulation(self) -> float:
+        """Seconds of a simulation."""
+        return SIMULATION + STEP * self.steps
+
+
+def _simulation(problem: Problem) -> tuple[int, float]:
+    """Samples and steps of what is simulated for one evaluation."""
+    experiment = problem.experiment
+    step = min(map(largest_step, (problem.simulator, problem.world)))
+    if problem.recording:
+        scenarios = problem.recording.fitting.scenarios
+        seconds = sum(float(s.times[-1] - s.times[0]) for s in scenarios)
+        return sum(s.times.size for s in scenarios), seconds / step
+    samples = experiment.sampling.samples
+    seconds = (samples - 1) / experiment.sampling.rate
+    return samples, max(seconds / step, samples - 1)
+
+
+def check_comparison(
+    experiment: Experiment,
+    folder: Path | None = None,
+    jobs: int = 2,
+    cluster: bool = False,
+    force: bool = False,
+) -> None:
+    """Refuse a comparison that is hopeless on this machine.
+
+    Args:
+        experiment: what it is of.
+        folder: where it would be written.
+        jobs: worker processes; 0 for none.
+        cluster: whether others do the work.
+        force: whether the user insists.
+
+    Raises:
+        InputError: it needs more than there is, in one line.
+    """
+    if force:
+        return
+    need = comparison(experiment, jobs, cluster)
+    refuse(f"experiment {experiment.name}", need, machine(folder))
+    if experiment.recording:
+        kind = simulators.get(experiment.simulator)
+        path = find_recording(experiment.recording.path)
+        refuse_odd(read_recording(path, kind), kind)
+
+
+def comparison(experiment: Experiment, jobs: int = 2, cluster: bool = False) -> Need:
+    """What all runs of an experiment would need; see `check_comparison`."""
+    sizes = _Experiment(experiment)
+    # Of a bounce shot these are its shots with one ball, of which there are a few.
+    targets = experiment.targets * len(experiment.ranges)
+    each = [(seeds_of(experiment, e), e.budget or experiment.budget) for e in sizes.tuners]
+    runs = targets * sum(seeds for seeds, _ in each)
+    simulations = targets * sum(seeds * budget for seeds, budget in each)
+    rows = runs + simulations
+    held_out = experiment.held_out.scenarios if experiment.held_out else 0
+    longest = max((budget for _, budget in each), default=0)
+    trained = experiment.training_budget if sizes.learned else 0
+    workers = _CLUSTER if cluster else max(jobs, 1)
+    memory = (
+        runs * _RUN_MEMORY
+        + targets * (1 + held_out) * sizes.observation
+        + rows * _ROW_MEMORY
+        + (0 if cluster else jobs * _WORKER)
+        + longest * (sizes.dim + 1) * NUMBER
+        + trained * sizes.observation
+        + sizes.steps * STEP_BYTES
+    )
+    seconds = (
+        simulations * sizes.simulation * (1 + held_out) / workers
+        + trained * sizes.simulation
+        + rows * _ROW_SECONDS
+        + runs * _RUN_SECONDS
+    )
+    counts = {
+        "targets": targets,
+        "seeds": max((seeds for seeds, _ in each), default=0),
+        "budget": longest,
+        "training_budget": trained,
+        "held_out.scenarios": held_out,
+        "sampling.samples": sizes.samples,
+        "steps": sizes.steps,
+        "jobs": jobs,
+    }
+    made = ", ".join(f"{name} {count:.4g}" for name, count in counts.items() if count)
+    return Need(
+        f"tuners {len(each)}, {made}",
+        _change(counts),
+        memory,
+        rows * _ROW_DISK,
+        runs / _PER_PART,
+        sizes.steps,
+        seconds,
+    )
+
+
+def _change(counts: Mapping[str, float]) -> str:
+    """What to change: whatever is the largest against its usual size."""
+    largest = max(counts, key=lambda name: counts[name] / _USUAL[name])
+    if largest == "steps":
+        return "set a longer time_step, or sample a shorter time"
+    return f"lower {largest}"
+
+
+def check_training(experiment: Experiment, entry: Entry, seeds: int, force: bool = False) -> None:
+    """Refuse trainings that are hopeless on this machine.
+
+    Args:
+        experiment: in which is trained.
+        entry: the tuner.
+        seeds: trainings.
+        force: whether the user insists.
+
+    Raises:
+        InputError: they need more than there is, in one line.
+    """
+    sizes = _Experiment(experiment)
+    budget = experiment.training_budget
+    need = Need(
+        f"{seeds} trainings of {entry.label} with {budget} simulations, each of {sizes.samples}"
+        f" samples and {sizes.steps:.3g} steps,",
+        _change({"seeds": seeds, "training_budget": budget, "steps": sizes.steps}),
+        memory=budget * sizes.observation + sizes.steps * STEP_BYTES,
+        files=seeds,
+        steps=sizes.steps,
+        seconds=seeds * (_TRAINING + budget * sizes.simulation),
+    )
+    refuse(f"experiment {experiment.name}", need, machine(), force)
