@@ -45,7 +45,9 @@ def _whole(text: str, least: int) -> int:
     except ValueError:
         value = least - 1
     if not least <= value <= MOST:
-        wanted = f"a whole number of at least {least} and at most {MOST:.0e}"
+        wanted = f"a whole number of at least {least}"
+        if value > MOST:
+            wanted = f"{wanted} and at most {MOST:.0e}"
         raise argparse.ArgumentTypeError(f"expected {wanted}, found '{cut(text)}'")
     return value
 
