@@ -18,6 +18,8 @@ from bench.store.folder import (
 from bench.store.journal import Journal
 from bench.store.planned import check_plan
 from bench.store.rows import RunsFile
+from bench.store.secret import kept as kept_salt
+from bench.store.secret import reveal, salted
 from bench.store.segments import (
     FOLDER,
     PLAN,
@@ -61,6 +63,7 @@ class Comparison:
         self.folder = folder
         self.configuration = configuration(folder)
         self.plugins = self.configuration.plugins
+        self.secret: str | None = None
         self.results: Results | None = None
 
     @classmethod
@@ -70,6 +73,7 @@ class Comparison:
         plugins: Sequence[str] = (),
         folder: Path | None = None,
         jobs: int = 2,
+        salt: str | None = None,
     ) -> Comparison:
         """A comparison in a new folder; the plan stands, and nothing has been run; see
         `bench.study.Study.begin`.
@@ -78,13 +82,17 @@ class Comparison:
         from bench.runs.runner import prepare, refuse_unreachable
 
         place = free_folder(experiment, folder)
-        results = prepare(experiment)
+        experiment, secret = salted(experiment, salt)
+        # Nothing is out of reach of what works in this process.
+        experiment = experiment.chosen(trusted=experiment.trusted or not jobs)
+        results = prepare(experiment, secret)
         # Before there is a folder: a fault of the user's leaves nothing behind.
         if jobs:
             refuse_unreachable(experiment)
         hashes = fingerprint(experiment, plugins)
-        create(place, Configuration(experiment, list(plugins), hashes), jobs)
+        create(place, Configuration(experiment, list(plugins), hashes), jobs, secret)
         comparison = cls(place)
+        comparison.secret = secret
         comparison._attach(results)
         return comparison
 
@@ -97,13 +105,19 @@ class Comparison:
         from bench.runs.runner import prepare
 
         comparison = cls(folder)
+        experiment = comparison.configuration.experiment
         comparison.plugins = unchanged(folder, comparison.configuration, plugins)
-        comparison._attach(prepare(comparison.configuration.experiment))
+        comparison.secret = kept_salt(folder, experiment)
+        comparison._attach(prepare(experiment, comparison.secret))
         return comparison
 
     def _attach(self, results: Results) -> None:
         """Open the journal of the folder, write or check the plan."""
+        from bench.runs.training import folder as trained
+
         self.results = results
+        # What is known of truths, of rivals and of earlier trainings is out of a tuner's reach.
+        results.hidden = tuple(str(place.resolve()) for place in (self.folder, trained()))
         ids = [job.order.run for job in results.plan]
         if not (self.folder / FOLDER).exists():
             results.kept.statuses = self._complete(ids)
@@ -190,6 +204,8 @@ class Comparison:
                 len(journal.statuses), len(results.plan), results.interrupted, results.stopped
             )
             if made.complete:
+                reveal(self.folder, self.secret)
+                self.configuration = configuration(self.folder)
                 journal.discard()
             else:
                 journal.close()

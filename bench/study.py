@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from bench.problem.salt import fresh
 from bench.store.folder import CONFIGURATION, configuration, free_folder
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ class Study(Protocol):
         plugins: Sequence[str] = (),
         folder: Path | None = None,
         jobs: int = 2,
+        salt: str | None = None,
     ) -> Study:
         """A study in a new folder, checked and planned.
 
@@ -52,7 +54,10 @@ class Study(Protocol):
             experiment: what it is of.
             plugins: plugin files that it needs; the caller has loaded them.
             folder: new or empty; one below results/ that is named for the time where None.
-            jobs: worker processes that it is meant to be made with; 0 for none.
+            jobs: worker processes that it is meant to be made with; 0 for none, and tuners that
+                are trusted.
+            salt: what its targets are drawn from, secret until it is complete; a fresh one where
+                None.
 
         Raises:
             InputError: a fault in the experiment, or the folder is not free.
@@ -101,9 +106,10 @@ def begin(
     plugins: Sequence[str] = (),
     folder: Path | None = None,
     jobs: int = 2,
+    salt: str | None = None,
 ) -> Study:
     """Begin the study that an experiment asks for; see `Study.begin`."""
-    return kind_of(experiment).begin(experiment, plugins, folder, jobs)
+    return kind_of(experiment).begin(experiment, plugins, folder, jobs, salt)
 
 
 def begin_all(
@@ -111,6 +117,7 @@ def begin_all(
     plugins: Sequence[str] = (),
     folder: Path | None = None,
     jobs: int = 2,
+    salt: str | None = None,
 ) -> list[Study]:
     """Begin the study, or the studies where the experiment sweeps over values.
 
@@ -120,6 +127,7 @@ def begin_all(
         folder: of the study; of several the folder in which each gets its own, named as its
             experiment is.
         jobs: as in `Study.begin`.
+        salt: as in `Study.begin`; of several one for all, so that they meet the same targets.
 
     Raises:
         InputError: a fault in one of them, or the folder is not free; nothing is left behind.
@@ -128,13 +136,15 @@ def begin_all(
 
     wanted = expand(experiment)
     if len(wanted) == 1:
-        return [begin(wanted[0], plugins, folder, jobs)]
+        return [begin(wanted[0], plugins, folder, jobs, salt)]
+    if salt is None and not experiment.salt:
+        salt = fresh()
     parent = free_folder(experiment, folder)
     begun: list[Study] = []
     try:
         # All before the first is made: a fault in the last would show after hours.
         for one in wanted:
-            begun.append(begin(one, plugins, parent / one.name, jobs))
+            begun.append(begin(one, plugins, parent / one.name, jobs, salt))
     except BaseException:
         for study in begun:
             study.close()

@@ -63,6 +63,7 @@ class Registry(Generic[T]):
     def __init__(self, kind: str, group: str, base: type[T]) -> None:
         self.kind, self.group, self.base = kind, group, base
         self._added: dict[str, Added[T]] = {}
+        self._announced: dict[str, Added[T]] = {}
         self._imported: dict[str, Any] = {}
 
     @cached_property
@@ -71,7 +72,7 @@ class Registry(Generic[T]):
 
     def names(self) -> list[str]:
         """All registered names, sorted."""
-        return sorted({*self._entries, *self._added})
+        return sorted({*self._entries, *self._announced, *self._added})
 
     def get(self, name: str) -> type[T]:
         """The class registered as `name`.
@@ -82,6 +83,8 @@ class Registry(Generic[T]):
         """
         if name in self._added:
             part: Any = self._added[name].part
+        elif name in self._announced:
+            part = self._announced[name].part
         elif name in self._entries:
             part = self._installed(name)
         else:
@@ -149,6 +152,33 @@ class Registry(Generic[T]):
         self._added[name] = Added(part, path)
         return part
 
+    def announce(self, part: type[T], path: Path | None) -> None:
+        """Let a name stand for a class whose code is not loaded into this process.
+
+        Args:
+            part: what is known of it, as a class.
+            path: its plugin file; None where an installed package has it, whose place it takes.
+
+        Raises:
+            InputError: its name is taken or cannot be used.
+        """
+        where = f"plugin {path}: " if path else ""
+        name = _name_of(part, where)
+        other = self._announced.get(name) or self._added.get(name)
+        taken = other is not None and other.path != path
+        if taken or (path is not None and name in self._entries):
+            raise InputError(f"{where}{self.kind} '{name}' exists already; give it another name")
+        self._announced[name] = Added(part, path)
+
+    def entry(self, name: str) -> str | None:
+        """The ``module:class`` of an installed part; None where no package has one of that name."""
+        return self._entries[name].value if name in self._entries else None
+
+    def place(self, name: str) -> Path | None:
+        """The plugin file of a part that came from one, loaded or only announced."""
+        added = self._added.get(name) or self._announced.get(name)
+        return added.path if added else None
+
     def _holds(self, name: str, part: type[T]) -> bool:
         """Whether the name stands for this very class."""
         if name in self._added:
@@ -173,6 +203,7 @@ class Registry(Generic[T]):
     def restore(self, snapshot: Mapping[str, Added[T]]) -> None:
         """Forget what has been added since the snapshot, and take back what has been lost."""
         self._added = dict(snapshot)
+        self._announced = {}
 
 
 def _qualified(part: type) -> tuple[str, str]:

@@ -14,10 +14,10 @@ from bench import study
 from bench.figures import comparison
 from bench.problem.experiment import Experiment, load
 from bench.problem.problem import Problem
-from bench.registry import load_plugins
 from bench.registry import tuners as registered
 from bench.report import tables
 from bench.runs.runner import Progress
+from bench.runs.survey import admit
 from bench.store.csvs import Csv
 from bench.store.folder import Stored, read
 from bench.store.schema import SHOT_STATUS, SHOT_TABLE, SHOTS
@@ -47,6 +47,9 @@ def compare(
     timeout: float | None = None,
     memory: int | None = None,
     jobs: int = 2,
+    trust: bool = False,
+    isolation: str | None = None,
+    salt: str | None = None,
     out: str | Path | None = None,
     plugins: Sequence[str | Path] = (),
     cluster: str | None = None,
@@ -65,7 +68,14 @@ def compare(
         timeout: seconds that a run may take, then it is ended.
         memory: MiB that a run may take; 0 is no limit.
         jobs: worker processes; 0 runs everything in this process, where prints show and
-            breakpoints hold, and which a class that is defined in a notebook's cell needs.
+            breakpoints hold, and which a class that is defined in a notebook's cell needs; its
+            tuners are trusted.
+        trust: run the tuners inside the harness, where nothing is out of their reach: quicker, and
+            what comes out is marked so.
+        isolation: "run" gives every run of a tuner a fresh process, "tuner" all with the same seed
+            one; the experiment's where None.
+        salt: what targets are drawn from, secret until the end; "public" for the published ones, a
+            fresh one where None.
         out: folder to write, a new one; below results/ where None.
         plugins: Python files with more tuners, simulators and effects.
         cluster: address of a Dask scheduler to run on instead.
@@ -75,9 +85,9 @@ def compare(
     Raises:
         InputError: a fault in what was asked for, in one line; nothing has been run then.
     """
-    files = _loaded(plugins)
+    files = [str(Path(plugin).resolve()) for plugin in plugins]
     chosen = choose(
-        experiment,
+        given(experiment, files, trust or not jobs, isolation),
         None if tuners is None else [_label(tuner) for tuner in tuners],
         seeds,
         targets=targets,
@@ -91,7 +101,7 @@ def compare(
     folder = None if out is None else Path(out)
     study.refuse_hopeless(chosen, folder, jobs, cluster is not None, force)
     pool = _cluster(cluster)
-    begun = study.begin(chosen, files, folder, jobs)
+    begun = study.begin(chosen, files, folder, jobs, salt)
     return _made(begun, jobs, progress, pool)
 
 
@@ -99,6 +109,8 @@ def sweep(
     experiment: str | Path | Experiment,
     *,
     jobs: int = 2,
+    trust: bool = False,
+    salt: str | None = None,
     out: str | Path | None = None,
     plugins: Sequence[str | Path] = (),
     progress: Progress | None = None,
@@ -109,6 +121,8 @@ def sweep(
     Args:
         experiment: its name, the path of its TOML file, or itself.
         jobs: as in `compare`.
+        trust: as in `compare`.
+        salt: as in `compare`; one for all, so that they meet the same targets.
         out: folder in which each gets its own, named as the experiment is.
         plugins: as in `compare`.
         progress: told of every step.
@@ -120,17 +134,29 @@ def sweep(
     Raises:
         InputError: a fault in what was asked for, in one line; nothing has been run then.
     """
-    files = _loaded(plugins)
-    chosen, folder = choose(experiment), None if out is None else Path(out)
+    files = [str(Path(plugin).resolve()) for plugin in plugins]
+    chosen = choose(given(experiment, files, trust or not jobs))
+    folder = None if out is None else Path(out)
     study.refuse_hopeless(chosen, folder, jobs, force=force)
-    begun = study.begin_all(chosen, files, folder, jobs)
+    begun = study.begin_all(chosen, files, folder, jobs, salt)
     return [_made(one, jobs, progress, None) for one in begun]
 
 
-def _loaded(plugins: Sequence[str | Path]) -> list[str]:
-    files = [str(Path(plugin).resolve()) for plugin in plugins]
-    load_plugins(files)
-    return files
+def given(
+    experiment: str | Path | Experiment,
+    plugins: Sequence[str | Path],
+    trust: bool,
+    isolation: str | None = None,
+) -> Experiment:
+    """An experiment whose plugins are known to this process; see `compare`.
+
+    Raises:
+        InputError: no such experiment, or a plugin cannot be used.
+    """
+    whole = experiment if isinstance(experiment, Experiment) else load(str(experiment))
+    whole = whole.chosen(trusted=whole.trusted or trust, isolation=isolation)
+    admit([str(Path(plugin).resolve()) for plugin in plugins], whole)
+    return whole
 
 
 def _cluster(address: str | None) -> Pool | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +12,10 @@ from bench.figures.training import draw
 from bench.problem.experiment import Entry, Experiment, load, names
 from bench.problem.problem import Problem
 from bench.registry import simulators, tuners
+from bench.runs.housing import tuned_of
 from bench.runs.runner import Progress
+from bench.runs.survey import admit, unbuildable
+from bench.runs.training import Lesson, folder
 from methods.base import Practice
 from sims import files
 from sims.base import InputError
@@ -23,7 +27,12 @@ _HELD_OUT = 160
 
 
 def choose(
-    tuner: str, simulator: str, experiment: str | None = None, budget: int | None = None
+    tuner: str,
+    simulator: str,
+    experiment: str | None = None,
+    budget: int | None = None,
+    plugins: Sequence[str | Path] = (),
+    trust: bool = False,
 ) -> tuple[Experiment, Entry]:
     """The experiment and the entry to train.
 
@@ -32,12 +41,18 @@ def choose(
         simulator: registered name.
         experiment: name or TOML file; the only one of the project with this simulator where None.
         budget: simulations to learn from; the experiment's where None.
+        plugins: plugin files that they need.
+        trust: train it inside the harness, for comparisons that do likewise.
 
     Raises:
         InputError: they do not go together, or the tuner does not learn.
     """
-    simulators.get(simulator)
+    if not plugins:
+        simulators.get(simulator)
     chosen = load(experiment or _only(simulator)).chosen(training_budget=budget)
+    chosen = chosen.chosen(trusted=trust or chosen.trusted)
+    admit([str(Path(plugin).resolve()) for plugin in plugins], chosen)
+    simulators.get(simulator)
     if chosen.simulator != simulator:
         raise InputError(
             f"experiment {chosen.name}: its simulator is {chosen.simulator}, not {simulator}"
@@ -46,7 +61,16 @@ def choose(
     entry = entries.get(tuner, Entry(tuner, tuner))
     if not tuners.get(entry.tuner).learned:
         raise InputError(f"tuner {entry.label} does not learn: there is nothing to train")
+    if not chosen.trusted:
+        unbuildable(entry)
     return chosen, entry
+
+
+def lesson(experiment: Experiment, entry: Entry, seed: int) -> Lesson:
+    """The training of an entry with a seed."""
+    if experiment.trusted:
+        return Lesson(entry, seed)
+    return Lesson(entry, seed, tuned_of(entry), (str(folder().resolve()),))
 
 
 def _only(simulator: str) -> str:

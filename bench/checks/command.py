@@ -13,6 +13,7 @@ from bench.checks.suites import SUITES
 from bench.checks.tuners import check_same_run_in_other_processes
 from bench.registry import REGISTRIES
 from bench.runs.pools import LocalPool
+from bench.runs.survey import Plugin
 from sims.base import InputError, unknown
 
 _HERE = (check_same_run_in_other_processes,)
@@ -108,7 +109,7 @@ def _isolated(kind: str, name: str, plugins: Sequence[str]) -> dict[int, Any]:
     places = [place for place, check in enumerate(SUITES[kind]) if check not in _HERE]
     ends: dict[int, Any] = {}
     with LocalPool(1) as pool:
-        pool.load(plugins)
+        pool.load([Plugin(path) for path in plugins])
         for i, end in pool.results([(attempt, (kind, name, place)) for place in places], LIMIT):
             ends[places[i]] = end
             if sum(isinstance(e, Exception) for e in ends.values()) == 2:

@@ -9,6 +9,7 @@ from functools import cache
 from typing import Any
 
 from bench.runs.pools import LocalPool
+from bench.runs.survey import Plugin
 
 LIMIT = 120.0
 """Seconds that one call may take before it is killed."""
@@ -17,7 +18,7 @@ LIMIT = 120.0
 @cache
 def _pool(workers: int, plugins: tuple[str, ...]) -> LocalPool:
     pool = LocalPool(workers)
-    pool.load(plugins)
+    pool.load([Plugin(path) for path in plugins])
     atexit.register(pool.__exit__)
     return pool
 

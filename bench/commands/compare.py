@@ -8,7 +8,16 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.commands.options import add_force, add_plugin, names, natural, positive, said_as, seconds
+from bench.commands.options import (
+    add_force,
+    add_plugin,
+    add_trust,
+    names,
+    natural,
+    positive,
+    said_as,
+    seconds,
+)
 
 if TYPE_CHECKING:
     from bench.problem.experiment import Experiment
@@ -76,6 +85,19 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
     compare.add_argument(
         "--memory", type=positive, metavar="MIB", help="memory that a run may take"
     )
+    add_trust(compare)
+    compare.add_argument(
+        "--isolation",
+        choices=("run", "tuner"),
+        help="a fresh process for every run of a tuner, or one for all with the same seed "
+        "(default: run)",
+    )
+    compare.add_argument(
+        "--salt",
+        metavar="TEXT",
+        help="draw the targets from this, which is kept secret until the end; `public` gives the "
+        "published ones (default: a fresh one)",
+    )
     compare.add_argument(
         "--allow-failures", action="store_true", help="exit with 0 although runs failed"
     )
@@ -110,16 +132,16 @@ def add_plot(plot: argparse.ArgumentParser) -> None:
 
 def _chosen(options: argparse.Namespace) -> Experiment:
     """The experiment that the options of `compare` describe."""
-    from bench.api.compare import choose
-    from bench.registry import load_plugins
+    from bench.api.compare import choose, given
     from sims.base import InputError
 
     if options.experiment is None:
         raise InputError("expected an experiment (see `simgap list experiments`), or --resume DIR")
-    load_plugins(options.plugin)
+    trust = options.trust or not options.jobs
+    experiment = given(options.experiment, options.plugin, trust, options.isolation)
     labels = names(options.tuners) if options.tuners else None
     changes = {name: getattr(options, name) for name in _CHANGES}
-    return choose(options.experiment, labels, options.seeds, **changes)
+    return choose(experiment, labels, options.seeds, **changes)
 
 
 def _refuse_beside_resume(options: argparse.Namespace) -> None:
@@ -130,8 +152,9 @@ def _refuse_beside_resume(options: argparse.Namespace) -> None:
     """
     from sims.base import InputError
 
-    described = ("experiment", "tuners", "seeds", "out", *_CHANGES)
+    described = ("experiment", "tuners", "seeds", "out", "salt", "isolation", *_CHANGES)
     given = [name for name in described if getattr(options, name) is not None]
+    given += ["trust"] if options.trust else []
     if given:
         raise InputError(
             f"--resume takes the configuration of its folder as it is; leave out {', '.join(given)}"
@@ -148,7 +171,7 @@ def _begun(options: argparse.Namespace) -> list[Study]:
     chosen, cluster = _chosen(options), options.cluster is not None
     refuse_hopeless(chosen, options.out, options.jobs, cluster, options.force)
     with said_as("--out", options.out):
-        return begin_all(chosen, options.plugin, options.out, options.jobs)
+        return begin_all(chosen, options.plugin, options.out, options.jobs, options.salt)
 
 
 def _cluster(address: str | None) -> Pool | None:
@@ -260,11 +283,14 @@ def _listed(standing: Standing, every: bool) -> list[str]:
 
 
 def _plot(options: argparse.Namespace) -> int:
-    from bench.registry import load_plugins
+    from bench.runs.survey import admit
     from bench.study import opened, parts_of
     from sims.base import InputError
 
-    load_plugins(options.plugin)
+    files = [str(path.resolve()) for path in map(Path, options.plugin)]
+    for folder in options.runs:
+        for part in parts_of(folder):
+            admit(files, opened(part).configuration.experiment)
     if len(options.runs) == 1 and not options.out:
         for part in parts_of(options.runs[0]):
             opened(part).finish(print)

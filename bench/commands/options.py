@@ -27,6 +27,16 @@ def add_force(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """The option ``--trust``."""
+    parser.add_argument(
+        "--trust",
+        action="store_true",
+        help="run the tuners inside the harness: quicker, nothing is out of their reach, and what "
+        "comes out is marked so",
+    )
+
+
 def positive(text: str) -> int:
     """A whole number of at least 1."""
     return _whole(text, 1)

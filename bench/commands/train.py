@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.commands.options import add_force, add_plugin, positive
+from bench.commands.options import add_force, add_plugin, add_trust, positive
 
 
 def add_train(parser: argparse.ArgumentParser) -> None:
@@ -37,22 +37,28 @@ def add_train(parser: argparse.ArgumentParser) -> None:
         "--out", metavar="DIR", type=Path, help="folder of losses (default: below results/train)"
     )
     add_plugin(parser, "of them")
+    add_trust(parser)
     add_force(parser)
     parser.set_defaults(command=_train)
 
 
 def _train(options: argparse.Namespace) -> int:
-    from bench.api.train import Losses, choose
+    from bench.api.train import Losses, choose, lesson
     from bench.commands.progress import Bars
-    from bench.registry import load_plugins
     from bench.runs.runner import seeds_of
     from bench.runs.size import check_training
     from bench.runs.training import train
     from methods.learning.rehearsal import TooFewError
     from sims.base import InputError
 
-    load_plugins(options.plugin)
-    experiment, entry = choose(options.tuner, options.simulator, options.experiment, options.budget)
+    experiment, entry = choose(
+        options.tuner,
+        options.simulator,
+        options.experiment,
+        options.budget,
+        options.plugin,
+        options.trust,
+    )
     seeds = options.seeds or seeds_of(experiment, entry)
     check_training(experiment, entry, seeds, options.force)
     with Bars("epoch") as bars:
@@ -60,7 +66,9 @@ def _train(options: argparse.Namespace) -> int:
         for seed in range(seeds):
             losses.begin(f"{entry.label} seed {seed}", seed)
             try:
-                training = train(experiment, entry, seed, losses, options.again)
+                training = train(
+                    experiment, lesson(experiment, entry, seed), losses, options.again
+                )
             except TooFewError as error:
                 raise InputError(f"tuner {entry.label}: {error}; give a larger --budget") from None
             how = "trained earlier with" if training.found else "trained with"
@@ -72,5 +80,6 @@ def _train(options: argparse.Namespace) -> int:
         for path in losses.write(folder, title):
             print(path)
     budget = f" --training-budget {options.budget}" if options.budget else ""
-    print(f"found by: simgap compare {options.experiment or experiment.name}{budget}")
+    trust = " --trust" if options.trust else ""
+    print(f"found by: simgap compare {options.experiment or experiment.name}{budget}{trust}")
     return 0

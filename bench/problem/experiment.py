@@ -17,6 +17,7 @@ from typing import Any, TypedDict
 from bench.problem import sweep
 from bench.problem.entries import Entry, entries_of
 from bench.problem.recorded import beside
+from bench.problem.salt import check_commitment
 from sims.base import InputError, unknown
 from sims.limits import FASTEST, NAME, WORDS
 from sims.user_toml import Pair, entries, fault, finite, hints_of, known, read_toml, text
@@ -40,6 +41,8 @@ _LONGEST = 1e9
 """Seconds of a limit beyond which waiting for it overflows; infinity is none."""
 _MOST_MEMORY = 10**9
 """MiB of a limit beyond which no machine has them."""
+ISOLATIONS = ("run", "tuner")
+"""How long a tuner's process lives."""
 
 Drawn = float | Pair
 """A number, or the range from which each scenario draws one uniformly."""
@@ -123,6 +126,14 @@ class Experiment:
         recording: the measured data, for range real.
         shot: where the experiment is a bounce shot, its scene (`bench.shot.settings`); targets are
             then shots a ball.
+        isolation: run: every run of a tuner has a fresh process; tuner: all runs of a tuner with
+            one seed that a worker makes share one.
+        trusted: tuners run in the harness's own processes, where nothing is out of their reach;
+            tables and figures say so.
+        salt: what targets are drawn from; empty for a secret one, fresh for each comparison and
+            revealed at its end; ``public`` for the targets that everybody can draw; any other text
+            is as public as the file that it stands in.
+        salt_sha256: of the secret salt, from the beginning; a folder of results has it.
         sweep: lists of values by key; the file stands for an experiment ``NAME[budget=10]`` for
             each combination of them. A key within a table is joined by dots, as ``noise.x``.
         tuners: a list of registered names, and of tables with ``tuner`` and, where two entries have
@@ -156,6 +167,10 @@ class Experiment:
     identifiability: bool = True
     recording: Source | None = None
     shot: Mapping[str, Any] = field(default_factory=dict)
+    isolation: str = "run"
+    trusted: bool = False
+    salt: str = ""
+    salt_sha256: str = ""
     sweep: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
     tuners: tuple[Entry, ...] = ()
 
@@ -177,6 +192,8 @@ class Experiment:
         known("range", self.ranges, RANGES)
         if not self.ranges or len(set(self.ranges)) < len(self.ranges):
             raise fault(who, "ranges", "one or more, each once", list(self.ranges))
+        known("isolation", [self.isolation], ISOLATIONS)
+        check_commitment(who, self.salt, self.salt_sha256)
         # A recording has no range to draw from, and ranges have no recording.
         real = "real" in self.ranges
         if real != (self.recording is not None) or (real and len(self.ranges) != 1):

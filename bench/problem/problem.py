@@ -38,16 +38,23 @@ class Problem:
         scale: (C,) what a residual is divided by: the noise, or the typical magnitude of the
             channel.
         recording: what the experiment's recording holds; None for simulated targets.
+        salt: what targets are drawn from.
         simulated: simulations made so far.
+
+    Args:
+        experiment: as it was read.
+        salt: the secret one, which only the process has that draws the targets; the experiment's
+            own where None.
     """
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: Experiment, salt: str | None = None) -> None:
         if experiment.sweep:
             swept = ", ".join(experiment.sweep)
             remedy = "run those that bench.problem.experiment.expand gives"
             raise InputError(f"experiment {experiment.name}: sweeps over {swept}; {remedy}")
         self.experiment = experiment
         self.simulated = 0
+        self.salt = experiment.salt if salt is None else salt
 
         kind = simulators.get(experiment.simulator)
         observe = experiment.observe or tuple(c.name for c in kind.channels)

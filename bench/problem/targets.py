@@ -1,7 +1,8 @@
 """Targets: scenarios and observations whose true parameters are sealed from the tuners.
 
-A target's numbers are drawn from a stream of its own, in a fixed order: start and truth, initial
-state, inputs, constants, sensor noise. Whatever is drawn in another order is another target.
+A target's numbers are drawn from streams of its own (`bench.problem.salt`), in a fixed order: start
+and truth, initial state, inputs, constants, sensor noise. Whatever is drawn in another order is
+another target.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from bench.problem.experiment import Drawn, Experiment
 from bench.problem.recorded import Measured, Side
-from bench.problem.seeds import rng_for
+from bench.problem.salt import Streams
 from bench.problem.signals import signal
 from sims.base import Array, Channel, Scenario, Simulator, UnitCube
 
@@ -61,9 +62,11 @@ class Drawing(Protocol):
         channels: observed, in order.
         noise: (C,) 1 sigma of each channel.
         recording: what the experiment's recording holds; None for simulated targets.
+        salt: what targets are drawn from.
     """
 
     experiment: Experiment
+    salt: str
     world: Simulator
     cube: UnitCube
     channels: tuple[Channel, ...]
@@ -80,20 +83,25 @@ def draw(problem: Drawing, kind: str, index: int) -> Target:
     """
     # No tuner, seed or budget in the stream's name: all tuners meet the same target.
     met = problem.experiment.same_targets_as or problem.experiment.name
-    rng = rng_for(met, "target", kind, index)
+    streams = Streams(problem.salt, met, kind, index)
     box = _CUBE if kind == "wide" else problem.cube.training
-    start, truth = rng.uniform(box[0], box[1], size=(2, problem.cube.dim))
+    start, truth = (
+        streams.of(what).uniform(box[0], box[1], size=problem.cube.dim)
+        for what in ("start", "truth")
+    )
     name = f"{kind}-{index:03d}"
     recording = problem.recording
     if recording:
         return Target(SealedTarget(name, kind, start, recording.fitting, recording.held_out), None)
-    scenarios = problem.scenarios(rng)  # a single one: several runs come from recordings
+    scenarios = problem.scenarios(
+        streams.of("scenario")
+    )  # a single one: several runs come from recordings
     # The world's own parameters are the first of those that are tuned.
     theta = problem.cube.physical(truth[None])[:, : len(problem.world.parameters)]
     clean = problem.world.simulate(theta, scenarios[0])[0]
-    observed = clean + problem.noise * rng.standard_normal(clean.shape)
+    observed = clean + problem.noise * streams.of("noise").standard_normal(clean.shape)
     fitting = Side(scenarios, observed)
-    held_out = _held_out(problem, theta, (met, kind, index))
+    held_out = _held_out(problem, theta, streams)
     sealed = SealedTarget(name, kind, start, fitting, held_out)
     return Target(sealed, problem.cube.physical(truth))
 
@@ -126,14 +134,14 @@ def _drawn(rng: np.random.Generator, value: Drawn) -> float:
     return rng.uniform(*value) if isinstance(value, tuple) else value
 
 
-def _held_out(problem: Drawing, theta: Array, names: tuple[str, str, int]) -> Side:
+def _held_out(problem: Drawing, theta: Array, target: Streams) -> Side:
     """Unseen scenarios, and what the target's world does in them, without sensor noise: what is to
     be predicted.
 
     Args:
         problem: the experiment's.
         theta: (1, p) the target's parameters.
-        names: of the target, on which the scenarios depend and on nothing else.
+        target: its streams, on which the scenarios depend and on nothing else.
     """
     experiment, wanted = problem.experiment, problem.experiment.held_out
     if wanted is None:
@@ -141,7 +149,7 @@ def _held_out(problem: Drawing, theta: Array, names: tuple[str, str, int]) -> Si
     initial = {**experiment.initial, **wanted.initial}
     inputs = {**experiment.inputs, **wanted.inputs}
     # A stream for each: more of them leave the first as they are.
-    streams = [rng_for(*names, "held-out", i) for i in range(wanted.scenarios)]
+    streams = [target.held_out(i) for i in range(wanted.scenarios)]
     scenarios = tuple(scenario(experiment, rng, initial, inputs) for rng in streams)
     observed = [problem.world.simulate(theta, each)[0] for each in scenarios]
     return Side(scenarios, np.concatenate(observed))

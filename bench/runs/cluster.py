@@ -22,6 +22,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from bench.runs.pools import Call, LocalPool, LostError
 from bench.runs.sources import rooms, versions
+from bench.runs.survey import Plugin
 from bench.runs.training import Training, folder, train
 from sims.base import InputError
 from sims.files import first_line, write
@@ -37,6 +38,8 @@ _LOSSES = 20
 
 Files = tuple[tuple[str, bytes], ...]
 """Name and content of files."""
+Luggage = tuple[tuple[Plugin, bytes], ...]
+"""Plugins and the contents of their files; of an installed one there is none."""
 
 
 @runtime_checkable
@@ -78,7 +81,7 @@ class ClusterPool:
             raise InputError(
                 f"{address}: no Dask scheduler answers there ({first_line(error)})"
             ) from None
-        self._files: Files = ()
+        self._plugins: Luggage = ()
         self._sent_files: dict[Path, Any] = {}
         self._check()
 
@@ -119,9 +122,9 @@ class ClusterPool:
                 raise answer
         return answers
 
-    def load(self, plugins: Sequence[str]) -> None:
-        """Make these plugin files known to the workers; before the first call."""
-        self._files = tuple((Path(p).name, Path(p).read_bytes()) for p in plugins)
+    def load(self, plugins: Sequence[Plugin]) -> None:
+        """Make these plugins known to the workers; before the first call."""
+        self._plugins = tuple((p, Path(p.path).read_bytes() if p.path else b"") for p in plugins)
 
     def __enter__(self) -> ClusterPool:
         return self
@@ -207,7 +210,7 @@ class ClusterPool:
         paths = [path for argument in travelling for path in argument.files()]
         contents = [self._sent(path) for path in paths]
         return self._client.submit(
-            on_worker, function, arguments, seconds, self._files, paths, contents, pure=False
+            on_worker, function, arguments, seconds, self._plugins, paths, contents, pure=False
         )
 
     def _sent(self, path: Path) -> Any:
@@ -247,14 +250,14 @@ def _identity() -> tuple[str, str]:
     return rooms(), versions()
 
 
-_pools: dict[tuple[int, Files], LocalPool] = {}
+_pools: dict[tuple[int, str], LocalPool] = {}
 
 
 def on_worker(
     function: Callable[..., Any],
     arguments: tuple[Any, ...],
     seconds: float,
-    plugins: Files,
+    plugins: Luggage,
     paths: Sequence[Path],
     contents: Sequence[tuple[str, bytes]],
 ) -> tuple[str, Any, bytes]:
@@ -264,7 +267,7 @@ def on_worker(
         function: what to call.
         arguments: of the call; files that they name lie on the machine that asks.
         seconds: soft limit of the call.
-        plugins: plugin files that the process loads.
+        plugins: that the process loads or knows of, and their files' contents.
         paths: places of the files there.
         contents: their names and contents, in the same order.
 
@@ -280,18 +283,26 @@ def on_worker(
             argument.moved(places) if isinstance(argument, Travelling) else argument
             for argument in arguments
         )
-    key = (threading.get_ident(), plugins)
+    key = (threading.get_ident(), repr(plugins))
     if key not in _pools:
         # Dask's workers are daemons, which may not have children for fear that these outlive them;
         # ours do not.
         multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
         _pools[key] = LocalPool(1)
         # Each in a folder of its own, so that a file is the same whatever else there is.
-        _pools[key].load([str(_unpacked((file,)) / file[0]) for file in plugins])
+        _pools[key].load([_here(plugin, content) for plugin, content in plugins])
     ((_, result),) = _pools[key].results([(function, arguments)], seconds)
     if function is train and isinstance(result, Training):
         return "weights", result, result.path.read_bytes()
     return "value", result, b""
+
+
+def _here(plugin: Plugin, content: bytes) -> Plugin:
+    """The plugin with its file on this machine."""
+    if not plugin.path:
+        return plugin
+    name = Path(plugin.path).name
+    return replace(plugin, path=str(_unpacked(((name, content),)) / name))
 
 
 def _unpacked(files: Files) -> Path:

@@ -10,14 +10,38 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
+from typing import Protocol
 
 import numpy as np
 
-from methods.base import Ask, Evaluation, Steps, Task, Tuner
-from sims.base import Array
+from bench.sealing.asked import as_points
+from bench.sealing.ended import EndedError
+from methods.base import Array, Ask, Evaluation, Task
 
 Evaluate = Callable[[Array], "tuple[Array, Array]"]
 """Unit-cube points (n, dim) -> observations (n, T, C), losses (n,)."""
+
+
+class Steps(Protocol):
+    """A tuner's run as `methods.base.Steps`, here or in another process."""
+
+    def __next__(self) -> Array | Ask: ...
+
+    def send(self, evaluation: Evaluation, /) -> Array | Ask:
+        """Hand an evaluation over; what the tuner asks for next."""
+        ...
+
+    def close(self) -> None:
+        """End the run."""
+        ...
+
+
+class Tunes(Protocol):
+    """What begins a run: a `methods.base.Tuner`, or one in another process."""
+
+    def tune(self, task: Task, rng: np.random.Generator, /) -> Steps:
+        """A run on this target."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -31,7 +55,7 @@ class Trace:
         losses: (k,).
         recommendations: (k + 1, dim) what the tuner would deliver after 0, 1, ... k simulations.
         tuner_seconds: (k,) time in the tuner before each simulation, shared out evenly over a
-            batch.
+            batch; of the last one also what came after it.
         simulator_seconds: (k,) time in the simulator.
     """
 
@@ -50,12 +74,7 @@ class _DivergenceError(Exception):
 
 def _points(asked: object, dim: int, what: str) -> Array:
     """The proposals as a fresh (n, dim) array inside the unit cube."""
-    # A copy: the tuner may go on using its own.
-    points = np.array(asked, dtype=np.float64, ndmin=2)
-    if points.ndim != 2 or points.shape[1] != dim or not len(points):
-        raise ValueError(
-            f"the tuner gave {what} of shape {points.shape}; expected (n, {dim}) with n >= 1"
-        )
+    points = as_points(asked, dim, what)
     # Almost always inside, so what is dear is asked only otherwise.
     if not _inside(points):
         if not np.isfinite(points).all():
@@ -116,6 +135,12 @@ class _Record:
         self._tuner_seconds.append((points, tuner))
         self._simulator_seconds.append((points, simulator))
 
+    def late(self, tuner: float) -> None:
+        """Add the seconds that came after the last simulation to those of its batch."""
+        if self._tuner_seconds:
+            points, seconds = self._tuner_seconds[-1]
+            self._tuner_seconds[-1] = points, seconds + tuner
+
     def trace(self, status: str, reason: str) -> Trace:
         """The whole run, now that it has ended."""
         return Trace(
@@ -130,7 +155,7 @@ class _Record:
 
 
 def drive(
-    tuner: Tuner,
+    tuner: Tunes,
     task: Task,
     evaluate: Evaluate,
     rng: np.random.Generator,
@@ -158,18 +183,20 @@ def drive(
     try:
         steps = tuner.tune(task, rng)
         status, reason = _exchange(steps, task, evaluate, record, started + seconds)
-        if status == "timeout":
-            reason = f"stopped after {perf_counter() - started:.1f} s, limit {seconds:g} s"
     except StopIteration as stop:
         status, reason = "converged", str(stop.value or "the tuner stopped")
     except _DivergenceError as error:
         status, reason = "diverged", str(error)
+    except EndedError as ended:
+        status, reason = ended.status, ended.reason
     except Exception:
         status, reason = "crashed", traceback.format_exc()
     finally:
         # Also where a person interrupts: what the tuner holds open is its own to close.
         fault = _closed(steps)
-    if fault:
+    if status == "timeout":
+        reason = f"stopped after {perf_counter() - started:.1f} s, limit {seconds:g} s"
+    elif fault:
         status, reason = "crashed", fault
     return record.trace(status, reason)
 
@@ -196,6 +223,8 @@ def _exchange(
         # Only now: what the tuner recommends after its last simulation counts.
         left = task.budget - record.used
         if left <= 0:
+            # And so does the time that it took to.
+            record.late(perf_counter() - before)
             return "done", ""
         cut = len(points) > left
         if cut:
@@ -221,6 +250,8 @@ def _closed(steps: Steps | None) -> str:
         return ""
     try:
         steps.close()
+    except EndedError as ended:
+        return ended.reason or "the tuner did not close what it holds"
     except Exception:
         return traceback.format_exc()
     return ""

@@ -6,19 +6,21 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
-from sims.base import InputError
+from bench.sealing.kernel import hide_memory
+
+if TYPE_CHECKING:
+    from bench.runs.survey import Plugin
 
 
-def initialise(plugins: Sequence[str], births: Any) -> None:
+def initialise(plugins: Sequence[Plugin], births: Any) -> None:
     """Prepare a worker: interrupts are the parent's to handle, output goes nowhere, no worker
-    outlives its parent.
+    outlives its parent, and nobody reads its memory.
 
     Args:
-        plugins: plugin files to load.
+        plugins: to load, or to know of.
         births: where the worker tells that it is there.
     """
     # A terminal's Ctrl-C reaches every process of the group; the parent alone answers it.
@@ -26,9 +28,10 @@ def initialise(plugins: Sequence[str], births: Any) -> None:
     # First of all that may fail: a birth that nobody hears of would look like a worker at work.
     births.send(os.getpid())
     threading.Thread(target=_end_with_parent, daemon=True, name="end-with-parent").start()
-    from bench.registry import load_plugins
+    hide_memory()
+    from bench.runs.survey import enter
 
-    load_plugins(plugins)
+    enter(plugins)
     _silence()
 
 
@@ -52,50 +55,3 @@ def _end_with_parent() -> None:
         connection.wait([parent.sentinel])
         # Not sys.exit, which would end this thread and leave the run hanging.
         os._exit(1)
-
-
-@contextmanager
-def memory_limit(mebibytes: int) -> Iterator[None]:
-    """Within the block this process may take so much memory more than it has; 0 is no limit.
-
-    What is asked for beyond it fails (`MemoryError`). Linux counts private writable memory
-    (RLIMIT_DATA), so that mapped files and libraries are free.
-
-    Raises:
-        InputError: this system has no such limit.
-    """
-    if not mebibytes:
-        yield
-        return
-    resource = limits()
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    # Beyond what the process has: how large that is depends on the packages it has loaded.
-    wanted = _data_bytes() + mebibytes * 2**20
-    soft = wanted if before[1] == resource.RLIM_INFINITY else min(wanted, before[1])
-    resource.setrlimit(resource.RLIMIT_DATA, (soft, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, before)
-
-
-def limits() -> Any:
-    """The module `resource` of a system that limits memory.
-
-    Raises:
-        InputError: it does not.
-    """
-    if not sys.platform.startswith("linux"):
-        raise InputError(f"memory: a limit needs Linux, this is {sys.platform}; leave it out")
-    import resource
-
-    return resource
-
-
-def _data_bytes() -> int:
-    """Private writable memory of this process, as RLIMIT_DATA counts it."""
-    with open("/proc/self/status", encoding="ascii") as lines:
-        for line in lines:
-            if line.startswith("VmData:"):
-                return int(line.split()[1]) * 1024
-    return 0

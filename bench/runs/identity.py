@@ -13,7 +13,7 @@ from pathlib import Path
 
 from bench.problem.experiment import Entry, Experiment
 from bench.problem.targets import SealedTarget
-from bench.registry import SkippedError, load_plugins, simulators, tuners
+from bench.registry import SkippedError, simulators, tuners
 from bench.runs.sources import (
     SHOT_ROOMS,
     digest,
@@ -25,6 +25,7 @@ from bench.runs.sources import (
     versions,
     what_matters,
 )
+from bench.runs.survey import admit
 from bench.store.folder import Configuration
 from sims.base import InputError
 
@@ -42,6 +43,8 @@ NOT_OF_A_RUN = {
     "identifiability": "is found beside the runs, which know nothing of it",
     "recording": "where it lies; what it holds is hashed",
     "shot": "what is done with a tuned model afterwards",
+    "salt": "which targets there are; their scenarios and observations are hashed",
+    "salt_sha256": "which targets there are; their scenarios and observations are hashed",
     "sweep": "what is run sweeps over nothing; it has values of its own",
     "tuners": "who else runs; each run's id has its own tuner with its options",
 }
@@ -53,7 +56,10 @@ def fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str
     would call it.
     """
     return {
-        "configuration": digest(experiment.name, experiment.document()),
+        # A salt is secret until the end, and its commitment stands from the beginning.
+        "configuration": digest(experiment.name, experiment.chosen(salt="").document())
+        if experiment.salt_sha256
+        else digest(experiment.name, experiment.document()),
         "recording": digest(recording_digest(experiment)),
         "plugins": plugin_files(plugins),
         "code": rooms(SHOT_ROOMS if experiment.shot else ()),
@@ -108,7 +114,7 @@ def unchanged(folder: Path, held: Configuration, plugins: Sequence[str]) -> list
     # The folder's own come first, in their order, as when it was begun.
     given = {str(Path(p).resolve()) for p in plugins}
     everything = held.plugins + sorted(given - set(held.plugins))
-    load_plugins(everything)
+    admit(everything, held.experiment)
     refuse_changes(folder, held.fingerprint, fingerprint(held.experiment, everything))
     return everything
 

@@ -20,10 +20,13 @@ from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import monotonic
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from bench.runs.guard import initialise
 from sims.base import InputError
+
+if TYPE_CHECKING:
+    from bench.runs.survey import Plugin
 
 GRACE = 30.0
 """Seconds by which the hard limit, which kills, exceeds the soft one, which a cooperative run meets
@@ -61,8 +64,8 @@ class LostError(RuntimeError):
 class Pool(Protocol):
     """What makes calls: worker processes here, a cluster's, or this process itself."""
 
-    def load(self, plugins: Sequence[str]) -> None:
-        """Make these plugin files known to the workers; before the first call."""
+    def load(self, plugins: Sequence[Plugin]) -> None:
+        """Make these plugins known to the workers; before the first call."""
         ...
 
     def results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
@@ -94,7 +97,7 @@ class InProcessPool:
     need not be in a file, and nothing but a tuner's good manners keeps it from the truth.
     """
 
-    def load(self, plugins: Sequence[str]) -> None:
+    def load(self, plugins: Sequence[Plugin]) -> None:
         """Nothing is to be done: who makes the calls has loaded the plugins."""
 
     def __enter__(self) -> InProcessPool:
@@ -186,11 +189,11 @@ class LocalPool:
         for name in THREADS:
             os.environ.setdefault(name, "1")
         self._jobs = jobs
-        self._plugins: list[str] = []
+        self._plugins: list[Plugin] = []
         self._slots: list[_Slot] = []
 
-    def load(self, plugins: Sequence[str]) -> None:
-        """Make these plugin files known to the workers; before the first call."""
+    def load(self, plugins: Sequence[Plugin]) -> None:
+        """Make these plugins known to the workers; before the first call."""
         self._plugins = list(plugins)
 
     def __enter__(self) -> LocalPool:
@@ -241,7 +244,7 @@ class _Slot:
     never read.
     """
 
-    def __init__(self, plugins: list[str]) -> None:
+    def __init__(self, plugins: list[Plugin]) -> None:
         self._plugins = plugins
         self._futile = 0
         self.given: dict[Future[Any], _Given] = {}

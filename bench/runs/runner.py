@@ -15,13 +15,16 @@ from bench.problem.identifiability import Spectrum
 from bench.problem.problem import Problem
 from bench.problem.targets import Target
 from bench.registry import Registry, SkippedError, effects, simulators, tuners
-from bench.runs.guard import limits
+from bench.runs.housing import tuned_of
 from bench.runs.identity import Identities
 from bench.runs.pools import Call, DeathError, LostError, Pool, pool_of
 from bench.runs.rows import rows, status_of, unfinished
 from bench.runs.sources import effect_names
-from bench.runs.training import Training, WeightsError, build, train
+from bench.runs.survey import admitted, unbuildable
+from bench.runs.training import Lesson, Training, WeightsError, build, train
 from bench.runs.worker import Order, Outcome, perform
+from bench.sealing.memory import limits
+from bench.sealing.outside import Tuned
 from bench.store.status import Status
 from sims.base import InputError
 
@@ -61,7 +64,8 @@ class Results:
     """A comparison: its problem, its plan once there is one, where its runs are kept, and what
     training cost.
 
-    `spectra` says what each target's data identify, by its name, where that can be asked.
+    `spectra` says what each target's data identify, by its name, where that can be asked; `tuned`
+    which tuner lives in a process of its own, by label; `hidden` what it must not reach.
     """
 
     problem: Problem
@@ -70,6 +74,8 @@ class Results:
     trainings: dict[tuple[str, int], Training] = field(default_factory=dict)
     spectra: dict[str, Spectrum] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
+    tuned: dict[str, Tuned] = field(default_factory=dict)
+    hidden: tuple[str, ...] = ()
     interrupted: bool = False
     stopped: str = ""
 
@@ -114,7 +120,8 @@ def check(experiment: Experiment) -> dict[str, str]:
     skipped = {}
     for entry in experiment.tuners:
         try:
-            build(entry)
+            if experiment.trusted or not unbuildable(entry):
+                build(entry)
         except SkippedError as error:
             skipped[entry.label] = error.reason
     return skipped
@@ -143,9 +150,13 @@ def refuse_unreachable(experiment: Experiment) -> None:
             )
 
 
-def prepare(experiment: Experiment) -> Results:
+def prepare(experiment: Experiment, salt: str | None = None) -> Results:
     """Check an experiment whole before any work: its simulator, recording, tuners and their
     options; plan its runs.
+
+    Args:
+        experiment: what is to be compared; its plugins are known.
+        salt: the secret one that its targets are drawn from; the experiment's own where None.
 
     Raises:
         InputError: a fault in it.
@@ -156,8 +167,10 @@ def prepare(experiment: Experiment) -> Results:
     # A limit that this system does not have would crash every single run.
     if experiment.memory:
         limits()
-    results = Results(Problem(experiment), skipped=check(experiment))
+    results = Results(Problem(experiment, salt), skipped=check(experiment))
     entries = [entry for entry in experiment.tuners if entry.label not in results.skipped]
+    if not experiment.trusted:
+        results.tuned = {entry.label: tuned_of(entry) for entry in entries}
     results.plan = list(_plan(experiment, entries, results.problem.targets()))
     # Workers open their own; what is left to do here needs no simulator for a while.
     results.problem.close()
@@ -187,7 +200,7 @@ def run(
 
     Args:
         results: from `prepare`.
-        plugins: plugin files that workers need; the caller has loaded them in this process.
+        plugins: plugin files that workers need; the caller has made them known in this process.
         jobs: worker processes; 0 for none, and everything in this one. The results do not depend
             on their number.
         progress: told of every step.
@@ -199,7 +212,7 @@ def run(
     if pool is not None or jobs:
         refuse_unreachable(results.problem.experiment)
     with pool or pool_of(jobs) as workers:
-        workers.load(plugins)
+        workers.load(admitted(plugins, results.problem.experiment))
         try:
             _run(results, workers, progress)
         except KeyboardInterrupt:
@@ -255,12 +268,14 @@ class _Calls(Sequence[Call]):
         return len(self._places)
 
     def __getitem__(self, i: Any) -> Any:
-        order = self._results.plan[self._places[i]].order
+        results = self._results
+        order = results.plan[self._places[i]].order
+        order = replace(order, tuned=results.tuned.get(order.entry.label), hidden=results.hidden)
         # The plan was made before the training, and ids do not depend on where weights lie.
-        training = self._results.trainings.get((order.entry.label, order.seed))
+        training = results.trainings.get((order.entry.label, order.seed))
         if training is not None:
             order = replace(order, weights=training.path)
-        return perform, (self._results.problem.experiment, order)
+        return perform, (results.problem.experiment, order)
 
 
 def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, int], Exception]:
@@ -282,7 +297,11 @@ def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, 
     if not wanted:
         return failures
     step = progress("training", len(wanted))
-    calls = [(train, (experiment, entry, seed)) for entry, seed in wanted]
+    lessons = [
+        Lesson(entry, seed, results.tuned.get(entry.label), results.hidden)
+        for entry, seed in wanted
+    ]
+    calls = [(train, (experiment, lesson)) for lesson in lessons]
     for place, training in pool.results(calls, math.inf):
         entry, seed = wanted[place]
         if isinstance(training, Training):

@@ -28,7 +28,7 @@ from sims.base import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 """Where this project's packages lie."""
-ROOMS = ("methods", "sims", "bench/problem", "bench/runs")
+ROOMS = ("methods", "sims", "bench/problem", "bench/runs", "bench/sealing")
 """Folders whose code makes runs: methods, worlds, and what drives and scores them."""
 SHOT_ROOMS = (*ROOMS, "bench/shot", "bench/gap", "bench/recordings")
 """Those whose code makes the shots of a bounce shot: its drops, films and explanations too."""

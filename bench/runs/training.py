@@ -14,7 +14,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from time import perf_counter
@@ -23,9 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.problem.experiment import Entry, Experiment
+from bench.problem.practice import Practice
 from bench.problem.problem import Problem
-from bench.problem.seeds import rng_for
+from bench.problem.seeds import stream_of
 from bench.registry import simulators, tuners
+from bench.runs.housing import housed
+from bench.runs.school import school
 from bench.runs.sources import (
     digest,
     effect_sources,
@@ -35,6 +38,8 @@ from bench.runs.sources import (
     versions,
     what_matters,
 )
+from bench.sealing.ended import EndedError
+from bench.sealing.outside import Tuned, moved
 from methods.base import Tuner, Watch
 from sims.base import Array, InputError
 from sims.files import replacing
@@ -99,6 +104,9 @@ NOT_OF_A_TRAINING = {
     "timeout": "of a run",
     "memory": "of a run",
     "identifiability": "is found beside the runs",
+    "isolation": "of a run; a training has a process of its own",
+    "salt": "targets are met after the training",
+    "salt_sha256": "targets are met after the training",
     "recording": "where it lies; what it holds is hashed",
     "shot": "what is done with a tuned model afterwards",
     "sweep": "what is run sweeps over nothing; it has values of its own",
@@ -140,36 +148,63 @@ def device() -> str:
     return str(torch.cuda.get_device_name()) if torch.cuda.is_available() else "cpu"
 
 
+@dataclass(frozen=True)
+class Lesson:
+    """One training to make.
+
+    Attributes:
+        entry: the tuner with its options.
+        seed: of the training.
+        tuned: the tuner, to be built in a process of its own; None where it is trusted.
+        hidden: folders that this process must not reach.
+    """
+
+    entry: Entry
+    seed: int
+    tuned: Tuned | None = None
+    hidden: tuple[str, ...] = ()
+
+    def files(self) -> tuple[Path, ...]:
+        """What must travel with it to another machine."""
+        return (Path(self.tuned.file),) if self.tuned and self.tuned.file else ()
+
+    def moved(self, places: Mapping[Path, Path]) -> Lesson:
+        """The same where its files have other places."""
+        return self if self.tuned is None else replace(self, tuned=moved(self.tuned, places))
+
+
 def train(
-    experiment: Experiment, entry: Entry, seed: int, watch: Watch | None = None, anew: bool = False
+    experiment: Experiment, lesson: Lesson, watch: Watch | None = None, anew: bool = False
 ) -> Training:
     """Train, or find trained: the tensors' file and what the training cost when it was done.
 
     Args:
         experiment: the training ground and budget.
-        entry: the tuner with its options.
-        seed: of the training.
+        lesson: who is trained, and where.
         watch: looks on, if it comes to training.
         anew: train even where there are weights, and replace them.
 
     Raises:
         WeightsError: there is a file, and it is damaged or foreign.
+        EndedError: the tuner failed in its process.
     """
+    entry, seed = lesson.entry, lesson.seed
     name = key(experiment, entry, seed)
     path = folder() / f"{name}.npz"
     if path.exists() and not anew:
         simulations, seconds = _checked(path, name)[_COUNTS]
         # Weights that do not fit must show now, and not in every run.
-        trained(entry, path)
+        _fitting(lesson, path)
         return Training(path, int(simulations), float(seconds), found=True)
-    tuner = build(entry)
-    tuner.watch = watch
     problem = Problem(experiment)
     practice = problem.practice(experiment.training_budget)
-    started = perf_counter()
     # Tuners that train alike share a stream: a comparison of them has the same network.
-    rng = rng_for(experiment.name, "fit", tuner.trains_as or entry.tuner, seed)
-    tuner.fit(practice, rng, experiment.training_budget)
+    stream = stream_of(
+        experiment.name, "fit", tuners.get(entry.tuner).trains_as or entry.tuner, seed
+    )
+    started = perf_counter()
+    learn = _learned_here if lesson.tuned is None else _learned_apart
+    state = learn(lesson, practice, stream, watch)
     seconds = perf_counter() - started
     problem.close()
     # Beside the tensors, so that a file that was renamed or exchanged is noticed.
@@ -177,8 +212,48 @@ def train(
         _COUNTS: np.array([practice.used, seconds]),
         _KEY: np.frombuffer(name.encode(), dtype=np.uint8),
     }
-    _write(path, {**tuner.state(), **about})
+    _write(path, {**state, **about})
     return Training(path, practice.used, seconds)
+
+
+def _learned_here(
+    lesson: Lesson, practice: Practice, stream: NDArray[np.uint32], watch: Watch | None
+) -> Mapping[str, Array]:
+    """What a trusted tuner learns, in this process."""
+    tuner = build(lesson.entry)
+    tuner.watch = watch
+    tuner.fit(practice, np.random.default_rng(stream), practice.budget)
+    return tuner.state()
+
+
+def _learned_apart(
+    lesson: Lesson, practice: Practice, stream: NDArray[np.uint32], watch: Watch | None
+) -> Mapping[str, Array]:
+    """What a tuner learns in its own process; what it simulates is counted here."""
+    assert lesson.tuned is not None
+    with housed(lesson.tuned, lesson.seed, "run", lesson.hidden) as tuner:
+        return school(tuner.child, practice, stream, watch)
+
+
+def _fitting(lesson: Lesson, path: Path) -> None:
+    """Refuse weights that the tuner cannot take.
+
+    Raises:
+        WeightsError: it cannot.
+    """
+    if lesson.tuned is None:
+        trained(lesson.entry, path)
+        return
+    try:
+        with housed(lesson.tuned, lesson.seed, "run", lesson.hidden, state=weights_of(path)):
+            return
+    except EndedError as ended:
+        said = ended.reason.strip().splitlines()[-1:]
+        raise _not_of(path, lesson.entry, "".join(said)) from None
+
+
+def _not_of(path: Path, entry: Entry, why: object) -> WeightsError:
+    return WeightsError(f"{path}: not the weights of {entry.label}: {why}; {_REMEDY}")
 
 
 def _write(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
@@ -195,15 +270,22 @@ def trained(entry: Entry, path: Path) -> Tuner:
         WeightsError: the file is missing, damaged, or foreign.
     """
     tuner = build(entry)
+    try:
+        tuner.restore(weights_of(path))
+    except ValueError as error:
+        raise _not_of(path, entry, error) from None
+    return tuner
+
+
+def weights_of(path: Path) -> dict[str, Array]:
+    """The tensors of a file.
+
+    Raises:
+        WeightsError: the file is missing, damaged, or foreign.
+    """
     state = _checked(path, path.stem)
     del state[_COUNTS], state[_KEY]
-    try:
-        tuner.restore(state)
-    except ValueError as error:
-        raise WeightsError(
-            f"{path}: not the weights of {entry.label}: {error}; {_REMEDY}"
-        ) from None
-    return tuner
+    return state
 
 
 def _checked(path: Path, name: str) -> dict[str, Array]:

@@ -2,7 +2,8 @@
 `bench.runs.training.train`).
 
 No true parameter ever enters a worker: it gets `SealedTarget`s and returns traces, which the parent
-scores.
+scores. No tuner's code enters it either, unless the tuners are trusted: it simulates, counts and
+times, and the tuner lives in a process of its own (`bench.sealing`).
 """
 
 from __future__ import annotations
@@ -15,20 +16,33 @@ from time import perf_counter
 
 from bench.problem.experiment import Entry, Experiment
 from bench.problem.problem import Problem
-from bench.problem.seeds import rng_for
+from bench.problem.seeds import rng_for, stream_of
 from bench.problem.targets import SealedTarget
-from bench.runs.drive import Trace, drive
+from bench.runs.drive import Steps, Trace, drive
 from bench.runs.evaluate import Evaluator
-from bench.runs.guard import memory_limit
-from bench.runs.training import build, trained
+from bench.runs.housing import housed
+from bench.runs.training import build, trained, weights_of
+from bench.sealing.ended import EndedError, KilledError
+from bench.sealing.memory import memory_limit
+from bench.sealing.outside import Sealed, Tuned, moved
+from bench.store.status import FAILED
 from methods.base import Task
 from sims.base import Array
 
 
 @dataclass(frozen=True)
 class Order:
-    """One run to make: its id, a tuner on a target with a seed; `weights` is the file of a learned
-    tuner's tensors.
+    """One run to make.
+
+    Attributes:
+        run: its id.
+        entry: the tuner's.
+        seed: of the tuner.
+        target: without its truth.
+        budget: simulations.
+        weights: the file of a learned tuner's tensors.
+        tuned: the tuner, to be built in a process of its own; None where it is trusted.
+        hidden: folders that this process must not reach.
     """
 
     run: str
@@ -37,14 +51,19 @@ class Order:
     target: SealedTarget
     budget: int
     weights: Path | None = None
+    tuned: Tuned | None = None
+    hidden: tuple[str, ...] = ()
 
     def files(self) -> tuple[Path, ...]:
         """What must travel with the order to another machine."""
-        return () if self.weights is None else (self.weights,)
+        plugin = Path(self.tuned.file) if self.tuned and self.tuned.file else None
+        return tuple(path for path in (self.weights, plugin) if path is not None)
 
     def moved(self, places: Mapping[Path, Path]) -> Order:
         """The order where its files have other places."""
-        return self if self.weights is None else replace(self, weights=places[self.weights])
+        weights = None if self.weights is None else places[self.weights]
+        tuned = None if self.tuned is None else moved(self.tuned, places)
+        return replace(self, weights=weights, tuned=tuned)
 
 
 @dataclass(frozen=True)
@@ -88,15 +107,30 @@ def release() -> None:
     _problems.clear()
 
 
+RETRIES = 3
+"""How often a run is made again whose tuner was killed from outside, which says nothing about it.
+"""
+
+
 def perform(experiment: Experiment, order: Order) -> Outcome:
     """Make one run; failures of the tuner or the simulator are a status of its trace.
 
     Raises:
         CheatError: more was simulated than the tuner asked the harness for.
+        KilledError: the tuner's process was killed from outside, again and again.
     """
+    for left in reversed(range(RETRIES)):
+        try:
+            return _perform(experiment, order)
+        except KilledError:
+            if not left:
+                raise
+    raise AssertionError
+
+
+def _perform(experiment: Experiment, order: Order) -> Outcome:
     problem = problem_of(experiment)
     target = order.target
-    tuner = build(order.entry) if order.weights is None else trained(order.entry, order.weights)
     evaluator = Evaluator(problem, target.fitting)
     task = Task(
         dim=problem.cube.dim,
@@ -108,12 +142,11 @@ def perform(experiment: Experiment, order: Order) -> Outcome:
         lengths=tuple(s.times.size for s in target.fitting.scenarios),
         scene=problem.scene(target.fitting.scenarios),
     )
-    rng = rng_for(experiment.name, order.entry.tuner, target.name, order.seed)
     # Scoring and what came before do not count.
     before = problem.simulated
     started = perf_counter()
-    with memory_limit(experiment.memory):
-        trace = drive(tuner, task, evaluator, rng, experiment.timeout)
+    drives = _trusted if order.tuned is None else _sealed
+    trace = drives(experiment, order, task, evaluator)
     seconds = perf_counter() - started
     beside = problem.simulated - before - len(trace.losses)
     # A simulator that raises has simulated, and nothing came of it.
@@ -129,3 +162,53 @@ def perform(experiment: Experiment, order: Order) -> Outcome:
             trace.proposals[:0], trace.recommendations
         )
     return Outcome(trace, evaluator.rmse(trace.proposals, trace.recommendations), heldout, seconds)
+
+
+def _names(experiment: Experiment, order: Order) -> tuple[str | int, ...]:
+    """What the run's own random stream depends on."""
+    return experiment.name, order.entry.tuner, order.target.name, order.seed
+
+
+def _trusted(experiment: Experiment, order: Order, task: Task, evaluator: Evaluator) -> Trace:
+    """A run whose tuner works in this very process."""
+    entry, weights = order.entry, order.weights
+    tuner = build(entry) if weights is None else trained(entry, weights)
+    rng = rng_for(*_names(experiment, order))
+    with memory_limit(experiment.memory):
+        return drive(tuner, task, evaluator, rng, experiment.timeout)
+
+
+def _sealed(experiment: Experiment, order: Order, task: Task, evaluator: Evaluator) -> Trace:
+    """A run whose tuner has a process of its own."""
+    assert order.tuned is not None
+    state = None if order.weights is None else weights_of(order.weights)
+    names = _names(experiment, order)
+    house = housed(
+        order.tuned, order.seed, experiment.isolation, order.hidden, experiment.memory, state
+    )
+    try:
+        with house as tuner:
+            run = Sealed(tuner, stream_of(*names), experiment.timeout)
+            trace = drive(run, task, evaluator, rng_for(*names), experiment.timeout)
+            # What failed may have left anything behind.
+            if trace.status in FAILED:
+                tuner.child.end()
+            return trace
+    except EndedError as ended:
+        # It never began: it could not be built.
+        return drive(Ended(ended), task, evaluator, rng_for(*names))
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A tuner that could not be built; its run ends as it begins."""
+
+    error: EndedError
+
+    def tune(self, _task: Task, _rng: object) -> Steps:
+        """Begin no run.
+
+        Raises:
+            EndedError: always.
+        """
+        raise self.error

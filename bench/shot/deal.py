@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.problem.experiment import Experiment
+from bench.problem.salt import PUBLIC
 from bench.problem.seeds import rng_for
 from bench.shot.filmed import filmed
 from bench.shot.settings import Settings
@@ -36,19 +37,21 @@ class Deal:
         ball: the truth, which only the world knows.
         scene: incline and hoop, which everybody knows.
         release: error of the place of release, m: along x, and in height.
+        salt: what it was drawn from.
     """
 
     name: str
     ball: BallKind
     scene: ShotScene
     release: tuple[float, float]
+    salt: str = ""
 
 
-def deal(experiment: Experiment, settings: Settings, kind: str, index: int) -> Deal:
+def deal(experiment: Experiment, settings: Settings, kind: str, index: int, salt: str = "") -> Deal:
     """Shot `index` of a kind of ball; it depends on the experiment's name, not on methods or
     numbers of shots.
     """
-    rng = rng_for(experiment.name, "shot", kind, index)
+    rng = rng_for(*_of(salt), experiment.name, "shot", kind, index)
     # The order of the draws is part of the experiment: another order gives other shots.
     ball = ball_named(kind).one(rng)
     angle, x, drop = (
@@ -58,15 +61,20 @@ def deal(experiment: Experiment, settings: Settings, kind: str, index: int) -> D
     # A ball that touches the incline at x = 0 has its centre radius / cos(angle) above it.
     touching = ball.radius / math.cos(angle)
     scene = ShotScene(angle, x, touching - drop, settings.hoop_radius)
-    return Deal(f"{kind}-{index:03d}", ball, scene, (dx, dz))
+    return Deal(f"{kind}-{index:03d}", ball, scene, (dx, dz), salt)
 
 
-def deals(experiment: Experiment, settings: Settings) -> list[Deal]:
+def _of(salt: str) -> tuple[str, ...]:
+    """What the names of streams begin with; public ones with nothing."""
+    return () if salt in ("", PUBLIC) else ("salt", salt)
+
+
+def deals(experiment: Experiment, settings: Settings, salt: str = "") -> list[Deal]:
     """All shots of an experiment; the balls take turns, so that a part of the work is a part of
     each.
     """
     return [
-        deal(experiment, settings, kind, i)
+        deal(experiment, settings, kind, i, salt)
         for i in range(experiment.targets)
         for kind in settings.balls
     ]
@@ -87,7 +95,7 @@ def record(experiment: Experiment, dealt: Deal, settings: Settings, path: Path) 
     # One of the two without the other is what a kill left.
     for left in (path, path.with_suffix(".toml")):
         left.unlink(missing_ok=True)
-    rng = rng_for(experiment.name, "drop", dealt.name)
+    rng = rng_for(*_of(dealt.salt), experiment.name, "drop", dealt.name)
     height = experiment.initial.get("z", 1.5)
     clear = float(rng.uniform(*height)) if isinstance(height, tuple) else height
     radius, sampling = dealt.ball.radius, experiment.sampling

@@ -10,15 +10,20 @@ from typing import Any
 
 from bench.problem.experiment import Experiment
 from bench.registry import tuners
+from bench.runs.housing import tuned_of
 from bench.runs.pools import Call, LostError, Pool, pool_of
 from bench.runs.runner import Progress, check, refuse_unreachable, silent
-from bench.runs.training import Training, train
+from bench.runs.survey import admitted
+from bench.runs.training import Lesson, Training, train
+from bench.runs.training import folder as trained
+from bench.sealing.outside import Tuned
 from bench.shot import tune
 from bench.shot.deal import RECORDINGS, Deal, deals, in_view, record
 from bench.shot.kept import SHOTS, keep, missing
 from bench.shot.kept import check as check_kept
 from bench.shot.settings import Settings, settings_of
 from bench.store.folder import Configuration, configuration, create, free_folder
+from bench.store.secret import kept, reveal, salted
 from bench.store.standing import MISSING, End, Made, Standing
 from sims.base import InputError
 from sims.camera import packages
@@ -54,6 +59,7 @@ class BounceShotStudy:
         plugins: Sequence[str] = (),
         folder: Path | None = None,
         jobs: int = 2,
+        salt: str | None = None,
     ) -> BounceShotStudy:
         """A bounce shot in a new folder; nothing has been dropped yet; see
         `bench.study.Study.begin`.
@@ -67,12 +73,15 @@ class BounceShotStudy:
                 f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'
             )
         place = free_folder(experiment, folder)
+        experiment, secret = salted(experiment, salt)
+        # Nothing is out of reach of what works in this process.
+        experiment = experiment.chosen(trusted=experiment.trusted or not jobs)
         # Before there is a folder: a fault of the user's leaves nothing behind.
         check(experiment)
         if jobs:
             refuse_unreachable(experiment)
         hashes = fingerprint(experiment, plugins)
-        create(place, Configuration(experiment, list(plugins), hashes), jobs)
+        create(place, Configuration(experiment, list(plugins), hashes), jobs, secret)
         return cls(place)
 
     @classmethod
@@ -108,7 +117,9 @@ class BounceShotStudy:
     @cached_property
     def deals(self) -> list[Deal]:
         """All shots."""
-        return deals(self.configuration.experiment, self.settings)
+        experiment = self.configuration.experiment
+        salt = kept(self.folder, experiment) or experiment.salt
+        return deals(experiment, self.settings, salt)
 
     def make(
         self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
@@ -132,6 +143,10 @@ class BounceShotStudy:
 
     def _made(self, **why: Any) -> Made:
         left = missing(self.folder, self.deals)
+        if not left and not why:
+            experiment = self.configuration.experiment
+            reveal(self.folder, kept(self.folder, experiment))
+            self.configuration = configuration(self.folder)
         return Made(len(self.deals) - len(left), len(self.deals), **why)
 
     def close(self) -> None:
@@ -172,6 +187,10 @@ class _Making:
     def __init__(self, study: BounceShotStudy, left: list[Deal], progress: Progress) -> None:
         self._study, self._left, self._progress = study, left, progress
         self._experiment, self._settings = study.experiment, study.settings
+        self._tuned: dict[str, Tuned] = {}
+        if not self._experiment.trusted:
+            self._tuned = {entry.label: tuned_of(entry) for entry in self._experiment.tuners}
+        self._hidden = tuple(str(place.resolve()) for place in (study.folder, trained()))
         self._paths = [study.folder / RECORDINGS / f"{one.name}.csv" for one in left]
 
     def run(self, jobs: int, pool: Pool | None) -> None:
@@ -187,7 +206,7 @@ class _Making:
         with pool_of(jobs) as workers:
             faults = self._record(workers)
         with pool or pool_of(jobs) as workers:
-            workers.load(self._study.plugins)
+            workers.load(admitted(self._study.plugins, self._experiment))
             weights = self._train(workers)
             self._shoot(workers, faults, weights)
 
@@ -214,7 +233,8 @@ class _Making:
         learned = [e for e in self._experiment.tuners if tuners.get(e.tuner).learned]
         grounds = [tune.tuned_in(self._experiment, self._settings, entry) for entry in learned]
         calls: list[Call] = [
-            (train, (ground, entry, 0)) for ground, entry in zip(grounds, learned, strict=True)
+            (train, (ground, Lesson(entry, 0, self._tuned.get(entry.label), self._hidden)))
+            for ground, entry in zip(grounds, learned, strict=True)
         ]
         step = self._progress("training", len(calls))
         weights = {}
@@ -233,7 +253,9 @@ class _Making:
         calls: list[Call] = []
         for place in seen:
             one = self._left[place]
-            known = tune.Known(one.name, self._paths[place], one.scene, weights)
+            known = tune.Known(
+                one.name, self._paths[place], one.scene, weights, self._tuned, self._hidden
+            )
             calls.append((tune.models, (self._experiment, self._settings, known)))
         step = self._progress("shooting", len(self._left))
         for place, fault in faults.items():

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -22,6 +22,8 @@ from bench.problem.experiment import Entry, Experiment
 from bench.problem.recorded import Side, scenario_of
 from bench.problem.targets import SealedTarget
 from bench.runs.worker import Order, perform, problem_of
+from bench.sealing.outside import Tuned
+from bench.sealing.outside import moved as elsewhere
 from bench.shot.rows import before_a_camera, rows_of
 from bench.shot.settings import Settings
 from sims.ball.simulator import Ball as BallSimulator
@@ -77,21 +79,28 @@ class Known:
         recording: of the ball's drop.
         scene: incline and hoop.
         weights: files of trained weights, by tuner.
+        tuned: which tuner lives in a process of its own, by label.
+        hidden: folders that it must not reach.
     """
 
     name: str
     recording: Path
     scene: ShotScene
     weights: Mapping[str, Path]
+    tuned: Mapping[str, Tuned] = field(default_factory=dict)
+    hidden: tuple[str, ...] = ()
 
     def files(self) -> tuple[Path, ...]:
         """What must travel with it to another machine."""
-        return self.recording, self.recording.with_suffix(".toml"), *self.weights.values()
+        plugins = {Path(tuned.file) for tuned in self.tuned.values() if tuned.file}
+        described = self.recording.with_suffix(".toml")
+        return self.recording, described, *self.weights.values(), *sorted(plugins)
 
     def moved(self, places: Mapping[Path, Path]) -> Known:
         """The same where its files have other places."""
         weights = {label: places[path] for label, path in self.weights.items()}
-        return replace(self, recording=places[self.recording], weights=weights)
+        tuned = {label: elsewhere(one, places) for label, one in self.tuned.items()}
+        return replace(self, recording=places[self.recording], weights=weights, tuned=tuned)
 
 
 def models(experiment: Experiment, settings: Settings, known: Known) -> list[dict[str, Any]]:
@@ -152,6 +161,8 @@ def _tuned(
             target,
             entry.budget or experiment.budget,
             known.weights.get(entry.label),
+            known.tuned.get(entry.label),
+            known.hidden,
         )
         outcome = perform(experiment, order)
     except InputError as error:

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 CONFIGURATION = "experiment.toml"
 """The file by which the folder of a study is known."""
+SALT = "salt"
+"""The file of a secret salt, below the folder of segments."""
 RESULTS = Path("results")
 """Below which new runs go that name no folder."""
 
@@ -64,14 +66,20 @@ class Configuration(NamedTuple):
     fingerprint: dict[str, str]
 
 
-def create(folder: Path, configuration: Configuration, jobs: int) -> None:
+def create(
+    folder: Path, configuration: Configuration, jobs: int, secret: str | None = None
+) -> None:
     """Make the folder with experiment.toml and environment.json in it, all at once or not at all.
+
+    Args:
+        folder: new or empty.
+        configuration: what it is for.
+        jobs: worker processes that it is meant to be made with.
+        secret: the salt that its targets are drawn from; see `bench.store.secret`.
 
     Raises:
         InputError: it cannot be made.
     """
-    import tomli_w
-
     experiment = configuration.experiment
     environment = {
         "simgap": __version__,
@@ -89,11 +97,27 @@ def create(folder: Path, configuration: Configuration, jobs: int) -> None:
     try:
         # What there is of a folder is never without what it is for.
         with fresh_folder(folder) as partial:
-            write(partial / CONFIGURATION, tomli_w.dumps(_plain(experiment.document())))
+            write_configuration(partial, experiment)
             write(partial / "environment.json", json.dumps(environment, indent=1) + "\n")
             (partial / FOLDER).mkdir()
+            if secret is not None:
+                _hide(partial / FOLDER / SALT, secret)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
+
+
+def _hide(path: Path, secret: str) -> None:
+    """Write a file that its owner alone can read."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+        file.write(secret)
+
+
+def write_configuration(folder: Path, experiment: Experiment) -> None:
+    """Write experiment.toml, whole or not at all."""
+    import tomli_w
+
+    write(folder / CONFIGURATION, tomli_w.dumps(_plain(experiment.document())))
 
 
 def _plain(value: Any) -> Any:

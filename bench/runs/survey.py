@@ -1,0 +1,311 @@
+"""What a plugin file or an installed package holds, found out in a sealed process: its code never
+runs where truths are.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any, ClassVar
+
+from bench.problem.experiment import Entry, Experiment
+from bench.registry import REGISTRIES, load_plugins, tuners
+from bench.runs.housing import housed, nursery, tuned_of
+from bench.runs.sources import digest, effect_names, source
+from bench.sealing.ended import EndedError, KilledError
+from bench.sealing.seals import Reach
+from bench.sealing.wire import Channel
+from methods.base import Tuner
+from sims.base import InputError
+from sims.registry import SkippedError
+
+_PATIENCE = 120.0
+"""Seconds that loading a plugin may take."""
+_OWN = "methods."
+"""The package of the project's own tuners, which are of the harness's making."""
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A plugin file, and what is known of it.
+
+    Attributes:
+        path: of the file.
+        loaded: whether its code runs in the harness's processes.
+        tuners: what is known of its tuners where it does not: fields of `Announced`.
+    """
+
+    path: str
+    loaded: bool = True
+    tuners: tuple[dict[str, Any], ...] = ()
+
+
+class Announced(Tuner):
+    """A tuner whose code is not in this process; what is known of it."""
+
+    file: ClassVar[str] = ""
+    module: ClassVar[str] = ""
+    source_digest: ClassVar[str] = ""
+
+
+def announced(known: dict[str, Any]) -> type[Announced]:
+    """The class that stands for a tuner."""
+    fields: dict[str, Any] = {
+        "name": str(known["name"]),
+        "stochastic": known["stochastic"] is not False,
+        "learned": known["learned"] is True,
+        "trains_as": str(known["trains_as"]),
+        "file": str(known["file"]),
+        "module": str(known["module"]),
+        "source_digest": str(known["source"]),
+        "__doc__": str(known["says"]),
+        "__module__": __name__,
+    }
+    made: type[Announced] = type(fields["name"], (Announced,), fields)
+    return made
+
+
+def enter(plugins: Iterable[Plugin]) -> None:
+    """Make plugins known to this process: their code, or what is known of them.
+
+    Raises:
+        InputError: a fault in one.
+    """
+    plugins = list(plugins)
+    load_plugins(plugin.path for plugin in plugins if plugin.loaded)
+    for plugin in plugins:
+        for known in plugin.tuners:
+            tuners.announce(announced(known), Path(plugin.path) if plugin.path else None)
+
+
+_admitted: dict[str, Plugin] = {}
+"""What this process knows of plugin files, by their path."""
+
+
+def admit(paths: Sequence[str], experiment: Experiment) -> None:
+    """Make plugin files known to this process before the experiment's runs: load those whose code
+    may run here, and find out what the others hold.
+
+    Args:
+        paths: of the files.
+        experiment: says which simulator and effects are used, and whether its tuners are trusted.
+
+    Raises:
+        InputError: a file cannot be used.
+    """
+    known = [Plugin(path) for path in paths]
+    if not experiment.trusted:
+        needed = {experiment.simulator, *effect_names(experiment.settings, experiment.world)}
+        known = survey(paths, needed | _written(experiment))
+    enter(known)
+    _admitted.update({plugin.path: plugin for plugin in known})
+    if not experiment.trusted:
+        _announce_installed(entry.tuner for entry in experiment.tuners)
+
+
+def _written(experiment: Experiment) -> set[str]:
+    """Names that an experiment's settings hold, of which no part is known yet."""
+    texts: set[str] = set()
+    for table in (experiment.settings, experiment.world):
+        for value in table.values():
+            if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
+                texts.update(name for name in value if isinstance(name, str))
+    return texts
+
+
+def admitted(paths: Sequence[str], experiment: Experiment) -> list[Plugin]:
+    """What other processes are to know of these files, and of installed packages' tuners.
+
+    Raises:
+        InputError: a file cannot be used.
+    """
+    if experiment.trusted:
+        return [Plugin(path) for path in paths]
+    missing = [path for path in paths if path not in _admitted]
+    if missing:
+        admit(missing, experiment)
+    names = {entry.tuner for entry in experiment.tuners}
+    packages = [plugin for name, plugin in _packages.items() if name in names]
+    return [_admitted[path] for path in paths] + packages
+
+
+_packages: dict[str, Plugin] = {}
+"""What this process knows of installed packages' tuners, by their name."""
+
+
+def _announce_installed(names: Iterable[str]) -> None:
+    """Find out about tuners of other packages before anybody imports them here."""
+    for name in names:
+        if foreign(name):
+            with suppress(SkippedError):
+                _packages[name] = installed(name)
+                enter([_packages[name]])
+
+
+def unbuildable(entry: Entry) -> bool:
+    """Whether the tuner of an entry must not be built in this process; if so, it has been built in
+    a process of its own.
+
+    Raises:
+        InputError: it cannot be built, or its code is in this process already.
+        SkippedError: it cannot be used here.
+    """
+    _announce_installed([entry.tuner])
+    kind, place = tuners.get(entry.tuner), tuners.place(entry.tuner)
+    if not issubclass(kind, Announced):
+        if place is not None:
+            raise InputError(
+                f"tuner {entry.label}: the code of {place} runs in this process, where the truths "
+                "are: a simulator or effect in it is used here, or it was loaded by hand; put the "
+                "tuner into a file of its own, or trust the tuners"
+            )
+        return False
+    try:
+        with housed(tuned_of(entry), 0, "run"):
+            return True
+    except (EndedError, KilledError) as ended:
+        said = "".join(str(ended).strip().splitlines()[-1:])
+        kind_of_error, _, why = said.partition(": ")
+        said = why if kind_of_error in ("TypeError", "ValueError") else said
+        raise InputError(f"tuner {entry.label}: {said}") from None
+
+
+def survey(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]:
+    """Find out what plugin files hold; those that worlds are made of are to be loaded.
+
+    Args:
+        paths: of the files.
+        needed: names of the simulators and effects that are used.
+
+    Raises:
+        InputError: a file cannot be used.
+    """
+    wanted = set(needed)
+    found = []
+    for path in paths:
+        # An extended simulator is data, and no code of anybody's.
+        if path.endswith(".toml"):
+            found.append(Plugin(path))
+            continue
+        parts = _asked({"file": path, "tuner": ""}, path)
+        worlds = {part["name"] for part in parts if part["kind"] != "tuner"}
+        known = tuple(part for part in parts if part["kind"] == "tuner")
+        found.append(Plugin(path, bool(worlds & wanted), known))
+    return found
+
+
+def installed(name: str) -> Plugin:
+    """What is known of a tuner that another package has installed.
+
+    Raises:
+        SkippedError: it cannot be used here.
+        InputError: it cannot even be looked at.
+    """
+    known = _asked({"file": "", "tuner": name}, name)
+    if known and "skipped" in known[0]:
+        raise SkippedError("tuner", name, known[0]["skipped"])
+    return Plugin("", False, tuple(known))
+
+
+def foreign(name: str) -> bool:
+    """Whether a registered tuner is another package's, and its code not in this process."""
+    place = tuners.entry(name)
+    known = tuners.place(name) is not None or place is None
+    return not known and not str(place).startswith(_OWN)
+
+
+def _asked(question: dict[str, str], what: str) -> list[dict[str, Any]]:
+    """The answer of a sealed process that has loaded what is asked about."""
+    file = question["file"]
+    if file and not Path(file).is_file():
+        raise InputError(f"plugin {file}: no such file")
+    house = nursery()
+    house.load(["bench.runs.survey"])
+    child = house.start("bench.runs.survey:describe", files=[file] if file else [])
+    deadline = perf_counter() + _PATIENCE
+    try:
+        child.ready()
+        child.send(b"Q", json.dumps(question).encode(), deadline=deadline)
+        answer = child.receive(1 << 20, deadline).document()
+    except EndedError as ended:
+        said = "takes too long to load" if ended.status == "timeout" else ended.reason
+        raise InputError(f"plugin {what}: {said.strip().splitlines()[-1]}") from None
+    except KilledError as error:
+        raise InputError(f"plugin {what}: {error}") from None
+    finally:
+        child.end()
+    if isinstance(answer, dict):
+        raise InputError(str(answer.get("fault")))
+    return [_plain(part, file) for part in answer]
+
+
+def _plain(part: Any, file: str) -> dict[str, Any]:
+    """A part of an answer, no more believed than it must be."""
+    if not isinstance(part, dict) or not {"kind", "name"} <= set(part):
+        raise InputError(f"plugin {file}: its process did not say what it holds")
+    text = {key: str(part.get(key, ""))[:500] for key in ("kind", "name", "trains_as", "says")}
+    # The file's own bytes beside what the plugin says of itself.
+    told = [str(part.get("source", "")), Path(file).read_bytes() if file else b""]
+    rest = {"file": file, "module": str(part.get("module", "")), "source": digest(*told)}
+    flags = {key: part.get(key) for key in ("stochastic", "learned")}
+    skipped = {"skipped": str(part["skipped"])[:500]} if "skipped" in part else {}
+    return {**text, **rest, **flags, **skipped}
+
+
+def describe(channel: Channel, _reach: Reach, held: list[str]) -> None:
+    """Answer one question; runs in the sealed process."""
+    channel.send_document(b"R", held)
+    question = channel.receive().document()
+    try:
+        answer: Any = _parts(question["file"]) if question["file"] else [_one(question["tuner"])]
+    except InputError as error:
+        answer = {"fault": str(error)}
+    channel.send_document(b"K", answer)
+    channel.receive()
+
+
+def _parts(file: str) -> list[dict[str, Any]]:
+    """What a plugin file defines.
+
+    Raises:
+        InputError: it cannot be loaded.
+    """
+    load_plugins([file])
+    path = Path(file).resolve()
+    return [
+        _told(registry.kind, added.part)
+        for registry in REGISTRIES
+        for added in registry.snapshot().values()
+        if added.path == path
+    ]
+
+
+def _one(name: str) -> dict[str, Any]:
+    """An installed tuner."""
+    try:
+        return _told("tuner", tuners.get(name))
+    except SkippedError as error:
+        return {"kind": "tuner", "name": name, "skipped": error.reason}
+
+
+def _told(kind: str, part: Any) -> dict[str, Any]:
+    known = {"kind": kind, "name": part.name, "says": (part.__doc__ or "").split("\n\n")[0]}
+    if kind != "tuner":
+        return known
+    try:
+        return {
+            **known,
+            "module": part.__module__,
+            "stochastic": part.stochastic,
+            "learned": part.learned,
+            "trains_as": part.trains_as,
+            "source": source(part),
+            # A package may be missing for the tuner and not for its file.
+            "name": tuners.get(part.name).name,
+        }
+    except SkippedError as error:
+        return {**known, "skipped": error.reason}

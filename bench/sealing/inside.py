@@ -1,0 +1,250 @@
+"""The tuner's side of the pipe: builds a tuner, and has it do what the harness asks.
+
+Nothing here can be trusted by the harness once a plugin's code has run beside it; everything that
+counts is counted on the other side.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import os
+import sys
+import traceback
+from contextlib import suppress
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.sealing.asked import as_points
+from bench.sealing.memory import limit_memory
+from bench.sealing.seals import Reach
+from bench.sealing.streams import state_of, stream_of
+from bench.sealing.wire import TEXT_LIMIT, Channel, GoneError, Message, packed, unpacked
+from methods.base import (
+    Array,
+    Ask,
+    BudgetExceededError,
+    Evaluation,
+    Practice,
+    Scene,
+    Steps,
+    Task,
+    Tuner,
+)
+
+_LIMIT = 1 << 40
+"""What the harness sends is not bounded: it is trusted."""
+
+
+def serve(channel: Channel, reach: Reach, held: list[str]) -> None:
+    """Do what is asked until nobody asks any more."""
+    channel.send_document(b"R", held)
+    limit_memory(reach.memory)
+    with suppress(GoneError):
+        tuner = None
+        while True:
+            message = channel.receive(_LIMIT)
+            try:
+                tuner = _served(channel, message, tuner)
+            except GoneError:
+                return
+            except BaseException:
+                # Also what asks to exit: it is the tuner's doing, and its run's end.
+                _say(channel, traceback.format_exc())
+
+
+def _say(channel: Channel, text: str) -> None:
+    """Tell of a failure; of a long text its end, which says what it was."""
+    channel.send(b"D", text.encode("utf-8", "replace")[-TEXT_LIMIT // 2 :])
+
+
+def _served(channel: Channel, message: Message, tuner: Tuner | None) -> Tuner | None:
+    """Answer one message; the tuner that there is now."""
+    if message.kind == b"B":
+        wanted = message.document()
+        tuner = found(wanted)(**wanted["options"])
+        channel.send(b"K")
+    elif tuner is None:
+        raise RuntimeError("asked before there was a tuner")
+    elif message.kind == b"L":
+        tuner.restore(unpacked(message.body))
+        channel.send(b"K")
+    elif message.kind == b"T":
+        _tune(channel, message, tuner)
+    elif message.kind == b"F":
+        _fit(channel, message, tuner)
+    return tuner
+
+
+def found(wanted: dict[str, Any]) -> type[Tuner]:
+    """The class of a tuner.
+
+    Args:
+        wanted: ``name`` of the tuner, and the ``file`` or the ``module`` that it is in.
+
+    Raises:
+        ImportError: it is not there any more.
+    """
+    module = (
+        _of_file(wanted["file"]) if wanted["file"] else importlib.import_module(wanted["module"])
+    )
+    for value in vars(module).values():
+        if inspect.isclass(value) and issubclass(value, Tuner) and value.name == wanted["name"]:
+            return value
+    raise ImportError(f"{wanted['file'] or wanted['module']} has no tuner {wanted['name']}")
+
+
+def _of_file(path: str) -> Any:
+    stem = os.path.splitext(os.path.basename(path))[0]
+    spec = importlib.util.spec_from_file_location(f"simgap_plugin_{stem}", path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path}: no Python file")
+    module = importlib.util.module_from_spec(spec)
+    # Dataclasses look their module up while they are made.
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def generator(arrays: dict[str, NDArray[Any]]) -> np.random.Generator:
+    """The run's own random stream; see `bench.problem.seeds`."""
+    return np.random.default_rng(arrays["stream"].astype(np.uint32))
+
+
+def _tune(channel: Channel, message: Message, tuner: Tuner) -> None:
+    given = unpacked(message.body)
+    task = Task(
+        dim=given["start"].size,
+        start=given["start"],
+        observed=given["observed"],
+        scale=given["scale"],
+        training=given["training"],
+        budget=int(given["budget"]),
+        lengths=tuple(given["lengths"].tolist()),
+        scene=Scene(given["initial"], given["inputs"]),
+    )
+    steps = tuner.tune(task, generator(given))
+    try:
+        _exchange(channel, steps, task)
+    except StopIteration as stop:
+        reason = str(stop.value or "the tuner stopped")
+        channel.send(b"S", reason.encode("utf-8", "replace")[: TEXT_LIMIT // 2])
+    except GeneratorExit:
+        steps.close()
+        channel.send(b"K")
+
+
+def _exchange(channel: Channel, steps: Steps, task: Task) -> NoReturn:
+    """Hand over what is asked for, and back what came of it.
+
+    Raises:
+        StopIteration: the tuner stopped.
+        GeneratorExit: the harness wants no more.
+        Exception: the tuner failed.
+    """
+    dim, used = task.dim, 0
+    length, channels = task.observed.shape
+    asked = next(steps)
+    while True:
+        recommendation: bytes | Array = b""
+        if type(asked) is Ask:
+            asked, recommend = asked
+            if recommend is not None:
+                recommendation = as_points(recommend, dim, "recommendations")[0]
+        points = as_points(asked, dim, "proposals")
+        # One beyond the budget tells the harness all that it asks.
+        points = points[: max(task.budget - used, 0) + 1]
+        channel.send(b"A", recommendation, points, flags=len(recommendation) > 0, size=len(points))
+        answer = channel.receive(_LIMIT)
+        if answer.kind != b"E":
+            raise GeneratorExit
+        if answer.flags:
+            _stay(answer.flags - 1)
+        numbers, n = answer.numbers(), answer.size
+        used += n
+        proposals = numbers[: n * dim].reshape(n, dim)
+        losses = numbers[n * dim : n * dim + n]
+        observations = numbers[n * dim + n :].reshape(n, length, channels)
+        proposals.setflags(write=False)
+        losses.setflags(write=False)
+        asked = steps.send(Evaluation(proposals, observations, losses))
+
+
+def _stay(processor: int) -> None:
+    """Work on the processor that the harness is on: handing over is quicker there."""
+    with suppress(OSError, AttributeError):
+        os.sched_setaffinity(
+            0, {processor} if processor < _ANYWHERE else range(os.cpu_count() or 1)
+        )
+
+
+_ANYWHERE = 254
+"""The number that stands for every processor."""
+
+
+class _Ground:
+    """The simulator as a learned tuner meets it; all that it does is on the pipe's other side."""
+
+    def __init__(self, channel: Channel, which: int) -> None:
+        self._channel, self._which = channel, which
+        channel.send(b"P", flags=which)
+        self._take(channel.receive(_LIMIT))
+
+    def _take(self, answer: Message) -> dict[str, NDArray[Any]]:
+        if answer.kind == b"X":
+            refused = answer.document()
+            kinds = {"budget": BudgetExceededError, "value": ValueError}
+            raise kinds.get(refused["kind"], RuntimeError)(refused["says"])
+        given = unpacked(answer.body)
+        self.training, self.scale = given["training"], given["scale"]
+        self.dim = self.training.shape[1]
+        self.lengths = tuple(given["lengths"].tolist())
+        self.scene = Scene(given["initial"], given["inputs"])
+        self.used, self.budget = given["counts"].tolist()
+        return given
+
+    def sample(self, rng: np.random.Generator, n: int) -> Array:
+        return rng.uniform(self.training[0], self.training[1], size=(n, self.dim))
+
+    def simulate(self, rng: np.random.Generator, points: Array) -> Array:
+        state = rng.bit_generator.state
+        plain = state["bit_generator"] == "PCG64"
+        # Another kind of stream gives one of this kind a seed.
+        sent = state if plain else np.random.PCG64(rng.integers(0, 1 << 62, 4).tolist()).state
+        asked = np.array(points, dtype=np.float64)
+        asked = asked.reshape(-1, self.dim)
+        self._channel.send(b"P", *_stream(sent), asked, flags=2 + self._which, size=len(asked))
+        given = self._take(self._channel.receive(_LIMIT))
+        if plain:
+            rng.bit_generator.state = state_of(given["stream"])
+        return given["observations"]
+
+
+def _stream(state: Any) -> tuple[bytes]:
+    return (stream_of(state).tobytes(),)
+
+
+class _Watch:
+    """Tells the harness how a training goes."""
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+
+    @property
+    def ground(self) -> Practice:
+        return _Ground(self._channel, 1)
+
+    def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
+        self._channel.send_document(b"W", [stage, epoch, epochs, float(loss), float(held_out)])
+        self._channel.receive(_LIMIT)
+
+
+def _fit(channel: Channel, message: Message, tuner: Tuner) -> None:
+    given = unpacked(message.body)
+    tuner.watch = _Watch(channel) if message.flags else None
+    tuner.fit(_Ground(channel, 0), generator(given), int(given["budget"]))
+    tuner.watch = None
+    channel.send(b"L", *packed(tuner.state()))

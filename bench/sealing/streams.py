@@ -1,0 +1,29 @@
+"""Random streams as plain numbers, to go through a pipe."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def stream_of(state: Any) -> NDArray[np.int64]:
+    """The state of a PCG64 generator as six whole numbers."""
+    inner, mask = state["state"], (1 << 64) - 1
+    wide = [part for n in (inner["state"], inner["inc"]) for part in (n & mask, n >> 64)]
+    whole = np.array([*wide, state["has_uint32"], state["uinteger"]], dtype="<u8")
+    return whole.view(np.int64)
+
+
+def state_of(stream: NDArray[Any]) -> dict[str, Any]:
+    """The state of a PCG64 generator from `stream_of`.
+
+    Raises:
+        ValueError: it is none.
+    """
+    low, high, low_step, high_step, has, held = (int(n) & (1 << 64) - 1 for n in stream)
+    if has not in (0, 1) or held >> 32:
+        raise ValueError("no state of a random stream")
+    inner = {"state": high << 64 | low, "inc": high_step << 64 | low_step}
+    return {"bit_generator": "PCG64", "state": inner, "has_uint32": has, "uinteger": held}
