@@ -147,6 +147,9 @@ class Registry(Generic[T]):
         name = _name_of(part, where)
         if self._holds(name, part):
             return part
+        # What was known of the file's part is known better now.
+        if name in self._announced and self._announced[name].path == path:
+            del self._announced[name]
         if name in self.names() and not self._may_replace(name, part, path):
             raise InputError(f"{where}{self.kind} '{name}' exists already; give it another name")
         self._added[name] = Added(part, path)

@@ -11,6 +11,7 @@ SPRING = {
     "timeout": 60,
     "sampling": {"rate": 20.0, "samples": 60},
     "initial": {"x": [0.8, 1.2]},
+    "salt": "public",
     "tuners": {"random": {}},
 }
 

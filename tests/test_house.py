@@ -16,7 +16,7 @@ PACKAGES = ("bench", "methods", "sims")
 ROOMS = {
     "across", "analysis", "api", "checks", "cli", "commands", "compare", "experiments", "figures",
     "gap", "problem",
-    "recordings", "registry", "report", "runs", "shot", "sizes", "store", "study",
+    "recordings", "registry", "report", "runs", "sealing", "shot", "sizes", "store", "study",
 }  # fmt: skip
 
 

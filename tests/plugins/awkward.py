@@ -1,11 +1,10 @@
 """Tuners that misbehave, each in its own way."""
 
 import gc
-import json
+import hashlib
 import os
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 
@@ -49,9 +48,12 @@ class Stopping(Tuner):
 
 
 class Snooping(Tuner):
-    """Writes down every number that it can reach: from its task, the frames that call it,
-    everything alive.
+    """Looks at every number that it can reach: from its task, the frames that call it, everything
+    alive; says how many there are, and the places of those whose hash is wanted.
     """
+
+    def __init__(self, wanted=()):
+        self.wanted = {text: place for place, text in enumerate(wanted)}
 
     def tune(self, task, rng):
         seen = yield task.start
@@ -66,7 +68,13 @@ class Snooping(Tuner):
                 thing, "__dataclass_fields__"
             ):
                 walk(thing, numbers, set(), 2)
-        Path(os.environ["SNOOPED"]).write_text(json.dumps(sorted(numbers)))
+        found = {self.wanted[h] for h in map(hashed, numbers) if h in self.wanted}
+        return " ".join(map(str, [len(numbers), *sorted(found)]))
+
+
+def hashed(number):
+    """Stands for a number to nine digits, and cannot be found in its place."""
+    return hashlib.sha256(f"{number:.8e}".encode()).hexdigest()[:16]
 
 
 def walk(thing, numbers, visited, depth):

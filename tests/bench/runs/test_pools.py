@@ -8,8 +8,9 @@ import numpy as np
 import psutil
 import pytest
 
-from bench.runs.guard import memory_limit
 from bench.runs.pools import RETRIES, DeathError, LocalPool
+from bench.runs.survey import Plugin
+from bench.sealing.memory import memory_limit
 from sims.base import InputError
 from tests.conftest import PLUGINS
 
@@ -53,7 +54,7 @@ def shout():
 
 def made(calls, seconds=60.0, jobs=2, plugins=()):
     with LocalPool(jobs) as pool:
-        pool.load(plugins)
+        pool.load([Plugin(path) for path in plugins])
         return dict(pool.results(calls, seconds))
 
 
