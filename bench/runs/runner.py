@@ -127,25 +127,31 @@ def check(experiment: Experiment) -> dict[str, str]:
     return skipped
 
 
-def refuse_unreachable(experiment: Experiment) -> None:
+def refuse_unreachable(experiment: Experiment, workers: bool = True) -> None:
     """Refuse classes that this process alone has, for work in other processes.
 
     A worker starts afresh, so that no tuner finds a truth in its memory; it gets plugin files and
-    installed packages, and not what a notebook's cell or a script defined.
+    installed packages, and not what a notebook's cell or a script defined. So does the process of
+    a tuner.
+
+    Args:
+        experiment: what is to be run.
+        workers: whether worker processes simulate; else the processes of tuners are all there are.
 
     Raises:
         InputError: the simulator, a tuner or an effect is one.
     """
-    used: list[tuple[Registry[Any], str]] = [(simulators, experiment.simulator)]
-    used += [(tuners, entry.tuner) for entry in experiment.tuners]
-    used += [(effects, name) for name in effect_names(experiment.settings, experiment.world)]
+    used: list[tuple[Registry[Any], str]] = [(tuners, entry.tuner) for entry in experiment.tuners]
+    if workers:
+        used.append((simulators, experiment.simulator))
+        used += [(effects, name) for name in effect_names(experiment.settings, experiment.world)]
     for registry, name in used:
         added = registry.snapshot().get(name)
         if added is not None and added.path is None:
             raise InputError(
                 f"{registry.kind} {name}: class {added.part.__qualname__} of "
                 f"{added.part.__module__} exists in this process alone, and worker processes load "
-                "files; use jobs=0, which runs everything here, or put the class into a file and "
+                "files; use jobs=0, which runs everything here and trusts the tuners, or put the class into a file and "
                 "give that as a plugin"
             )
 
@@ -209,8 +215,9 @@ def run(
     Raises:
         InputError: workers cannot be had, or a class that they cannot have is wanted.
     """
-    if pool is not None or jobs:
-        refuse_unreachable(results.problem.experiment)
+    experiment = results.problem.experiment
+    if pool is not None or jobs or not experiment.trusted:
+        refuse_unreachable(experiment, workers=pool is not None or jobs > 0)
     with pool or pool_of(jobs) as workers:
         workers.load(admitted(plugins, results.problem.experiment))
         try:

@@ -86,12 +86,13 @@ def test_runs_are_isolated_there_too_and_a_lost_scheduler_leaves_a_folder_to_res
     ends = {(s.tuner, s.status) for s in kept.values()}
     assert ends == {("random", "done"), ("chaos_exit", "crashed"), ("chaos_raise", "crashed")}
     assert {s.reason for s in kept.values() if s.tuner == "chaos_exit"} == {
-        "the worker process exited with code 7"
+        "the tuner's process exited with code 7"
     }
 
 
 SHOT = """
 simulator = "ball"
+salt = "public"
 observe = ["z"]
 targets = 1
 budget = 6

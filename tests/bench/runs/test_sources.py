@@ -67,7 +67,7 @@ def swing(path):
 def names_with(plugin, experiment, entry):
     """Training key and run ids with this plugin alone loaded."""
     with alone(plugin):
-        plan = prepare(replace(experiment, tuners=(entry,))).plan
+        plan = prepare(replace(experiment, tuners=(entry,), trusted=True)).plan
         return key(experiment, entry, 0), {job.order.run for job in plan}
 
 
@@ -319,6 +319,8 @@ CHANGES = {
     "error_channel": "v",
     "timeout": 61.0,
     "memory": 99,
+    "isolation": "tuner",
+    "trusted": True,
     "noise": {"x": 0.1},
     "settings": {"engine": "batch"},
     "world": {"engine": "batch"},
@@ -332,7 +334,7 @@ CHANGES = {
 """A change to every key of an experiment that determines a run or a training."""
 NO_MATTER = {
     "identity": {"training_budget"},
-    "training": {"error_channel", "world", "timeout", "memory"},
+    "training": {"error_channel", "world", "timeout", "memory", "isolation"},
 }
 """Those of them that determine the other of the two alone."""
 
