@@ -151,8 +151,8 @@ def refuse_unreachable(experiment: Experiment, workers: bool = True) -> None:
             raise InputError(
                 f"{registry.kind} {name}: class {added.part.__qualname__} of "
                 f"{added.part.__module__} exists in this process alone, and worker processes load "
-                "files; use jobs=0, which runs everything here and trusts the tuners, or put the class into a file and "
-                "give that as a plugin"
+                "files; use jobs=0, which runs everything here and trusts the tuners, or put the "
+                "class into a file and give that as a plugin"
             )
 
 
