@@ -15,8 +15,10 @@ from bench.registry import simulators, tuners
 from bench.runs.housing import tuned_of
 from bench.runs.runner import Progress
 from bench.runs.survey import admit, unbuildable
-from bench.runs.training import Lesson, folder
-from methods.base import Practice
+from bench.runs.training import Lesson, Training, folder, train
+from bench.sealing.ended import EndedError
+from methods.base import Practice, Watch
+from methods.learning.rehearsal import TooFewError
 from sims import files
 from sims.base import InputError
 
@@ -66,11 +68,27 @@ def choose(
     return chosen, entry
 
 
-def lesson(experiment: Experiment, entry: Entry, seed: int) -> Lesson:
-    """The training of an entry with a seed."""
-    if experiment.trusted:
-        return Lesson(entry, seed)
-    return Lesson(entry, seed, tuned_of(entry), (str(folder().resolve()),))
+def taught(
+    experiment: Experiment, entry: Entry, seed: int, watch: Watch | None, again: bool
+) -> Training:
+    """Train, or find trained; see `bench.runs.training.train`.
+
+    Raises:
+        InputError: the training budget does not last.
+    """
+    lesson = Lesson(entry, seed)
+    if not experiment.trusted:
+        lesson = Lesson(entry, seed, tuned_of(entry), (str(folder().resolve()),))
+    try:
+        return train(experiment, lesson, watch, again)
+    except TooFewError as error:
+        said = str(error)
+    except EndedError as ended:
+        # Of what went wrong in the tuner's process its name has come here, and its words.
+        name, _, said = "".join(ended.reason.strip().splitlines()[-1:]).partition(": ")
+        if not name.endswith(TooFewError.__name__):
+            raise
+    raise InputError(f"tuner {entry.label}: {said}; give a larger budget")
 
 
 def _only(simulator: str) -> str:

@@ -43,13 +43,10 @@ def add_train(parser: argparse.ArgumentParser) -> None:
 
 
 def _train(options: argparse.Namespace) -> int:
-    from bench.api.train import Losses, choose, lesson
+    from bench.api.train import Losses, choose, taught
     from bench.commands.progress import Bars
     from bench.runs.runner import seeds_of
     from bench.runs.size import check_training
-    from bench.runs.training import train
-    from methods.learning.rehearsal import TooFewError
-    from sims.base import InputError
 
     experiment, entry = choose(
         options.tuner,
@@ -66,9 +63,7 @@ def _train(options: argparse.Namespace) -> int:
         for seed in range(seeds):
             losses.begin(f"{entry.label} seed {seed}", seed)
             try:
-                training = train(
-                    experiment, lesson(experiment, entry, seed), losses, options.again
-                )
+                training = taught(experiment, entry, seed, losses, options.again)
             except TooFewError as error:
                 raise InputError(f"tuner {entry.label}: {error}; give a larger --budget") from None
             how = "trained earlier with" if training.found else "trained with"

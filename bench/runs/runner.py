@@ -23,6 +23,7 @@ from bench.runs.sources import effect_names
 from bench.runs.survey import admitted, unbuildable
 from bench.runs.training import Lesson, Training, WeightsError, build, train
 from bench.runs.worker import Order, Outcome, perform
+from bench.sealing.ended import EndedError
 from bench.sealing.memory import limits
 from bench.sealing.outside import Tuned
 from bench.store.status import Status
@@ -330,6 +331,8 @@ def _file(results: Results, place: int, outcome: Outcome | Exception) -> None:
         outcome = unfinished(problem, job.target, "timeout", reason)
     elif isinstance(outcome, DeathError):
         outcome = unfinished(problem, job.target, "crashed", str(outcome))
+    elif isinstance(outcome, EndedError):
+        outcome = unfinished(problem, job.target, outcome.status, outcome.reason)
     elif isinstance(outcome, Exception):
         reason = "".join(traceback.format_exception(outcome))
         outcome = unfinished(problem, job.target, "crashed", reason)
