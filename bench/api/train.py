@@ -74,21 +74,19 @@ def taught(
     """Train, or find trained; see `bench.runs.training.train`.
 
     Raises:
-        InputError: the training budget does not last.
+        TooFewError: the training budget does not last.
     """
     lesson = Lesson(entry, seed)
     if not experiment.trusted:
         lesson = Lesson(entry, seed, tuned_of(entry), (str(folder().resolve()),))
     try:
         return train(experiment, lesson, watch, again)
-    except TooFewError as error:
-        said = str(error)
     except EndedError as ended:
         # Of what went wrong in the tuner's process its name has come here, and its words.
         name, _, said = "".join(ended.reason.strip().splitlines()[-1:]).partition(": ")
-        if not name.endswith(TooFewError.__name__):
-            raise
-    raise InputError(f"tuner {entry.label}: {said}; give a larger budget")
+        if name.endswith(TooFewError.__name__):
+            raise TooFewError(said) from None
+        raise
 
 
 def _only(simulator: str) -> str:

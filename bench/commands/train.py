@@ -47,6 +47,8 @@ def _train(options: argparse.Namespace) -> int:
     from bench.commands.progress import Bars
     from bench.runs.runner import seeds_of
     from bench.runs.size import check_training
+    from methods.learning.rehearsal import TooFewError
+    from sims.base import InputError
 
     experiment, entry = choose(
         options.tuner,
