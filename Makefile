@@ -51,6 +51,7 @@ benchmark: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.engines
 	$(BIN)/python -m tests.benchmarks.scale
 	$(BIN)/python -m tests.benchmarks.peers
+	$(BIN)/python -m tests.benchmarks.sealed
 
 chaos: $(STAMP)
 	$(BIN)/python -m tests.chaos --kills 100

@@ -43,6 +43,8 @@ def serve(channel: Channel, reach: Reach, held: list[str]) -> None:
     """Do what is asked until nobody asks any more."""
     channel.send_document(b"R", held)
     limit_memory(reach.memory)
+    # Loaded ahead, it would give each run the same numbers to those who use it in place of theirs.
+    np.random.seed()  # noqa: NPY002
     with suppress(GoneError):
         tuner = None
         while True:

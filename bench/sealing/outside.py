@@ -40,7 +40,7 @@ from methods.base import Array, Ask, Evaluation, Task
 _START = (
     "import sys; sys.path[:] = {path!r}; from bench.sealing.nursery import main; main({descriptor})"
 )
-_PRELOADED = ("bench.sealing.inside",)
+_PRELOADED = ("numpy.random", "bench.sealing.inside")
 _NUMERICAL = ("OPENBLAS_", "MKL_", "OMP_", "NPY_")
 """With which the names of variables begin that tell numerical libraries how to compute."""
 _PATIENCE = 60.0

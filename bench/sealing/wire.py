@@ -30,6 +30,9 @@ _TYPES = ("<f8", "<f4", "<i8", "<i4", "|u1", "|b1")
 _ARRAYS = 10_000
 """How many it may have."""
 
+_LONGEST = float((1 << 31) - 1)
+"""Milliseconds that the kernel waits at most."""
+
 TEXT_LIMIT = 1 << 16
 """Bytes of a message that is text."""
 ASKED_LIMIT = 1 << 28
@@ -194,9 +197,9 @@ class Channel:
 
 
 def _milliseconds(deadline: float) -> float | None:
-    if deadline == float("inf"):
-        return None
-    return max(0.0, (deadline - perf_counter()) * 1e3)
+    left = (deadline - perf_counter()) * 1e3
+    # A limit of years is none, and more than poll takes.
+    return None if left > _LONGEST else max(0.0, left)
 
 
 def packed(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, ...]:

@@ -1,8 +1,8 @@
 """Overhead beside benchopt and nevergrad: what each harness adds to a trivial problem that costs
 nothing itself.
 
-Run: `python -m tests.benchmarks.peers`. The peers are installed into a throwaway environment by
-this script alone.
+Run: `python -m tests.benchmarks.peers`. The peers are installed into a throwaway environment, or
+are those of the Python that $PEERS names.
 
 - an evaluation: random search over two numbers, the objective a sum of squares, evaluated a few
   thousand times, less the bare loop over the same numbers; nevergrad by `RandomSearch.minimize`,
@@ -15,6 +15,7 @@ this script alone.
 from __future__ import annotations
 
 import json
+import os
 import statistics
 import subprocess
 import sys
@@ -158,6 +159,23 @@ def benchopt_run(python, folder):
     return 1e3 * (times[410] - times[10]) / 400
 
 
+def environment(folder):
+    """Python of an environment that has the peers: of $PEERS, else of one made below `folder`; None
+    where they cannot be had.
+    """
+    if os.environ.get("PEERS"):
+        return os.environ["PEERS"]
+    python = str(folder / "venv" / "bin" / "python")
+    install = [python, "-m", "pip", "install", "--quiet", "benchopt", "nevergrad"]
+    try:
+        subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
+        subprocess.run(install, check=True, capture_output=True)
+    except subprocess.CalledProcessError:
+        print("peers: cannot be installed here, nothing to compare with", file=sys.stderr)
+        return None
+    return python
+
+
 def main():
     mine = {
         "evaluation_us": simgap_evaluation(),
@@ -167,13 +185,9 @@ def main():
     print(json.dumps({"simgap": {k: round(v, 2) for k, v in mine.items()}}), flush=True)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
-        python = str(folder / "venv" / "bin" / "python")
-        subprocess.run(
-            [python, "-m", "pip", "install", "--quiet", "benchopt", "nevergrad"],
-            check=True,
-            capture_output=True,
-        )
+        python = environment(folder)
+        if python is None:
+            return
         evaluation = nevergrad_evaluation(python)
         ratio = round(evaluation / mine["evaluation_us"], 2)
         print(
