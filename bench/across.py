@@ -14,12 +14,13 @@ import numpy as np
 import pandas as pd
 
 from bench.analysis.curves import Curves
+from bench.analysis.marks import marked
 from bench.analysis.paired import PROBLEMS, nemenyi, pairs, ranks
 from bench.analysis.runtimes import ert_table, solved
 from bench.analysis.statistics import Statistics
 from bench.figures import runtimes
 from bench.figures.comparison import statistics_of
-from bench.figures.style import Styles, save
+from bench.figures.style import Styles, mark, save
 from bench.problem.experiment import Entry, Experiment
 from bench.report import NEEDED
 from bench.store.folder import read
@@ -64,7 +65,7 @@ def read_together(folders: Sequence[Path]) -> Together:
         stored = read(folder, NEEDED)
         if stored.runs.empty:
             raise InputError(f"{folder}: holds no runs")
-        parts.append(Part(statistics_of(stored), stored.experiment.budget))
+        parts.append(Part(statistics_of(stored), stored.experiment))
     first, *others = (part.statistics.curves.tuners() for part in parts)
     tuners = [t for t in first if all(t in other for other in others)]
     if not tuners:
@@ -74,10 +75,10 @@ def read_together(folders: Sequence[Path]) -> Together:
 
 @dataclass(frozen=True)
 class Part:
-    """One of the comparisons: its statistics and its budget."""
+    """One of the comparisons: its statistics, and what was asked for."""
 
     statistics: Statistics
-    budget: int
+    experiment: Experiment
 
 
 @dataclass(frozen=True)
@@ -111,17 +112,29 @@ class Together:
 
     def tables(self) -> dict[str, str]:
         """ert, pairs, ranks, and nemenyi where `comparable`: CSV by name."""
-        parts = [(part.statistics, part.budget) for part in self.parts]
-        ert = pd.concat([ert_table(s.curves, s.levels, budget) for s, budget in parts])
-        paired = pd.concat([pairs(s.curves) for s, _ in parts])
+        ert, paired = [], []
+        for part in self.parts:
+            curves, levels = part.statistics.curves, part.statistics.levels
+            times = ert_table(curves, levels, part.experiment.budget)
+            ert.append(marked(times, part.experiment))
+            paired.append(marked(pairs(curves), part.experiment))
         texts = {
-            "ert": ert.to_csv(index=False),
-            "pairs": paired.to_csv(index=False),
-            "ranks": self.ranked.to_csv(index_label="problem"),
+            "ert": pd.concat(ert).to_csv(index=False),
+            "pairs": pd.concat(paired).to_csv(index=False),
+            "ranks": self._squared(self.ranked).to_csv(index_label="problem"),
         }
         if self.comparable:
-            texts["nemenyi"] = self.tests[1].to_csv(index_label="tuner")
+            texts["nemenyi"] = self._squared(self.tests[1]).to_csv(index_label="tuner")
         return texts
+
+    @property
+    def trusted(self) -> bool:
+        """Whether tuners were trusted in any of them."""
+        return any(part.experiment.trusted for part in self.parts)
+
+    def _squared(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """A table with a column a tuner; it has another only where there is something to say."""
+        return frame.assign(trusted=True) if self.trusted else frame
 
     def figures(self) -> dict[str, Figure]:
         """runtime-distribution, and critical-difference where `comparable`."""
@@ -129,7 +142,7 @@ class Together:
         if self.comparable:
             friedman, p_values = self.tests
             drawn["critical-difference"] = runtimes.rank_figure(self.ranked, p_values, friedman)
-        return drawn
+        return {name: mark(figure, self.trusted) for name, figure in drawn.items()}
 
     def _joint_figure(self) -> Figure:
         title = f"{len(self.ranked)} problems"

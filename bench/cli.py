@@ -13,7 +13,7 @@ from typing import NoReturn
 
 from bench import __version__
 from bench.commands.check import add_check
-from bench.commands.compare import INTERRUPTED, add_compare, add_plot, add_status
+from bench.commands.compare import INTERRUPTED, add_compare, add_plot, add_status, add_verify
 from bench.commands.explain import add_explain, add_score
 from bench.commands.film import add_film, add_track
 from bench.commands.listing import add_list
@@ -24,6 +24,7 @@ COMMANDS = (
     ("compare", add_compare, "run an experiment: tuners x targets x seeds; write table and figure"),
     ("train", add_train, "train a learned tuner ahead of the comparisons that use it"),
     ("status", add_status, "what a comparison's folder holds, and what is missing"),
+    ("verify", add_verify, "see whether a finished comparison follows from its salt and its rows"),
     ("check", add_check, "run the conformance suite on a tuner, a simulator or an effect"),
     ("plot", add_plot, "write table and figures of a comparison again, or of several together"),
     ("simulate", add_simulate, "write a recording of a simulated system, its truth apart"),

@@ -78,6 +78,7 @@ class Comparison:
         """A comparison in a new folder; the plan stands, and nothing has been run; see
         `bench.study.Study.begin`.
         """
+        from bench.runs.housing import seals
         from bench.runs.identity import fingerprint
         from bench.runs.runner import prepare, refuse_unreachable
 
@@ -90,7 +91,8 @@ class Comparison:
         if jobs:
             refuse_unreachable(experiment)
         hashes = fingerprint(experiment, plugins)
-        create(place, Configuration(experiment, list(plugins), hashes), jobs, secret)
+        held = () if experiment.trusted else seals()
+        create(place, Configuration(experiment, list(plugins), hashes), jobs, secret, held)
         comparison = cls(place)
         comparison.secret = secret
         comparison._attach(results)
@@ -198,7 +200,13 @@ class Comparison:
             run(results, self.plugins, jobs, progress or silent, pool)
         finally:
             # Also where a worker cannot be had: what there is can be looked at.
-            write_results(self.folder, journal, results.training_rows(), results.skipped_rows())
+            write_results(
+                self.folder,
+                journal,
+                results.training_rows(),
+                results.skipped_rows(),
+                self.configuration.experiment.trusted,
+            )
             self._write_spectra(results)
             made = Made(
                 len(journal.statuses), len(results.plan), results.interrupted, results.stopped

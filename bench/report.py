@@ -9,13 +9,15 @@ from pathlib import Path
 import pandas as pd
 
 from bench.analysis.amortisation import EVEN_COLUMNS, SHARED, break_even_table, winners
+from bench.analysis.marks import marked, with_salt
 from bench.analysis.paired import pairs
 from bench.analysis.runtimes import ert_table
 from bench.analysis.statistics import Statistics
 from bench.analysis.table import summary, table
 from bench.figures import comparison
 from bench.figures.comparison import Labels, labels_of, statistics_of
-from bench.figures.style import save
+from bench.figures.style import TRUSTED, save
+from bench.problem.experiment import Experiment
 from bench.problem.problem import Problem
 from bench.store.folder import Stored, read
 from bench.store.status import FAILURES
@@ -68,6 +70,8 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     lines = made["table"]
     for text in _results(lines, labels):
         say(text)
+    for text in _marks(stored.experiment):
+        say(text)
     failed = stored.statuses[stored.statuses["status"].isin(FAILURES)]
     for text in failure_lines(failed):
         say(text)
@@ -92,13 +96,15 @@ def tables(stored: Stored, statistics: Statistics | None = None) -> dict[str, pd
         return {}
     experiment = stored.experiment
     statistics = statistics or statistics_of(stored)
-    return {
-        "table": table(stored.runs, stored.statuses, experiment.budget, stored.costs),
+    lines = table(stored.runs, stored.statuses, experiment.budget, stored.costs)
+    frames = {
+        "table": with_salt(lines, experiment),
         "ert": ert_table(statistics.curves, statistics.levels, experiment.budget),
         "pairs": pairs(statistics.curves),
         "break_even": _break_even(experiment.name, statistics),
         "who_wins": _who_wins(experiment.name, statistics),
     }
+    return {name: marked(frame, experiment) for name, frame in frames.items()}
 
 
 def _break_even(experiment: str, statistics: Statistics) -> pd.DataFrame:
@@ -129,6 +135,16 @@ def _drawn(folder: Path, stored: Stored, labels: Labels, statistics: Statistics)
         figure = comparison.figure(stored, labels, name, statistics)
         paths.append(save(figure, folder / "figures" / comparison.FILES[name])[0])
     return paths
+
+
+def _marks(experiment: Experiment) -> list[str]:
+    """How the runs were made, where it takes something away from what came out."""
+    texts = []
+    if experiment.trusted:
+        texts.append(f"\n{TRUSTED}")
+    if not experiment.salt_sha256:
+        texts.append("\nthe targets have a public salt: everybody can draw them")
+    return texts
 
 
 def _results(lines: pd.DataFrame, labels: Labels) -> list[str]:

@@ -17,6 +17,7 @@ ROOMS = {
     "across", "analysis", "api", "checks", "cli", "commands", "compare", "experiments", "figures",
     "gap", "problem",
     "recordings", "registry", "report", "runs", "sealing", "shot", "sizes", "store", "study",
+    "verify",
 }  # fmt: skip
 
 

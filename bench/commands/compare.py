@@ -108,10 +108,25 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
 def add_status(status: argparse.ArgumentParser) -> None:
     """The options of `simgap status`."""
     status.add_argument(
-        "run", metavar="DIR", type=Path, help="the folder of a comparison or bounce shot"
+        "run",
+        metavar="DIR",
+        type=Path,
+        nargs="?",
+        help="the folder of a comparison or bounce shot; without it: which seals hold around "
+        "tuners on this machine",
     )
     status.add_argument("--runs", action="store_true", help="list every run or shot")
     status.set_defaults(command=_status)
+
+
+def add_verify(verify: argparse.ArgumentParser) -> None:
+    """The options of `simgap verify`."""
+    verify.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished comparison")
+    verify.add_argument(
+        "--all", action="store_true", help="make every simulation again, and not a share of them"
+    )
+    add_plugin(verify, "simulators")
+    verify.set_defaults(command=_verify)
 
 
 def add_plot(plot: argparse.ArgumentParser) -> None:
@@ -227,8 +242,39 @@ def _left(study: Study, made: Made) -> int:
 def _status(options: argparse.Namespace) -> int:
     from bench.study import opened, parts_of
 
+    if options.run is None:
+        return _seals()
     complete = [_stands(opened(part), options.runs) for part in parts_of(options.run)]
     return 0 if all(complete) else 1
+
+
+def _seals() -> int:
+    """Say which seals hold on this machine."""
+    from bench.runs.housing import seals
+    from bench.sealing.seals import SEALS
+
+    there = seals()
+    print("seals around a tuner's process on this machine (docs/sealing.md)")
+    for name, says in SEALS.items():
+        print(f"  {name:10} {'holds' if name in there else 'DOES NOT HOLD':14} {says}")
+    return 0
+
+
+def _sealed(study: Study) -> str:
+    """How the tuners of a study are kept from its truths."""
+    from bench.sealing.seals import SEALS
+
+    held = study.configuration
+    experiment = held.experiment
+    if experiment.trusted:
+        return "trusted: its tuners run inside the harness"
+    missing = [name for name in SEALS if name not in held.seals]
+    kept = "sealed: a process for each "
+    kept += "run" if experiment.isolation == "run" else "tuner and seed"
+    without = f", WITHOUT the seals {', '.join(missing)}" if missing else ", every seal holds"
+    salt = experiment.salt_sha256
+    told = f"; salt with SHA-256 {salt[:12]}" if salt else "; its salt is public"
+    return kept + without + told + (", revealed" if salt and experiment.salt else "")
 
 
 def _stands(study: Study, every: bool) -> bool:
@@ -238,6 +284,7 @@ def _stands(study: Study, every: bool) -> bool:
     complete = ", complete" if standing.complete else ""
     print(f"{standing.name}: {standing.finished} of {planned} {what}{complete}")
     print("  " + ", ".join(f"{name} {value}" for name, value in standing.hashes.items()))
+    print(f"  {_sealed(study)}")
     for line in _counts(standing):
         print(f"  {line}")
     for line in _listed(standing, every):
@@ -280,6 +327,14 @@ def _listed(standing: Standing, every: bool) -> list[str]:
     if not every and len(standing.ends) > len(shown):
         lines.append(f"({len(shown)} of {len(standing.ends)} listed; --runs lists all)")
     return lines
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from bench.study import parts_of
+    from bench.verify import verify
+
+    doubts = [verify(part, print, options.plugin, options.all) for part in parts_of(options.run)]
+    return 1 if any(doubts) else 0
 
 
 def _plot(options: argparse.Namespace) -> int:

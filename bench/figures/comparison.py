@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from bench.analysis.statistics import Statistics
 from bench.figures import errors, identifiability, runtimes
-from bench.figures.style import Styles
+from bench.figures.style import Styles, mark
 from bench.problem.experiment import Experiment
 from bench.problem.problem import Problem
 from bench.store.folder import Stored
@@ -90,6 +90,10 @@ def figure(
     """
     if name not in (known := names(stored)):
         raise unknown("figure", name, known)
+    return mark(_figure(stored, labels, name, statistics), stored.experiment.trusted)
+
+
+def _figure(stored: Stored, labels: Labels, name: str, statistics: Statistics | None) -> Figure:
     experiment, runs = stored.experiment, stored.runs
     if name == "error":
         return errors.error_figure(experiment, runs, labels.channel, labels.parameter)

@@ -42,6 +42,17 @@ def nursery() -> Nursery:
     return held
 
 
+@cache
+def seals() -> tuple[str, ...]:
+    """The seals that hold around a tuner's process on this machine; see `bench.sealing.seals`."""
+    child = nursery().start("bench.sealing.inside:serve")
+    try:
+        child.ready()
+        return tuple(child.seals)
+    finally:
+        child.end()
+
+
 def close() -> None:
     """End every tuner's process of this one."""
     _waiting.clear()

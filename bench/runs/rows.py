@@ -36,6 +36,7 @@ def status_of(problem: Problem, order: Order, outcome: Outcome) -> Status:
         reason=trace.reason,
         simulations=len(trace.losses),
         seconds=outcome.seconds,
+        trusted=problem.experiment.trusted,
     )
 
 
@@ -60,6 +61,7 @@ def rows(
         "target": [target.sealed.name] * (k + 1),
         "seed": [order.seed] * (k + 1),
         "range": [target.sealed.range] * (k + 1),
+        "trusted": [problem.experiment.trusted] * (k + 1),
         "k": np.arange(k + 1),
         "loss": _after_start(trace.losses),
     }

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -24,6 +25,7 @@ from bench.runs.survey import admitted, unbuildable
 from bench.runs.training import Lesson, Training, WeightsError, build, train
 from bench.runs.worker import Order, Outcome, perform
 from bench.sealing.ended import EndedError
+from bench.sealing.kernel import memory_hidden
 from bench.sealing.memory import limits
 from bench.sealing.outside import Tuned
 from bench.store.status import Status
@@ -88,8 +90,10 @@ class Results:
 
     def skipped_rows(self) -> list[dict[str, Any]]:
         """Rows of status.csv for tuners that could not be used."""
-        simulator = self.problem.experiment.simulator
+        experiment = self.problem.experiment
+        simulator = experiment.simulator
         fixed = {"target": "", "seed": 0, "status": "skipped", "simulations": 0, "seconds": 0.0}
+        fixed["trusted"] = experiment.trusted
         return [
             {"run": label, "tuner": label, "simulator": simulator, **fixed, "reason": reason}
             for label, reason in self.skipped.items()
@@ -219,7 +223,9 @@ def run(
     experiment = results.problem.experiment
     if pool is not None or jobs or not experiment.trusted:
         refuse_unreachable(experiment, workers=pool is not None or jobs > 0)
-    with pool or pool_of(jobs) as workers:
+    # Here are the truths, and a tuner's process may be this user's.
+    hidden = nullcontext() if experiment.trusted else memory_hidden()
+    with hidden, pool or pool_of(jobs) as workers:
         workers.load(admitted(plugins, results.problem.experiment))
         try:
             _run(results, workers, progress)

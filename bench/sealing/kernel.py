@@ -13,7 +13,8 @@ import os
 import platform
 import struct
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -165,6 +166,17 @@ def hide_memory() -> None:
     """Let no other process of this user read this one's memory, files or environment."""
     if LINUX:
         _prctl(_PR_SET_DUMPABLE, 0)
+
+
+@contextmanager
+def memory_hidden() -> Iterator[None]:
+    """Within the block this process is as after `hide_memory`."""
+    hide_memory()
+    try:
+        yield
+    finally:
+        if LINUX:
+            _prctl(_PR_SET_DUMPABLE, 1)
 
 
 def no_new_rights() -> None:

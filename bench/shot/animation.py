@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.figures.style import BLUE, VERMILION, blank
+from bench.figures.style import BLUE, TRUSTED, VERMILION, blank
 from bench.shot.deal import RECORDINGS, Deal
 from bench.shot.pictures import Shown, end_of, shot_panel, thrown
 from bench.shot.settings import Settings
@@ -67,7 +67,11 @@ class _Filmed(NamedTuple):
 
 
 def animate(
-    folder: Path, settings: Settings, example: tuple[Deal, list[str]], kept: Mapping[str, Any]
+    folder: Path,
+    settings: Settings,
+    example: tuple[Deal, list[str]],
+    kept: Mapping[str, Any],
+    trusted: bool = False,
 ) -> Path:
     """Write figures/shot.gif: the drop at its own speed, where it was filmed, and the shots at half
     of it.
@@ -104,6 +108,8 @@ def animate(
                 one.show(round(later * step))
         return []
 
+    if trusted:
+        figure.suptitle(TRUSTED, fontsize=7)
     figure.tight_layout()
     path = folder / "figures" / "shot.gif"
     frames = len(film.pictures) + shots + _HOLD

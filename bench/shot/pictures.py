@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.figures.style import BLACK, BLUE, GREY, SLOPE, SOFT, VERMILION, blank, save
+from bench.figures.style import BLACK, BLUE, GREY, SLOPE, SOFT, VERMILION, blank, mark, save
 from bench.problem.experiment import Experiment
 from bench.shot.deal import Deal
 from bench.shot.settings import Settings
@@ -53,7 +53,10 @@ def draw(
     chosen = examples(dealt, kept, rows)
     if chosen:
         figures["shots"] = shots_figure(settings, chosen, kept)
-    return [save(figure, folder / "figures" / name)[0] for name, figure in figures.items()]
+    return [
+        save(mark(figure, experiment.trusted), folder / "figures" / name)[0]
+        for name, figure in figures.items()
+    ]
 
 
 def group_of(method: str) -> str:

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import pandas as pd
 
+from bench.analysis.marks import marked
 from bench.problem.experiment import Experiment
 from bench.shot.animation import animate
 from bench.shot.deal import Deal
@@ -79,13 +80,14 @@ def finish(study: Shots, say: Callable[[str], None]) -> int:
     for name in _NUMBERS:
         # A column that is empty throughout has no type of its own.
         rows[name] = pd.to_numeric(rows[name])
-    lines = table(rows)
-    statuses = _statuses(rows, study.skipped)
+    lines = marked(table(rows), study.experiment)
+    rows = marked(rows, study.experiment)
+    statuses = marked(_statuses(rows, study.skipped), study.experiment)
     for name, frame in (("table", lines), ("shots", rows), ("status", statuses)):
         write(folder / f"{name}.csv", frame.to_csv(index=False, float_format="%.6g"))
     figures = draw(folder, study.experiment, study.settings, study.deals, kept, rows, lines)
     for example in examples(study.deals, kept, rows)[:1]:
-        figures.append(animate(folder, study.settings, example, kept))
+        figures.append(animate(folder, study.settings, example, kept, study.experiment.trusted))
     # Every new folder has one for a journal, which a bounce shot does not keep.
     journal = folder / FOLDER
     if journal.is_dir() and not any(journal.iterdir()):
@@ -127,7 +129,7 @@ def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
     if not skipped:
         return made
     left = [
-        (label, label, SIMULATOR, "", 0, "skipped", reason, 0, 0.0)
+        (label, label, SIMULATOR, "", 0, "skipped", reason, 0, 0.0, False)
         for label, reason in skipped.items()
     ]
     return pd.concat([made, pd.DataFrame(left, columns=STATUS_COLUMNS)])

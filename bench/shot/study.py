@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 from bench.problem.experiment import Experiment
 from bench.registry import tuners
-from bench.runs.housing import tuned_of
+from bench.runs.housing import seals, tuned_of
 from bench.runs.pools import Call, LostError, Pool, pool_of
 from bench.runs.runner import Progress, check, refuse_unreachable, silent
 from bench.runs.survey import admitted
 from bench.runs.training import Lesson, Training, train
 from bench.runs.training import folder as trained
+from bench.sealing.kernel import memory_hidden
 from bench.sealing.outside import Tuned
 from bench.shot import tune
 from bench.shot.deal import RECORDINGS, Deal, deals, in_view, record
@@ -81,7 +83,8 @@ class BounceShotStudy:
         if jobs:
             refuse_unreachable(experiment)
         hashes = fingerprint(experiment, plugins)
-        create(place, Configuration(experiment, list(plugins), hashes), jobs, secret)
+        held = () if experiment.trusted else seals()
+        create(place, Configuration(experiment, list(plugins), hashes), jobs, secret, held)
         return cls(place)
 
     @classmethod
@@ -205,7 +208,9 @@ class _Making:
         # These workers know the balls, and tune nothing; those that tune are others.
         with pool_of(jobs) as workers:
             faults = self._record(workers)
-        with pool or pool_of(jobs) as workers:
+        # Here are the true balls, and a tuner's process may be this user's.
+        hidden = nullcontext() if self._experiment.trusted else memory_hidden()
+        with hidden, pool or pool_of(jobs) as workers:
             workers.load(admitted(self._study.plugins, self._experiment))
             weights = self._train(workers)
             self._shoot(workers, faults, weights)

@@ -59,15 +59,21 @@ class Configuration(NamedTuple):
         experiment: the exact configuration.
         plugins: plugin files that it needs.
         fingerprint: hashes of what must not change until it is complete.
+        seals: that held around its tuners where it was begun.
     """
 
     experiment: Experiment
     plugins: list[str]
     fingerprint: dict[str, str]
+    seals: tuple[str, ...] = ()
 
 
 def create(
-    folder: Path, configuration: Configuration, jobs: int, secret: str | None = None
+    folder: Path,
+    configuration: Configuration,
+    jobs: int,
+    secret: str | None = None,
+    seals: Sequence[str] = (),
 ) -> None:
     """Make the folder with experiment.toml and environment.json in it, all at once or not at all.
 
@@ -76,6 +82,7 @@ def create(
         configuration: what it is for.
         jobs: worker processes that it is meant to be made with.
         secret: the salt that its targets are drawn from; see `bench.store.secret`.
+        seals: that hold around its tuners on this machine.
 
     Raises:
         InputError: it cannot be made.
@@ -86,6 +93,7 @@ def create(
         "experiment": experiment.name,
         "plugins": [str(Path(p).resolve()) for p in configuration.plugins],
         "jobs": jobs,
+        "seals": list(seals),
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "python": sys.version,
         "platform": platform.platform(),
@@ -143,7 +151,10 @@ def configuration(folder: Path) -> Configuration:
     environment = _environment(folder)
     experiment = parse(str(environment["experiment"]), read_toml(path), path)
     return Configuration(
-        experiment, list(environment["plugins"]), dict(environment.get("fingerprint", {}))
+        experiment,
+        list(environment["plugins"]),
+        dict(environment.get("fingerprint", {})),
+        tuple(environment.get("seals", ())),
     )
 
 
@@ -175,6 +186,7 @@ def write_results(
     journal: Journal,
     trainings: Iterable[tuple[str, int, int, float]],
     skipped: Iterable[Mapping[str, Any]],
+    trusted: bool = False,
 ) -> None:
     """Write runs.parquet, training.csv and status.csv in the order of the plan, each whole or not
     at all.
@@ -184,6 +196,7 @@ def write_results(
         journal: its finished runs.
         trainings: tuner, seed, simulations and seconds of each training.
         skipped: rows of status.csv for tuners that could not be used.
+        trusted: whether the tuners ran inside the harness.
     """
     import pandas as pd
     import pyarrow as pa
@@ -200,6 +213,7 @@ def write_results(
         else:
             writer.close()
     training = pd.DataFrame(sorted(trainings), columns=["tuner", "seed", "simulations", "seconds"])
+    training["trusted"] = trusted
     write(folder / "training.csv", training.to_csv(index=False))
     rows_of_statuses = [
         asdict(journal.statuses[place]) for place in sorted(journal.statuses)

@@ -143,6 +143,7 @@ TRAINING: Columns = (
     _count("seed"),
     _count("simulations"),
     _size("seconds"),
+    _TRUSTED,
 )
 """training.csv: a row a training."""
 
@@ -171,6 +172,7 @@ TABLE: Columns = (
     _size("fit_seconds"),
     _size("tuner_seconds", Empty.MAY),
     _size("simulator_seconds", Empty.MAY),
+    Column("salt", str, words=("secret", "public"), required=False),
     _TRUSTED,
 )
 """table.csv of a comparison."""
@@ -204,6 +206,7 @@ SHOTS: Columns = (
     Column("status", str, words=SHOT_STATUSES),
     Column("reason", str, empty=Empty.MAY),
     _size("seen", high=1.0),
+    _TRUSTED,
 )
 """shots.csv of a bounce shot, and the rows in shots/NAME.json."""
 
@@ -228,6 +231,7 @@ SHOT_TABLE: Columns = (
     _size("simulations"),
     _size("seconds", Empty.MAY),
     _count("failures"),
+    _TRUSTED,
 )
 """table.csv of a bounce shot."""
 
@@ -236,6 +240,7 @@ ENVIRONMENT: Mapping[str, Any] = {
     "experiment": str,
     "plugins": tuple[str, ...],
     "jobs": int,
+    "seals": tuple[str, ...],
     "started": str,
     "python": str,
     "platform": str,
@@ -245,7 +250,7 @@ ENVIRONMENT: Mapping[str, Any] = {
     "packages": Mapping[str, str],
 }
 """environment.json: by key what its value is; a file may have others beside them."""
-OLDER = ("fingerprint",)
+OLDER = ("fingerprint", "seals")
 """Keys that folders of an older simgap lack."""
 
 

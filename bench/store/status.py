@@ -19,6 +19,7 @@ class Status:
         reason: why, in words; the traceback of a crash.
         simulations: used on the target.
         seconds: wall-clock time.
+        trusted: whether the tuner ran inside the harness.
     """
 
     run: str
@@ -30,6 +31,7 @@ class Status:
     reason: str
     simulations: int
     seconds: float
+    trusted: bool = False
 
 
 STATUS_COLUMNS = [field.name for field in fields(Status)]

@@ -1,0 +1,220 @@
+"""Sees whether a finished comparison tells the truth: its targets follow from the salt that was
+committed before the first run, its errors from its targets, its losses from its proposals,
+and its tables from its rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from bench.problem.experiment import Experiment
+from bench.problem.problem import Problem
+from bench.problem.targets import Target
+from bench.report import tables
+from bench.runs.evaluate import Evaluator
+from bench.runs.survey import admit
+from bench.store.folder import CONFIGURATION, Stored, checked, configuration
+from bench.store.segments import FOLDER
+from sims.base import Array, InputError
+
+Say = Callable[[str], None]
+ROWS = 2000
+"""Simulations that are made again where not all are asked for."""
+_SAME = 1e-9
+"""Share by which a number may differ that arithmetic alone gives."""
+_SIMULATED = 1e-6
+"""Share by which one may differ that a simulator gives, on another machine perhaps."""
+
+
+class Doubt(NamedTuple):
+    """What does not follow.
+
+    Attributes:
+        file: in the folder.
+        row: of it, from 1; 0 for the whole file.
+        says: what was expected, and what was found.
+    """
+
+    file: str
+    row: int
+    says: str
+
+    def __str__(self) -> str:
+        return f"{self.file}{f', row {self.row}' if self.row else ''}: {self.says}"
+
+
+def verify(folder: Path, say: Say, plugins: Sequence[str] = (), every: bool = False) -> int:
+    """See whether a finished comparison tells the truth, and say so.
+
+    Args:
+        folder: the comparison's.
+        say: prints a line.
+        plugins: plugin files beside those that it names.
+        every: whether every simulation is made again, and not a share.
+
+    Returns:
+        How many things do not follow.
+
+    Raises:
+        InputError: it is not finished, or damaged.
+    """
+    held = configuration(folder)
+    experiment = held.experiment
+    if (folder / FOLDER).exists():
+        raise InputError(f"{folder}: not finished, and its salt not revealed; resume it first")
+    if experiment.shot:
+        raise InputError(f"{folder}: expected a comparison, found a bounce shot")
+    # A fault in experiment.toml's salt has been refused by who read it.
+    stored = checked(folder)
+    say(_salt(experiment))
+    files = [*held.plugins, *(str(Path(plugin).resolve()) for plugin in plugins)]
+    admit(list(dict.fromkeys(files)), experiment)
+    problem = Problem(experiment)
+    try:
+        doubts = _rows(stored, problem, say, every)
+    finally:
+        problem.close()
+    doubts += _tables(folder, stored, say)
+    for doubt in doubts[:20]:
+        say(f"DOES NOT FOLLOW  {folder}/{doubt}")
+    if len(doubts) > 20:
+        say(f"and {len(doubts) - 20} more")
+    if not doubts:
+        say("all of it follows")
+    return len(doubts)
+
+
+def _salt(experiment: Experiment) -> str:
+    if not experiment.salt_sha256:
+        return f"{CONFIGURATION}: a public salt: everybody could draw the targets beforehand"
+    return (
+        f"{CONFIGURATION}: the salt has the SHA-256 that was committed, "
+        f"{experiment.salt_sha256[:12]}"
+    )
+
+
+def _rows(stored: Stored, problem: Problem, say: Say, every: bool) -> list[Doubt]:
+    """What does not follow in runs.parquet."""
+    targets = {target.sealed.name: target for target in problem.targets()}
+    runs = stored.runs
+    doubts = [
+        Doubt("runs.parquet", int(runs.index[runs["target"] == name][0]) + 1, f"no target {name}")
+        for name in runs["target"].unique()
+        if name not in targets
+    ]
+    if doubts:
+        return doubts
+    for name, rows in runs.groupby("target", sort=False):
+        doubts += _errors(problem, targets[str(name)], rows)
+    say(f"runs.parquet: {len(targets)} targets drawn again, {len(runs)} rows compared with them")
+    shown = _chosen(runs, ROWS if not every else len(runs))
+    for name, rows in shown.groupby("target", sort=False):
+        doubts += _losses(problem, targets[str(name)], rows)
+    say(f"runs.parquet: {len(shown)} of {len(runs)} rows simulated again")
+    doubts += [
+        Doubt("runs.parquet", int(row) + 1, f"trusted: expected {problem.experiment.trusted}")
+        for row in runs.index[runs["trusted"] != problem.experiment.trusted][:1]
+    ]
+    return doubts
+
+
+def _errors(problem: Problem, target: Target, rows: pd.DataFrame) -> Iterator[Doubt]:
+    """What does not follow from a target's truth in its rows."""
+    if target.truth is None:
+        return
+    names = [parameter.name for parameter in problem.cube.parameters]
+    recommended = rows[[f"recommendation_{name}" for name in names]].to_numpy()
+    errors = np.abs(recommended - target.truth)
+    expected = {f"true_{name}": np.full(len(rows), target.truth[i]) for i, name in enumerate(names)}
+    expected["param_error"] = (errors / problem.cube.training_widths()).mean(axis=1)
+    expected["outside"] = np.full(len(rows), problem.outside(target.truth))
+    if len(names) == 1:
+        expected["param_abs_error"] = errors[:, 0]
+    for column, values in expected.items():
+        # Rounding of parameters far larger than their error is no fault.
+        slack = 1e-12 * float(np.abs(target.truth).max())
+        yield from _unlike(rows, column, values, _SAME, slack)
+
+
+def _losses(problem: Problem, target: Target, rows: pd.DataFrame) -> Iterator[Doubt]:
+    """What a simulation that is made again does not give."""
+    names = [parameter.name for parameter in problem.cube.parameters]
+    channel = problem.error_channel
+    made = rows[rows["k"] > 0]
+    fitting = Evaluator(problem, target.sealed.fitting)
+    if len(made):
+        proposed = _points(problem, made[[f"proposal_{name}" for name in names]])
+        losses = np.concatenate([fitting(point[None])[1] for point in proposed])
+        yield from _unlike(made, "loss", losses, _SIMULATED, _SIMULATED)
+    recommended = _points(problem, rows[[f"recommendation_{name}" for name in names]])
+    for column, side in (
+        ("obs_error", target.sealed.fitting),
+        ("heldout_error", target.sealed.held_out),
+    ):
+        # Who ended before it had delivered anything has no error.
+        there = rows[column].notna().to_numpy()
+        if side.scenarios and there.any():
+            rmse = Evaluator(problem, side).rmse(recommended[:0], recommended[there])
+            typical = _SIMULATED * float(problem.scale[channel])
+            yield from _unlike(rows[there], column, rmse[:, channel], _SIMULATED, typical)
+
+
+def _points(problem: Problem, frame: pd.DataFrame) -> Array:
+    """Rows of parameters as points of the unit cube, from which rounding may have moved them."""
+    points: Array = np.clip(problem.cube.inverse(frame.to_numpy(dtype=float)), 0.0, 1.0)
+    return points
+
+
+def _unlike(
+    rows: pd.DataFrame, column: str, expected: Array, share: float, slack: float
+) -> Iterator[Doubt]:
+    """The first row in which a column is not what it should be."""
+    if column not in rows:
+        return
+    found = rows[column].to_numpy(dtype=float)
+    same = np.isclose(found, expected, rtol=share, atol=slack, equal_nan=True)
+    if not same.all():
+        place = int(np.argmin(same))
+        count = int((~same).sum())
+        says = f"{column}: expected {expected[place]:.9g}, found {found[place]:.9g}"
+        more = f" ({count} rows of {rows['target'].iloc[0]})" if count > 1 else ""
+        yield Doubt("runs.parquet", int(rows.index[place]) + 1, says + more)
+
+
+def _chosen(runs: pd.DataFrame, most: int) -> pd.DataFrame:
+    """So many rows, evenly over all of them."""
+    places = np.unique(np.linspace(0, len(runs) - 1, min(most, len(runs))).round().astype(int))
+    return runs.iloc[places]
+
+
+def _tables(folder: Path, stored: Stored, say: Say) -> list[Doubt]:
+    """What does not follow from the rows in table.csv."""
+    path = folder / "table.csv"
+    if not path.exists():
+        say("table.csv: none; simgap plot writes it")
+        return []
+    found = pd.read_csv(path, keep_default_na=True)
+    expected = tables(stored)["table"].reset_index(drop=True)
+    if len(found) != len(expected):
+        return [Doubt(path.name, 0, f"expected {len(expected)} rows, found {len(found)}")]
+    doubts = []
+    for column in expected:
+        if column not in found:
+            doubts.append(Doubt(path.name, 0, f"expected a column {column}, found none"))
+            continue
+        a, b = expected[column], found[column]
+        if pd.api.types.is_numeric_dtype(a) and a.dtype != bool:
+            same = np.isclose(a.astype(float), b.astype(float), rtol=_SAME, equal_nan=True)
+        else:
+            same = (a.astype(str) == b.fillna("").astype(str)).to_numpy()
+        if not same.all():
+            place = int(np.argmin(same))
+            says = f"{column}: expected {a[place]}, found {b[place]}"
+            doubts.append(Doubt(path.name, place + 2, says))
+    say(f"table.csv: {len(found)} rows made again from runs.parquet")
+    return doubts
