@@ -146,10 +146,11 @@ def refuse_unreachable(experiment: Experiment, workers: bool = True) -> None:
     Raises:
         InputError: the simulator, a tuner or an effect is one.
     """
-    used: list[tuple[Registry[Any], str]] = [(tuners, entry.tuner) for entry in experiment.tuners]
+    tuned: list[tuple[Registry[Any], str]] = [(tuners, e.tuner) for e in experiment.tuners]
+    used = tuned
     if workers:
-        used.append((simulators, experiment.simulator))
-        used += [(effects, name) for name in effect_names(experiment.settings, experiment.world)]
+        named = effect_names(experiment.settings, experiment.world)
+        used = [(simulators, experiment.simulator), *tuned, *((effects, name) for name in named)]
     for registry, name in used:
         added = registry.snapshot().get(name)
         if added is not None and added.path is None:

@@ -64,7 +64,7 @@ def read(folder: Path, dealt: Deal) -> dict[str, Any] | None:
     try:
         kept: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         _check(kept, "models", MODEL)
-        _check(kept, "rows", SHOT_COLUMNS)
+        _check(kept, "rows", tuple(c for c in SHOT_COLUMNS if c.required))
     except CellError as error:
         raise InputError(f"{path}, {error.says}; {_REMEDY}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):

@@ -208,7 +208,7 @@ SHOTS: Columns = (
     _size("seen", high=1.0),
     _TRUSTED,
 )
-"""shots.csv of a bounce shot, and the rows in shots/NAME.json."""
+"""shots.csv of a bounce shot; without the last the rows in shots/NAME.json."""
 
 SHOT_STATUS: Columns = tuple(
     replace(column, words=SHOT_STATUSES)

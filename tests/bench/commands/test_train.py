@@ -12,7 +12,8 @@ import tomli_w
 from bench.api.train import Losses
 from bench.cli import main
 from bench.problem.experiment import Entry, load
-from bench.runs.training import WeightsError, key, train, trained
+from bench.runs.housing import tuned_of
+from bench.runs.training import Lesson, WeightsError, key, train, trained
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING
 
@@ -97,8 +98,8 @@ def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
 
 def test_hybrid_starts_from_the_same_network_as_tunenet(experiment):
     settings = load(str(experiment))
-    one, two = (dict(np.load(train(settings, Entry("x", name, TUNER["options"]),
-    1).path)) for name in
+    one, two = (dict(np.load(train(settings, Lesson(Entry("x", name, TUNER["options"]),
+    1)).path)) for name in
                 ("tunenet", "hybrid"))  # fmt: skip
     arrays = [name for name in one if "." in name]
     assert len(arrays) > 6
@@ -111,15 +112,23 @@ def test_looking_on_changes_nothing(experiment):
     compare`.
     """
     settings, entry = load(str(experiment)), Entry("small", "tunenet", TUNER["options"])
-    watched = train(settings, entry, 0, Losses(settings, lambda *_: lambda: None))
+    watched = train(settings, Lesson(entry, 0), Losses(settings, lambda *_: lambda: None))
     first = dict(np.load(watched.path))
-    again = dict(np.load(train(settings, entry, 0, anew=True).path))
     assert watched.simulations == 56
-    assert all(
-        np.array_equal(first[name], again[name])
-        for name in first
-        if not name.startswith("__simulations")
-    )
+    apart = Lesson(entry, 0, tuned_of(entry))
+    # Nor where: in a process of its own a tuner learns the same, looked at or not.
+    for lesson, watch in (
+        (Lesson(entry, 0), None),
+        (apart, None),
+        (apart, Losses(settings, lambda *_: lambda: None)),
+    ):
+        again = dict(np.load(train(settings, lesson, watch, anew=True).path))
+        assert all(
+            np.array_equal(first[name], again[name])
+            for name in first
+            if not name.startswith("__simulations")
+        )
+        assert watch is None or len(watch.rows) > 2
 
 
 def test_budget_and_seeds(experiment, cache, capsys):

@@ -17,7 +17,7 @@ from bench.api.compare import Compared
 from bench.problem.experiment import load, names
 from bench.registry import REGISTRIES
 from bench.runs.pools import LostError
-from bench.runs.training import train
+from bench.runs.training import Lesson, train
 from bench.shot import study, tune
 from bench.shot.deal import deal, deals, record
 from bench.shot.rows import rows_of
@@ -163,7 +163,7 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
         ("z", "v"),
         "ball",
     )
-    weights = {"tunenet-vision": train(watching, experiment.tuners[0], 0).path}
+    weights = {"tunenet-vision": train(watching, Lesson(experiment.tuners[0], 0)).path}
     found = {}
     for kind in ("golf", "squash"):
         dealt = deal(experiment, settings, kind, 0)
@@ -215,7 +215,8 @@ shot = {{ balls = ["golf"], filmed = 16 }}
 
 
 def test_methods_get_the_recording_and_the_scene_and_not_the_ball():
-    assert {f.name for f in fields(Known)} == {"name", "recording", "scene", "weights"}
+    known = {"name", "recording", "scene", "weights"}
+    assert {f.name for f in fields(Known)} == known | {"tuned", "hidden"}, "and who, and where not"
 
 
 def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp_path, monkeypatch):
