@@ -65,14 +65,14 @@ PROBLEMS := ball-drop slider-push pendulum-swing servo-step ball-wind ball-cross
 REFERENCE := results/comparison
 
 reference: $(STAMP)
-	for e in $(PROBLEMS); do $(BIN)/simgap compare $$e --targets 5 --seeds 1 --budget 30 --out $(REFERENCE)/$$e || exit 1; done
+	for e in $(PROBLEMS); do $(BIN)/simgap compare $$e --targets 5 --seeds 1 --budget 30 --salt public --out $(REFERENCE)/$$e || exit 1; done
 	$(BIN)/simgap plot $(PROBLEMS:%=$(REFERENCE)/%) --out $(REFERENCE)/all
 
 SEVERAL := ball-tilt pendulum-driven servo-friction arm-swing
 MULTI := results/multi
 
 multi: $(STAMP)
-	for e in $(SEVERAL); do $(BIN)/simgap compare $$e --targets 3 --seeds 2 --budget 50 $(if $(TUNERS),--tuners $(TUNERS)) --out $(MULTI)/$$e --allow-failures || exit 1; done
+	for e in $(SEVERAL); do $(BIN)/simgap compare $$e --targets 3 --seeds 2 --budget 50 --salt public $(if $(TUNERS),--tuners $(TUNERS)) --out $(MULTI)/$$e --allow-failures || exit 1; done
 	$(BIN)/simgap plot $(SEVERAL:%=$(MULTI)/%) --out $(MULTI)/all
 	$(BIN)/python -m tests.benchmarks.multi $(MULTI) > $(MULTI)/tables.md
 

@@ -89,7 +89,7 @@ def test_compare_writes_the_folder_it_promises_and_a_plugin_tuner_is_in_it(exper
     assert done.returncode == 0, done.stderr
     folder = tmp_path / "out"
     lines = pd.read_csv(folder / "table.csv")
-    assert list(lines.columns) == COLUMNS
+    assert list(lines.columns) == [*COLUMNS, "salt", "trusted"]
     assert set(lines["tuner"]) == {"random", "nelder_mead", "corners"}
     assert set(lines["simulations"]) == {0, 1, 2, 3, 5, 6}
     assert set(lines["metric"]) == {"param_error", "stiff_error", "sloppy_error", "obs_error"}

@@ -205,7 +205,7 @@ def test_every_chaos_tuner_has_its_status_and_the_others_do_not_change_by_a_bit(
     assert {name: found[name] for name in STATUSES} == STATUSES
     reasons = statuses.groupby("tuner")["reason"].first()
     assert "MemoryError" in reasons["chaos_memory_hog"]
-    assert "1000 simulations beside the budget" in reasons["chaos_cheat"]
+    assert "f_locals" in reasons["chaos_cheat"], "no frame that calls it knows the simulator"
     assert "read-only" in reasons["chaos_record_spoiler"]
     assert "SIGSEGV" in reasons["chaos_segfault"]
     assert statuses.groupby("tuner")["simulations"].max()[

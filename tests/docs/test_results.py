@@ -132,18 +132,18 @@ def test_several_comparisons(folder, tmp_path, capsys):
     assert written | {"nemenyi.csv"} == set(told("## plot of several comparisons"))
     names = written_out(told("### `ranks.csv`"), TUNER=TUNERS)
     assert set(columns(tmp_path / "all" / "ranks.csv")) == set(names)
-    assert set(PAIR_COLUMNS) == set(columns(tmp_path / "all" / "pairs.csv"))
-    assert set(EVEN_COLUMNS) == set(told("### `break_even.csv`"))
+    assert {*PAIR_COLUMNS, "trusted"} == set(columns(tmp_path / "all" / "pairs.csv"))
+    assert {*EVEN_COLUMNS, "trusted"} == set(told("### `break_even.csv`"))
 
 
 def test_the_tables_of_the_bounce_shot():
-    assert told("### `table.csv` of shots") == SHOT_COLUMNS
+    assert told("### `table.csv` of shots") == [*SHOT_COLUMNS, "trusted"]
     experiment = load("bounce-shot")
     settings = settings_of(experiment)
     # Without a plan no shot is flown, and the row has its columns all the same.
     nothing = vars(TunedModel("nominal", 0.5, {}, 0, 0.0, "no plan"))
     (row,) = thrown(deals(experiment, settings)[0], settings, [nothing])
-    assert [*row, "seen"] == told("### `shots.csv`")
+    assert [*row, "seen", "trusted"] == told("### `shots.csv`")
 
 
 def test_the_losses_of_a_training(tmp_path, monkeypatch, spring, capsys):
