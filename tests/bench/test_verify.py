@@ -1,4 +1,4 @@
-"""A folder that tells the truth follows from its salt and its rows; one that was changed does not."""
+"""A folder that tells the truth follows from its salt and its rows; a changed one does not."""
 
 import json
 import os
