@@ -12,7 +12,8 @@ import psutil
 class Cluster:
     """Processes of a scheduler and of workers that a nanny restarts."""
 
-    def __init__(self, folder, workers=2):
+    def __init__(self, folder, workers=2, environment=None):
+        self._environment = environment
         self._file = folder / "scheduler.json"
         common = ["--scheduler-file", str(self._file), "--no-dashboard", "--host", "127.0.0.1"]
         self.scheduler = self._start("scheduler", "--port", "0", *common)
@@ -24,7 +25,8 @@ class Cluster:
 
     def _start(self, *arguments):
         command = [sys.executable, "-m", "dask", *arguments]
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        nowhere = subprocess.DEVNULL
+        return subprocess.Popen(command, stdout=nowhere, stderr=nowhere, env=self._environment)
 
     def _await(self, condition):
         deadline = time.monotonic() + 60
@@ -51,7 +53,8 @@ class Cluster:
         processes = [
             psutil.Process(p.pid) for p in (*self.nannies, self.scheduler) if p.poll() is None
         ]
-        everyone = [c for p in processes for c in p.children(recursive=True)] + processes
+        # What they have started ends with them, and clears up.
+        everyone = processes + [c for p in processes for c in p.children()]
         for process in everyone:
             try:
                 process.kill()
@@ -69,8 +72,8 @@ def said(process):
 
 
 @contextmanager
-def cluster(folder, workers=2):
-    started = Cluster(folder, workers)
+def cluster(folder, workers=2, environment=None):
+    started = Cluster(folder, workers, environment)
     try:
         yield started
     finally:

@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from bench.sealing.asked import as_points
-from bench.sealing.ended import EndedError
+from bench.sealing.ended import EndedError, KilledError
 from methods.base import Array, Ask, Evaluation, Task
 
 Evaluate = Callable[[Array], "tuple[Array, Array]"]
@@ -175,7 +175,10 @@ def drive(
         seconds: time limit, checked between evaluations.
 
     Returns:
-        The trace; failures are a status there, never an exception.
+        The trace; failures are a status there.
+
+    Raises:
+        KilledError: the tuner's process was killed from outside, which is no failure of its own.
     """
     record = _Record(task)
     started = perf_counter()
@@ -189,6 +192,9 @@ def drive(
         status, reason = "diverged", str(error)
     except EndedError as ended:
         status, reason = ended.status, ended.reason
+    except KilledError:
+        # Nothing that the run did: it is made again.
+        raise
     except Exception:
         status, reason = "crashed", traceback.format_exc()
     finally:
@@ -252,6 +258,8 @@ def _closed(steps: Steps | None) -> str:
         steps.close()
     except EndedError as ended:
         return ended.reason or "the tuner did not close what it holds"
+    except KilledError:
+        raise
     except Exception:
         return traceback.format_exc()
     return ""

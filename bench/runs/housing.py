@@ -7,17 +7,20 @@ from __future__ import annotations
 import ast
 import importlib.util
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
 from bench.problem.experiment import Entry
 from bench.registry import tuners
+from bench.sealing.ended import KilledError
 from bench.sealing.outside import Nursery, SealedTuner, Tuned
+
+Result = TypeVar("Result")
 
 _KNOWN = (
     "botorch", "cma", "gpytorch", "linear_operator", "methods", "nlopt", "numpy", "pandas", "sbi",
@@ -29,6 +32,9 @@ plugin imports is imported anew in each run: it could remember what an earlier o
 _KEPT = 8
 """Tuners that wait for another run at a time."""
 
+RETRIES = 3
+"""How often work is begun whose processes are killed from outside, which says nothing about it."""
+
 _houses: dict[int, Nursery] = {}
 _waiting: OrderedDict[Any, SealedTuner] = OrderedDict()
 
@@ -37,7 +43,8 @@ def nursery() -> Nursery:
     """The nursery of this process, begun when it is first needed."""
     held = _houses.get(0)
     if held is None or not held.alive:
-        _waiting.clear()
+        # Also one that was killed from outside, which leaves a folder.
+        close()
         held = _houses[0] = Nursery()
     return held
 
@@ -59,6 +66,21 @@ def close() -> None:
     for house in _houses.values():
         house.close()
     _houses.clear()
+
+
+def undisturbed(work: Callable[[], Result]) -> Result:
+    """What `work` gives; it is begun again where one of its processes was killed from outside.
+
+    Raises:
+        KilledError: that happened again and again.
+    """
+    for left in reversed(range(RETRIES)):
+        try:
+            return work()
+        except KilledError:
+            if not left:
+                raise
+    raise AssertionError
 
 
 def tuned_of(entry: Entry) -> Tuned:

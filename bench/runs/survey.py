@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 from bench.problem.experiment import Entry, Experiment
 from bench.registry import REGISTRIES, load_plugins, tuners
-from bench.runs.housing import housed, nursery, tuned_of
+from bench.runs.housing import housed, nursery, tuned_of, undisturbed
 from bench.runs.sources import digest, effect_names, source
 from bench.sealing.ended import EndedError, KilledError
 from bench.sealing.seals import Reach
@@ -165,13 +165,18 @@ def unbuildable(entry: Entry) -> bool:
             )
         return False
     try:
-        with housed(tuned_of(entry), 0, "run"):
-            return True
+        undisturbed(lambda: _build(entry))
+        return True
     except (EndedError, KilledError) as ended:
         said = "".join(str(ended).strip().splitlines()[-1:])
         kind_of_error, _, why = said.partition(": ")
         said = why if kind_of_error in ("TypeError", "ValueError") else said
         raise InputError(f"tuner {entry.label}: {said}") from None
+
+
+def _build(entry: Entry) -> None:
+    with housed(tuned_of(entry), 0, "run"):
+        return
 
 
 def survey(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]:
@@ -223,24 +228,29 @@ def _asked(question: dict[str, str], what: str) -> list[dict[str, Any]]:
     file = question["file"]
     if file and not Path(file).is_file():
         raise InputError(f"plugin {file}: no such file")
-    house = nursery()
-    house.load(["bench.runs.survey"])
-    child = house.start("bench.runs.survey:describe", files=[file] if file else [])
-    deadline = perf_counter() + _PATIENCE
     try:
-        child.ready()
-        child.send(b"Q", json.dumps(question).encode(), deadline=deadline)
-        answer = child.receive(1 << 20, deadline).document()
+        answer = undisturbed(lambda: _answer(question, [file] if file else []))
     except EndedError as ended:
         said = "takes too long to load" if ended.status == "timeout" else ended.reason
         raise InputError(f"plugin {what}: {said.strip().splitlines()[-1]}") from None
     except KilledError as error:
         raise InputError(f"plugin {what}: {error}") from None
-    finally:
-        child.end()
     if isinstance(answer, dict):
         raise InputError(str(answer.get("fault")))
     return [_plain(part, file) for part in answer]
+
+
+def _answer(question: dict[str, str], files: list[str]) -> Any:
+    house = nursery()
+    house.load(["bench.runs.survey"])
+    child = house.start("bench.runs.survey:describe", files)
+    deadline = perf_counter() + _PATIENCE
+    try:
+        child.ready()
+        child.send(b"Q", json.dumps(question).encode(), deadline=deadline)
+        return child.receive(1 << 20, deadline).document()
+    finally:
+        child.end()
 
 
 def _plain(part: Any, file: str) -> dict[str, Any]:

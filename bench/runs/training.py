@@ -27,7 +27,7 @@ from bench.problem.practice import Practice
 from bench.problem.problem import Problem
 from bench.problem.seeds import stream_of
 from bench.registry import simulators, tuners
-from bench.runs.housing import housed
+from bench.runs.housing import housed, undisturbed
 from bench.runs.school import school
 from bench.runs.sources import (
     digest,
@@ -187,7 +187,12 @@ def train(
     Raises:
         WeightsError: there is a file, and it is damaged or foreign.
         EndedError: the tuner failed in its process.
+        KilledError: its process was killed from outside, again and again.
     """
+    return undisturbed(lambda: _train(experiment, lesson, watch, anew))
+
+
+def _train(experiment: Experiment, lesson: Lesson, watch: Watch | None, anew: bool) -> Training:
     entry, seed = lesson.entry, lesson.seed
     name = key(experiment, entry, seed)
     path = folder() / f"{name}.npz"

@@ -20,9 +20,9 @@ from bench.problem.seeds import rng_for, stream_of
 from bench.problem.targets import SealedTarget
 from bench.runs.drive import Steps, Trace, drive
 from bench.runs.evaluate import Evaluator
-from bench.runs.housing import housed
+from bench.runs.housing import housed, undisturbed
 from bench.runs.training import build, trained, weights_of
-from bench.sealing.ended import EndedError, KilledError
+from bench.sealing.ended import EndedError
 from bench.sealing.memory import memory_limit
 from bench.sealing.outside import Sealed, Tuned, moved
 from bench.store.status import FAILED
@@ -107,11 +107,6 @@ def release() -> None:
     _problems.clear()
 
 
-RETRIES = 3
-"""How often a run is made again whose tuner was killed from outside, which says nothing about it.
-"""
-
-
 def perform(experiment: Experiment, order: Order) -> Outcome:
     """Make one run; failures of the tuner or the simulator are a status of its trace.
 
@@ -119,13 +114,7 @@ def perform(experiment: Experiment, order: Order) -> Outcome:
         CheatError: more was simulated than the tuner asked the harness for.
         KilledError: the tuner's process was killed from outside, again and again.
     """
-    for left in reversed(range(RETRIES)):
-        try:
-            return _perform(experiment, order)
-        except KilledError:
-            if not left:
-                raise
-    raise AssertionError
+    return undisturbed(lambda: _perform(experiment, order))
 
 
 def _perform(experiment: Experiment, order: Order) -> Outcome:

@@ -372,6 +372,8 @@ class SealedSteps:
     def send(self, evaluation: Evaluation) -> Array | Ask:
         """Hand an evaluation over; what is asked for next."""
         flags = self._pace.step()
+        # Until it asks again: where this fails, its process has been ended.
+        self._waits = False
         self._child.send(
             b"E",
             evaluation.proposals.tobytes(),

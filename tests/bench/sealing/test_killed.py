@@ -1,0 +1,108 @@
+"""A process that is killed from outside says nothing about what it was at: that is made again."""
+
+import threading
+import time
+from contextlib import suppress
+
+import numpy as np
+import psutil
+import pytest
+
+from bench.problem.experiment import Entry
+from bench.runs import housing
+from bench.runs.survey import admit, survey
+from bench.runs.training import Lesson, train, weights_of
+from bench.runs.worker import Order, perform, problem_of
+from tests.chaos import SEALED, below
+from tests.experiments import spring_experiment
+
+SLOW = """
+import time
+import numpy as np
+from methods.base import Tuner
+
+time.sleep(0.2)
+
+
+class Slow(Tuner):
+    name = "slow"
+    learned = True
+
+    def fit(self, practice, rng, budget):
+        points = practice.sample(rng, budget)
+        time.sleep(0.2)
+        self.seen = practice.simulate(rng, points)
+
+    def state(self):
+        return {"seen": self.seen}
+
+    def restore(self, state):
+        self.seen = state["seen"]
+
+    def tune(self, task, rng):
+        while True:
+            time.sleep(0.1)
+            yield rng.uniform(size=(1, task.dim))
+"""
+
+
+@pytest.fixture
+def slow(tmp_path, spring, fresh_registries):
+    path = tmp_path / "slow.py"
+    path.write_text(SLOW)
+    experiment = spring_experiment(budget=4, training_budget=5, simulator=spring.name)
+    yield experiment, str(path)
+    housing.close()
+
+
+class Killing:
+    """Kills the first process of a kind that it sees, a while after that began."""
+
+    def __init__(self, what):
+        self._what, self.killed = what, 0
+        self._thread = threading.Thread(target=self._kill)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._thread.join()
+
+    def _kill(self):
+        until = time.monotonic() + 10.0
+        while not self.killed and time.monotonic() < until:
+            tuners = below([psutil.Process()], "tuner")
+            if not tuners:
+                time.sleep(0.01)
+                continue
+            time.sleep(0.1)
+            with suppress(psutil.NoSuchProcess, IndexError):
+                below([psutil.Process()], self._what)[0].kill()
+                self.killed += 1
+
+
+@pytest.mark.parametrize("what", SEALED)
+def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
+    experiment, path = slow
+    with Killing(what) as killing:
+        known = survey([path], [])
+    assert killing.killed == 1
+    assert [tuner["name"] for tuner in known[0].tuners] == ["slow"]
+    admit([path], experiment)
+    entry = Entry("slow", "slow")
+    lesson = Lesson(entry, 0, housing.tuned_of(entry))
+    undisturbed = weights_of(train(experiment, lesson, anew=True).path)
+    with Killing(what) as killing:
+        disturbed = weights_of(train(experiment, lesson, anew=True).path)
+    assert killing.killed == 1
+    np.testing.assert_array_equal(disturbed["seen"], undisturbed["seen"])
+    weights = train(experiment, lesson).path
+    target = problem_of(experiment).targets()[0].sealed
+    order = Order("run", entry, 0, target, 4, weights, housing.tuned_of(entry))
+    undisturbed = perform(experiment, order).trace
+    with Killing(what) as killing:
+        disturbed = perform(experiment, order).trace
+    assert killing.killed == 1
+    assert disturbed.status == undisturbed.status == "done", disturbed.reason
+    np.testing.assert_array_equal(disturbed.recommendations, undisturbed.recommendations)
