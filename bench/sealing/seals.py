@@ -92,11 +92,12 @@ def leave_the_world() -> list[str]:
     them either. Says which seals hold.
     """
     user, group = os.geteuid(), os.getegid()
-    if not _put_on(lambda: _leave(kernel.NEW_USER)):
-        return []
-    if not _put_on(lambda: kernel.keep_identity(user, group)):
-        return []
-    held = ["memory"]
+    held = []
+    if _put_on(lambda: _leave(kernel.NEW_USER)) and _put_on(
+        lambda: kernel.keep_identity(user, group)
+    ):
+        held.append("memory")
+    # A superuser can leave these without the first.
     if _put_on(lambda: _leave(kernel.NEW_NETWORK)):
         held.append("network")
     if _put_on(lambda: _leave(kernel.NEW_IPC)):
