@@ -10,20 +10,23 @@ a tuner may remain.
 from __future__ import annotations
 
 import argparse
+import fcntl
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
 import psutil
 import tomli_w
 
+from bench.sealing.folders import sweep
 from bench.store.folder import configuration
 from bench.store.segments import finished
 from tests.cluster import cluster, said
@@ -173,12 +176,22 @@ def orphans(place, running):
 
 
 def deserted(place):
-    """Folders of tuners without a living process."""
-    used = set()
-    for process in of_ours(place):
-        with suppress(psutil.Error):
-            used.add(process.environ()["TMPDIR"])
-    return [f for f in place.glob("simgap-tuner-*") if str(f) not in used]
+    """Folders of tuners that no living process holds."""
+    found = []
+    for path in place.glob("simgap-tuner-*"):
+        with suppress(OSError), closing(path) as folder:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            found.append(path)
+    return found
+
+
+@contextmanager
+def closing(path):
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        yield folder
+    finally:
+        os.close(folder)
 
 
 def compare(folder, undisturbed):
@@ -230,6 +243,9 @@ def chaos(folder, kills, seed, on_cluster, targets=60):
             hits += disturbed(folder_here, experiment, left, rng, running, environment, isolation)
             compare(folder_here, undisturbed)
             refuse_remains(place, running)
+    # As the next to begin does: the cluster itself has been killed, on both sides of its pipes.
+    with patch("tempfile.tempdir", str(place)):
+        sweep()
     refuse_remains(place, None)
     return hits, rounds, len(pd.read_csv(undisturbed / "status.csv"))
 

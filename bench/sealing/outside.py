@@ -13,7 +13,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.sealing import nursery
+from bench.sealing import folders, nursery
 from bench.sealing.ended import EndedError, KilledError
 from bench.sealing.seals import ROOT, readable
 from bench.sealing.wire import (
@@ -79,7 +78,8 @@ class Nursery:
     """Starts tuners' processes; see `bench.sealing.nursery`."""
 
     def __init__(self) -> None:
-        self._folder = tempfile.mkdtemp(prefix="simgap-tuner-")
+        self._place: folders.Folder | None = folders.new()
+        self._folder = self._place.path
         self._loaded: set[str] = set()
         self._link, theirs = socket.socketpair()
         path = [place for place in sys.path if place not in ("", str(ROOT))] + [str(ROOT)]
@@ -176,7 +176,11 @@ class Nursery:
             self._process.wait(timeout=5.0)
         self._process.kill()
         self._process.wait()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        if self._place is not None:
+            self._place.remove()
+            self._place = None
+        # Workers that have ended by now may have left theirs.
+        folders.sweep()
 
 
 def _environment(folder: str) -> dict[str, str]:

@@ -1,8 +1,12 @@
 """A process that is killed from outside says nothing about what it was at: that is made again."""
 
+import os
+import subprocess
+import sys
 import threading
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -13,6 +17,7 @@ from bench.runs import housing
 from bench.runs.survey import admit, survey
 from bench.runs.training import Lesson, train, weights_of
 from bench.runs.worker import Order, perform, problem_of
+from bench.sealing.folders import new, sweep
 from tests.chaos import SEALED, below
 from tests.experiments import spring_experiment
 
@@ -106,3 +111,33 @@ def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
     assert killing.killed == 1
     assert disturbed.status == undisturbed.status == "done", disturbed.reason
     np.testing.assert_array_equal(disturbed.recommendations, undisturbed.recommendations)
+
+
+ALONE = """
+import sys, time
+from bench.runs import housing
+housing.nursery()
+print("there", flush=True)
+time.sleep(60)
+"""
+
+
+def test_folders_whose_processes_were_all_killed_are_cleared_by_the_next(tmp_path, monkeypatch):
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-c", ALONE]
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE)
+    assert process.stdout.readline()
+    (nursery,) = below([psutil.Process(process.pid)], "nursery")
+    (left,) = tmp_path.iterdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    sweep()
+    assert left.exists()
+    for one in (nursery, process):
+        one.kill()
+    process.stdout.close()
+    process.wait()
+    assert left.exists()
+    folder = new()
+    assert list(tmp_path.iterdir()) == [Path(folder.path)]
+    folder.remove()
+    assert not list(tmp_path.iterdir())
