@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bench.checks.base import CheckError
-from bench.runs.drive import Trace, drive
+from bench.runs.drive import Evaluate, Trace, drive
 from methods.base import NOTHING, BudgetExceededError, Task, Tuner
 from sims.base import Array
 
@@ -111,6 +111,12 @@ def run(
 ) -> Trace:
     """One run; simulation number k fails where `fails(k)`."""
     given, _ = task_of(dim, budget, target)
+    evaluate = evaluation_of(given, fails)
+    return drive(tuner, given, evaluate, np.random.default_rng(seed))
+
+
+def evaluation_of(given: Task, fails: Callable[[int], bool] = lambda _: False) -> Evaluate:
+    """What simulates on a target; simulation number k fails where `fails(k)`."""
     simulated = 0
 
     def evaluate(points: Array) -> tuple[Array, Array]:
@@ -124,4 +130,4 @@ def run(
         losses[np.isnan(losses)] = np.inf  # what the harness says of a simulation that failed
         return observations, losses
 
-    return drive(tuner, given, evaluate, np.random.default_rng(seed))
+    return evaluate

@@ -19,6 +19,7 @@ from bench.checks.base import (
     same_bits,
 )
 from bench.checks.processes import elsewhere
+from bench.checks.sealed import check_same_run_when_sealed
 from bench.checks.toy import LEARNED, observe, ready, run, task_of
 from bench.runs.drive import Trace
 from methods.base import Ask, Evaluation, Steps, Task, Tuner
@@ -352,4 +353,5 @@ TUNER_CHECKS: tuple[Callable[[type[Tuner]], NotApplicable | None], ...] = (
     check_beats_random_search,
     check_what_was_learned_can_be_stored,
     check_instances_can_be_sent_to_workers,
+    check_same_run_when_sealed,
 )

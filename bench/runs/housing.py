@@ -88,7 +88,7 @@ def tuned_of(entry: Entry) -> Tuned:
     kind = tuners.get(entry.tuner)
     place = tuners.place(entry.tuner)
     module = getattr(kind, "module", "") or kind.__module__
-    ahead = _ahead(str(place) if place else _file_of(module)) if place or module else ()
+    ahead = ahead_of(str(place) if place else _file_of(module)) if place or module else ()
     return Tuned(kind.name, module, str(place or ""), dict(entry.options), ahead)
 
 
@@ -101,7 +101,7 @@ def _file_of(module: str) -> str:
 
 
 @cache
-def _ahead(file: str) -> tuple[str, ...]:
+def ahead_of(file: str) -> tuple[str, ...]:
     """The packages that a source file imports anywhere in it, as far as they are known, and those
     that these of this project import: they are read, and nothing of the file is run.
     """

@@ -27,7 +27,7 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 CONTRACTS = (
     "budget", "files", "held_out", "intervals", "noise", "p_values", "pairing", "recommendation",
-    "resume", "seeds", "statuses", "units", "verdict",
+    "resume", "sealing", "seeds", "statuses", "units", "verdict",
 )  # fmt: skip
 """What must have mutants, whatever else has."""
 

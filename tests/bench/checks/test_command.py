@@ -35,7 +35,7 @@ def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
     plugin.write_text(SOUND)
     code, said = checked(capsys, "shrinking", "--plugin", str(plugin))
     assert code == 0, said
-    assert said.count("ok    ") == 13
+    assert said.count("ok    ") == 14
     assert (
         "-       stochastic is declared\n        not applicable: it says that it uses chance"
         in said
@@ -44,7 +44,7 @@ def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
         "-       what was learned can be stored\n        not applicable: it does not learn" in said
     )
     assert said.endswith(
-        "tuner shrinking (simgap_plugin_shrinking.Shrinking): all 13 checks passed, "
+        "tuner shrinking (simgap_plugin_shrinking.Shrinking): all 14 checks passed, "
         "2 not applicable\n"
     )
 
