@@ -20,7 +20,7 @@ import sys
 import warnings
 from contextlib import suppress
 from time import perf_counter, sleep
-from typing import Any
+from typing import Any, NoReturn
 
 from bench.sealing import seals
 from bench.sealing.kernel import die_with_parent
@@ -114,6 +114,16 @@ def _start(
             os.close(descriptor)
         return keeper
     link.close()
+    try:
+        _keep(service, descriptors, reach, held)
+    finally:
+        # A copy that went on would take itself for the nursery, and clear up after it.
+        os._exit(1)
+    raise AssertionError
+
+
+def _keep(service: str, descriptors: list[int], reach: seals.Reach, held: list[str]) -> NoReturn:
+    """Be a keeper: start the process that serves the channel, and end as it does."""
     die_with_parent()
     held = [*held, *seals.empty_folder(reach.folder), *seals.own_processes()]
     if child := os.fork():
