@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bench.problem.experiment import Entry
 from bench.registry import tuners
-from bench.sealing.ended import KilledError
+from bench.sealing.ended import EndedError, KilledError
 from bench.sealing.outside import Nursery, SealedTuner, Tuned
 
 Result = TypeVar("Result")
@@ -72,15 +72,15 @@ def undisturbed(work: Callable[[], Result]) -> Result:
     """What `work` gives; it is begun again where one of its processes was killed from outside.
 
     Raises:
-        KilledError: that happened again and again.
+        EndedError: that happened again and again.
     """
-    for left in reversed(range(RETRIES)):
+    for _ in range(RETRIES):
         try:
             return work()
-        except KilledError:
-            if not left:
-                raise
-    raise AssertionError
+        except KilledError as killed:
+            said = str(killed)
+    # By then it is more likely its own doing.
+    raise EndedError("crashed", f"{said}, {RETRIES} times")
 
 
 def tuned_of(entry: Entry) -> Tuned:
@@ -119,7 +119,8 @@ def ahead_of(file: str) -> tuple[str, ...]:
 def _imported(file: str) -> list[str]:
     try:
         tree = ast.parse(Path(file).read_bytes())
-    except (OSError, SyntaxError, ValueError):
+    # Deep enough a file is more than the parser can take.
+    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
         return []
     names: list[str] = []
     for node in ast.walk(tree):

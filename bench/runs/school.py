@@ -12,7 +12,15 @@ from bench.problem.practice import Practice
 from bench.sealing.ended import EndedError
 from bench.sealing.outside import Child
 from bench.sealing.streams import state_of, stream_of
-from bench.sealing.wire import ASKED_LIMIT, STATE_LIMIT, FoulError, Message, packed, unpacked
+from bench.sealing.wire import (
+    ASKED_LIMIT,
+    STATE_LIMIT,
+    FoulError,
+    Message,
+    packed,
+    printable,
+    unpacked,
+)
 from methods.base import BudgetExceededError, Watch
 from methods.base import Practice as Ground
 from sims.base import Array
@@ -79,7 +87,7 @@ def _told(said: Any) -> tuple[str, int, int, float, float]:
     """
     try:
         stage, epoch, epochs, loss, held_out = said
-        return str(stage)[:80], int(epoch), int(epochs), float(loss), float(held_out)
+        return printable(str(stage)[:80]), int(epoch), int(epochs), float(loss), float(held_out)
     except (TypeError, ValueError, OverflowError):
         raise FoulError("it told of no epoch") from None
 

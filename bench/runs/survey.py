@@ -16,15 +16,17 @@ from bench.problem.experiment import Entry, Experiment
 from bench.registry import REGISTRIES, load_plugins, tuners
 from bench.runs.housing import housed, nursery, tuned_of, undisturbed
 from bench.runs.sources import digest, effect_names, source
-from bench.sealing.ended import EndedError, KilledError
+from bench.sealing.ended import EndedError
 from bench.sealing.seals import Reach
-from bench.sealing.wire import Channel
+from bench.sealing.wire import Channel, printable
 from methods.base import Tuner
 from sims.base import InputError
 from sims.registry import SkippedError
 
 _PATIENCE = 120.0
 """Seconds that loading a plugin may take."""
+_ANSWER = 1 << 20
+"""Bytes that may be said of what it holds."""
 _OWN = "methods."
 """The package of the project's own tuners, which are of the harness's making."""
 
@@ -101,17 +103,39 @@ def admit(paths: Sequence[str], experiment: Experiment) -> None:
     if not experiment.trusted:
         needed = {experiment.simulator, *effect_names(experiment.settings, experiment.world)}
         known = survey(paths, needed | _written(experiment))
+        _refuse_both(known, experiment)
     enter(known)
     _admitted.update({plugin.path: plugin for plugin in known})
     if not experiment.trusted:
         _announce_installed(entry.tuner for entry in experiment.tuners)
 
 
+def _refuse_both(plugins: Iterable[Plugin], experiment: Experiment) -> None:
+    """Refuse to load a file for its world that has one of the experiment's tuners too.
+
+    Raises:
+        InputError: there is one.
+    """
+    labels = {entry.tuner: entry.label for entry in experiment.tuners}
+    for plugin in plugins:
+        for known in plugin.tuners:
+            if plugin.loaded and known["name"] in labels:
+                raise _among_truths(labels[known["name"]], plugin.path)
+
+
+def _among_truths(label: str, place: object) -> InputError:
+    return InputError(
+        f"tuner {label}: the code of {place} runs in this process, where the truths are: a "
+        "simulator or effect in it is used here, or it was loaded by hand; put the tuner into a "
+        "file of its own, or trust the tuners"
+    )
+
+
 def _written(experiment: Experiment) -> set[str]:
-    """Names that an experiment's settings hold, of which no part is known yet."""
+    """Names where an experiment names effects, of which nothing may be known yet."""
     texts: set[str] = set()
     for table in (experiment.settings, experiment.world):
-        for value in table.values():
+        for value in (table.get("effects"), table.get("fixed")):
             if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
                 texts.update(name for name in value if isinstance(name, str))
     return texts
@@ -158,16 +182,12 @@ def unbuildable(entry: Entry) -> bool:
     kind, place = tuners.get(entry.tuner), tuners.place(entry.tuner)
     if not issubclass(kind, Announced):
         if place is not None:
-            raise InputError(
-                f"tuner {entry.label}: the code of {place} runs in this process, where the truths "
-                "are: a simulator or effect in it is used here, or it was loaded by hand; put the "
-                "tuner into a file of its own, or trust the tuners"
-            )
+            raise _among_truths(entry.label, place)
         return False
     try:
         undisturbed(lambda: _build(entry))
         return True
-    except (EndedError, KilledError) as ended:
+    except EndedError as ended:
         said = "".join(str(ended).strip().splitlines()[-1:])
         kind_of_error, _, why = said.partition(": ")
         said = why if kind_of_error in ("TypeError", "ValueError") else said
@@ -191,6 +211,7 @@ def survey(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]:
     """
     wanted = set(needed)
     found = []
+    claimed: dict[tuple[str, str], str] = {}
     for path in paths:
         # An extended simulator is data, and no code of anybody's.
         if path.endswith(".toml"):
@@ -198,9 +219,28 @@ def survey(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]:
             continue
         parts = _asked({"file": path, "tuner": ""}, path)
         worlds = {part["name"] for part in parts if part["kind"] != "tuner"}
+        for part in parts:
+            if part["name"] in wanted and part["kind"] != "tuner":
+                _refuse_taken(part["kind"], part["name"], path, claimed)
         known = tuple(part for part in parts if part["kind"] == "tuner")
         found.append(Plugin(path, bool(worlds & wanted), known))
     return found
+
+
+def _refuse_taken(kind: str, name: str, path: str, claimed: dict[tuple[str, str], str]) -> None:
+    """Refuse a file that says it has a part which is another's, before its code is let in: what it
+    says need not be so.
+
+    Raises:
+        InputError: the name is taken.
+    """
+    for registry in REGISTRIES:
+        taken = registry.kind == kind and name in registry.names()
+        if taken and registry.place(name) != Path(path).resolve():
+            raise InputError(f"plugin {path}: {kind} '{name}' exists already; give it another name")
+    other = claimed.setdefault((kind, name), path)
+    if other != path:
+        raise InputError(f"plugin {path}: {kind} '{name}' is in {other} too; give one another name")
 
 
 def installed(name: str) -> Plugin:
@@ -233,8 +273,6 @@ def _asked(question: dict[str, str], what: str) -> list[dict[str, Any]]:
     except EndedError as ended:
         said = "takes too long to load" if ended.status == "timeout" else ended.reason
         raise InputError(f"plugin {what}: {said.strip().splitlines()[-1]}") from None
-    except KilledError as error:
-        raise InputError(f"plugin {what}: {error}") from None
     if isinstance(answer, dict):
         raise InputError(str(answer.get("fault")))
     return [_plain(part, file) for part in answer]
@@ -248,19 +286,23 @@ def _answer(question: dict[str, str], files: list[str]) -> Any:
     try:
         child.ready()
         child.send(b"Q", json.dumps(question).encode(), deadline=deadline)
-        return child.receive(1 << 20, deadline).document()
+        return child.receive(_ANSWER, deadline).document(_ANSWER)
     finally:
         child.end()
 
 
 def _plain(part: Any, file: str) -> dict[str, Any]:
     """A part of an answer, no more believed than it must be."""
-    if not isinstance(part, dict) or not {"kind", "name"} <= set(part):
+    kinds = [registry.kind for registry in REGISTRIES]
+    if not isinstance(part, dict) or part.get("kind") not in kinds or "name" not in part:
         raise InputError(f"plugin {file}: its process did not say what it holds")
-    text = {key: str(part.get(key, ""))[:500] for key in ("kind", "name", "trains_as", "says")}
+    keys = ("kind", "name", "trains_as", "says")
+    text = {key: printable(str(part.get(key, ""))[:500]) for key in keys}
     # The file's own bytes beside what the plugin says of itself.
     told = [str(part.get("source", "")), Path(file).read_bytes() if file else b""]
-    rest = {"file": file, "module": str(part.get("module", "")), "source": digest(*told)}
+    # What is found by its file needs no module, and may not pass a text on to its runs.
+    module = "" if file else str(part.get("module", ""))
+    rest = {"file": file, "module": module, "source": digest(*told)}
     flags = {key: part.get(key) for key in ("stochastic", "learned")}
     skipped = {"skipped": str(part["skipped"])[:500]} if "skipped" in part else {}
     return {**text, **rest, **flags, **skipped}

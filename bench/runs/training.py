@@ -52,6 +52,10 @@ _REMEDY = "delete it to have it trained again"
 """What to do with a file that cannot be used; it is never repaired silently."""
 
 
+MADE_AGAIN = "it was killed, and asked for other simulations when it was made again"
+"""What ends one that is not the same again."""
+
+
 class WeightsError(InputError):
     """A file of trained weights that cannot be used."""
 
@@ -187,12 +191,14 @@ def train(
     Raises:
         WeightsError: there is a file, and it is damaged or foreign.
         EndedError: the tuner failed in its process.
-        KilledError: its process was killed from outside, again and again.
     """
-    return undisturbed(lambda: _train(experiment, lesson, watch, anew))
+    before: list[str] = []
+    return undisturbed(lambda: _train(experiment, lesson, watch, anew, before))
 
 
-def _train(experiment: Experiment, lesson: Lesson, watch: Watch | None, anew: bool) -> Training:
+def _train(
+    experiment: Experiment, lesson: Lesson, watch: Watch | None, anew: bool, before: list[str]
+) -> Training:
     entry, seed = lesson.entry, lesson.seed
     name = key(experiment, entry, seed)
     path = folder() / f"{name}.npz"
@@ -202,13 +208,13 @@ def _train(experiment: Experiment, lesson: Lesson, watch: Watch | None, anew: bo
         _fitting(lesson, path)
         return Training(path, int(simulations), float(seconds), found=True)
     problem = Problem(experiment)
-    practice = problem.practice(experiment.training_budget)
     # Tuners that train alike share a stream: a comparison of them has the same network.
     stream = stream_of(
         experiment.name, "fit", tuners.get(entry.tuner).trains_as or entry.tuner, seed
     )
-    started = perf_counter()
     learn = _learned_here if lesson.tuned is None else _learned_apart
+    practice = _Repeated(problem, experiment.training_budget, before)
+    started = perf_counter()
     state = learn(lesson, practice, stream, watch)
     seconds = perf_counter() - started
     problem.close()
@@ -219,6 +225,30 @@ def _train(experiment: Experiment, lesson: Lesson, watch: Watch | None, anew: bo
     }
     _write(path, {**state, **about})
     return Training(path, practice.used, seconds)
+
+
+class _Repeated(Practice):
+    """A ground for a training that is made again after a kill and must ask for the same: who could
+    have itself killed would else learn from the budget several times.
+    """
+
+    def __init__(self, problem: Problem, budget: int, before: list[str]) -> None:
+        super().__init__(problem, budget)
+        self._before, self._place = before, 0
+
+    def simulate(self, rng: np.random.Generator, points: Array) -> Array:
+        """As of any ground.
+
+        Raises:
+            EndedError: what is asked for is not what was asked for before the kill.
+        """
+        asked = digest(repr(rng.bit_generator.state), np.asarray(points).tobytes())
+        if self._place == len(self._before):
+            self._before.append(asked)
+        elif self._before[self._place] != asked:
+            raise EndedError("crashed", MADE_AGAIN)
+        self._place += 1
+        return super().simulate(rng, points)
 
 
 def _learned_here(
@@ -237,7 +267,12 @@ def _learned_apart(
     """What a tuner learns in its own process; what it simulates is counted here."""
     assert lesson.tuned is not None
     with housed(lesson.tuned, lesson.seed, "run", lesson.hidden) as tuner:
-        return school(tuner.child, practice, stream, watch)
+        state = school(tuner.child, practice, stream, watch)
+    # By such names the file is written, or says what it holds.
+    taken = {"file", "allow_pickle", _COUNTS, _KEY} & set(state)
+    if taken:
+        raise EndedError("crashed", f"the tuner learned what cannot be kept by the names {taken}")
+    return state
 
 
 def _fitting(lesson: Lesson, path: Path) -> None:

@@ -14,14 +14,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
+import numpy as np
+
 from bench.problem.experiment import Entry, Experiment
 from bench.problem.problem import Problem
 from bench.problem.seeds import rng_for, stream_of
 from bench.problem.targets import SealedTarget
-from bench.runs.drive import Steps, Trace, drive
+from bench.runs.drive import Evaluate, Steps, Trace, drive
 from bench.runs.evaluate import Evaluator
 from bench.runs.housing import housed, undisturbed
-from bench.runs.training import build, trained, weights_of
+from bench.runs.training import MADE_AGAIN, build, trained, weights_of
 from bench.sealing.ended import EndedError
 from bench.sealing.memory import memory_limit
 from bench.sealing.outside import Sealed, Tuned, moved
@@ -112,12 +114,30 @@ def perform(experiment: Experiment, order: Order) -> Outcome:
 
     Raises:
         CheatError: more was simulated than the tuner asked the harness for.
-        KilledError: the tuner's process was killed from outside, again and again.
+        EndedError: the tuner's process was killed from outside, again and again.
     """
-    return undisturbed(lambda: _perform(experiment, order))
+    before: list[Array] = []
+    return undisturbed(lambda: _perform(experiment, order, before))
 
 
-def _perform(experiment: Experiment, order: Order) -> Outcome:
+class _Repeated:
+    """Simulates what a run asks for, which is made again after a kill and must ask for the same:
+    who could have itself killed would else try until it is lucky.
+    """
+
+    def __init__(self, evaluate: Evaluate, before: list[Array]) -> None:
+        self._evaluate, self._before, self._place = evaluate, before, 0
+
+    def __call__(self, points: Array) -> tuple[Array, Array]:
+        if self._place == len(self._before):
+            self._before.append(points)
+        elif not np.array_equal(self._before[self._place], points):
+            raise EndedError("crashed", MADE_AGAIN)
+        self._place += 1
+        return self._evaluate(points)
+
+
+def _perform(experiment: Experiment, order: Order, before: list[Array]) -> Outcome:
     problem = problem_of(experiment)
     target = order.target
     evaluator = Evaluator(problem, target.fitting)
@@ -132,12 +152,12 @@ def _perform(experiment: Experiment, order: Order) -> Outcome:
         scene=problem.scene(target.fitting.scenarios),
     )
     # Scoring and what came before do not count.
-    before = problem.simulated
+    simulated = problem.simulated
     started = perf_counter()
     drives = _trusted if order.tuned is None else _sealed
-    trace = drives(experiment, order, task, evaluator)
+    trace = drives(experiment, order, task, _Repeated(evaluator, before))
     seconds = perf_counter() - started
-    beside = problem.simulated - before - len(trace.losses)
+    beside = problem.simulated - simulated - len(trace.losses)
     # A simulator that raises has simulated, and nothing came of it.
     if beside > 0 and trace.status != "crashed":
         raise CheatError(f"{beside} simulations beside the budget")
@@ -158,16 +178,16 @@ def _names(experiment: Experiment, order: Order) -> tuple[str | int, ...]:
     return experiment.name, order.entry.tuner, order.target.name, order.seed
 
 
-def _trusted(experiment: Experiment, order: Order, task: Task, evaluator: Evaluator) -> Trace:
+def _trusted(experiment: Experiment, order: Order, task: Task, evaluate: Evaluate) -> Trace:
     """A run whose tuner works in this very process."""
     entry, weights = order.entry, order.weights
     tuner = build(entry) if weights is None else trained(entry, weights)
     rng = rng_for(*_names(experiment, order))
     with memory_limit(experiment.memory):
-        return drive(tuner, task, evaluator, rng, experiment.timeout)
+        return drive(tuner, task, evaluate, rng, experiment.timeout)
 
 
-def _sealed(experiment: Experiment, order: Order, task: Task, evaluator: Evaluator) -> Trace:
+def _sealed(experiment: Experiment, order: Order, task: Task, evaluate: Evaluate) -> Trace:
     """A run whose tuner has a process of its own."""
     assert order.tuned is not None
     state = None if order.weights is None else weights_of(order.weights)
@@ -178,14 +198,14 @@ def _sealed(experiment: Experiment, order: Order, task: Task, evaluator: Evaluat
     try:
         with house as tuner:
             run = Sealed(tuner, stream_of(*names), experiment.timeout)
-            trace = drive(run, task, evaluator, rng_for(*names), experiment.timeout)
+            trace = drive(run, task, evaluate, rng_for(*names), experiment.timeout)
             # What failed may have left anything behind.
             if trace.status in FAILED:
                 tuner.child.end()
             return trace
     except EndedError as ended:
         # It never began: it could not be built.
-        return drive(Ended(ended), task, evaluator, rng_for(*names))
+        return drive(Ended(ended), task, evaluate, rng_for(*names))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,10 @@ class EndedError(Exception):
         super().__init__(reason)
         self.status, self.reason = status, reason
 
+    def __reduce__(self) -> tuple[type[EndedError], tuple[str, str]]:
+        # Workers hand errors over pickled, which calls the class with the message alone.
+        return EndedError, (self.status, self.reason)
+
 
 class KilledError(Exception):
     """A process was killed from outside, which says nothing about what it was at."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import resource
 import shutil
 import signal
 import socket
@@ -130,16 +131,16 @@ def _keep(service: str, descriptors: list[int], reach: seals.Reach, held: list[s
         for descriptor in descriptors:
             os.close(descriptor)
         _, ended = os.waitpid(child, 0)
-        # As a shell says it: who was killed by signal n ends with 128 + n.
-        os._exit(128 + os.WTERMSIG(ended) if os.WIFSIGNALED(ended) else os.WEXITSTATUS(ended))
+        _end_as(ended)
     die_with_parent()
+    # Not of the nursery's group: what is done to a group would reach it.
+    os.setsid()
     code = 1
     try:
         _serve(service, descriptors, reach, held)
         code = 0
     finally:
         os._exit(code)
-    raise AssertionError
 
 
 def _serve(service: str, descriptors: list[int], reach: seals.Reach, held: list[str]) -> None:
@@ -151,9 +152,23 @@ def _serve(service: str, descriptors: list[int], reach: seals.Reach, held: list[
     os.environ.update({"HOME": reach.folder, "TMPDIR": reach.folder})
     module, _, function = service.partition(":")
     work = getattr(importlib.import_module(module), function)
-    held = seals.listed([*held, *seals.shut(reach)])
+    held = seals.listed([*held, *seals.shut(reach, "memory" in held)])
     channel = Channel(reading, writing)
     work(channel, reach, held)
+
+
+def _end_as(ended: int) -> NoReturn:
+    """End this process as another has ended: a number would not tell a signal from an exit by the
+    tuner's own will.
+    """
+    if os.WIFSIGNALED(ended):
+        number = os.WTERMSIG(ended)
+        # A second dump of the same memory helps nobody.
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        with suppress(OSError, ValueError):
+            signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
+    os._exit(os.WEXITSTATUS(ended) if os.WIFEXITED(ended) else 1)
 
 
 def _silence() -> None:
@@ -173,15 +188,14 @@ def _end(keeper: int, kill: bool) -> int | None:
             os.kill(keeper, signal.SIGKILL)
     with suppress(ChildProcessError):
         ended = _waited(keeper)
-        if os.WIFSIGNALED(ended):
-            return None if kill else -os.WTERMSIG(ended)
-        code = os.WEXITSTATUS(ended)
-        return 128 - code if code > 128 else code
+        if ended is None or kill:
+            return None
+        return -os.WTERMSIG(ended) if os.WIFSIGNALED(ended) else os.WEXITSTATUS(ended)
     return None
 
 
-def _waited(keeper: int) -> int:
-    """The end of a keeper; it is killed where it takes its time."""
+def _waited(keeper: int) -> int | None:
+    """The end of a keeper; None where it took its time and was killed."""
     patience = perf_counter() + _PATIENCE
     while perf_counter() < patience:
         gone, ended = os.waitpid(keeper, os.WNOHANG)
@@ -189,7 +203,8 @@ def _waited(keeper: int) -> int:
             return ended
         sleep(0.0005)
     os.kill(keeper, signal.SIGKILL)
-    return os.waitpid(keeper, 0)[1]
+    os.waitpid(keeper, 0)
+    return None
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ _NUMERICAL = ("OPENBLAS_", "MKL_", "OMP_", "NPY_")
 _PATIENCE = 60.0
 """Seconds in which a process must have been started, and a tuner built."""
 _FAREWELL = 10.0
-"""Seconds in which a tuner must have closed what it holds."""
+"""Seconds in which a tuner must have closed what it holds; no more than its run may take."""
 _OUTSIDE = (-9, -15)
 """How who was killed from outside ends: SIGKILL (also the kernel's, short of memory), SIGTERM."""
 
@@ -246,8 +246,7 @@ class Child:
             self.end()
             raise EndedError("timeout", "") from None
         except FoulError as error:
-            self.end()
-            raise EndedError("crashed", f"the tuner's process broke the pipe: {error}") from None
+            raise self._foul(str(error)) from None
         except GoneError:
             raise self._gone() from None
         if message.kind == b"D":
@@ -256,6 +255,9 @@ class Child:
 
     def send(self, kind: bytes, *parts: bytes | Array, deadline: float, **head: int) -> None:
         """Send it a message; raises as `receive`."""
+        # An answer before the question would seem to take no time.
+        if self.channel.spoken_to:
+            raise self._foul("it spoke without having been asked")
         try:
             self.channel.send(kind, *parts, deadline=deadline, **head)
         except TimeoutError:
@@ -263,6 +265,10 @@ class Child:
             raise EndedError("timeout", "") from None
         except GoneError:
             raise self._gone() from None
+
+    def _foul(self, says: str) -> EndedError:
+        self.end()
+        return EndedError("crashed", f"the tuner's process broke the pipe: {says}")
 
     def _gone(self) -> EndedError | KilledError:
         code = self.end(kill=False)
@@ -338,8 +344,7 @@ class Sealed:
 
     def tune(self, task: Task, _: np.random.Generator) -> SealedSteps:
         """Begin the run; its random numbers are drawn on the other side."""
-        deadline = perf_counter() + self.seconds
-        return SealedSteps(self.tuner.child, task, self.stream, deadline)
+        return SealedSteps(self.tuner.child, task, self.stream, self.seconds)
 
 
 class SealedSteps:
@@ -348,9 +353,11 @@ class SealedSteps:
     """
 
     def __init__(
-        self, child: Child, task: Task, stream: NDArray[np.uint32], deadline: float
+        self, child: Child, task: Task, stream: NDArray[np.uint32], seconds: float
     ) -> None:
-        self._child, self._task, self._stream, self._deadline = child, task, stream, deadline
+        self._child, self._task, self._stream = child, task, stream
+        self._deadline = perf_counter() + seconds
+        self._farewell = min(seconds, _FAREWELL)
         self._pace = _Pace()
         self._waits = False
         self._limit = min(ASKED_LIMIT, 8 * task.dim * (task.budget + 2))
@@ -420,7 +427,7 @@ class SealedSteps:
         self._pace.release()
         if self._waits:
             self._waits = False
-            deadline = perf_counter() + _FAREWELL
+            deadline = perf_counter() + self._farewell
             self._child.send(b"C", deadline=deadline)
             self._child.receive(deadline=deadline)
 

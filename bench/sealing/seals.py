@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.sealing import kernel
+from bench.sealing import calls, kernel
 
 SEALS = {
     "process": "the tuner has a process of its own, with a task and a pipe and nothing else",
@@ -34,8 +34,8 @@ FOLDER_BYTES = 64 << 20
 """What a tuner's own folder can hold."""
 _FILES = 512
 """Files that it may hold open."""
-_THREADS = 256
-"""Threads that it may have, where it is no superuser's."""
+_THREADS = 1024
+"""Threads that a user's tuners may have; a superuser's are not counted."""
 
 ROOT = Path(__file__).resolve().parents[2]
 """Where this project's packages lie."""
@@ -111,6 +111,8 @@ def empty_folder(folder: str) -> list[str]:
     def put() -> None:
         _leave(kernel.NEW_MOUNTS)
         kernel.private_mounts()
+        # Before its own folder, which it may write to; times and rights of files would tell others.
+        _put_on(kernel.read_only_mounts)
         kernel.mount("tmpfs", folder, f"size={FOLDER_BYTES},nr_inodes=4096,mode=700")
 
     return ["disk"] if _put_on(put) else []
@@ -121,23 +123,34 @@ def own_processes() -> list[str]:
     return ["processes"] if _put_on(lambda: _leave(kernel.NEW_PROCESSES)) else []
 
 
-def shut(reach: Reach) -> list[str]:
-    """Take from this process, for good, what is left; says which seals hold."""
+def shut(reach: Reach, own_user: bool) -> list[str]:
+    """Take from this process, for good, what is left; says which seals hold.
+
+    Args:
+        reach: what it may reach.
+        own_user: whether it has a user namespace.
+    """
     held = []
     # One's own; where it cannot be had, the files seal leaves of the other one's no more than this.
     _put_on(lambda: kernel.mount("proc", "/proc"))
     os.chdir(reach.folder)
-    _limit()
+    _limit(own_user)
+    # Short of memory the kernel ends the tuner first, and no rival.
+    _put_on(lambda: _write("/proc/self/oom_score_adj", "1000"))
     if _put_on(lambda: kernel.landlock(reach.readable, [reach.folder, *_DEVICES])):
         held.append("files")
-    _put_on(kernel.drop_capabilities)
-    if _put_on(kernel.refuse_processes):
+    _put_on(calls.drop_capabilities)
+    if _put_on(lambda: calls.refuse_processes(limited=reach.memory > 0)):
         held += ["calls", "network"]
     return held
 
 
 def _leave(flags: int) -> None:
     kernel.unshare(flags)
+
+
+def _write(path: str, text: str) -> None:
+    Path(path).write_text(text, encoding="ascii")
 
 
 def _put_on(seal: Callable[[], None]) -> bool:
@@ -149,12 +162,13 @@ def _put_on(seal: Callable[[], None]) -> bool:
     return True
 
 
-def _limit() -> None:
-    """No dumps, few files, and where it binds a number of threads."""
+def _limit(own_user: bool) -> None:
+    """No dumps, few files, and few threads where a user's are counted apart."""
     wanted = {
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_NOFILE: _FILES,
         resource.RLIMIT_FSIZE: FOLDER_BYTES,
+        **({resource.RLIMIT_NPROC: _THREADS} if own_user else {}),
     }
     for limit, most in wanted.items():
         hard = resource.getrlimit(limit)[1]

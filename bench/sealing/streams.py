@@ -23,7 +23,9 @@ def state_of(stream: NDArray[Any]) -> dict[str, Any]:
         ValueError: it is none.
     """
     low, high, low_step, high_step, has, held = (int(n) & (1 << 64) - 1 for n in stream)
-    if has not in (0, 1) or held >> 32:
+    # With an even step a stream can stand still, and who draws from it until a number fits would
+    # never end.
+    if has not in (0, 1) or held >> 32 or not low_step & 1:
         raise ValueError("no state of a random stream")
     inner = {"state": high << 64 | low, "inc": high_step << 64 | low_step}
     return {"bit_generator": "PCG64", "state": inner, "has_uint32": has, "uinteger": held}

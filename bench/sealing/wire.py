@@ -29,6 +29,8 @@ _TYPES = ("<f8", "<f4", "<i8", "<i4", "|u1", "|b1")
 """Of arrays that a tuner may have learned."""
 _ARRAYS = 10_000
 """How many it may have."""
+_NAMES = 1 << 20
+"""Bytes that their names and shapes may take."""
 
 _LONGEST = float((1 << 31) - 1)
 """Milliseconds that the kernel waits at most."""
@@ -74,20 +76,30 @@ class Message(NamedTuple):
             raise FoulError("it sent half a number")
         return np.frombuffer(self.body, dtype="<f8").astype(np.float64)
 
-    def document(self) -> Any:
+    def document(self, limit: int = TEXT_LIMIT) -> Any:
         """The body as JSON.
 
+        Args:
+            limit: bytes that it may have, since what it becomes takes much more.
+
         Raises:
-            FoulError: it is none.
+            FoulError: it is none, or longer.
         """
+        if len(self.body) > limit:
+            raise FoulError(f"it sent {len(self.body)} bytes of JSON, {limit} are allowed")
         try:
             return json.loads(bytes(self.body))
         except (ValueError, RecursionError):
             raise FoulError("it sent what is no JSON") from None
 
     def text(self) -> str:
-        """The body as text."""
-        return bytes(self.body).decode("utf-8", "replace")
+        """The body as text that can stand in a table."""
+        return printable(bytes(self.body[:TEXT_LIMIT]).decode("utf-8", "replace"))
+
+
+def printable(text: str) -> str:
+    """A text without what would move a terminal's cursor or end a table's row."""
+    return "".join(c if c.isprintable() or c in "\n\t" else "\ufffd" for c in text)
 
 
 class Channel:
@@ -112,6 +124,11 @@ class Channel:
         """Close both pipes; the other side learns of it."""
         for descriptor in (self._reading, self._writing):
             os.close(descriptor)
+
+    @property
+    def spoken_to(self) -> bool:
+        """Whether there is something to be read."""
+        return any(event & select.POLLIN for _, event in self._incoming.poll(0))
 
     def send(
         self,
@@ -172,16 +189,21 @@ class Channel:
             raise FoulError(f"it sent {length} bytes at once, {limit} are allowed")
         if there > _HEAD.size + length:
             raise FoulError("it spoke without having been asked")
-        if _HEAD.size + length <= _BUFFER:
-            body = self._view[_HEAD.size : _HEAD.size + length]
-            there -= _HEAD.size
-        else:
-            body = memoryview(bytearray(length))
-            there -= _HEAD.size
-            body[:there] = self._view[_HEAD.size : _HEAD.size + there]
+        there -= _HEAD.size
+        if _HEAD.size + length > _BUFFER:
+            return Message(kind, flags, size, self._long(there, length, deadline))
+        body = self._view[_HEAD.size : _HEAD.size + length]
         while there < length:
             there += self._read(body[there:], deadline)
         return Message(kind, flags, size, body)
+
+    def _long(self, there: int, length: int, deadline: float) -> memoryview:
+        """A body that is longer than the buffer; it takes no more memory than has been sent."""
+        body = bytearray(self._view[_HEAD.size : _HEAD.size + there])
+        while len(body) < length:
+            part = self._view[: min(_BUFFER, length - len(body))]
+            body += part[: self._read(part, deadline)]
+        return memoryview(body)
 
     def _read(self, into: memoryview, deadline: float) -> int:
         # Waiting and reading: a read that waits could not be ended at the deadline.
@@ -223,22 +245,39 @@ def unpacked(body: memoryview) -> dict[str, NDArray[Any]]:
     Raises:
         FoulError: it is none.
     """
-    data = bytes(body)
-    line, _, rest = data.partition(b"\n")
+    line, _, _ = bytes(body[:_NAMES]).partition(b"\n")
+    rest = body[len(line) + 1 :]
     try:
         says = json.loads(line)
         arrays, place = {}, 0
         for name, kind, shape in says[:_ARRAYS]:
             array, place = _array(rest, place, kind, shape)
-            arrays[str(name)] = array
+            arrays[_name(name)] = array
     except (ValueError, TypeError, KeyError, RecursionError):
         raise FoulError("it sent what are no arrays") from None
-    if place != len(rest) or len(says) > _ARRAYS:
+    if place != len(rest) or not len(arrays) == len(says) <= _ARRAYS:
         raise FoulError("it sent more or less than the arrays that it names")
     return arrays
 
 
-def _array(data: bytes, place: int, kind: str, shape: Sequence[int]) -> tuple[NDArray[Any], int]:
+def _name(name: object) -> str:
+    """The name of an array, which becomes one of a file's.
+
+    Raises:
+        ValueError: it cannot.
+    """
+    if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) < _NAME_LENGTH:
+        raise ValueError
+    return name
+
+
+_NAME_LENGTH = 500
+"""Characters of an array's name."""
+
+
+def _array(
+    data: memoryview, place: int, kind: str, shape: Sequence[int]
+) -> tuple[NDArray[Any], int]:
     """The array that begins at a place, and where it ends.
 
     Raises:

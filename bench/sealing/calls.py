@@ -1,0 +1,203 @@
+"""The filter of system calls around a tuner's process: what it may ask of the kernel.
+
+Sources: man-pages seccomp(2), capset(2), https://man7.org/linux/man-pages; the numbers of system
+calls: the kernel's ``arch/x86/entry/syscalls/syscall_64.tbl`` and
+``include/uapi/asm-generic/unistd.h``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import struct
+import sys
+from collections.abc import Mapping, Sequence
+
+from bench.sealing.kernel import LINUX, PR_SET_PDEATHSIG, call, no_new_rights, prctl
+
+_PR_SET_SECCOMP = 22
+
+_NUMBERS: Mapping[str, Mapping[str, int]] = {
+    "x86_64": {
+        "fork": 57, "vfork": 58, "clone": 56, "clone3": 435, "execve": 59, "execveat": 322,
+        "ptrace": 101, "process_vm_readv": 310, "process_vm_writev": 311, "unshare": 272,
+        "setns": 308, "mount": 165, "umount2": 166, "bpf": 321, "perf_event_open": 298,
+        "add_key": 248, "request_key": 249, "keyctl": 250, "userfaultfd": 323, "kcmp": 312,
+        "io_uring_setup": 425, "pidfd_open": 434, "pidfd_getfd": 438, "shmget": 29, "semget": 64,
+        "msgget": 68, "mq_open": 240, "capset": 126, "socket": 41, "socketpair": 53, "bind": 49,
+        "connect": 42, "kill": 62, "tkill": 200, "tgkill": 234, "rt_sigqueueinfo": 129,
+        "rt_tgsigqueueinfo": 297, "pidfd_send_signal": 424, "prctl": 157, "prlimit64": 302,
+        "setpriority": 141, "ioprio_set": 251, "fcntl": 72, "flock": 73, "inotify_init": 253,
+        "inotify_init1": 294, "fanotify_init": 300, "chmod": 90, "fchmod": 91, "fchmodat": 268,
+        "fchmodat2": 452, "chown": 92, "fchown": 93, "lchown": 94, "fchownat": 260, "utime": 132,
+        "utimes": 235, "futimesat": 261, "utimensat": 280, "setxattr": 188, "lsetxattr": 189,
+        "fsetxattr": 190, "removexattr": 197, "lremovexattr": 198, "fremovexattr": 199,
+        "setxattrat": 463, "removexattrat": 466, "file_setattr": 469, "truncate": 76,
+        "cachestat": 451, "memfd_create": 319, "memfd_secret": 447, "mmap": 9,
+    },
+    "aarch64": {
+        "clone": 220, "clone3": 435, "execve": 221, "execveat": 281, "ptrace": 117,
+        "process_vm_readv": 270, "process_vm_writev": 271, "unshare": 97, "setns": 268,
+        "mount": 40, "umount2": 39, "bpf": 280, "perf_event_open": 241, "add_key": 217,
+        "request_key": 218, "keyctl": 219, "userfaultfd": 282, "kcmp": 272,
+        "io_uring_setup": 425, "pidfd_open": 434, "pidfd_getfd": 438, "shmget": 194,
+        "semget": 190, "msgget": 186, "mq_open": 180, "capset": 91, "socket": 198,
+        "socketpair": 199, "bind": 200, "connect": 203, "kill": 129, "tkill": 130, "tgkill": 131,
+        "rt_sigqueueinfo": 138, "rt_tgsigqueueinfo": 240, "pidfd_send_signal": 424, "prctl": 167,
+        "prlimit64": 261, "setpriority": 140, "ioprio_set": 30, "fcntl": 25, "flock": 32,
+        "inotify_init1": 26, "fanotify_init": 262, "fchmod": 52, "fchmodat": 53, "fchmodat2": 452,
+        "fchown": 55, "fchownat": 54, "utimensat": 88, "setxattr": 5, "lsetxattr": 6,
+        "fsetxattr": 7, "removexattr": 14, "lremovexattr": 15, "fremovexattr": 16,
+        "setxattrat": 463, "removexattrat": 466, "file_setattr": 469, "truncate": 45,
+        "cachestat": 451, "memfd_create": 279, "memfd_secret": 447, "mmap": 222,
+    },
+}  # fmt: skip
+"""Of the calls that are taken away or judged, by machine.
+
+Times, rights and locks of files that one may only read, and sockets by name, would tell another run
+what this one has found; Landlock leaves all of them free.
+"""
+_ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
+"""AUDIT_ARCH of each machine: a call by another's numbers is none of ours."""
+_ABSENT = ("clone3", "io_uring_setup")
+"""Calls that libraries try first and do without where the kernel says that it has none."""
+_UNCOUNTED = ("memfd_create", "memfd_secret")
+"""Calls that give memory which no limit of a process counts."""
+_JUDGED = (
+    "clone", "socketpair", "capset", "kill", "tgkill", "prctl", "prlimit64", "fcntl", "flock",
+    "mmap",
+)  # fmt: skip
+"""Calls whose arguments say whether they are allowed, or that are ours alone."""
+
+
+def drop_capabilities() -> None:
+    """Give up every right of a superuser, also of a namespace's own."""
+    version_3 = struct.pack("<Ii", 0x20080522, 0)
+    call(_NUMBERS[platform.machine()]["capset"], version_3, bytes(24))
+
+
+_LOAD, _AND, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x54, 0x15, 0x35, 0x45, 0x06
+"""Instructions of a filter: load a word, keep some bits of it, jump where it equals, is at least,
+has a bit; return.
+"""
+_ALLOW, _KILL, _FAIL = 0x7FFF0000, 0x80000000, 0x00050000
+"""Verdicts of a filter; with an error's number the last makes the call fail, with 0 it does
+nothing.
+"""
+_EPERM, _ENOMEM, _ENOSYS = _FAIL | 1, _FAIL | 12, _FAIL | 38
+"""Not permitted; no memory; there is no such call."""
+_THREAD = 0x00010000
+"""CLONE_THREAD: what is made is a thread of this process."""
+_STREAMS = tuple(1 | flags for flags in (0, 0x800, 0x80000, 0x80800))
+"""SOCK_STREAM; a pair of any other kind can be given names."""
+_LOCKS = (6, 7, 37, 38)
+"""F_SETLK, F_SETLKW and those of open files: there is nobody to lock out, and a lock on a file that
+others read too would tell them something. They do nothing, which suits who is alone.
+"""
+_BACK_DOORS = (8, 10, 15, 1024, 1026, 1036, 1038)
+"""F_SETOWN, F_SETSIG, F_SETOWN_EX, F_SETLEASE, F_NOTIFY and hints about a file: they signal to
+others, or tell them.
+"""
+_OF_FILES = {**dict.fromkeys(_LOCKS, _FAIL), **dict.fromkeys(_BACK_DOORS, _EPERM)}
+"""Verdicts on what fcntl is asked for."""
+_NOBODYS = 0x21
+"""MAP_SHARED and MAP_ANONYMOUS: memory that no limit of a process counts."""
+_X32 = 0x40000000
+"""From which on calls are numbered of a kind that nobody uses."""
+
+
+def can_filter() -> bool:
+    """Whether `refuse_processes` knows this machine."""
+    return LINUX and platform.machine() in _ARCHITECTURES and sys.byteorder == "little"
+
+
+def refuse_processes(limited: bool = False) -> None:
+    """Let this process start no other, look into none, signal to none, and reach no network;
+    threads stay.
+
+    Args:
+        limited: whether its memory is, so that none may escape being counted.
+
+    Raises:
+        OSError: the kernel does not filter system calls, or this machine's are not known here.
+    """
+    if not can_filter():
+        raise OSError(f"no filter for {platform.machine()}")
+    machine = platform.machine()
+    program = _program(_ARCHITECTURES[machine], _NUMBERS[machine], os.getpid(), limited)
+    lines = ctypes.create_string_buffer(b"".join(struct.pack("<HBBI", *line) for line in program))
+    header = struct.pack("<HxxxxxxQ", len(program), ctypes.addressof(lines))
+    no_new_rights()
+    prctl(_PR_SET_SECCOMP, 2, ctypes.create_string_buffer(header))
+
+
+Line = tuple[int, int, int, int]
+"""Instruction, lines to skip where it holds, where it does not, its number."""
+
+
+def _program(
+    architecture: int, numbers: Mapping[str, int], own: int, limited: bool
+) -> Sequence[Line]:
+    """The filter: a call's number stands at offset 0, its machine at 4, its arguments from 16.
+
+    Args:
+        architecture: of the machine.
+        numbers: of its calls.
+        own: the number of the process.
+        limited: whether its memory is.
+    """
+    lines: list[Line] = [
+        (_LOAD, 0, 0, 4),
+        (_EQUAL, 1, 0, architecture),
+        (_RETURN, 0, 0, _KILL),
+        (_LOAD, 0, 0, 0),
+        (_AT_LEAST, 0, 1, _X32),
+        (_RETURN, 0, 0, _ENOSYS),
+    ]
+    for name, number in numbers.items():
+        if name not in _JUDGED and (limited or name not in _UNCOUNTED):
+            verdict = _ENOSYS if name in (*_ABSENT, *_UNCOUNTED) else _EPERM
+            lines += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, verdict)]
+    lines += [
+        # The first argument of clone says what is made: a thread is allowed.
+        (_EQUAL, 0, 4, numbers["clone"]),
+        (_LOAD, 0, 0, 16),
+        (_ANY_BIT, 1, 0, _THREAD),
+        (_RETURN, 0, 0, _EPERM),
+        (_RETURN, 0, 0, _ALLOW),
+        *_judged(numbers["kill"], 0, {own: _ALLOW}, _EPERM),
+        *_judged(numbers["tgkill"], 0, {own: _ALLOW}, _EPERM),
+        *_judged(numbers["prlimit64"], 0, {0: _ALLOW, own: _ALLOW}, _EPERM),
+        *_judged(numbers["prctl"], 0, {PR_SET_PDEATHSIG: _EPERM}, _ALLOW),
+        *_judged(numbers["socketpair"], 1, dict.fromkeys(_STREAMS, _ALLOW), _EPERM),
+        *_judged(numbers["fcntl"], 1, _OF_FILES, _ALLOW),
+        (_EQUAL, 0, 1, numbers["flock"]),
+        (_RETURN, 0, 0, _FAIL),
+    ]
+    if limited:
+        lines += [
+            (_EQUAL, 0, 5, numbers["mmap"]),
+            (_LOAD, 0, 0, 16 + 8 * 3),
+            (_AND, 0, 0, _NOBODYS),
+            (_EQUAL, 0, 1, _NOBODYS),
+            (_RETURN, 0, 0, _ENOMEM),
+            (_RETURN, 0, 0, _ALLOW),
+        ]
+    return [*lines, (_RETURN, 0, 0, _ALLOW)]
+
+
+def _judged(number: int, argument: int, verdicts: Mapping[int, int], otherwise: int) -> list[Line]:
+    """What becomes of a call by the lower half of one of its arguments.
+
+    Args:
+        number: of the call.
+        argument: which, from 0.
+        verdicts: by its value.
+        otherwise: where it has none of these.
+    """
+    cases: list[Line] = []
+    for value, verdict in verdicts.items():
+        cases += [(_EQUAL, 0, 1, value), (_RETURN, 0, 0, verdict)]
+    load = (_LOAD, 0, 0, 16 + 8 * argument)
+    return [(_EQUAL, 0, len(cases) + 2, number), load, *cases, (_RETURN, 0, 0, otherwise)]
