@@ -102,7 +102,7 @@ def both(first, second):
 
 
 PARQUET, STATUS_CSV, PLAN = "runs.parquet", "status.csv", "segments/plan.txt"
-TRAINED = ["random,0,1,1.5"]
+TRAINED = ["random,0,1,1.5,True"]
 DONE = {
     "no column": (PARQUET, rows(lambda f: f.drop(columns="loss"))),
     "no run": (PARQUET, rows(lambda f: f.drop(columns="run"))),
@@ -154,7 +154,7 @@ DONE = {
     "unknown status": (STATUS_CSV, text(STATUS_CSV, ",done,", ",perfect,")),
     "done too early": (
         STATUS_CSV,
-        both(rows(lambda f: f.drop(index=3)), column_of(STATUS_CSV, -2, lambda _: "2")),
+        both(rows(lambda f: f.drop(index=3)), column_of(STATUS_CSV, -3, lambda _: "2")),
     ),
     "status shortened": (STATUS_CSV, lines(STATUS_CSV, lambda ls: ls[:-1])),
     "status header": (STATUS_CSV, lines(STATUS_CSV, lambda ls: ls[:1])),
@@ -169,22 +169,22 @@ DONE = {
     "open quote": (STATUS_CSV, text(STATUS_CSV, ",done,", ',"')),
     "column gone": (STATUS_CSV, text(STATUS_CSV, "seconds", "minutes")),
     "column twice": (STATUS_CSV, text(STATUS_CSV, "reason", "status")),
-    "negative time": (STATUS_CSV, column_of(STATUS_CSV, -1, lambda v: f"-{v}")),
-    "infinite time": (STATUS_CSV, column_of(STATUS_CSV, -1, lambda _: "inf")),
-    "no time": (STATUS_CSV, column_of(STATUS_CSV, -1, lambda _: "")),
-    "time in words": (STATUS_CSV, column_of(STATUS_CSV, -1, lambda _: "1_0")),
-    "half a simulation": (STATUS_CSV, column_of(STATUS_CSV, -2, lambda v: f"{v}.5")),
-    "more simulations": (STATUS_CSV, column_of(STATUS_CSV, -2, lambda _: "4")),
-    "endless simulations": (STATUS_CSV, column_of(STATUS_CSV, -2, lambda _: "9" * 40)),
+    "negative time": (STATUS_CSV, column_of(STATUS_CSV, -2, lambda v: f"-{v}")),
+    "infinite time": (STATUS_CSV, column_of(STATUS_CSV, -2, lambda _: "inf")),
+    "no time": (STATUS_CSV, column_of(STATUS_CSV, -2, lambda _: "")),
+    "time in words": (STATUS_CSV, column_of(STATUS_CSV, -2, lambda _: "1_0")),
+    "half a simulation": (STATUS_CSV, column_of(STATUS_CSV, -3, lambda v: f"{v}.5")),
+    "more simulations": (STATUS_CSV, column_of(STATUS_CSV, -3, lambda _: "4")),
+    "endless simulations": (STATUS_CSV, column_of(STATUS_CSV, -3, lambda _: "9" * 40)),
     "another tuner": (STATUS_CSV, column_of(STATUS_CSV, 1, another)),
     "another target": (STATUS_CSV, column_of(STATUS_CSV, 3, lambda _: "in-001")),
     "another seed": (STATUS_CSV, column_of(STATUS_CSV, 4, lambda _: "7")),
     "another simulator": (STATUS_CSV, column_of(STATUS_CSV, 2, lambda _: "pendulum")),
     "escapes": (STATUS_CSV, column_of(STATUS_CSV, 1, lambda _: "\x1b[31m\u2028")),
     "training header": ("training.csv", text("training.csv", "seconds", "s")),
-    "training of nobody": ("training.csv", lines("training.csv", lambda ls: [*ls, "me,0,1,1"])),
+    "training of nobody": ("training.csv", lines("training.csv", lambda ls: [*ls, "me,0,1,1,True"])),
     "training twice": ("training.csv", lines("training.csv", lambda ls: [ls[0], *TRAINED * 2])),
-    "training cost": ("training.csv", lines("training.csv", lambda ls: [*ls, "random,0,-1,1"])),
+    "training cost": ("training.csv", lines("training.csv", lambda ls: [*ls, "random,0,-1,1,True"])),
     "training gone": ("training.csv", lambda folder: (folder / "training.csv").unlink()),
     "no direction": ("identifiability.csv", column_of("identifiability.csv", 3, lambda _: "0")),
     "directions": ("identifiability.csv", column_of("identifiability.csv", 3, lambda _: "2")),

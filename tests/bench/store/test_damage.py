@@ -159,7 +159,7 @@ def test_what_is_said_names_file_row_expected_found_and_remedy(folders, tmp_path
         f"skipped, found 'over'{remedy}"
     )
     short = both(quoted, lines(STATUS_CSV, lambda ls: [*ls[:-1], "random"]))
-    assert told(short) == f"/status.csv, line 15: expected 9 cells, found 1{remedy}"
+    assert told(short) == f"/status.csv, line 15: expected 10 cells, found 1{remedy}"
     assert told(lines(STATUS_CSV, lambda ls: ls[:-1])) == (
         f"/status.csv: expected a run of nelder_mead on wide-001 with seed 0, found none{remedy}"
     )
@@ -202,7 +202,7 @@ def test_a_damaged_part_that_was_deleted_is_made_again(folders, tmp_path):
 def test_tuners_that_were_skipped_have_no_rows(folders, tmp_path):
     folder = damaged(folders, "done", lambda _: None, tmp_path)
     rows(lambda f: f[f["tuner"] != "nelder_mead"])(folder)
-    skipped = "nelder_mead,nelder_mead,spring,,0,skipped,no such package,0,0.0"
+    skipped = "nelder_mead,nelder_mead,spring,,0,skipped,no such package,0,0.0,True"
     made = [line for line in (folder / STATUS_CSV).read_text().splitlines() if "nelder" not in line]
     (folder / STATUS_CSV).write_text("\n".join([*made, skipped]) + "\n")
     assert read(folder).statuses["status"].tolist() == ["done"] * 8 + ["skipped"]
@@ -216,6 +216,9 @@ def test_tuners_that_were_skipped_have_no_rows(folders, tmp_path):
 
 def test_a_column_that_older_folders_lack_has_its_default(folders, tmp_path):
     folder = damaged(folders, "done", lambda _: None, tmp_path)
+    assert read(folder).runs["trusted"].all(), "without workers tuners are trusted"
+    rows(lambda f: f.drop(columns="trusted"))(folder)
+    lines(STATUS_CSV, lambda ls: [line.rpartition(",")[0] for line in ls])(folder)
     assert not read(folder).runs["trusted"].any()
     assert not read(folder).statuses["trusted"].any()
     assert "trusted" not in read(folder, ["run", "k"]).runs
@@ -250,9 +253,9 @@ def test_what_is_written_is_what_is_declared(folders):
         ("identifiability", IDENTIFIABILITY),
     ):
         written = list(pd.read_csv(folder / f"{name}.csv", nrows=0).columns)
-        assert written == [c.name for c in spelled(declared, *names) if c.required]
+        assert written == [c.name for c in spelled(declared, *names)]
 
 
 def test_tables_are_declared_as_they_are_written():
-    assert [column.name for column in TABLE if column.required] == COLUMNS
-    assert [column.name for column in SHOT_TABLE] == OF_SHOTS
+    assert [column.name for column in TABLE] == [*COLUMNS, "salt", "trusted"]
+    assert [column.name for column in SHOT_TABLE] == [*OF_SHOTS, "trusted"]
