@@ -5,6 +5,7 @@
 # make exam      hides causes in hundreds of recordings and has explain find them (about an hour; QUICK=--quick)
 # make benchmark measurements printed as ratios
 # make chaos     100 kills at random moments; what is resumed must equal what was never disturbed (about 10 minutes)
+# make malformed ten thousand malformed files, folders and arguments to every command (about 5 minutes; KINDS="films weights")
 # make mutants   two hundred wrong changes, each of which a test must notice (about 10 minutes; ONLY="budget noise", JOBS=4)
 # make reference the comparison of results/reference/comparison again, below results/ (about 10 minutes)
 # make multi     the comparison of results/reference/multi again, below results/ (about 15 minutes; TUNERS=a,b,... for others)
@@ -13,7 +14,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: compare explain test check exam benchmark chaos mutants reference multi install
+.PHONY: compare explain test check exam benchmark chaos malformed mutants reference multi install
 install: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml
@@ -55,6 +56,9 @@ benchmark: $(STAMP)
 
 chaos: $(STAMP)
 	$(BIN)/python -m tests.chaos --kills 100
+
+malformed: $(STAMP)
+	$(BIN)/python -m tests.malformed $(KINDS)
 
 JOBS ?= 2
 

@@ -42,7 +42,9 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose faults are one line, as every other of the user's is."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"simgap: {message}; see {self.prog} --help\n")
+        from sims.base import InputError  # its message can be printed, whatever was typed
+
+        self.exit(2, f"simgap: {InputError(message)}; see {self.prog} --help\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

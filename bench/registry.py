@@ -119,6 +119,17 @@ def _run(path: Path) -> ModuleType:
         spec.loader.exec_module(module)
     except SyntaxError as error:
         raise InputError(f"plugin {path}, line {error.lineno}: {error.msg}") from error
-    except (Exception, SystemExit) as error:
-        raise InputError(f"plugin {path}: {type(error).__name__}: {error}") from error
+    except KeyboardInterrupt:
+        raise
+    # Also what asks to exit, or is no `Exception` at all.
+    except BaseException as error:
+        raise InputError(f"plugin {path}: {type(error).__name__}: {_said(error)}") from error
     return module
+
+
+def _said(error: BaseException) -> str:
+    """What an error says, where it says anything: its words are a plugin's code too."""
+    try:
+        return str(error)
+    except Exception:
+        return "without words"

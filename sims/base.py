@@ -29,7 +29,8 @@ class InputError(ValueError):
         # Names and cells from a user's file may hold anything; what would break the line or a
         # terminal is escaped.
         escaped = [c if c.isprintable() else ascii(c)[1:-1] for c in cut(message, MESSAGE)]
-        super().__init__("".join(escaped))
+        # Escaped it may be longer again.
+        super().__init__(cut("".join(escaped), MESSAGE))
 
 
 def unknown(kind: str, name: str, known: Sequence[str]) -> InputError:

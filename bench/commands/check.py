@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from bench.commands.options import file
+
 
 def add_check(check: argparse.ArgumentParser) -> None:
     """The options of `simgap check`."""
@@ -11,7 +13,12 @@ def add_check(check: argparse.ArgumentParser) -> None:
         "name", metavar="NAME", help="registered name, e.g. cma_es, pendulum or drag.linear"
     )
     check.add_argument(
-        "--plugin", action="append", default=[], metavar="FILE", help="Python file that defines it"
+        "--plugin",
+        type=file,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="Python file that defines it",
     )
     check.set_defaults(command=_check)
 

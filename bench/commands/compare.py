@@ -14,6 +14,7 @@ from bench.commands.options import (
     add_trust,
     names,
     natural,
+    place,
     positive,
     said_as,
     seconds,
@@ -66,12 +67,12 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
     compare.add_argument(
         "--out",
         metavar="DIR",
-        type=Path,
+        type=place,
         help="folder to write (default: a new one below results/)",
     )
     add_plugin(compare, "tuners")
     compare.add_argument(
-        "--resume", metavar="DIR", type=Path, help="finish what is missing in this folder instead"
+        "--resume", metavar="DIR", type=place, help="finish what is missing in this folder instead"
     )
     compare.add_argument(
         "--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler"
@@ -110,7 +111,7 @@ def add_status(status: argparse.ArgumentParser) -> None:
     status.add_argument(
         "run",
         metavar="DIR",
-        type=Path,
+        type=place,
         nargs="?",
         help="the folder of a comparison or bounce shot; without it: which seals hold around "
         "tuners on this machine",
@@ -121,7 +122,9 @@ def add_status(status: argparse.ArgumentParser) -> None:
 
 def add_verify(verify: argparse.ArgumentParser) -> None:
     """The options of `simgap verify`."""
-    verify.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished comparison")
+    verify.add_argument(
+        "run", metavar="RUN", type=place, help="the folder of a finished comparison"
+    )
     verify.add_argument(
         "--all", action="store_true", help="make every simulation again, and not a share of them"
     )
@@ -134,12 +137,12 @@ def add_plot(plot: argparse.ArgumentParser) -> None:
     plot.add_argument(
         "runs",
         metavar="RUN",
-        type=Path,
+        type=place,
         nargs="+",
         help="the folder of a comparison or bounce shot; several comparisons: ranks",
     )
     plot.add_argument(
-        "--out", metavar="DIR", type=Path, help="folder for what several comparisons give together"
+        "--out", metavar="DIR", type=place, help="folder for what several comparisons give together"
     )
     add_plugin(plot, "simulators")
     plot.set_defaults(command=_plot)

@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from bench.commands.options import add_force, add_plugin, names
+from bench.commands.options import add_force, add_plugin, names, place
 
 
 def add_explain(parser: argparse.ArgumentParser) -> None:
@@ -14,7 +14,7 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recording",
         metavar="RECORDING.csv",
-        type=Path,
+        type=place,
         help="the table; its .toml stands beside it",
     )
     parser.add_argument(
@@ -29,7 +29,7 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="DIR",
-        type=Path,
+        type=place,
         help="folder to write (default: a new one below results/)",
     )
     parser.add_argument(
@@ -51,12 +51,12 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
 def add_score(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap score`."""
     parser.add_argument(
-        "model", metavar="extended.toml", type=Path, help="as `simgap explain` writes it"
+        "model", metavar="extended.toml", type=place, help="as `simgap explain` writes it"
     )
     parser.add_argument(
         "recording",
         metavar="OTHER.csv",
-        type=Path,
+        type=place,
         help="the recording; its .toml stands beside it",
     )
     parser.add_argument(

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
-from bench.commands.options import add_force
+from bench.commands.options import add_force, place
 
 
 def add_film(parser: argparse.ArgumentParser) -> None:
@@ -14,11 +13,11 @@ def add_film(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recording",
         metavar="RECORDING.csv",
-        type=Path,
+        type=place,
         help="a recording of a ball, with channel z",
     )
     parser.add_argument(
-        "--out", metavar="FILM.mp4", type=Path, required=True, help="video to write, a new one"
+        "--out", metavar="FILM.mp4", type=place, required=True, help="video to write, a new one"
     )
     parser.add_argument("--run", metavar="NAME", help="which run (default: the first)")
     parser.add_argument(
@@ -40,11 +39,11 @@ def add_track(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "video",
         metavar="VIDEO",
-        type=Path,
+        type=place,
         help="a film of one dropped ball by a camera that stands",
     )
     parser.add_argument(
-        "--out", metavar="NAME.csv", type=Path, required=True, help="recording to write, a new one"
+        "--out", metavar="NAME.csv", type=place, required=True, help="recording to write, a new one"
     )
     parser.add_argument(
         "--ball-diameter", metavar="M", type=float, help="the ball's diameter in metres"

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 
 def add_plugin(parser: argparse.ArgumentParser, more: str) -> None:
     """The option ``--plugin FILE``; `more` says what such a file adds."""
     parser.add_argument(
         "--plugin",
+        type=file,
         action="append",
         default=[],
         metavar="FILE",
@@ -71,6 +73,27 @@ def seconds(text: str) -> float:
     if not value > 0:
         raise argparse.ArgumentTypeError(f"expected a number of seconds above 0, found '{text}'")
     return value
+
+
+def place(text: str) -> Path:
+    """The path of what is there, or could be."""
+    from sims.limits import cut
+
+    try:
+        Path(text).lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    # Too long, of links that lead in a circle, or not ours to look at.
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise argparse.ArgumentTypeError(f"expected a path, found '{cut(text)}' ({why})") from None
+    return Path(text)
+
+
+def file(text: str) -> str:
+    """The same of a file that is named in words."""
+    place(text)
+    return text
 
 
 def names(text: str) -> list[str]:

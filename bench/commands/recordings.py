@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.commands.options import add_force, add_plugin, names, positive
+from bench.commands.options import add_force, add_plugin, names, place, positive
 
 
 def add_simulate(simulate: argparse.ArgumentParser) -> None:
@@ -52,7 +52,7 @@ def add_simulate(simulate: argparse.ArgumentParser) -> None:
         "--held-out", type=int, metavar="M", help="mark the last M runs (default: a third)"
     )
     simulate.add_argument(
-        "--out", type=Path, metavar="FILE.csv", required=True, help="file to write, a new one"
+        "--out", type=place, metavar="FILE.csv", required=True, help="file to write, a new one"
     )
     add_plugin(simulate, "systems")
     add_force(simulate)
@@ -62,13 +62,13 @@ def add_simulate(simulate: argparse.ArgumentParser) -> None:
 def add_inspect(inspect: argparse.ArgumentParser) -> None:
     """The options of `simgap inspect`."""
     inspect.add_argument(
-        "recording", metavar="FILE.csv", type=Path, help="the table; its .toml stands beside it"
+        "recording", metavar="FILE.csv", type=place, help="the table; its .toml stands beside it"
     )
     inspect.add_argument(
         "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
     )
     inspect.add_argument(
-        "--out", metavar="DIR", type=Path, help="folder for the figure (default: results/inspect)"
+        "--out", metavar="DIR", type=place, help="folder for the figure (default: results/inspect)"
     )
     add_plugin(inspect, "systems")
     inspect.set_defaults(command=_inspect)

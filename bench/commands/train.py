@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.commands.options import add_force, add_plugin, add_trust, positive
+from bench.commands.options import add_force, add_plugin, add_trust, place, positive
 
 
 def add_train(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +34,7 @@ def add_train(parser: argparse.ArgumentParser) -> None:
         "--again", action="store_true", help="train although there are weights, and replace them"
     )
     parser.add_argument(
-        "--out", metavar="DIR", type=Path, help="folder of losses (default: below results/train)"
+        "--out", metavar="DIR", type=place, help="folder of losses (default: below results/train)"
     )
     add_plugin(parser, "of them")
     add_trust(parser)

@@ -62,6 +62,7 @@ class Problem:
         self.world = self.simulator
         if experiment.world:
             self.world = self._simulator(kind, observe, experiment.world)
+            self._check_world()
 
         self._check_constants()
         self.cube = UnitCube(adjusted(self.simulator.parameters, experiment.parameters))
@@ -90,6 +91,19 @@ class Problem:
         except TypeError as error:  # a setting that its constructor does not take
             who = f"experiment {experiment.name}: simulator {experiment.simulator}"
             raise InputError(f"{who}: {error}") from None
+
+    def _check_world(self) -> None:
+        """Refuse a world whose parameters are not the first of the tuned ones."""
+        tuned, made = (
+            [parameter.name for parameter in simulator.parameters]
+            for simulator in (self.simulator, self.world)
+        )
+        if made != tuned[: len(made)]:
+            raise InputError(
+                f"experiment {self.experiment.name}: world: expected none but the first of the "
+                f"tuned parameters {', '.join(tuned)}, found {', '.join(made)}; name effects in "
+                "fixed = { NAME = COEFFICIENT }"
+            )
 
     def _check_constants(self) -> None:
         """Refuse constants that scenarios would draw and no simulator could have."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.store.schema import Column, Columns, Empty
+from sims.files import first_line
 from sims.user_toml import shown
 
 if TYPE_CHECKING:
@@ -64,6 +65,11 @@ def of_parquet(column: Column, values: pa.Array) -> pa.Array:
     import pyarrow as pa
     from pyarrow import compute
 
+    try:
+        # Flipped bytes of a text need not be one any more.
+        values.validate(full=True)
+    except pa.ArrowInvalid as error:
+        raise CellError(None, column.name, column.wanted, first_line(error)) from None
     kind = values.type
     if pa.types.is_dictionary(kind):
         values = values.cast(kind.value_type)

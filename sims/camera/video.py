@@ -161,7 +161,8 @@ class Video:
             file = av.open(str(self.path))
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read ({error.strerror})") from None
-        except ValueError:
+        # Besides what Python has a name for, such as an end of the file.
+        except (ValueError, av.FFmpegError):
             raise InputError(f"{self.path}: {_why_not(self.path)}") from None
         if not file.streams.video:
             if not len(file.streams):

@@ -1,0 +1,78 @@
+"""Cuts commands short where their inputs turned out sound: what is tried is how they are read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from bench.registry import REGISTRIES
+from sims.base import InputError
+
+HERE = "here"
+"""The folder in which a command works, in the place of a case."""
+
+
+class CutError(BaseException):
+    """The inputs are sound, and the work would begin."""
+
+
+def _cut(*_: Any, **__: Any) -> Any:
+    raise CutError
+
+
+def _nothing(*_: Any, **__: Any) -> list[Any]:
+    return []
+
+
+def _closed(study: Any, *_: Any) -> int:
+    study.close()
+    return 0
+
+
+def _nobody(address: str) -> Any:
+    raise InputError(f"{address}: no Dask scheduler answers there")
+
+
+SHORT = {
+    "bench.commands.compare._made": _closed,
+    "bench.runs.cluster.ClusterPool": _nobody,
+    "bench.report.tables": _cut,
+    "bench.across.Together.tables": _cut,
+    "bench.store.folder.distributions": _nothing,
+    "bench.gap.explain._Explainer.run": _cut,
+    "bench.checks.command._isolated": _cut,
+    "bench.recordings.film.write_video": _cut,
+    "bench.figures.recording.draw": _nothing,
+    "bench.figures.track.drawn": lambda *_: (b"", b""),
+    "bench.api.train.Losses.write": _nothing,
+}
+"""What is put in the place of work."""
+
+
+@contextmanager
+def environment(folder: Path) -> Iterator[None]:
+    """Within the block trained weights are looked for in the place of a case, `folder`/place, and
+    nothing is known but what is installed.
+    """
+    known = [registry.snapshot() for registry in REGISTRIES]
+    try:
+        for registry, parts in zip(REGISTRIES, known, strict=True):
+            registry.restore({name: part for name, part in parts.items() if part.path is None})
+        with patch.dict(os.environ, {"SIMGAP_CACHE": str(folder / "place" / HERE / "run")}):
+            yield
+    finally:
+        for registry, parts in zip(REGISTRIES, known, strict=True):
+            registry.restore(parts)
+
+
+@contextmanager
+def shortened() -> Iterator[None]:
+    """Within the block commands end where work would begin."""
+    with ExitStack() as stack:
+        for name, act in SHORT.items():
+            stack.enter_context(patch(name, act))
+        yield

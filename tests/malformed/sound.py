@@ -1,0 +1,149 @@
+"""Sound inputs, from which malformed ones are made."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from pathlib import Path
+from unittest.mock import patch
+
+import tomli_w
+
+from bench.api.recordings import simulate
+from bench.cli import main
+from bench.compare import Comparison
+from bench.problem.experiment import load
+from bench.recordings.film import write as film
+from bench.registry import REGISTRIES
+from bench.runs.runner import run
+from bench.runs.survey import admit
+from tests.conftest import PLUGINS
+
+LEARNER = Path(__file__).with_name("learner.py")
+SPRING = PLUGINS / "spring.py"
+SWING = {
+    "title": "a swing",
+    "simulator": "pendulum",
+    "observe": ["q"],
+    "targets": 1,
+    "seeds": 1,
+    "budget": 2,
+    "training_budget": 5,
+    "timeout": 60,
+    "salt": "public",
+    "sampling": {"rate": 20.0, "samples": 30},
+    "initial": {"q": [0.8, 1.2]},
+    "noise": {"q": 0.01},
+    "tuners": {"random": {"seeds": 1}, "cma": {"tuner": "cma_es", "options": {"sigma": 0.2}}},
+}
+MORE = (
+    "memory", "settings", "world", "constants", "recording", "ranges", "held_out", "parameters",
+    "inputs", "sweep", "shot", "tags", "says", "same_targets_as", "isolation", "trusted",
+    "salt_sha256", "identifiability", "error_channel", "bounds", "effects", "oops",
+)  # fmt: skip
+"""Keys that a sound experiment need not have."""
+SECRET = {key: value for key, value in SWING.items() if key != "salt"}
+WORLDLY = {
+    **SECRET,
+    "settings": {"engine": "batch"},
+    "world": {"time_step": 0.001},
+    "held_out": {"scenarios": 2},
+    "constants": {"gravity": 9.8},
+    "ranges": ["in", "wide"],
+    "tags": ["x"],
+    "sweep": {"budget": [2, 3]},
+}
+LEARNED = {**SWING, "tuners": {"learner": {"seeds": 1}}}
+
+
+def toml(document) -> bytes:
+    return tomli_w.dumps(document).encode()
+
+
+@cache
+def recorded(system: str) -> dict[str, bytes]:
+    """A short recording of a system: the table and its description."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "data.csv"
+        initial = {"ball": {"z": 1.0}, "pendulum": {"q": (0.8, 1.2)}}[system]
+        channels = {"ball": ["z"], "pendulum": ["q", "qd"]}[system]
+        simulate(
+            system, observe=channels, runs=2, seconds=1.0, rate=20.0, initial=initial,
+            noise={channels[0]: 0.01},
+        ).write(path)  # fmt: skip
+        return {"data.csv": path.read_bytes(), "data.toml": path.with_suffix(".toml").read_bytes()}
+
+
+MODEL = {
+    "name": "pendulum_extended",
+    "system": "pendulum",
+    "engine": "batch",
+    "title": "a pendulum with drag",
+    "observe": ["q"],
+    "constants": {"gravity": 9.81},
+    "parameters": {},
+    "effects": {"drag.linear": {"coefficient": {"value": 0.001, "unit": "N m s/rad"}}},
+}
+
+
+@cache
+def model() -> dict:
+    """What `simgap explain` writes of a pendulum."""
+    import tomllib
+
+    from sims.pendulum.simulator import Pendulum
+
+    reference = Path(__file__).parents[2] / "results/reference/real/pendulum_free_swing/recording"
+    held = tomllib.loads((reference / "extended.toml").read_text(encoding="utf-8"))
+    assert held["system"] == Pendulum.name
+    return held
+
+
+def bases(folder: Path) -> dict[str, Path]:
+    """Result folders: one that is complete, one that is not; one whose salt is public; weights; a
+    film.
+    """
+    made = {}
+    known = [registry.snapshot() for registry in REGISTRIES]
+    with patch.dict(os.environ, {"SIMGAP_CACHE": str(folder / "cache")}):
+        experiments = {
+            "done": {**SECRET, "tuners": {"random": {}, "learner": {}}},
+            "public": SWING,
+            "half": SECRET,
+        }
+        for name, document in experiments.items():
+            path = folder / f"swing-{name}.toml"
+            path.write_bytes(toml(document))
+            experiment = load(str(path)).chosen(trusted=True)
+            plugins = [str(LEARNER)] if name == "done" else []
+            admit(plugins, experiment)
+            made[name] = folder / name
+            comparison = Comparison.begin(experiment, plugins, made[name], jobs=0)
+            if name == "half":
+                run(comparison.results, plugins, 0)
+                comparison.results.kept.close()
+            else:
+                comparison.make(jobs=0)
+                with patch("bench.report._drawn", return_value=[]):
+                    comparison.finish(lambda _: None)
+    path = folder / "learned.toml"
+    path.write_bytes(toml(LEARNED))
+    made["weights"] = folder / "weights"
+    with patch.dict(os.environ, {"SIMGAP_CACHE": str(made["weights"])}):
+        assert main(trains(str(path), str(folder / "losses"))) == 0
+    made["film"] = folder / "film"
+    made["film"].mkdir()
+    drop = simulate("ball", observe=["z"], runs=1, seconds=0.8, rate=50.0, initial={"z": 2.0})
+    drop.write(folder / "drop.csv")
+    film(folder / "drop.csv", made["film"] / "drop.mp4", None, 64, 0)
+    for registry, snapshot in zip(REGISTRIES, known, strict=True):
+        registry.restore(snapshot)
+    return made
+
+
+def trains(experiment: str, out: str) -> list[str]:
+    """A training of the plugin's learner."""
+    plugin = ["--plugin", str(LEARNER), "--trust", "--out", out]
+    return ["train", "learner", "pendulum", "--experiment", experiment, *plugin]

@@ -1,0 +1,77 @@
+"""Inputs that once did what they must not, each under the name of what went wrong."""
+
+import pytest
+
+from tests.malformed import sound
+from tests.malformed.case import Case, tried
+from tests.malformed.kinds import files_of_arguments
+from tests.malformed.short import environment, shortened
+
+
+def compare(document, *more):
+    files = {"spoilt.toml": sound.toml(document)}
+    return Case(("compare", "spoilt.toml", "--out", "out", *more), files, owns=("out",))
+
+
+def listed(plugin):
+    return Case(("list", "tuners", "--plugin", "plugin.py"), {"plugin.py": plugin.encode()})
+
+
+def said(*words):
+    return Case(words, files_of_arguments(), "done")
+
+
+WIDE = "\\x04" * 3000
+SPEECHLESS = "raise type('E', (Exception,), {'__str__': lambda s: 1 / 0})()"
+CASES = {
+    "a plugin that raises what is no Exception": (listed("raise BaseException('x')"), "x"),
+    "an error that cannot say anything": (listed(SPEECHLESS), "E: without words"),
+    "a message that its escapes make long": (listed(f"raise ValueError('{WIDE}')"), "\\x04"),
+    "a name that no file can have": (said("status", "x" * 900), "DIR: expected a path"),
+    "a plugin's name that no file can have": (
+        said("list", "tuners", "--plugin", "x" * 900),
+        "--plugin: expected a path",
+    ),
+    "arguments that turn the line around": (said("list", "systems", "\u202eabc"), "\\u202eabc"),
+    "an endless argument": (said("compare", "swing.toml", "9" * 5000), "unrecognized"),
+    "a world with parameters of its own": (
+        compare({**sound.SWING, "world": {"effects": ["drag.linear"]}}),
+        "fixed = { NAME",
+    ),
+}
+
+
+def test_a_film_with_a_box_of_an_unknown_version(ready, tmp_path):
+    folder, there = ready
+    film = (there["film"] / "drop.mp4").read_bytes()
+    name, version = b"mdhd\x00", b"mdhd\xff"
+    assert name in film
+    files = {"run/drop.mp4": film.replace(name, version)}
+    case = Case(("track", "run/drop.mp4", "--out", "track.csv"), files, "film")
+    with environment(folder), shortened():
+        heard = tried(case, tmp_path / "place", there)
+    assert heard.code == 2
+    assert heard.err.startswith("simgap: run/drop.mp4: ")
+
+
+def test_flipped_bytes_of_a_text_in_parquet(ready, tmp_path):
+    folder, there = ready
+    rows = (there["done"] / "runs.parquet").read_bytes()
+    name = b"swing-done"
+    files = {"run/runs.parquet": rows.replace(name, b"swing\xfadone", 1)}
+    assert files["run/runs.parquet"] != rows
+    case = Case(("status", "run"), files, "done")
+    with environment(folder), shortened():
+        heard = tried(case, tmp_path / "place", there)
+    assert heard.code == 2
+    assert "experiment: expected text, found Invalid" in heard.err
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_kept(ready, tmp_path, name):
+    folder, there = ready
+    case, words = CASES[name]
+    with environment(folder), shortened():
+        heard = tried(case, tmp_path / "place", there)
+    assert heard.code == 2
+    assert words in heard.err

@@ -1,0 +1,31 @@
+"""A share of the ten thousand malformed inputs of `make malformed`: each gives one clear line, or
+is sound after all.
+"""
+
+import shutil
+from collections import Counter
+
+import pytest
+
+from tests.malformed.case import tried
+from tests.malformed.kinds import SHARES, made, share, strategies
+from tests.malformed.short import environment, shortened
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SHARES)
+def test_malformed(ready, kind):
+    folder, there = ready
+    codes = Counter()
+
+    def act(case):
+        place = folder / "place"
+        try:
+            codes[tried(case, place, there).code] += 1
+        finally:
+            shutil.rmtree(place, ignore_errors=True)
+
+    with environment(folder), shortened():
+        made(strategies(there)[kind], share(kind), act)
+    # Otherwise nothing would have been tried.
+    assert codes[2] > 0.3 * sum(codes.values())
