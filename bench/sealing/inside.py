@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.sealing.asked import as_points
-from bench.sealing.memory import limit_memory
 from bench.sealing.seals import Reach
 from bench.sealing.streams import state_of, stream_of
 from bench.sealing.wire import TEXT_LIMIT, Channel, GoneError, Message, packed, unpacked
@@ -39,10 +38,9 @@ _LIMIT = 1 << 40
 """What the harness sends is not bounded: it is trusted."""
 
 
-def serve(channel: Channel, reach: Reach, held: list[str]) -> None:
+def serve(channel: Channel, _reach: Reach, held: list[str]) -> None:
     """Do what is asked until nobody asks any more."""
     channel.send_document(b"R", held)
-    limit_memory(reach.memory)
     # Loaded ahead, it would give each run the same numbers to those who use it in place of theirs.
     np.random.seed()  # noqa: NPY002
     with suppress(GoneError):

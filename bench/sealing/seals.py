@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench.sealing import calls, kernel
+from bench.sealing.memory import limit_memory
 
 SEALS = {
     "process": "the tuner has a process of its own, with a task and a pipe and nothing else",
@@ -65,7 +66,6 @@ class Reach(NamedTuple):
     memory: int = 0
 
 
-@cache
 def readable(hidden: tuple[str, ...]) -> tuple[str, ...]:
     """Files and folders that Python, its packages and this project's code need.
 
@@ -73,9 +73,15 @@ def readable(hidden: tuple[str, ...]) -> tuple[str, ...]:
         hidden: folders that must not be reached, such as the one of the results; a folder of
             packages that one of them lies in is left out.
     """
+    # A notebook may have added a folder since.
+    return _readable(hidden, tuple(sys.path))
+
+
+@cache
+def _readable(hidden: tuple[str, ...], packages: tuple[str, ...]) -> tuple[str, ...]:
     kept = [Path(path).resolve() for path in hidden]
     interpreter = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}
-    places = [*sorted(interpreter), *site.getsitepackages(), site.getusersitepackages(), *sys.path]
+    places = [*sorted(interpreter), *site.getsitepackages(), site.getusersitepackages(), *packages]
     found = []
     for text in places:
         place = Path(text or ".").resolve()
@@ -135,6 +141,8 @@ def shut(reach: Reach, own_user: bool) -> list[str]:
     _put_on(lambda: kernel.mount("proc", "/proc"))
     os.chdir(reach.folder)
     _limit(own_user)
+    # Before the files seal: without a /proc of its own it may be refused to look into itself.
+    limit_memory(reach.memory)
     # Short of memory the kernel ends the tuner first, and no rival.
     _put_on(lambda: _write("/proc/self/oom_score_adj", "1000"))
     if _put_on(lambda: kernel.landlock(reach.readable, [reach.folder, *_DEVICES])):

@@ -9,7 +9,13 @@ from bench.sealing.seals import SEALS
 from tests.cheats import arena
 
 KINDS = {**arena.cheats("force"), **arena.cheats("talk"), **arena.cheats("school")}
-NEEDED = {"shared-hog": "calls", "file-hog": "calls", "spoiling": "files", "full-disk": "disk"}
+NEEDED = {
+    "shared-hog": "calls",
+    "file-hog": "calls",
+    "spoiling": "files",
+    "full-disk": "disk",
+    "many-files": "disk",
+}
 """Seals without which a cheater would do harm to whoever tries."""
 RIVALS = {"random": {}, "nelder_mead": {}, "least_squares": {}}
 pytestmark = pytest.mark.slow

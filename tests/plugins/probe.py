@@ -1,0 +1,63 @@
+"""Tuners that do in their process what a test asks for, and say as they stop what came of it."""
+
+import time
+
+import numpy as np
+
+from methods.base import Ask, Tuner
+
+SEEN = []
+"""Of earlier runs in this process."""
+
+
+class Probe(Tuner):
+    """Runs a piece of code whose last line is an expression.
+
+    Args:
+        code: Python.
+    """
+
+    def __init__(self, code=""):
+        self.code = code
+
+    def tune(self, task, rng):
+        yield task.start
+        *before, last = self.code.strip().splitlines()
+        names = {"task": task}
+        try:
+            exec("\n".join(before), names)
+            return repr(eval(last, names))
+        except Exception as error:
+            return f"{type(error).__name__}: {error}"
+
+
+class Remembering(Tuner):
+    """Says how many runs this process has seen before."""
+
+    def tune(self, task, rng):
+        before = len(SEEN)
+        SEEN.append(task)
+        yield task.start
+        return f"saw {before}"
+
+
+class Late(Tuner):
+    """Takes its time before, between and behind its simulations, and has stopped its clock."""
+
+    def tune(self, task, rng):
+        time.perf_counter = time.monotonic = time.time = lambda: 0.0
+        time.sleep(0.02)
+        for i in range(task.budget):
+            yield rng.uniform(size=(1, task.dim))
+            time.sleep(0.05 if i == task.budget - 1 else 0.01)
+        yield Ask(task.start, task.start)
+
+
+class Drawing(Tuner):
+    """Draws from the system's chance, so that no two runs are alike."""
+
+    def tune(self, task, rng):
+        other = np.random.default_rng()
+        while True:
+            time.sleep(0.05)
+            yield other.uniform(size=(1, task.dim))
