@@ -182,9 +182,15 @@ DONE = {
     "another simulator": (STATUS_CSV, column_of(STATUS_CSV, 2, lambda _: "pendulum")),
     "escapes": (STATUS_CSV, column_of(STATUS_CSV, 1, lambda _: "\x1b[31m\u2028")),
     "training header": ("training.csv", text("training.csv", "seconds", "s")),
-    "training of nobody": ("training.csv", lines("training.csv", lambda ls: [*ls, "me,0,1,1,True"])),
+    "training of nobody": (
+        "training.csv",
+        lines("training.csv", lambda ls: [*ls, "me,0,1,1,True"]),
+    ),
     "training twice": ("training.csv", lines("training.csv", lambda ls: [ls[0], *TRAINED * 2])),
-    "training cost": ("training.csv", lines("training.csv", lambda ls: [*ls, "random,0,-1,1,True"])),
+    "training cost": (
+        "training.csv",
+        lines("training.csv", lambda ls: [*ls, "random,0,-1,1,True"]),
+    ),
     "training gone": ("training.csv", lambda folder: (folder / "training.csv").unlink()),
     "no direction": ("identifiability.csv", column_of("identifiability.csv", 3, lambda _: "0")),
     "directions": ("identifiability.csv", column_of("identifiability.csv", 3, lambda _: "2")),
