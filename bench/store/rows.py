@@ -51,7 +51,8 @@ class RunsFile(NamedTuple):
 
         try:
             return list(parquet.read_schema(self.path).names)
-        except (OSError, ArrowException) as error:
+        # Of damaged bytes even the names of columns may be no text.
+        except (OSError, ArrowException, UnicodeDecodeError) as error:
             raise self._unreadable(error) from None
 
     def runs(
@@ -76,7 +77,7 @@ class RunsFile(NamedTuple):
             return checked_runs([whole], whole.column_names, experiment)
         except CellError as error:
             raise self.fault(error.row, error.says) from None
-        except (OSError, pa.ArrowException) as error:
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
             raise self._unreadable(error) from None
 
     def _batches(self) -> Iterator[pa.Table]:

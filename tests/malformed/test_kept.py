@@ -54,17 +54,25 @@ def test_a_film_with_a_box_of_an_unknown_version(ready, tmp_path):
     assert heard.err.startswith("simgap: run/drop.mp4: ")
 
 
-def test_flipped_bytes_of_a_text_in_parquet(ready, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "flipped", "words"),
+    [
+        (b"swing-done", b"swing\xfadone", "experiment: expected text, found Invalid"),
+        (b"simulator_seconds", b"simulator\xb6seconds", "expected a Parquet file, found 'utf-8'"),
+    ],
+    ids=["cell", "column"],
+)
+def test_flipped_bytes_of_a_text_in_parquet(ready, tmp_path, name, flipped, words):
     folder, there = ready
     rows = (there["done"] / "runs.parquet").read_bytes()
-    name = b"swing-done"
-    files = {"run/runs.parquet": rows.replace(name, b"swing\xfadone", 1)}
+    # A cell is damaged once, a column wherever the file speaks of it.
+    files = {"run/runs.parquet": rows.replace(name, flipped, 1 if b"-" in name else -1)}
     assert files["run/runs.parquet"] != rows
     case = Case(("status", "run"), files, "done")
     with environment(folder), shortened():
         heard = tried(case, tmp_path / "place", there)
     assert heard.code == 2
-    assert "experiment: expected text, found Invalid" in heard.err
+    assert words in heard.err
 
 
 @pytest.mark.parametrize("name", CASES)
