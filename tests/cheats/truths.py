@@ -127,7 +127,7 @@ class Journal(Cheat):
     name = "journal"
 
     def find(self, task):
-        return rivals([*self.places, Path.cwd(), Path.home()])
+        return rivals([*self.places, Path.cwd()])
 
 
 class Anywhere(Cheat):
