@@ -106,7 +106,8 @@ def test_compare_writes_the_folder_it_promises_and_a_plugin_tuner_is_in_it(exper
     assert len(runs) == 2 * 3 * (2 + 1 + 2) * 7, "nelder_mead uses no chance: one seed"
     statuses = pd.read_csv(folder / "status.csv")
     assert list(statuses.columns) == [
-        "run", "tuner", "simulator", "target", "seed", "status", "reason", "simulations", "seconds"
+        "run", "tuner", "simulator", "target", "seed", "status", "reason", "simulations", "seconds",
+        "trusted",
     ]  # fmt: skip
     environment = json.loads((folder / "environment.json").read_text())
     assert environment["packages"]["numpy"]
