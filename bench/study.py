@@ -155,32 +155,6 @@ def begin_all(
     return begun
 
 
-def refuse_hopeless(
-    experiment: Experiment,
-    folder: Path | None = None,
-    jobs: int = 2,
-    cluster: bool = False,
-    force: bool = False,
-) -> None:
-    """Refuse what could never be finished on this machine, before anything is made of it.
-
-    Args:
-        experiment: what is asked for; it may sweep over values.
-        folder: where it would be written.
-        jobs: as in `Study.begin`.
-        cluster: whether other machines do the work.
-        force: whether the user insists.
-
-    Raises:
-        InputError: it needs more than there is, in one line.
-    """
-    from bench.problem.experiment import expand
-    from bench.runs.size import check_comparison
-
-    for one in expand(experiment):
-        check_comparison(one, folder, jobs, cluster, force)
-
-
 def parts_of(folder: Path) -> list[Path]:
     """The folders of the studies in a folder: itself, or those that a sweep has put there."""
     if (folder / CONFIGURATION).exists() or not folder.is_dir():

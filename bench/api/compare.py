@@ -17,6 +17,7 @@ from bench.problem.problem import Problem
 from bench.registry import tuners as registered
 from bench.report import tables
 from bench.runs.runner import Progress
+from bench.runs.size import check_comparison
 from bench.runs.survey import admit
 from bench.store.csvs import Csv
 from bench.store.folder import Stored, read
@@ -99,7 +100,7 @@ def compare(
     if chosen.sweep:
         raise InputError(f"experiment {chosen.name} sweeps over values: use simgap.sweep")
     folder = None if out is None else Path(out)
-    study.refuse_hopeless(chosen, folder, jobs, cluster is not None, force)
+    check_comparison(chosen, folder, jobs, cluster is not None, force)
     pool = _cluster(cluster)
     begun = study.begin(chosen, files, folder, jobs, salt)
     return _made(begun, jobs, progress, pool)
@@ -137,7 +138,7 @@ def sweep(
     files = [str(Path(plugin).resolve()) for plugin in plugins]
     chosen = choose(given(experiment, files, trust or not jobs))
     folder = None if out is None else Path(out)
-    study.refuse_hopeless(chosen, folder, jobs, force=force)
+    check_comparison(chosen, folder, jobs, force=force)
     begun = study.begin_all(chosen, files, folder, jobs, salt)
     return [_made(one, jobs, progress, None) for one in begun]
 

@@ -181,13 +181,14 @@ def _refuse_beside_resume(options: argparse.Namespace) -> None:
 
 def _begun(options: argparse.Namespace) -> list[Study]:
     """The study that is begun or resumed; several of a sweep."""
-    from bench.study import begin_all, parts_of, refuse_hopeless, resume
+    from bench.runs.size import check_comparison
+    from bench.study import begin_all, parts_of, resume
 
     if options.resume:
         _refuse_beside_resume(options)
         return [resume(part, options.plugin) for part in parts_of(options.resume)]
     chosen, cluster = _chosen(options), options.cluster is not None
-    refuse_hopeless(chosen, options.out, options.jobs, cluster, options.force)
+    check_comparison(chosen, options.out, options.jobs, cluster, options.force)
     with said_as("--out", options.out):
         return begin_all(chosen, options.plugin, options.out, options.jobs, options.salt)
 

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from bench.problem.experiment import Entry
 from bench.registry import tuners
+from bench.sealing.children import Nursery
 from bench.sealing.ended import EndedError, KilledError
-from bench.sealing.outside import Nursery, SealedTuner, Tuned
+from bench.sealing.outside import SealedTuner, Tuned
 
 Result = TypeVar("Result")
 
@@ -155,7 +156,9 @@ def housed(
         EndedError: it cannot be built.
         KilledError: it was killed from outside.
     """
-    key = (repr(tuned), seed, hidden, memory, _digest(state or {}))
+    kept = isolation == "tuner"
+    # Weights are hashed only where a tuner may wait that has others.
+    key = (repr(tuned), seed, hidden, memory, _digest(state or {})) if kept else None
     tuner = _waiting.pop(key, None)
     if tuner is None or not tuner.child.alive:
         house = nursery()
@@ -174,7 +177,7 @@ def housed(
     except BaseException:
         tuner.child.end()
         raise
-    if isolation == "run":
+    if not kept:
         tuner.child.end()
     elif tuner.child.alive:
         _waiting[key] = tuner

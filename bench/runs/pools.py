@@ -23,6 +23,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol
 
 from bench.runs.guard import initialise
+from bench.sealing.ended import how_it_ended
 from sims.base import InputError
 
 if TYPE_CHECKING:
@@ -357,12 +358,5 @@ def _end_of(error: BaseException) -> BaseException:
 
 def _says(code: int) -> str:
     """How a worker process ended, in words."""
-    import signal
-
-    if code >= 0:
-        return f"the worker process exited with code {code}"
-    try:
-        name = signal.Signals(-code).name
-    except ValueError:
-        name = f"signal {-code}"
-    return f"the worker process was killed by {name}" + (" (out of memory?)" if code == -9 else "")
+    said = how_it_ended("the worker process", code)
+    return f"{said} (out of memory?)" if code == -9 else said

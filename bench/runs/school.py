@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.problem.practice import Practice
+from bench.sealing.children import Child
 from bench.sealing.ended import EndedError
-from bench.sealing.outside import Child
 from bench.sealing.streams import state_of, stream_of
 from bench.sealing.wire import (
     ASKED_LIMIT,

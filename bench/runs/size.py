@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from bench.problem.experiment import Entry, Experiment
+from bench.problem.experiment import Entry, Experiment, expand
 from bench.problem.problem import Problem
 from bench.problem.recorded import find_recording
 from bench.recordings.stamps import refuse_odd
@@ -101,7 +101,7 @@ def check_comparison(
     """Refuse a comparison that is hopeless on this machine.
 
     Args:
-        experiment: what it is of.
+        experiment: what it is of; it may sweep over values.
         folder: where it would be written.
         jobs: worker processes; 0 for none.
         cluster: whether others do the work.
@@ -112,12 +112,13 @@ def check_comparison(
     """
     if force:
         return
-    need = comparison(experiment, jobs, cluster)
-    refuse(f"experiment {experiment.name}", need, machine(folder))
-    if experiment.recording:
-        kind = simulators.get(experiment.simulator)
-        path = find_recording(experiment.recording.path)
-        refuse_odd(read_recording(path, kind), kind)
+    for one in expand(experiment):
+        need = comparison(one, jobs, cluster)
+        refuse(f"experiment {one.name}", need, machine(folder))
+        if one.recording:
+            kind = simulators.get(one.simulator)
+            path = find_recording(one.recording.path)
+            refuse_odd(read_recording(path, kind), kind)
 
 
 def comparison(experiment: Experiment, jobs: int = 2, cluster: bool = False) -> Need:

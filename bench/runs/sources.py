@@ -241,12 +241,16 @@ def effect_sources(*settings: Mapping[str, Any]) -> list[str]:
 
 def effect_names(*settings: Mapping[str, Any]) -> list[str]:
     """Names of the effects in ``effects`` and ``fixed`` of these settings, each once, sorted."""
-    known = effects.names()
+    return sorted(named_effects(*settings) & set(effects.names()))
+
+
+def named_effects(*settings: Mapping[str, Any]) -> set[str]:
+    """All names that stand there, of effects that are known and of such as a plugin may have."""
     names: set[str] = set()
     for table in settings:
         for key in ("effects", "fixed"):
             value = table.get(key, ())
             # What is no list, or no effect, is the simulator's to refuse.
             if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
-                names.update(name for name in value if name in known)
-    return sorted(names)
+                names.update(name for name in value if isinstance(name, str))
+    return names

@@ -5,7 +5,7 @@ runs where truths are.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 from bench.problem.experiment import Entry, Experiment
 from bench.registry import REGISTRIES, load_plugins, tuners
 from bench.runs.housing import housed, nursery, tuned_of, undisturbed
-from bench.runs.sources import digest, effect_names, source
+from bench.runs.sources import digest, named_effects, source
 from bench.sealing.ended import EndedError
 from bench.sealing.seals import Reach
 from bench.sealing.wire import Channel, printable
@@ -49,7 +49,6 @@ class Plugin:
 class Announced(Tuner):
     """A tuner whose code is not in this process; what is known of it."""
 
-    file: ClassVar[str] = ""
     module: ClassVar[str] = ""
     source_digest: ClassVar[str] = ""
 
@@ -61,7 +60,6 @@ def announced(known: dict[str, Any]) -> type[Announced]:
         "stochastic": known["stochastic"] is not False,
         "learned": known["learned"] is True,
         "trains_as": str(known["trains_as"]),
-        "file": str(known["file"]),
         "module": str(known["module"]),
         "source_digest": str(known["source"]),
         "__doc__": str(known["says"]),
@@ -101,8 +99,8 @@ def admit(paths: Sequence[str], experiment: Experiment) -> None:
     """
     known = [Plugin(path) for path in paths]
     if not experiment.trusted:
-        needed = {experiment.simulator, *effect_names(experiment.settings, experiment.world)}
-        known = survey(paths, needed | _written(experiment))
+        needed = {experiment.simulator} | named_effects(experiment.settings, experiment.world)
+        known = survey(paths, needed)
         _refuse_both(known, experiment)
     enter(known)
     _admitted.update({plugin.path: plugin for plugin in known})
@@ -129,16 +127,6 @@ def _among_truths(label: str, place: object) -> InputError:
         "simulator or effect in it is used here, or it was loaded by hand; put the tuner into a "
         "file of its own, or trust the tuners"
     )
-
-
-def _written(experiment: Experiment) -> set[str]:
-    """Names where an experiment names effects, of which nothing may be known yet."""
-    texts: set[str] = set()
-    for table in (experiment.settings, experiment.world):
-        for value in (table.get("effects"), table.get("fixed")):
-            if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
-                texts.update(name for name in value if isinstance(name, str))
-    return texts
 
 
 def admitted(paths: Sequence[str], experiment: Experiment) -> list[Plugin]:

@@ -154,8 +154,10 @@ def _perform(experiment: Experiment, order: Order, before: list[Array]) -> Outco
     # Scoring and what came before do not count.
     simulated = problem.simulated
     started = perf_counter()
-    drives = _trusted if order.tuned is None else _sealed
-    trace = drives(experiment, order, task, _Repeated(evaluator, before))
+    if order.tuned is None:
+        trace = _trusted(experiment, order, task, evaluator)
+    else:
+        trace = _sealed(experiment, order, task, _Repeated(evaluator, before))
     seconds = perf_counter() - started
     beside = problem.simulated - simulated - len(trace.losses)
     # A simulator that raises has simulated, and nothing came of it.

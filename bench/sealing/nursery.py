@@ -17,7 +17,6 @@ import shutil
 import signal
 import socket
 import struct
-import sys
 import warnings
 from contextlib import suppress
 from time import perf_counter, sleep
@@ -205,7 +204,3 @@ def _waited(keeper: int) -> int | None:
     os.kill(keeper, signal.SIGKILL)
     os.waitpid(keeper, 0)
     return None
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]))

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.sealing.children import Child
 from bench.sealing.ended import EndedError
-from bench.sealing.outside import Child
 from bench.sealing.streams import state_of, stream_of
 from bench.sealing.wire import Channel, FoulError, GoneError, Message, packed, printable, unpacked
 
