@@ -20,6 +20,7 @@ from bench.registry import tuners
 from bench.sealing.children import Nursery
 from bench.sealing.ended import EndedError, KilledError
 from bench.sealing.outside import SealedTuner, Tuned
+from sims.base import InputError
 
 Result = TypeVar("Result")
 
@@ -52,7 +53,21 @@ def nursery() -> Nursery:
 
 @cache
 def seals() -> tuple[str, ...]:
-    """The seals that hold around a tuner's process on this machine; see `bench.sealing.seals`."""
+    """The seals that hold around a tuner's process on this machine; see `bench.sealing.seals`.
+
+    Raises:
+        InputError: no such process can be started.
+    """
+    try:
+        return undisturbed(_seals)
+    except EndedError as ended:
+        raise InputError(
+            f"no tuner can have a process of its own here: {ended}; mend that, or give --trust for "
+            "tuners that you know"
+        ) from None
+
+
+def _seals() -> tuple[str, ...]:
     child = nursery().start("bench.sealing.inside:serve")
     try:
         child.ready()

@@ -121,6 +121,7 @@ class ClosedPipe(Outliving):
 
 class ThreadBomb(Force):
     name = "thread-bomb"
+    ends = ("done", "timeout")
 
     def act(self, task):
         stop = threading.Event()

@@ -43,6 +43,7 @@ class Talk(RandomSearch):
 
     name = "talk"
     ends = "crashed"
+    waits = False  # for an answer: whether two messages are read at once is chance
 
     def say(self, task):
         """Bytes for the harness, in place of what it waits for."""
@@ -52,6 +53,8 @@ class Talk(RandomSearch):
         yield task.start[None]
         with contextlib.suppress(OSError):
             write(self.say(task))
+        if self.waits:
+            time.sleep(1000)
         while True:
             yield rng.uniform(size=(1, task.dim))
 
@@ -166,6 +169,7 @@ class LongReason(Talk):
 
     name = "long-reason"
     ends = "converged"
+    waits = True
 
     def say(self, task):
         return message(b"S", b"x" * (1 << 15))
@@ -176,6 +180,7 @@ class FoulReason(Talk):
 
     name = "foul-reason"
     ends = "converged"
+    waits = True
 
     def say(self, task):
         return message(b"S", b'\0\x1b[2J"\r\n",,\x85\xff\xfe=cmd()\xe2\x80\xa8;' * 3)

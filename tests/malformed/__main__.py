@@ -49,7 +49,7 @@ def main():
     parser.add_argument("--cases", type=int, default=sum(SHARES.values()))
     options = parser.parse_args()
     faults = {}
-    with tempfile.TemporaryDirectory() as place, environment(Path(place)):
+    with tempfile.TemporaryDirectory() as place, environment(Path(place) / "place"):
         folder = Path(place)
         ready = bases(folder)
         for kind, strategy in strategies(ready).items():

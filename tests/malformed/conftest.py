@@ -8,5 +8,5 @@ from tests.malformed.sound import bases
 def ready(tmp_path_factory):
     """A folder to work in, and prepared folders by name."""
     folder = tmp_path_factory.mktemp("malformed")
-    with environment(folder):
+    with environment(folder / "place"):
         return folder, bases(folder)

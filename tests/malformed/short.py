@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import pkgutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import bench
 from bench.registry import REGISTRIES
 from sims.base import InputError
 
@@ -41,6 +45,7 @@ SHORT = {
     "bench.commands.compare._made": _closed,
     "bench.runs.cluster.ClusterPool": _nobody,
     "bench.report.tables": _cut,
+    "bench.verify.tables": _cut,
     "bench.across.Together.tables": _cut,
     "bench.store.folder.distributions": _nothing,
     "bench.gap.explain._Explainer.run": _cut,
@@ -54,15 +59,15 @@ SHORT = {
 
 
 @contextmanager
-def environment(folder: Path) -> Iterator[None]:
-    """Within the block trained weights are looked for in the place of a case, `folder`/place, and
-    nothing is known but what is installed.
+def environment(place: Path) -> Iterator[None]:
+    """Within the block trained weights are looked for in the `place` of a case, and nothing is
+    known but what is installed.
     """
     known = [registry.snapshot() for registry in REGISTRIES]
     try:
         for registry, parts in zip(REGISTRIES, known, strict=True):
             registry.restore({name: part for name, part in parts.items() if part.path is None})
-        with patch.dict(os.environ, {"SIMGAP_CACHE": str(folder / "place" / HERE / "run")}):
+        with patch.dict(os.environ, {"SIMGAP_CACHE": str(place / HERE / "run")}):
             yield
     finally:
         for registry, parts in zip(REGISTRIES, known, strict=True):
@@ -72,7 +77,17 @@ def environment(folder: Path) -> Iterator[None]:
 @contextmanager
 def shortened() -> Iterator[None]:
     """Within the block commands end where work would begin."""
+    _whole()
     with ExitStack() as stack:
         for name, act in SHORT.items():
             stack.enter_context(patch(name, act))
         yield
+
+
+@cache
+def _whole() -> None:
+    """Import all of the harness: what is imported within the block would keep what stands there in
+    the place of work.
+    """
+    for module in pkgutil.walk_packages(bench.__path__, "bench."):
+        importlib.import_module(module.name)

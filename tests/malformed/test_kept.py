@@ -42,14 +42,14 @@ CASES = {
 
 
 def test_a_film_with_a_box_of_an_unknown_version(ready, tmp_path):
-    folder, there = ready
+    _, there = ready
     film = (there["film"] / "drop.mp4").read_bytes()
     name, version = b"mdhd\x00", b"mdhd\xff"
     assert name in film
     files = {"run/drop.mp4": film.replace(name, version)}
     case = Case(("track", "run/drop.mp4", "--out", "track.csv"), files, "film")
-    with environment(folder), shortened():
-        heard = tried(case, tmp_path / "place", there)
+    with environment(tmp_path), shortened():
+        heard = tried(case, tmp_path, there)
     assert heard.code == 2
     assert heard.err.startswith("simgap: run/drop.mp4: ")
 
@@ -63,23 +63,23 @@ def test_a_film_with_a_box_of_an_unknown_version(ready, tmp_path):
     ids=["cell", "column"],
 )
 def test_flipped_bytes_of_a_text_in_parquet(ready, tmp_path, name, flipped, words):
-    folder, there = ready
+    _, there = ready
     rows = (there["done"] / "runs.parquet").read_bytes()
     # A cell is damaged once, a column wherever the file speaks of it.
     files = {"run/runs.parquet": rows.replace(name, flipped, 1 if b"-" in name else -1)}
     assert files["run/runs.parquet"] != rows
     case = Case(("status", "run"), files, "done")
-    with environment(folder), shortened():
-        heard = tried(case, tmp_path / "place", there)
+    with environment(tmp_path), shortened():
+        heard = tried(case, tmp_path, there)
     assert heard.code == 2
     assert words in heard.err
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_kept(ready, tmp_path, name):
-    folder, there = ready
+    _, there = ready
     case, words = CASES[name]
-    with environment(folder), shortened():
-        heard = tried(case, tmp_path / "place", there)
+    with environment(tmp_path), shortened():
+        heard = tried(case, tmp_path, there)
     assert heard.code == 2
     assert words in heard.err

@@ -16,16 +16,15 @@ from tests.malformed.short import environment, shortened
 @pytest.mark.parametrize("kind", SHARES)
 def test_malformed(ready, kind):
     folder, there = ready
-    codes = Counter()
+    codes, place = Counter(), folder / "place"
 
     def act(case):
-        place = folder / "place"
         try:
             codes[tried(case, place, there).code] += 1
         finally:
             shutil.rmtree(place, ignore_errors=True)
 
-    with environment(folder), shortened():
+    with environment(place), shortened():
         made(strategies(there)[kind], share(kind), act)
     # Otherwise nothing would have been tried.
     assert codes[2] > 0.3 * sum(codes.values())

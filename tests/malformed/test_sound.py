@@ -22,11 +22,11 @@ REFUSED = ("track none.mp4", "--cluster", "score extended.toml data.csv --json -
 
 @pytest.mark.parametrize("line", [line for line in SOUND if not any(r in line for r in REFUSED)])
 def test_what_is_not_spoilt_is_taken(ready, tmp_path, line):
-    folder, there = ready
+    _, there = ready
     files = {**files_of_arguments(), "worldly.toml": sound.toml(sound.WORLDLY)}
     for path in there["film"].iterdir():
         files[f"film/{path.name}"] = path.read_bytes()
     case = Case(tuple(line.split()), files, "half" if "resume" in line else "done", owns=("",))
-    with environment(folder), shortened():
-        heard = tried(case, tmp_path / "place", there)
+    with environment(tmp_path), shortened():
+        heard = tried(case, tmp_path, there)
     assert heard.code == 0, heard.err

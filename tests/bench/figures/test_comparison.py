@@ -95,7 +95,7 @@ def test_tables_can_be_had_without_a_file():
     made = tables(whole)
     assert list(made) == ["table", "ert", "pairs", "break_even", "who_wins"]
     expected = table(whole.runs, whole.statuses, 12, whole.costs)
-    pd.testing.assert_frame_equal(made["table"], expected)
+    pd.testing.assert_frame_equal(made["table"].drop(columns=["salt", "trusted"]), expected)
     assert set(made["ert"]["tuner"]) == {"random", "tunenet"}
     assert set(made["pairs"]["range"]) == {"in", "wide"}
     assert set(made["break_even"]["learned"]) == {"tunenet"}

@@ -17,7 +17,9 @@ from bench.runs import housing
 from bench.runs.survey import admit, survey
 from bench.runs.training import Lesson, train, weights_of
 from bench.runs.worker import Order, perform, problem_of
+from bench.sealing.ended import KilledError
 from bench.sealing.folders import new, sweep
+from sims.base import InputError
 from tests.chaos import SEALED, below
 from tests.experiments import spring_experiment
 
@@ -26,7 +28,7 @@ import time
 import numpy as np
 from methods.base import Tuner
 
-time.sleep(0.2)
+time.sleep(0.5)
 
 
 class Slow(Tuner):
@@ -81,7 +83,7 @@ class Killing:
             if not tuners:
                 time.sleep(0.01)
                 continue
-            time.sleep(0.1)
+            time.sleep(0.05)
             with suppress(psutil.NoSuchProcess, IndexError):
                 below([psutil.Process()], self._what)[0].kill()
                 self.killed += 1
@@ -111,6 +113,29 @@ def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
     assert killing.killed == 1
     assert disturbed.status == undisturbed.status == "done", disturbed.reason
     np.testing.assert_array_equal(disturbed.recommendations, undisturbed.recommendations)
+
+
+@pytest.mark.parametrize("kills", [2, 3])
+def test_a_look_at_the_seals_is_begun_again_as_often_as_a_run(monkeypatch, kills):
+    ends = iter([KilledError("killed")] * kills + [("process",)])
+
+    def looked():
+        match next(ends):
+            case KilledError() as killed:
+                raise killed
+            case held:
+                return held
+
+    monkeypatch.setattr(housing, "_seals", looked)
+    # Another test's look is kept, and is no business of this one.
+    look = housing.seals.__wrapped__
+    if kills < housing.RETRIES:
+        assert look() == ("process",)
+    else:
+        with pytest.raises(
+            InputError, match="a process of its own here: killed, 3 times; .*--trust"
+        ):
+            look()
 
 
 ALONE = """
