@@ -133,7 +133,7 @@ def test_a_look_at_the_seals_is_begun_again_as_often_as_a_run(monkeypatch, kills
         assert look() == ("process",)
     else:
         with pytest.raises(
-            InputError, match="a process of its own here: killed, 3 times; .*--trust"
+            InputError, match=r"a process of its own here: killed, 3 times; .*--trust"
         ):
             look()
 
