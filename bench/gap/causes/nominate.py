@@ -9,7 +9,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from bench.gap.causes.candidates import Directions
-from bench.gap.causes.score_test import Group, Scores
+from bench.gap.causes.gains import Group
+from bench.gap.causes.score_test import Scores
 from bench.gap.model.base_fit import HORIZONS
 from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.fit import Start

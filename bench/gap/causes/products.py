@@ -2,209 +2,334 @@
 by itself.
 
 Residual e, directions D and Jacobian J are whitened by W(phi), a first-order autoregression, run by
-run, where phi is common to all channels. For a sample t that follows another, and a first one f,
+run, where phi is common to all channels. W'W has three diagonals. With a_t, b_t samples of two
+columns, zero where nothing was seen, and n_t how many of the two neighbours of t are missing,
 
-    (W a)'(W b) = a_f b_f + (a_t b_t - phi (a_t b_t-1 + a_t-1 b_t) + phi^2 a_t-1 b_t-1)
-                  / (1 - phi^2), summed over f and t                                           (1)
+    (W a)'(W b) = ((1 + phi^2) sum a_t b_t - phi sum a_t (b_t-1 + b_t+1) - phi^2 sum n_t a_t b_t)
+                  / (1 - phi^2)                                                                (1)
 
-so four products of the samples serve every phi. What the model's own freedom absorbs is taken out
-of each product of two columns a and b by a Schur complement, the initial states of each run first
-and the parameters of all runs after (the theorem of R. Frisch, F. V. Waugh and M. C. Lovell):
+so three products of the samples serve every phi, the last of them over the ends of runs alone. What
+the model's own freedom absorbs is taken out of each product of two columns a and b by a Schur
+complement, the initial states of each run first and the parameters of all runs after (the theorem
+of R. Frisch, F. V. Waugh and M. C. Lovell), with L a root of the inverse, L L' = (J'J)^-1:
 
-    <a, b> = a'b - a'J (J'J)^-1 J'b                                                            (2)
+    <a, b> = a'b - (L'J'a)'(L'J'b)                                                             (2)
+
+Directions are multiplied with each other only where they act together, so that the cost is
+proportional to their number, as it is to that of samples and of residuals.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from bench.gap.model.fit import Fit
 from bench.gap.model.noise import Mask
+from bench.gap.model.world import Indices
 from sims.base import Array
 
 ABSORBED = 1e-12
 """Of a direction's sum of squares less than this share is left where the model's own freedom
 absorbs it.
 """
-
-
 RANK = 1e-9
 """Directions below this share of the largest eigenvalue of their scaled products are none."""
+CHUNK = 400_000
+"""Numbers of one array that are worked on at once: more would not stay in the cache."""
+SHORTEST = 64
+"""But so many samples at least, or each stretch would cost more than its products."""
 
 
 class Parts(NamedTuple):
-    """Products of samples that eq. (1) puts together."""
+    """The three sums that eq. (1) puts together, each an array of products."""
 
-    first: Array
-    """of samples without a forerunner."""
-    now: Array
-    """of samples with one."""
+    whole: Array
     mixed: Array
-    """of those with their forerunners, both ways."""
-    before: Array
-    """of the forerunners."""
+    ends: Array
+
+    @staticmethod
+    def of(*shape: int) -> Parts:
+        """Nothing yet, to be added to."""
+        return Parts(np.zeros(shape), np.zeros(shape), np.zeros(shape))
 
     def at(self, phi: float) -> Array:
         """The products after whitening by a correlation."""
-        follow = self.now - phi * self.mixed + phi * phi * self.before
-        return self.first + follow / (1.0 - phi * phi)  # (1)
+        square = phi * phi
+        follow = (1.0 + square) * self.whole - phi * self.mixed - square * self.ends
+        result: Array = follow / (1.0 - square)  # (1)
+        return result
 
 
-class _Run(NamedTuple):
-    """Products of one run: of residuals with themselves, of columns, of columns with residuals."""
+class _Place(NamedTuple):
+    """A stretch of a run.
 
-    squares: Parts
-    columns: Parts
-    cross: Parts
+    Attributes:
+        run: which.
+        begin, end: its samples.
+        edge: which of them lack a neighbour, all channels in a row.
+        lacking: (m,) how many each of those lacks.
+    """
+
+    run: int
+    begin: int
+    end: int
+    edge: Indices
+    lacking: Array
+
+
+class _Columns(NamedTuple):
+    """Columns over a stretch in sigmas, all channels in a row.
+
+    Attributes:
+        now: (k, n) the samples.
+        near: (k, n) those before and behind each, added.
+        edge: (k, m) those that lack a neighbour.
+    """
+
+    now: Array
+    near: Array
+    edge: Array
+
+
+class _Reduced(NamedTuple):
+    """What a design is after whitening, without what is absorbed.
+
+    Attributes:
+        states: (R, s, s) roots of the inverse normal matrices of initial states.
+        by_states: (R s, q + K) L'J'a of eq. (2), of parameters and directions.
+        own: (q, q) the root for the parameters.
+        by_own: (q, K) what they take from directions.
+        grams: (n, k, k) products of directions in each block.
+        acting: (K,) which of them are not absorbed.
+    """
+
+    states: Array
+    by_states: Array
+    own: Array
+    by_own: Array
+    grams: list[Array]
+    acting: Mask
+
+
+class Design:
+    """What products about one model have in common, whatever the residuals: its Jacobian and the
+    directions.
+
+    Attributes:
+        blocks: as given.
+
+    Args:
+        at: the model.
+        directions: (R, T, C, K) what each would change.
+        seen: (R, T, C) which samples there are.
+        sigma: (C,) that weighs the channels.
+        blocks: (n, k) each, columns of the directions that act together, as many in every row.
+    """
+
+    def __init__(
+        self, at: Fit, directions: Array, seen: Mask, sigma: Array, blocks: Sequence[Indices]
+    ) -> None:
+        self.blocks = list(blocks)
+        self._own = at.free.size
+        self._jacobian = np.moveaxis(at.jacobian, 3, 0)
+        self._directions = np.moveaxis(directions, 3, 0)
+        self._weights = seen / sigma
+        self._lacking = _lacking(seen)
+        size, runs, *_ = self._jacobian.shape
+        count = len(self._directions)
+        self._normal = Parts.of(runs, size, size)
+        self._mixed = Parts.of(runs, size, count)
+        self._powers = Parts.of(count)
+        self._grams = [Parts.of(*block.shape, block.shape[1]) for block in self.blocks]
+        self._known: dict[float, _Reduced] = {}
+        for place in self._places():
+            self._add(place)
+
+    def _places(self) -> Iterator[_Place]:
+        """All runs, in stretches that stay in the cache."""
+        count, runs, length, channels = self._directions.shape
+        step = max(CHUNK // (max(count, 1) * channels), SHORTEST)
+        for run in range(runs):
+            for begin in range(0, length, step):
+                end = min(begin + step, length)
+                lacking = self._lacking[run, begin:end].ravel()
+                edge = np.flatnonzero(lacking)
+                yield _Place(run, begin, end, edge, lacking[edge])
+
+    def _columns(self, values: Array, place: _Place, beside: bool = True) -> _Columns:
+        """Of values (k, R, T, C); the neighbours only where they are asked for."""
+        run, begin, end = place.run, place.begin, place.end
+        rows = len(values)
+        # One sample more at either side, as a neighbour of the outermost.
+        first, last = (max(begin - 1, 0), end + 1) if beside else (begin, end)
+        around = values[:, run, first:last] * self._weights[run, first:last]
+        now = around[:, begin - first : end - first]
+        near = np.zeros_like(now)
+        if beside:
+            former = around[:, : end - first - 1]
+            near[:, now.shape[1] - former.shape[1] :] += former
+            latter = around[:, begin - first + 1 :]
+            near[:, : latter.shape[1]] += latter
+        flat = now.reshape(rows, -1)
+        return _Columns(flat, near.reshape(rows, -1), flat[:, place.edge])
+
+    def _add(self, place: _Place) -> None:
+        """The products of one stretch."""
+        own = self._columns(self._jacobian, place)
+        some = self._columns(self._directions, place)
+        _gather(_part(self._normal, place.run), own, own, place)
+        _gather(_part(self._mixed, place.run), own, some, place)
+        _squares(self._powers, some, place)
+        for block, parts in zip(self.blocks, self._grams, strict=True):
+            # A column that acts alone has its square already.
+            if block.shape[1] > 1:
+                members = _Columns(some.now[block], some.near[block], some.edge[block])
+                _gather(parts, members, members, place)
+
+    def crossed(self, residuals: Array) -> tuple[Parts, Parts, Parts]:
+        """Products of residuals (S, R, T, C) with themselves (S,), with the Jacobian run by run
+        (R, q + s, S), and of directions with them (K, S).
+        """
+        size, runs, *_ = self._jacobian.shape
+        samples = len(residuals)
+        squares = Parts.of(samples)
+        shared = Parts.of(runs, size, samples)
+        cross = Parts.of(len(self._directions), samples)
+        for place in self._places():
+            left = self._columns(residuals, place)
+            own = self._columns(self._jacobian, place)
+            some = self._columns(self._directions, place, beside=False)
+            _squares(squares, left, place)
+            _gather(_part(shared, place.run), own, left, place)
+            _gather(cross, some, left, place)
+        return squares, shared, cross
+
+    def reduced(self, phi: float) -> _Reduced:
+        """Whitened by a correlation, without what is absorbed; kept for the next residuals."""
+        if phi not in self._known:
+            self._known[phi] = self._reduce(phi)
+        return self._known[phi]
+
+    def _reduce(self, phi: float) -> _Reduced:
+        q = self._own
+        normal = self._normal.at(phi)
+        mixed = self._mixed.at(phi)
+        powers = self._powers.at(phi)
+
+        # (2) with the initial states of each run for J, then with the parameters.
+        states = _root(normal[:, q:, q:])
+        others = np.concatenate([normal[:, q:, :q], mixed[:, q:]], axis=2)
+        by_states = _absorbed(states, others)
+        by_parameters, by_directions = by_states[:, :q], by_states[:, q:]
+        left = normal[:, :q, :q].sum(axis=0) - by_parameters.T @ by_parameters
+        own = _root(left)
+        by_own = own.T @ (mixed[:, :q].sum(axis=0) - by_parameters.T @ by_directions)
+
+        # Of directions that are absorbed only rounding is left, which would explain at random.
+        taken = np.concatenate([by_directions, by_own])
+        remaining = powers - np.einsum("ak,ak->k", taken, taken)
+        acting = remaining > ABSORBED * powers
+        remaining = np.where(acting, remaining, 0.0)
+        grams = []
+        for block, parts in zip(self.blocks, self._grams, strict=True):
+            if block.shape[1] == 1:
+                grams.append(remaining[block][:, :, None])
+                continue
+            columns = np.moveaxis(taken[:, block], 0, 2)
+            gram = parts.at(phi) - columns @ columns.transpose(0, 2, 1)
+            # Rounding has made the two halves differ, and an eigensolver reads one of them.
+            symmetric = (gram + gram.transpose(0, 2, 1)) / 2.0
+            both = acting[block][:, :, None] & acting[block][:, None, :]
+            grams.append(np.where(both, symmetric, 0.0))
+        return _Reduced(states, by_states, own, by_own, grams, acting)
 
 
 class Products:
     """Inner products of residuals and directions after all that the model's own freedom absorbs is
     taken out, eq. (2).
 
-    Whitening by a correlation phi mixes products of samples with themselves and with those before
-    them, so that one pass over the samples serves every phi. All are computed run by run, since
-    initial states are a run's own.
+    Args:
+        design: the model's Jacobian and the directions.
+        residuals: (S, R, T, C), zero where nothing was seen.
     """
 
-    def __init__(
-        self, at: Fit, residuals: Array, directions: Array, seen: Mask, sigma: Array
-    ) -> None:
-        self._own = at.free.size
-        self._states = at.jacobian.shape[3] - at.free.size
-        self._runs: list[_Run] = []
-        # Behind a gap noise starts anew: what it remembers of before is not known.
-        follows = np.zeros_like(seen)
-        follows[:, 1:] = seen[:, 1:] & seen[:, :-1]
-        units = sigma[:, None]
-        for r in range(len(seen)):
-            columns = np.concatenate([at.jacobian[r], directions[r]], axis=2)
-            run = _products(
-                columns / units,
-                residuals[r] / units,
-                seen[r],
-                follows[r],
-            )
-            self._runs.append(run)
+    def __init__(self, design: Design, residuals: Array) -> None:
+        self._design = design
+        self._squares, self._shared, self._cross = design.crossed(residuals)
 
-    def projected(self, phi: float) -> tuple[Array, Array, Array]:
+    def projected(self, phi: float) -> tuple[Array, list[Array], Array]:
         """Products of eq. (2) after whitening by a correlation.
 
         Returns:
-            Sums of squares (S,) of the residuals, products of directions (K, K) and of both (K, S).
+            Sums of squares (S,) of the residuals, products (n, k, k) of the directions in each
+            block, and of directions with residuals (K, S).
         """
-        q = self._own
-        total, cross, normal, whole = self._without_states(phi)
-        # (2) once more, for the parameters that all runs share.
-        inverse = _inverse(normal[:q, :q])
-        shared = cross[:q]
-        mixed = normal[q:, :q]
-        absorbed = np.einsum("ks,kl,ls->s", shared, inverse, shared)
-        left = total - absorbed
-        gram = normal[q:, q:] - mixed @ inverse @ normal[:q, q:]
-        both = cross[q:] - mixed @ (inverse @ shared)
-
-        # Of directions that are absorbed only rounding is left, which would explain at random.
-        acting = np.diagonal(gram) > ABSORBED * whole
-        rows = acting[:, None]
-        # Rounding has made the two halves differ, and an eigensolver reads one of them.
-        symmetric = (gram + gram.T) / 2.0
-        gram = np.where(rows & acting, symmetric, 0.0)
-        both = np.where(rows, both, 0.0)
-        return np.maximum(left, 0.0), gram, both
-
-    def _without_states(self, phi: float) -> tuple[Array, Array, Array, Array]:
-        """Sums over runs of what each run's initial states leave: of residuals, of both, of
-        parameters and directions; and the squares of directions before anything is taken out.
-        """
-        q = self._own
-        last = q + self._states
-        own = slice(q, last)
-        total: Array = np.zeros(())
-        cross = normal = whole = total
-        for run in self._runs:
-            n = run.columns.at(phi)
-            c = run.cross.at(phi)
-            t = run.squares.at(phi)
-            whole = whole + np.diagonal(n)[last:]
-
-            # (2) with the initial states of this run for J.
-            rest = np.r_[0:q, last : len(n)]
-            inverse = _inverse(n[own, own])
-            mixed = n[rest][:, own]
-            states = c[own]
-            absorbed = np.einsum("ks,kl,ls->s", states, inverse, states)
-            total = total + t - absorbed
-            cross = cross + c[rest] - mixed @ (inverse @ states)
-            others = n[np.ix_(rest, rest)]
-            normal = normal + others - mixed @ inverse @ n[own][:, rest]
-        return total, cross, normal, whole
+        known = self._design.reduced(phi)
+        q = len(known.own)
+        shared = self._shared.at(phi)
+        # (2) with the initial states of each run for J, then with the parameters.
+        by_states = _absorbed(known.states, shared[:, q:])
+        left = shared[:, :q].sum(axis=0) - known.by_states[:, :q].T @ by_states
+        by_own = known.own.T @ left
+        taken = np.concatenate([by_states, by_own])
+        total = self._squares.at(phi) - np.einsum("as,as->s", taken, taken)
+        others = np.concatenate([known.by_states[:, q:], known.by_own])
+        cross = self._cross.at(phi) - others.T @ taken
+        return np.maximum(total, 0.0), known.grams, np.where(known.acting[:, None], cross, 0.0)
 
 
-def _products(columns: Array, residuals: Array, seen: Mask, follows: Mask) -> _Run:
-    """The products of one run.
+def _lacking(seen: Mask) -> Array:
+    """(R, T, C) how many of its two neighbours each sample lacks that is there."""
+    lacking = np.full(seen.shape, 2.0)
+    lacking[:, 1:] -= seen[:, :-1]
+    lacking[:, :-1] -= seen[:, 1:]
+    # Behind a gap noise starts anew: what it remembers of before is not known.
+    return np.where(seen, lacking, 0.0)
 
-    Args:
-        columns: (T, C, M) Jacobian and directions, in sigmas.
-        residuals: (T, C, S) in sigmas.
-        seen: (T, C) which samples there are.
-        follows: (T, C) which of them have a forerunner.
+
+def _part(parts: Parts, run: int) -> Parts:
+    """Those of one run, where they are kept."""
+    return Parts(*(values[run] for values in parts))
+
+
+def _gather(parts: Parts, some: _Columns, others: _Columns, place: _Place) -> None:
+    """Add the products of all columns of some with all of others."""
+    parts.whole[...] += some.now @ np.swapaxes(others.now, -1, -2)
+    # Summed over a run it makes no difference on which side the neighbours are.
+    parts.mixed[...] += some.now @ np.swapaxes(others.near, -1, -2)
+    parts.ends[...] += (some.edge * place.lacking) @ np.swapaxes(others.edge, -1, -2)
+
+
+def _squares(parts: Parts, some: _Columns, place: _Place) -> None:
+    """Add the products of columns with themselves."""
+    parts.whole[...] += np.einsum("kn,kn->k", some.now, some.now)
+    parts.mixed[...] += np.einsum("kn,kn->k", some.near, some.now)
+    parts.ends[...] += np.einsum("km,km,m->k", some.edge, some.edge, place.lacking)
+
+
+def _absorbed(roots: Array, products: Array) -> Array:
+    """(R s, n) L'J'a of eq. (2), of products (R, s, n)."""
+    runs, size, count = products.shape
+    return (roots.transpose(0, 2, 1) @ products).reshape(runs * size, count)
+
+
+def _root(normal: Array) -> Array:
+    """L of eq. (2) for positive semidefinite matrices (..., s, s); directions that hardly count are
+    left out.
     """
-    first = seen & ~follows
-    later = follows[1:]
-    x_first = _rows(columns, first)
-    e_first = _rows(residuals, first)
-    x_now = _rows(columns[1:], later)
-    e_now = _rows(residuals[1:], later)
-    x_before = _rows(columns[:-1], later)
-    e_before = _rows(residuals[:-1], later)
-    # Of residuals only each with itself is asked for, never one surrogate with another.
-    squares = Parts(
-        first=np.square(e_first).sum(axis=0),
-        now=np.square(e_now).sum(axis=0),
-        mixed=2.0 * (e_now * e_before).sum(axis=0),
-        before=np.square(e_before).sum(axis=0),
-    )
-    mixed = x_now.T @ x_before
-    products = Parts(
-        first=x_first.T @ x_first,
-        now=x_now.T @ x_now,
-        mixed=mixed + mixed.T,
-        before=x_before.T @ x_before,
-    )
-    cross = Parts(
-        first=x_first.T @ e_first,
-        now=x_now.T @ e_now,
-        mixed=x_now.T @ e_before + x_before.T @ e_now,
-        before=x_before.T @ e_before,
-    )
-    return _Run(squares, products, cross)
-
-
-def _rows(values: Array, mask: Mask) -> Array:
-    """Values (T, C, M) where the mask (T, C) holds, (n, M)."""
-    # Without gaps a view will do, and these are the largest arrays of the test.
-    if mask.all():
-        return values.reshape(-1, values.shape[2])
-    return values[mask]
-
-
-def _inverse(normal: Array) -> Array:
-    """Of a positive semidefinite matrix; directions that hardly count are left out."""
-    # Columns of any unit on one scale, so that the cut-off means the same for each.
-    powers = np.maximum(np.diagonal(normal), 0.0)
-    scale = np.sqrt(powers)
-    # A row of zeros stays one: divided by infinity it has no part in any direction.
-    scale = np.where(scale > 0, scale, np.inf)
-    if not scale.size:
+    if not normal.shape[-1]:
         return normal
-    units = np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(normal / units)
-    largest = max(float(values[-1]), 1e-300)
+    # Columns of any unit on one scale, so that the cut-off means the same for each.
+    powers = np.diagonal(normal, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.maximum(powers, 0.0))
+    # A row of zeros stays one: divided by infinity it has no part in any direction.
+    scale = np.where(scale > 0, scale, np.inf)[..., None]
+    values, vectors = np.linalg.eigh(normal / scale / np.swapaxes(scale, -1, -2))
+    largest = np.maximum(values[..., -1:], 1e-300)
     counted = values > RANK * largest
-    some = vectors[:, counted]
-    weighted = some / values[counted]
-    result: Array = weighted @ some.T / units
+    root = np.where(counted, 1.0 / np.sqrt(np.where(counted, values, 1.0)), 0.0)
+    result: Array = vectors * root[..., None, :] / scale
     return result

@@ -10,10 +10,9 @@ found by doing the same to surrogate residuals (max-statistic calibration; P. H.
 Young 1993).
 
 The inner products <a, b> of residuals e and directions D, whitened by a correlation phi and without
-what is absorbed, are those of `bench.gap.causes.products`, eqs. (1) and (2) there.
-
-With G = <D, D> and h = <D, e> a group of directions explains h'G^-1 h of the sum of squares <e, e>.
-The sigma of n samples estimated besides, twice the log likelihood is, up to a constant,
+what is absorbed, are those of `bench.gap.causes.products`, eqs. (1) and (2) there; what a group of
+directions explains with G = <D, D> and h = <D, e> is found in `bench.gap.causes.gains`. The sigma
+of n samples estimated besides, twice the log likelihood is, up to a constant,
 
     l(phi) = log det W'W - n log(<e, e> - h'G^-1 h)                                            (3)
 
@@ -28,21 +27,19 @@ For effects k and surrogates s, with chance_k the 90 % quantile of score_k over 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.gap.causes.candidates import Directions
-from bench.gap.causes.products import RANK, Products
+from bench.gap.causes.gains import Batch, Group, batches, explained, groups
+from bench.gap.causes.products import Design, Products
 from bench.gap.model.fit import Fit
 from bench.gap.model.noise import GRID, Mask, Noise, log_determinant
 from sims.base import Array
 
-SMALL = 4
-"""Groups of more columns are taken as they are, without a choice of columns."""
 MANY = 12
 """An effect with more shapes than this is begun from several of them."""
 PEAKS = 3
@@ -55,22 +52,6 @@ BEYOND = 0.2
 """The share of them that lies there."""
 FEWEST = 20
 """Of fewer surrogates no tail is guessed."""
-
-
-@dataclass(frozen=True)
-class Group:
-    """Columns that act together.
-
-    Attributes:
-        effect: whose they are.
-        columns: their places among the directions.
-        positive: which of them must not be negative.
-    """
-
-    effect: str
-    columns: tuple[int, ...]
-    positive: tuple[bool, ...]
-
 
 Peak = tuple[Group, Array]
 
@@ -103,99 +84,47 @@ class Scores:
     white: Array
 
 
-def groups(directions: Directions) -> list[Group]:
-    """The directions that act together."""
-    places: dict[tuple[str, int], list[int]] = {}
-    for i, probe in enumerate(directions.probes):
-        key = probe.effect, probe.group
-        places.setdefault(key, []).append(i)
-    members = []
-    for (effect, _), columns in places.items():
-        probes = [directions.probes[i] for i in columns]
-        positive = tuple(not probe.signed for probe in probes)
-        members.append(Group(effect, tuple(columns), positive))
-    return members
+class ScoreTest:
+    """Scores every effect that has directions, against any residuals of one model.
 
-
-def explained(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
-    """Sum of squares (S,) that a group explains, and its coefficients (k, S): the best choice of
-    its columns.
-
-    Coefficients that must not be negative are held at zero where they would be: the least squares
-    of the constraint are those of some choice of columns, so all are tried (C. L. Lawson, R. J.
-    Hanson, Solving Least Squares Problems, 1974, chapter 23).
+    Args:
+        at: the model that the directions are about.
+        directions: of the candidates.
+        seen: (R, T, C) which samples there are.
+        noise: sigma weighs channels against each other; its correlation is not used.
     """
-    count = len(group.columns)
-    if count > SMALL:
-        return _jointly(gram, cross, group)
-    samples = cross.shape[1]
-    best = np.zeros(samples)
-    coefficients = np.zeros((count, samples))
-    for chosen in _choices(count):
-        columns = [group.columns[i] for i in chosen]
-        solved = _solved(gram, cross, columns)
-        if solved is None:
-            continue
-        gain, c, scaled = solved
-        allowed = np.ones(samples, dtype=bool)
-        for i, row in zip(chosen, scaled, strict=True):
-            if group.positive[i]:
-                allowed &= row >= 0
-        # More columns must explain more than rounding: else the fewer stand.
-        more = gain > best * (1.0 + 1e-9)
-        better = allowed & more
-        best = np.where(better, gain, best)
-        # Columns that are not chosen have no part in it.
-        whole = np.zeros_like(coefficients)
-        whole[chosen] = c
-        coefficients = np.where(better, whole, coefficients)
-    return best, coefficients
 
+    def __init__(self, at: Fit, directions: Directions, seen: Mask, noise: Noise) -> None:
+        self._groups = groups(directions)
+        self._batches = batches(self._groups)
+        self._count = int(seen.sum())
+        blocks = [batch.columns for batch in self._batches]
+        self._design = Design(at, directions.values, seen, noise.sigma, blocks)
+        self._determinants = {
+            phi: 2.0 * log_determinant(seen, np.full(seen.shape[2], phi)) for phi in GRID
+        }
 
-def _choices(count: int) -> Iterator[list[int]]:
-    """Every choice of at least one of so many columns, those of fewer first."""
-    for size in range(1, count + 1):
-        for chosen in combinations(range(count), size):
-            yield list(chosen)
+    def scores(self, residual: Array, surrogate: Array | None = None) -> Scores:
+        """Score a residual.
 
-
-def _solved(gram: Array, cross: Array, columns: list[int]) -> tuple[Array, Array, Array] | None:
-    """h'G^-1 h (S,) of some columns, G^-1 h (k, S), and that in units of the columns' lengths; None
-    where columns are absorbed or alike.
-    """
-    powers = np.diagonal(gram)[columns]
-    scale = np.sqrt(np.maximum(powers, 0.0))
-    if not (scale > 0).all():
-        return None
-    products = gram[np.ix_(columns, columns)]
-    normal = products / np.outer(scale, scale)
-    # Columns that are alike share what they explain in any way: a choice with fewer has it.
-    if np.linalg.eigvalsh(normal)[0] < RANK:
-        return None
-    lengths = scale[:, None]
-    right = cross[columns] / lengths
-    scaled = np.linalg.solve(normal, right)
-    gain = np.einsum("ks,ks->s", scaled, right)
-    return gain, scaled / lengths, scaled
-
-
-def _jointly(gram: Array, cross: Array, group: Group) -> tuple[Array, Array]:
-    """The same for a group of many columns, none of them held."""
-    columns = list(group.columns)
-    # Of many columns some nearly repeat others, as hats that overlap do: what they add is rounding.
-    powers = np.diagonal(gram)[columns]
-    scale = np.sqrt(np.maximum(powers, 1e-300))
-    products = gram[np.ix_(columns, columns)]
-    scaled = products / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(scaled)
-    counted = values > RANK * values[-1]
-    some = vectors[:, counted]
-    lengths = scale[:, None]
-    # Along eigenvectors G is diagonal, and h'G^-1 h a sum of one term for each.
-    right = some.T @ (cross[columns] / lengths)
-    solved = right / values[counted, None]
-    gain: Array = np.einsum("ks,ks->s", right, solved)
-    return gain, (some @ solved) / lengths
+        Args:
+            residual: (R, T, C) what the model leaves, zero where nothing was seen.
+            surrogate: (S, R, T, C) residuals that mean nothing.
+        """
+        # The residual is the first of all: they are scored in the same products.
+        everything = residual[None]
+        if surrogate is not None:
+            everything = np.concatenate([everything, surrogate])
+        table = _Table(self._groups, len(everything), self._count)
+        products = Products(self._design, everything)
+        # A grid: the products of one pass over the samples serve every correlation.
+        for phi, determinant in self._determinants.items():
+            total, grams, cross = products.projected(phi)
+            table.begin(phi, determinant, total)
+            for batch, gram in zip(self._batches, grams, strict=True):
+                table.enter(batch, *explained(gram, cross[batch.columns], batch.positive))
+            table.end()
+        return table.ranked()
 
 
 def score(
@@ -206,160 +135,126 @@ def score(
     noise: Noise,
     surrogate: Array | None = None,
 ) -> Scores:
-    """Score every effect that has directions.
-
-    Args:
-        at: the model that the directions are about.
-        residual: (R, T, C) what it leaves.
-        directions: of the candidates.
-        seen: (R, T, C) which samples there are.
-        noise: sigma weighs channels against each other; its correlation is not used.
-        surrogate: (S, R, T, C) residuals that mean nothing.
-    """
-    # One column for the residual and one for each surrogate: all are scored in the same products.
-    everything = residual[..., None]
-    if surrogate is not None:
-        drawn = np.moveaxis(surrogate, 0, -1)
-        everything = np.concatenate([everything, drawn], axis=3)
-    columns = everything.shape[3]
-    table = _Table(groups(directions), columns, int(seen.sum()))
-    products = Products(
-        at,
-        everything,
-        directions.values,
-        seen,
-        noise.sigma,
-    )
-    # A grid: the products of one pass over the samples serve every correlation.
-    for phi in GRID:
-        common = np.full(seen.shape[2], phi)
-        determinant = 2.0 * log_determinant(seen, common)
-        table.enter(phi, determinant, *products.projected(phi))
-    gains = table.best - table.without  # (4)
-    return _ranked(table.names, gains, table.hypotheses, table.white)
+    """Score every effect that has directions once; arguments as those of `ScoreTest`."""
+    return ScoreTest(at, directions, seen, noise).scores(residual, surrogate)
 
 
 class _Table:
-    """The best of every effect so far, over the correlations that were entered.
+    """The best of every group and effect so far, over the correlations that were entered.
 
     Args:
         members: the groups of all effects.
-        columns: residual and surrogates.
+        residuals: how many there are.
         count: n of eq. (3).
     """
 
-    def __init__(self, members: Sequence[Group], columns: int, count: int) -> None:
+    def __init__(self, members: Sequence[Group], residuals: int, count: int) -> None:
         self._count = count
-        self.hypotheses: dict[str, list[_Hypothesis]] = {}
-        for group in members:
-            unknown = _Hypothesis(-np.inf, group, np.zeros(0), 0.0)
-            self.hypotheses.setdefault(group.effect, []).append(unknown)
-        self.names = list(self.hypotheses)
-        count = len(self.names)
-        self.best = np.full((count, columns), -np.inf)
-        self.without = np.full(columns, -np.inf)
-        self.white = np.zeros(count)
+        self._groups = members
+        self._names = list(dict.fromkeys(group.effect for group in members))
+        rows = {name: row for row, name in enumerate(self._names)}
+        self._rows = np.array([rows[group.effect] for group in members], dtype=np.intp)
+        effects = len(self._names)
+        self._best = np.full((effects, residuals), -np.inf)
+        self._without = np.full(residuals, -np.inf)
+        self._white = np.zeros(effects)
+        # Of each group as a hypothesis: twice its log likelihood, correlation, coefficients.
+        self._values = np.full(len(members), -np.inf)
+        self._phis = np.zeros(len(members))
+        widest = max((len(group.columns) for group in members), default=0)
+        self._coefficients = np.zeros((len(members), widest))
+        self._gains = np.zeros((effects, residuals))
+        self._phi = self._determinant = 0.0
+        self._total = np.zeros(residuals)
 
-    def enter(
-        self, phi: float, determinant: float, total: Array, gram: Array, cross: Array
-    ) -> None:
-        """Take a correlation into account.
+    def begin(self, phi: float, determinant: float, total: Array) -> None:
+        """Take a correlation into account, with log det W'W and <e, e> (S,) of eq. (3)."""
+        self._phi, self._determinant, self._total = phi, determinant, total
+        self._gains[...] = 0.0
+        self._without = np.maximum(self._without, self._value(self._total, self._total))
 
-        Args:
-            phi: the correlation.
-            determinant: log det W'W of eq. (3).
-            total: <e, e> (S,).
-            gram: G (K, K).
-            cross: h (K, S).
-        """
+    def _value(self, left: Array, total: Array) -> Array:
+        """Eq. (3) of what is left of sums of squares."""
         # What is explained whole leaves rounding, of which the logarithm has a bound.
         floor = 1e-12 * total + 1e-300
-        left = np.maximum(total, floor)
-        nothing = determinant - self._count * np.log(left)  # (3) without directions
-        self.without = np.maximum(self.without, nothing)
-        for row, name in enumerate(self.names):
-            hypotheses = self.hypotheses[name]
-            for i, hypothesis in enumerate(hypotheses):
-                group = hypothesis.group
-                gain, c = explained(gram, cross, group)
-                left = np.maximum(total - gain, floor)
-                value = determinant - self._count * np.log(left)  # (3)
-                self.best[row] = np.maximum(self.best[row], value)
-                # The first column is the residual; only its coefficients begin fits.
-                own = float(value[0])
-                if own > hypothesis.value:
-                    hypotheses[i] = _Hypothesis(own, group, c[:, 0], phi)
-                # White noise is the one of the grid that leaves sums of squares as they are.
-                if phi == 0:
-                    ratio = float(np.log(total[0] / left[0]))
-                    self.white[row] = max(self.white[row], self._count * ratio)
+        logarithms = np.log(np.maximum(left, floor))
+        result: Array = self._determinant - self._count * logarithms
+        return result
 
+    def enter(self, batch: Batch, gain: Array, coefficients: Array) -> None:
+        """What some groups explain (n, S), and their coefficients (n, k) of the residual."""
+        rows = self._rows[batch.places]
+        order = np.argsort(rows, kind="stable")
+        present, first = np.unique(rows[order], return_index=True)
+        largest = np.maximum.reduceat(gain[order], first, axis=0)
+        self._gains[present] = np.maximum(self._gains[present], largest)
+        own = self._value(self._total[0] - gain[:, 0], self._total[0])
+        # The first one is the residual; only its coefficients begin fits.
+        better = own > self._values[batch.places]
+        places = batch.places[better]
+        self._values[places] = own[better]
+        self._phis[places] = self._phi
+        self._coefficients[places, : coefficients.shape[1]] = coefficients[better]
 
-class _Hypothesis(NamedTuple):
-    """The likeliest hypothesis about a group: twice its log likelihood, coefficients, correlation
-    of the noise.
-    """
+    def end(self) -> None:
+        """All groups have been entered."""
+        values = self._value(self._total - self._gains, self._total)
+        self._best = np.maximum(self._best, values)
+        # White noise is the one of the grid that leaves sums of squares as they are.
+        if self._phi == 0 and len(self._names):
+            nothing = self._value(self._total[0], self._total[0])
+            self._white = np.maximum(values[:, 0] - nothing, 0.0)
 
-    value: float
-    group: Group
-    c: Array
-    phi: float
+    def ranked(self) -> Scores:
+        """The scores in order, and how likely the best is by chance."""
+        gains = self._best - self._without  # (4)
+        observed = gains[:, 0]
+        drawn = gains[:, 1:]
+        chance = np.zeros(len(self._names))
+        p_value = 1.0
+        if drawn.shape[1]:
+            # An effect with many shapes gains more by chance, and must not set the level for the
+            # rest.
+            chance = np.quantile(drawn, LUCK, axis=1)
+            p_value = tail(drawn - chance[:, None], observed - chance)  # (5)
+        by_chance = drawn - chance[:, None]
+        order = np.argsort(-observed, kind="stable")
+        phi = 0.0
+        if order.size:
+            members = np.flatnonzero(self._rows == order[0])
+            phi = float(self._phis[members[np.argmax(self._values[members])]])
+        return Scores(
+            effects=tuple(self._names[i] for i in order),
+            score=observed[order],
+            chance=chance[order],
+            peaks=tuple(self._peaks(np.flatnonzero(self._rows == i)) for i in order),
+            p_value=p_value,
+            phi=phi,
+            by_chance=by_chance[order],
+            white=self._white[order],
+        )
 
-
-def _peaks(hypotheses: Sequence[_Hypothesis]) -> tuple[Peak, ...]:
-    """The best, and of a dozen and more the next that are better than their neighbours."""
-    values = np.array([hypothesis.value for hypothesis in hypotheses])
-    several = len(hypotheses) > MANY
-    peaks = values == values.max()
-    if several:
-        # Neighbours of the best are the same answer once more, so only local maxima count.
-        around = np.concatenate([[-np.inf], values, [-np.inf]])
-        above_former = values >= around[:-2]
-        above_latter = values >= around[2:]
-        peaks = above_former & above_latter
-    order = np.argsort(-values, kind="stable")
-    most = PEAKS if several else 1
-    chosen = [hypotheses[i] for i in order if peaks[i]][:most]
-    return tuple((hypothesis.group, hypothesis.c) for hypothesis in chosen)
-
-
-def _ranked(
-    names: Sequence[str], gains: Array, hypotheses: dict[str, list[_Hypothesis]], white: Array
-) -> Scores:
-    """The scores in order, and how likely the best is by chance.
-
-    Args:
-        names: (E,) effects.
-        gains: (E, 1 + S) scores of the residual, then of the surrogates.
-        hypotheses: the likeliest of each effect's groups.
-        white: (E,) scores without correlation.
-    """
-    observed = gains[:, 0]
-    drawn = gains[:, 1:]
-    chance = np.zeros(len(names))
-    p_value = 1.0
-    if drawn.shape[1]:
-        # An effect with many shapes gains more by chance, and must not set the level for the rest.
-        chance = np.quantile(drawn, LUCK, axis=1)
-        p_value = tail(drawn - chance[:, None], observed - chance)  # (5)
-    by_chance = drawn - chance[:, None]
-    order = np.argsort(-observed, kind="stable")
-    ranked = [names[i] for i in order]
-    phi = 0.0
-    if ranked:
-        best = hypotheses[ranked[0]]
-        phi = max(best, key=lambda hypothesis: hypothesis.value).phi
-    peaks = [_peaks(hypotheses[name]) for name in ranked]
-    return Scores(
-        effects=tuple(ranked),
-        score=observed[order],
-        chance=chance[order],
-        peaks=tuple(peaks),
-        p_value=p_value,
-        phi=phi,
-        by_chance=by_chance[order],
-        white=white[order],
-    )
+    def _peaks(self, places: NDArray[np.intp]) -> tuple[Peak, ...]:
+        """Of an effect's groups the best, and of a dozen and more the next that are better than
+        their neighbours.
+        """
+        values = self._values[places]
+        several = len(places) > MANY
+        peaks = values == values.max()
+        if several:
+            # Neighbours of the best are the same answer once more, so only local maxima count.
+            around = np.concatenate([[-np.inf], values, [-np.inf]])
+            above_former = values >= around[:-2]
+            above_latter = values >= around[2:]
+            peaks = above_former & above_latter
+        order = np.argsort(-values, kind="stable")
+        most = PEAKS if several else 1
+        chosen = [places[i] for i in order if peaks[i]][:most]
+        result = []
+        for i in chosen:
+            group = self._groups[i]
+            result.append((group, self._coefficients[i, : len(group.columns)].copy()))
+        return tuple(result)
 
 
 def tail(by_chance: Array, observed: Array) -> float:

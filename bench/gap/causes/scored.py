@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.gap.causes.candidates import Directions, directions
 from bench.gap.causes.nominate import nominated
-from bench.gap.causes.score_test import Scores, score, tail
+from bench.gap.causes.score_test import Scores, ScoreTest, tail
 from bench.gap.model.models import Model, Models
 from bench.gap.model.noise import forgets, surrogates
 from sims.base import Array
@@ -34,9 +34,10 @@ this.
 
 
 class Scanned(NamedTuple):
-    """What each effect would change about a model, and the scores of that."""
+    """What each effect would change about a model, the test of that, and its scores."""
 
     directions: Directions
+    test: ScoreTest
     scores: Scores
 
 
@@ -73,20 +74,17 @@ class Scored(Models):
         if known is not None and against is None:
             return known.scores
         # Directions cost a simulation of each candidate; other surrogates need no new ones.
-        candidates = self._lacking(model) if known is None else known.directions
+        if known is None:
+            candidates = self._lacking(model)
+            test = ScoreTest(model.fit, candidates, self.seen, self.weights(model))
+        else:
+            candidates, test, _ = known
         residual = self.residual(model.fit)
         # The colour of noise is best known from a model that leaves less structure.
         meaningless = residual if against is None else against
         surrogate = surrogates(meaningless, self.seen, SURROGATES, self.rng)
-        scores = score(
-            model.fit,
-            residual,
-            candidates,
-            self.seen,
-            self.weights(model),
-            surrogate,
-        )
-        self.scanned[key] = Scanned(candidates, scores)
+        scores = test.scores(residual, surrogate)
+        self.scanned[key] = Scanned(candidates, test, scores)
         self.tests[key] = scores.p_value
         # Kept from the first scan, so that merits stay comparable when a better base fit turns up.
         if not key and not self.chances:
@@ -112,7 +110,7 @@ class Scored(Models):
             # A better fit since then has taken its scores away.
             if key not in self.scanned:
                 self.scan(model)
-            candidates, scores = self.scanned[key]
+            candidates, _, scores = self.scanned[key]
             # The model may have been fitted better since it was put into the beam.
             newest = self.models[key]
             further = nominated(

@@ -5,8 +5,9 @@ import pytest
 from scipy.optimize import nnls
 
 from bench.gap.causes.candidates import Directions, Probe
-from bench.gap.causes.products import Products
-from bench.gap.causes.score_test import Group, explained, groups, score, tail
+from bench.gap.causes.gains import explained, groups
+from bench.gap.causes.products import Design, Products
+from bench.gap.causes.score_test import score, tail
 from bench.gap.model.noise import GRID, Noise, surrogates
 from tests.bench.gap.made import correlated, covariance_of, linear_fit
 
@@ -50,13 +51,25 @@ def dense(jacobian, seen, phi, *values):
     return result
 
 
+def whole(jacobian, directions, residual, seen):
+    """Products of one residual with all directions in one block."""
+    block = np.arange(directions.shape[3])[None]
+    design = Design(linear_fit(jacobian, Q), directions, seen, SIGMA, [block])
+    products = Products(design, residual[None])
+
+    def projected(phi):
+        total, (gram,), cross = products.projected(phi)
+        return total, gram[0], cross
+
+    return projected
+
+
 @pytest.mark.parametrize("phi", [0.0, 0.3, 0.8, 0.95])
 @pytest.mark.parametrize("holes", [0.0, 0.2])
 def test_products_are_those_of_whole_matrices(phi, holes):
     jacobian, directions, residual, seen = problem(1, holes)
     jacobian, directions = (np.where(seen[..., None], part, 0.0) for part in (jacobian, directions))
-    products = Products(linear_fit(jacobian, Q), residual[..., None], directions, seen, SIGMA)
-    total, gram, cross = products.projected(phi)
+    total, gram, cross = whole(jacobian, directions, residual, seen)(phi)
     d, r = dense(jacobian, seen, phi, directions, residual)
     assert total[0] == pytest.approx(r @ r, rel=1e-9)
     np.testing.assert_allclose(gram, d.T @ d, rtol=1e-8, atol=1e-9 * np.abs(d.T @ d).max())
@@ -107,32 +120,51 @@ def test_coefficients_that_cannot_be_negative_are_held_at_zero():
     jacobian, directions, residual, seen = problem(3)
     d, r = dense(jacobian, seen, 0.0, directions, residual)
     scale = np.linalg.norm(d, axis=0)
-    gram, cross = d.T @ d, np.stack([d.T @ r, -(d.T @ r)], axis=1)
-    group = Group("x", (0, 1, 2, 3), (True,) * 4)
-    gain, c = explained(gram, cross, group)
+    gram, cross = (d.T @ d)[None, :4, :4], np.stack([d.T @ r, -(d.T @ r)], axis=1)[None, :4]
     for column, sign in enumerate((1.0, -1.0)):
+        gain, c = explained(gram, sign * cross, (True,) * 4)
         solved, left = nnls(d[:, :4] / scale[:4], sign * r)
-        assert gain[column] == pytest.approx(r @ r - left**2, rel=1e-8)
-        np.testing.assert_allclose(c[:, column], solved / scale[:4], rtol=1e-6, atol=1e-12)
-        assert (c[:, column] == 0).sum() == (solved == 0).sum() > 0
-    free, _ = explained(gram, cross, Group("x", (0, 1, 2, 3), (False,) * 4))
+        assert gain[0, 0] == pytest.approx(r @ r - left**2, rel=1e-8)
+        assert explained(gram, cross, (True,) * 4)[0][0, column] == gain[0, 0]
+        np.testing.assert_allclose(c[0], solved / scale[:4], rtol=1e-6, atol=1e-12)
+        assert (c[0] == 0).sum() == (solved == 0).sum() > 0
+    held, _ = explained(gram, cross, (True,) * 4)
+    free, _ = explained(gram, cross, (False,) * 4)
     left = r - d[:, :4] @ np.linalg.lstsq(d[:, :4], r, rcond=None)[0]
     np.testing.assert_allclose(free, r @ r - left @ left, rtol=1e-8)
-    assert (free > gain).all()
+    assert (free > held).all()
 
 
 def test_a_large_group_is_one_regression_and_equal_columns_count_once():
     jacobian, directions, residual, seen = problem(4)
     doubled = np.concatenate([directions, 7.0 * directions[..., :2]], axis=3)
     d, r = dense(jacobian, seen, 0.0, doubled, residual)
-    group = Group("x", tuple(range(7)), (False,) * 7)
-    gain, c = explained(d.T @ d, (d.T @ r)[:, None], group)
+    gram, cross = d.T @ d, (d.T @ r)[:, None]
+    gain, c = explained(gram[None], cross[None], (False,) * 7)
     left = r - d @ np.linalg.lstsq(d, r, rcond=None)[0]
-    assert gain[0] == pytest.approx(r @ r - left @ left, rel=1e-6)
-    np.testing.assert_allclose(r - d @ c[:, 0], left, atol=1e-6)
-    pair, _ = explained(d.T @ d, (d.T @ r)[:, None], Group("x", (0, 5), (False, False)))
-    one, _ = explained(d.T @ d, (d.T @ r)[:, None], Group("x", (0,), (False,)))
-    assert pair[0] == pytest.approx(one[0], rel=1e-9)
+    assert gain[0, 0] == pytest.approx(r @ r - left @ left, rel=1e-6)
+    np.testing.assert_allclose(r - d @ c[0], left, atol=1e-6)
+    alike = np.array([0, 5])
+    pair, _ = explained(gram[np.ix_(alike, alike)][None], cross[alike][None], (False, False))
+    one, _ = explained(gram[None, :1, :1], cross[None, :1], (False,))
+    assert pair[0, 0] == pytest.approx(one[0, 0], rel=1e-9)
+
+
+def test_groups_solved_together_are_what_each_is_alone():
+    jacobian, directions, residual, seen = problem(9)
+    d, r = dense(jacobian, seen, 0.0, directions, residual)
+    shrunk = d.T @ np.stack([r, r[::-1], -r], axis=1)
+    columns = np.array([[0, 4], [1, 2], [3, 3], [2, 0]])
+    gram = np.stack([(d.T @ d)[np.ix_(some, some)] for some in columns])
+    gram[3, 1] = gram[3, :, 1] = 0.0  # absorbed
+    cross = shrunk[columns]
+    for positive in ((False, True), (True, True), (False, False)):
+        gain, c = explained(gram, cross, positive)
+        for i in range(len(columns)):
+            alone, own = explained(gram[i : i + 1], cross[i : i + 1], positive)
+            np.testing.assert_allclose(gain[i], alone[0], rtol=1e-12)
+            np.testing.assert_allclose(c[i], own[0], rtol=1e-12)
+        assert c[3, 1] == 0.0
 
 
 def test_what_the_model_absorbs_is_no_evidence():
@@ -150,9 +182,9 @@ def test_what_the_model_absorbs_is_no_evidence():
         1e9 * jacobian[..., 1] + directions[..., 2]
     )  # of two alike little but rounding is left
     directions[..., 3] = 1e9 * jacobian[..., 1] + directions[..., 2]
-    products = Products(linear_fit(jacobian, Q), residual[..., None], directions, seen, SIGMA)
+    projected = whole(jacobian, directions, residual, seen)
     for phi in GRID:
-        _, gram, cross = products.projected(phi)
+        _, gram, cross = projected(phi)
         np.testing.assert_array_equal(gram, gram.T)
         assert not gram[[0, 1, 3]].any()
         assert not cross[[0, 1, 3]].any()
