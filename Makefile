@@ -38,7 +38,7 @@ explain: $(STAMP)
 	$(BIN)/simgap score results/example/explained/extended.toml results/example/swing.csv
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 check: $(STAMP)
 	$(BIN)/ruff check .

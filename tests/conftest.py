@@ -1,5 +1,6 @@
 import os
 import signal
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -63,3 +64,15 @@ def fresh_registries():
     yield
     for registry, snapshot in zip(REGISTRIES, before, strict=True):
         registry.restore(snapshot)
+
+
+_SECONDS = {True: 15.0, False: 0.2}
+"""What a test takes, about, by whether it is marked as slow."""
+
+
+def pytest_collection_modifyitems(items):
+    """Files that take long come first: one that began last would keep the other workers waiting."""
+    seconds = Counter()
+    for item in items:
+        seconds[item.path] += _SECONDS[item.get_closest_marker("slow") is not None]
+    items.sort(key=lambda item: -seconds[item.path])
