@@ -13,9 +13,10 @@ from typing import NoReturn
 
 from bench import __version__
 from bench.commands.check import add_check
-from bench.commands.compare import INTERRUPTED, add_compare, add_plot, add_status, add_verify
+from bench.commands.compare import add_compare, add_plot, add_status, add_verify
 from bench.commands.explain import add_explain, add_score
 from bench.commands.film import add_film, add_track
+from bench.commands.interrupts import INTERRUPTED
 from bench.commands.listing import add_list
 from bench.commands.recordings import add_inspect, add_simulate
 from bench.commands.train import add_train

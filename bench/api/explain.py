@@ -8,8 +8,10 @@ from typing import Any
 
 from bench.gap import explain as explaining
 from bench.gap.explanation import Explanation
+from bench.gap.model.watch import Watch
 from bench.gap.score_model import scored
 from bench.recordings.simulate import SimulatedRecording
+from sims.base import InputError
 from sims.recording.recording import Recording
 
 
@@ -22,7 +24,10 @@ def explain(
     tuner: str | None = None,
     seed: int = 0,
     force: bool = False,
+    budget: float | None = None,
     say: Callable[[str], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[float, str], None] | None = None,
 ) -> Explanation:
     """Show what the simulation of a recording gets wrong, name the cause, extend the simulator.
 
@@ -34,14 +39,22 @@ def explain(
         tuner: a registered tuner that finds where the fit of the base parameters begins.
         seed: of the surrogates and the bootstrap.
         force: explain what needs more than this machine has, or has stamps that cannot be seconds.
+        budget: seconds of the clock after which the search ends with what it has then; the
+            answer's ``cut`` says what was not asked any more. None: it comes to its end.
         say: told what is being done.
+        stop: asked between two steps of the search; True ends it as a budget does.
+        progress: told the share that is done, as far as can be known, and what is looked at.
 
     Raises:
-        InputError: the recording cannot be read, is too short, or is of nothing that takes effects.
+        InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
+            or the budget is no number above 0, or ended before anything could be simulated.
     """
     if isinstance(recording, SimulatedRecording):
         recording = recording.recording
-    return explaining.explain(recording, system, engine, seed, free, tuner, say, force)
+    if budget is not None and not budget > 0:
+        raise InputError(f"budget: expected a number of seconds above 0, found {budget!r}")
+    watch = Watch(budget, stop, progress)
+    return explaining.explain(recording, system, engine, seed, free, tuner, say, force, watch)
 
 
 def score(

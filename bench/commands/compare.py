@@ -8,6 +8,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bench.commands.interrupts import INTERRUPTED
 from bench.commands.options import (
     add_force,
     add_plugin,
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from bench.store.standing import Made, Standing
     from bench.study import Study
 
-INTERRUPTED = 130
-"""Exit code of what a person interrupted, as shells have it."""
 _FEW = 20
 """Runs that `simgap status` lists unless all are asked for."""
 _CHANGES = ("targets", "budget", "training_budget", "timeout", "memory")

@@ -6,7 +6,8 @@ import argparse
 import json
 from pathlib import Path
 
-from bench.commands.options import add_force, add_plugin, names, place
+from bench.commands.interrupts import INTERRUPTED, Interrupts
+from bench.commands.options import add_force, add_plugin, names, place, seconds
 
 
 def add_explain(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +44,13 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="a tuner that finds where the base fit begins (default: a grid)",
     )
+    parser.add_argument(
+        "--budget",
+        type=seconds,
+        metavar="S",
+        help="seconds after which the search ends with what it has (default: it comes to its end); "
+        "Ctrl-C ends it likewise",
+    )
     add_plugin(parser, "systems")
     add_force(parser)
     parser.set_defaults(command=_explain)
@@ -71,7 +79,7 @@ def add_score(parser: argparse.ArgumentParser) -> None:
 def _explain(options: argparse.Namespace) -> int:
     """Explain a recording, write what was found, print the account."""
     from bench.api.explain import explain
-    from bench.commands.progress import narrator
+    from bench.commands.progress import Look
     from bench.gap.report.account import account
     from bench.registry import load_plugins
     from sims.files import refuse_full, stamped
@@ -80,16 +88,20 @@ def _explain(options: argparse.Namespace) -> int:
     # Before the work, which may take minutes.
     if options.out is not None:
         refuse_full(options.out)
-    explanation = explain(
-        options.recording,
-        system=options.system,
-        engine=options.engine,
-        free=names(options.free),
-        tuner=options.tuner,
-        seed=options.seed,
-        force=options.force,
-        say=narrator(),
-    )
+    with Look() as look, Interrupts() as interrupts:
+        explanation = explain(
+            options.recording,
+            system=options.system,
+            engine=options.engine,
+            free=names(options.free),
+            tuner=options.tuner,
+            seed=options.seed,
+            force=options.force,
+            budget=options.budget,
+            say=look.say,
+            stop=interrupts.asked,
+            progress=look.show,
+        )
     folder = options.out or stamped(Path("results"), f"explain-{options.recording.stem}")
     paths = explanation.write(folder)
     for line in account(explanation.story):
@@ -97,7 +109,8 @@ def _explain(options: argparse.Namespace) -> int:
     print(f"\nreport  {paths[-1]}")
     for path in paths[:2]:
         print(f"{path.stem:7} {path}")
-    return 0
+    cut = explanation.answer.cut
+    return INTERRUPTED if cut is not None and cut.by == "interrupt" else 0
 
 
 def _score(options: argparse.Namespace) -> int:

@@ -75,6 +75,7 @@ class Assessor:
             proposed,
             int(simulations),
             time.perf_counter() - started,
+            finding.cut,
         )
 
     def numbers(self, search: Search, model: Model) -> dict[int, Number]:
@@ -171,7 +172,9 @@ class Assessor:
         return float(np.clip(share, WORST, 1.0)) if np.isfinite(share) else None
 
     def _next(self, search: Search, finding: Finding) -> Experiment | None:
-        """What to record next; None where nothing is open."""
+        """What to record next; None where nothing is open, or nobody waits for it."""
+        if finding.cut is not None:
+            return None
         if finding.verdict == "unidentifiable":
             return _apart(finding.vague)
         # The strongest cause that is open first, against its most plausible alternative.

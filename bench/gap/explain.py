@@ -19,6 +19,7 @@ from bench.gap.measure import HeldOutRuns
 from bench.gap.model.base_fit import fit_base
 from bench.gap.model.floor import Floor, noise_floor
 from bench.gap.model.noise import Noise
+from bench.gap.model.watch import Watch
 from bench.gap.model.world import World
 from bench.gap.tell import Teller
 from bench.problem.seeds import rng_for
@@ -51,6 +52,7 @@ def explain(
     tuner: str | None = None,
     say: Say = lambda _: None,
     force: bool = False,
+    watch: Watch | None = None,
 ) -> Explanation:
     """Explain a recording.
 
@@ -63,11 +65,14 @@ def explain(
         tuner: a registered tuner that finds where the fit of the base parameters begins.
         say: told what is being done.
         force: whether the user insists on a recording that is refused otherwise.
+        watch: says when the search has to end, and is told how far it is.
 
     Raises:
-        InputError: the recording cannot be read, is too short, or is of nothing that takes effects.
+        InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
+            or the search was ended before anything could be simulated.
     """
-    return _Explainer(recording, system, engine, seed, tuple(free), tuner, say, force).run()
+    watch = watch or Watch()
+    return _Explainer(recording, system, engine, seed, tuple(free), tuner, say, force, watch).run()
 
 
 class _Explainer:
@@ -81,6 +86,7 @@ class _Explainer:
         tuner: str | None,
         say: Say,
         force: bool,
+        watch: Watch,
     ) -> None:
         self.started = time.perf_counter()
         self.seed = seed
@@ -108,6 +114,10 @@ class _Explainer:
             World(kind, self.recording, held_out, self.engine, [Hat], free) if held_out else None
         )
         self.floor: Floor = noise_floor(self.fitting, self.recording)
+        self.watch = watch
+        for part in (self.fitting, self.measuring):
+            if part is not None:
+                part.watch = watch
         # White to begin with: each likelihood finds the memory of the noise for itself.
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
         self.assessor = Assessor(
@@ -146,10 +156,7 @@ class _Explainer:
         self.say("fitting the base model")
         base = fit_base(self.fitting, self.noise, self._given())
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
-            raise InputError(
-                f"{self.path}: the simulation fails wherever a fit begins; "
-                "check constants, units, inputs and initial states"
-            )
+            raise self._fails()
         # One stream for surrogates and bootstrap: the same seed tells the same story.
         rng = rng_for("explain", self.recording.system, self.seed)
         search = Search(self.fitting, self.noise, base.untouched, rng, self.floor.stated)
@@ -166,6 +173,17 @@ class _Explainer:
             if world is not None:
                 world.close()
         return Explanation(verdict, story, extended)
+
+    def _fails(self) -> InputError:
+        """Why nothing could be simulated."""
+        if self.watch.left():
+            return InputError(
+                f"{self.path}: the search was ended before a fit could follow the recording"
+            )
+        return InputError(
+            f"{self.path}: the simulation fails wherever a fit begins; "
+            "check constants, units, inputs and initial states"
+        )
 
     def _given(self) -> Array | None:
         """Where a registered tuner would begin; None without one."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from bench.gap.causes.rules import VerdictName
 from bench.gap.report import pictures
-from bench.gap.report.account import closes, interval
+from bench.gap.report.account import closes, cut, interval
 from bench.gap.report.elements import framed
 from bench.gap.report.page import page
 from bench.gap.report.pictures import Printed
@@ -104,6 +104,7 @@ class Explanation:
 
     def __repr__(self) -> str:
         lines = [f"{self.verdict}: {self.story.title}", self._causes_in_words(), self._gain()]
+        lines.append(cut(self.story))
         # Titles and names are from files: a long one must not fill the cell.
         return "\n".join(clean(line, WIDEST) for line in lines if line)
 

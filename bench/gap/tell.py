@@ -120,6 +120,8 @@ class Teller:
     def _why(self) -> Iterator[str]:
         """Why the verdict is what it is, the most important first."""
         finding = self.finding
+        if finding.cut is not None:
+            return
         if finding.verdict == "unknown" and finding.causes:
             yield "the effects that help most do not close enough of the gap to be its explanation"
         if finding.verdict in ("partial", "unknown") and finding.remains.structure:

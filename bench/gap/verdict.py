@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap.causes.rules import MEANING, VerdictName
+from bench.gap.causes.rules import CUT, MEANING, VerdictName
+from bench.gap.model.watch import Cut
 from bench.gap.propose import Experiment
 from sims.extended import Number
 
@@ -144,6 +145,7 @@ class Verdict:
         next_experiment: what to record next; None where nothing is open.
         simulations: how many were spent.
         seconds: how long it took.
+        cut: that the search was ended early, and what was not asked; None where it came to its end.
     """
 
     verdict: VerdictName
@@ -156,11 +158,12 @@ class Verdict:
     next_experiment: Experiment | None
     simulations: int
     seconds: float
+    cut: Cut | None = None
 
     @property
     def says(self) -> str:
         """What the word means, in one sentence."""
-        return MEANING[self.verdict]
+        return MEANING[self.verdict] if self.cut is None else CUT[self.verdict]
 
     def document(self) -> Document:
         """The content of verdict.json."""
@@ -177,6 +180,7 @@ class Verdict:
             "next_experiment": proposed.document() if proposed is not None else None,
             "simulations": self.simulations,
             "seconds": self.seconds,
+            "cut": self.cut.document() if self.cut is not None else None,
         }
 
     @classmethod
@@ -184,6 +188,8 @@ class Verdict:
         """From the content of a verdict.json that explain has written."""
         # Null stands for what there was nothing to say of.
         heldout, proposed = document["heldout"], document["next_experiment"]
+        # Older files do not know of it.
+        cut = document.get("cut")
         return cls(
             document["verdict"],
             document["system"],
@@ -195,6 +201,7 @@ class Verdict:
             Experiment(**proposed) if proposed is not None else None,
             document["simulations"],
             document["seconds"],
+            Cut.of(cut) if cut is not None else None,
         )
 
     def __repr__(self) -> str:

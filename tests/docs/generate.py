@@ -16,6 +16,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints, is_typedd
 from bench.cli import parser
 from bench.gap.causes import rules
 from bench.gap.causes.rules import MEANING
+from bench.gap.model.watch import Cut
 from bench.gap.propose import Experiment as NextExperiment
 from bench.gap.verdict import Candidate, Cause, Heldout, Verdict
 from bench.problem.experiment import Experiment
@@ -212,6 +213,7 @@ KINDS = {
     Heldout: "the gain on held-out runs",
     Candidate: "a candidate",
     NextExperiment: "the next experiment",
+    Cut: "the early end",
 }
 """Objects in verdict.json, as the page calls them."""
 ESTIMATE = {

@@ -47,11 +47,13 @@ class Alternatives:
         search: with every model that was fitted.
         trial: the models on held-out runs; None where there are none.
         structure: whether the model leaves structure that no effect accounts for.
+        simulates: False where what has been fitted and scored by now must do.
     """
 
     search: Search
     trial: Trial | None
     structure: bool
+    simulates: bool = True
 
     def evidence(self, model: Model) -> tuple[Evidence, ...]:
         """The model's effects, strongest first."""
@@ -59,10 +61,10 @@ class Alternatives:
         return tuple(sorted(effects, key=lambda evidence: -evidence.gain))
 
     def _evidence(self, model: Model, effect: str) -> Evidence:
-        rest = self.search.without(model, effect)
+        rest = self._rest(model, effect)
         gain = model.likelihood.value - rest.likelihood.value
         p_value = self._p_value(rest, effect, gain)
-        rivals = self._rivals(model, rest, effect)
+        rivals = self._rivals(model, effect)
         # What explains the data with a coefficient that nobody would expect comes last in its set.
         rivals.sort(key=lambda rival: (not self._is_plausible(rival[1]), rival))
         ordered = [name for _, name in rivals]
@@ -77,11 +79,20 @@ class Alternatives:
             preferred=preferred,
         )
 
+    def _rest(self, model: Model, effect: str) -> Model:
+        """The model without the effect; the base model where that would have to be fitted."""
+        if self.simulates:
+            return self.search.without(model, effect)
+        rest = frozenset(model.names) - {effect}
+        return self.search.models.get(rest, self.search.base)
+
     def _p_value(self, rest: Model, effect: str, gain: float) -> float:
         """Chance of such a gain, or of the best score of all, about the model without it."""
         search = self.search
         key = frozenset(rest.names)
         known = search.scanned.get(key)
+        if known is None and not self.simulates:
+            return search.tests.get(key, 1.0)
         scores = search.scan(rest) if known is None else known.scores
         chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         # The score is linear and the gain of a fit is not; either may see more.
@@ -90,9 +101,9 @@ class Alternatives:
         by_score = search.tests.get(key, 1.0)
         return min(by_score, by_refit)
 
-    def _rivals(self, model: Model, rest: Model, effect: str) -> list[tuple[float, str]]:
+    def _rivals(self, model: Model, effect: str) -> list[tuple[float, str]]:
         """How far behind, and the name, of each effect that does as well in place of this one."""
-        shared = set(rest.names)
+        shared = set(model.names) - {effect}
         rivals = [(0.0, effect)]
         for other in list(self.search.models.values()):
             names = set(other.names)

@@ -8,19 +8,20 @@ thresholds that answer stand in `bench.gap.causes.rules`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bench.gap.causes import rules
 from bench.gap.causes.alternatives import Alternatives, Evidence
-from bench.gap.causes.rules import State, VerdictName, verdict_of
+from bench.gap.causes.rules import State, VerdictName, verdict_of, verdict_of_cut
 from bench.gap.causes.search import Search
 from bench.gap.causes.settle import rivals, settle
-from bench.gap.causes.structure import Remains, remains
+from bench.gap.causes.structure import Remains, remains, unasked
 from bench.gap.causes.trial import Trial
 from bench.gap.measure import HeldOutRuns, Measured, covariance
 from bench.gap.model.models import Model, Names
+from bench.gap.model.watch import Cut, EndedError
 from sims.base import Array
 
 SHOWN = 6
@@ -39,6 +40,7 @@ class Finding:
         remains: what the extended model leaves.
         vague: base parameters that the data do not fix.
         measured: models on held-out runs, by their effects; None where there are none.
+        cut: what was not asked; None where the search came to its end.
     """
 
     verdict: VerdictName
@@ -48,6 +50,7 @@ class Finding:
     remains: Remains
     vague: tuple[str, ...] = ()
     measured: Mapping[Names, Measured] | None = None
+    cut: Cut | None = None
 
 
 def name(search: Search, held_out: HeldOutRuns | None) -> Finding:
@@ -57,40 +60,105 @@ def name(search: Search, held_out: HeldOutRuns | None) -> Finding:
         search: with the base model entered.
         held_out: the runs for measuring; None if there are none.
     """
-    # Without motion nothing is asked further: any test of such residuals is one of rounding.
-    if shows_nothing(search):
-        return _without_motion(search)
-    base = search.base
-    vague = unfixed(search, base)
-    # The same goes for a base that is not fixed: causes would stand for values of its parameters.
-    if vague:
-        left = remains(search, base)
-        return Finding(verdict_of(State(fixed=False)), base, base, (), left, vague)
-    model = settle(search, search.run())
-    trial = _trial(search, model, held_out)
-    if trial is not None:
-        model = trial.without_idle(search, model)
-    left = remains(search, model)
-    model, causes = _preferred(search, trial, model, left)
-    if trial is not None and model.names not in trial.measured:
-        trial.measure([model])
-    state = State(
-        causes=len(causes),
-        alternatives=any(cause.alternatives for cause in causes),
-        closed=closed(search, model, left),
-        unexplained=_is_unexplained(search, model, left),
-        missed=trial is not None and trial.misses(model, left),
-    )
-    measured = trial.measured if trial is not None else None
-    # The base is the one that was asked first, whatever better fit of it the search came upon.
-    return Finding(
-        verdict=verdict_of(state),
-        model=model,
-        base=base,
-        causes=causes,
-        remains=left,
-        measured=measured,
-    )
+    inquiry = _Inquiry(search, held_out)
+    try:
+        return inquiry.answered()
+    except EndedError:
+        return inquiry.so_far()
+
+
+class _Inquiry:
+    """The questions in their order, and what has been answered.
+
+    Args:
+        search: with the base model entered.
+        held_out: the runs for measuring; None if there are none.
+    """
+
+    def __init__(self, search: Search, held_out: HeldOutRuns | None) -> None:
+        self._search = search
+        self._held_out = held_out
+        self._watch = search.world.watch
+        self._trial: Trial | None = None
+        self._model: Model | None = None
+
+    def answered(self) -> Finding:
+        """The finding when all is answered.
+
+        Raises:
+            EndedError: the search has to end before.
+        """
+        search = self._search
+        # A base model that is not fitted to its end says nothing, of motion neither.
+        if self._watch.left():
+            raise EndedError
+        # Without motion nothing is asked further: any test of such residuals is one of rounding.
+        if shows_nothing(search):
+            return _without_motion(search)
+        base = search.base
+        vague = unfixed(search, base)
+        # The same goes for a base that is not fixed: causes would stand for values of it.
+        if vague:
+            left = remains(search, base)
+            return Finding(verdict_of(State(fixed=False)), base, base, (), left, vague)
+        self._watch.begin("search")
+        self._model = search.run()
+        self._watch.begin("rivals")
+        self._model = settle(search, self._model)
+        self._try()
+        self._watch.begin("structure")
+        left = remains(search, self._model)
+        self._watch.begin("alternatives")
+        model, causes = _preferred(search, self._trial, self._model, left)
+        trial = self._trial
+        if trial is not None and model.names not in trial.measured:
+            trial.measure([model])
+            self._watch.check()
+        state = State(
+            causes=len(causes),
+            alternatives=any(cause.alternatives for cause in causes),
+            closed=closed(search, model, left),
+            unexplained=_is_unexplained(search, model, left),
+            missed=trial is not None and trial.misses(model, left),
+        )
+        # The base is the one that was asked first, whatever better fit of it the search came upon.
+        return self._finding(verdict_of(state), base, model, causes, left)
+
+    def _try(self) -> None:
+        """Ask the held-out runs."""
+        if self._held_out is None or self._model is None:
+            return
+        self._watch.begin("held_out")
+        trial = _trial(self._search, self._model, self._held_out)
+        # Initial states that were left off would speak against their model.
+        self._watch.check()
+        self._trial = trial
+        self._model = trial.without_idle(self._search, self._model)
+
+    def so_far(self) -> Finding:
+        """The finding where the search had to end: never more than what was answered supports."""
+        search = self._search
+        cut = self._watch.cut(self._held_out is not None)
+        model = self._model or search.so_far()
+        # What nobody asked about is taken for structure, so that no share is called closed for it.
+        left = replace(unasked(search, model), p_value=0.0)
+        alternatives = Alternatives(search, self._trial, structure=False, simulates=False)
+        causes = alternatives.evidence(model)
+        share = closed(search, model, left)
+        verdict = verdict_of_cut(len(causes), share, cut.not_asked)
+        found = self._finding(verdict, search.base, model, causes, unasked(search, model))
+        return replace(found, cut=cut)
+
+    def _finding(
+        self,
+        verdict: VerdictName,
+        base: Model,
+        model: Model,
+        causes: tuple[Evidence, ...],
+        left: Remains,
+    ) -> Finding:
+        measured = self._trial.measured if self._trial is not None else None
+        return Finding(verdict, model, base, causes, left, measured=measured)
 
 
 def shows_nothing(search: Search) -> bool:
@@ -127,12 +195,10 @@ def unfixed(search: Search, base: Model) -> tuple[str, ...]:
     return tuple(vague)
 
 
-def _trial(search: Search, model: Model, held_out: HeldOutRuns | None) -> Trial | None:
+def _trial(search: Search, model: Model, held_out: HeldOutRuns) -> Trial:
     """On held-out runs: the base model, the best ones with one effect, and all that are near the
     one found.
     """
-    if held_out is None:
-        return None
     models = search.models.values()
     # Parts of the model, since an effect without which held-out runs are as good will go.
     names = set(model.names)

@@ -7,7 +7,7 @@ that RMS less one, so that 0 is a model that leaves nothing but noise.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -61,6 +61,13 @@ EXPLAINED = 0.7
 """Share of the gap that the effects must close to be taken for its explanation."""
 STRANGE = 0.5
 """Excess of held-out runs above which they show something that the fitted runs do not."""
+CUT: Mapping[VerdictName, str] = {
+    "partial": "the causes are real, and what else is missing was not asked to the end",
+    "unknown": "the search was ended before it could say what is missing",
+}
+"""The same as `MEANING` of a search that was ended early, which has no other verdicts."""
+LAST: Collection[str] = frozenset({"structure", "alternatives"})
+"""Questions without which a cause may be real already."""
 
 
 def shows_nothing(ranges: Array, left: Array, sigma: Array, touched: bool) -> bool:
@@ -217,3 +224,19 @@ def verdict_of(state: State) -> VerdictName:
     if incomplete:
         return "partial"
     return "ambiguous" if state.alternatives else "named"
+
+
+def verdict_of_cut(causes: int, closed: float, not_asked: Sequence[str]) -> VerdictName:
+    """The verdict of a search that was ended early: never more than what was asked supports.
+
+    Without an answer to every question nothing is adequate and nothing is named. Causes are real
+    where they stood against their rivals and held-out runs; else they are listed, and not believed.
+
+    Args:
+        causes: how many were found.
+        closed: share of the gap on the fitted runs that they close, what is left taken for
+            structure.
+        not_asked: the questions that are open.
+    """
+    stood = all(name in LAST for name in not_asked)
+    return "partial" if causes and stood and explains(closed) else "unknown"

@@ -73,6 +73,8 @@ class Scored(Models):
         known = self.scanned.get(key)
         if known is not None and against is None:
             return known.scores
+        about = " + ".join(model.names) or "the base model"
+        self.world.watch.look(f"scores of the library about {about}")
         # Directions cost a simulation of each candidate; other surrogates need no new ones.
         if known is None:
             candidates = self._lacking(model)
@@ -137,14 +139,14 @@ class Scored(Models):
         """
         gain = larger.likelihood.value - model.likelihood.value
         model = self.models[frozenset(model.names)]
-        first = self._gained(self.scan(model), larger, gain)
+        first = self.gained(self.scan(model), larger, gain)
         # No colour of the surrogates makes such a gain a matter of chance.
         if first < CERTAIN:
             return first
         scores = self.scan(model, self.residual(larger.fit))
-        return min(scores.p_value, self._gained(scores, larger, gain))
+        return min(scores.p_value, self.gained(scores, larger, gain))
 
-    def _gained(self, scores: Scores, larger: Model, gain: float) -> float:
+    def gained(self, scores: Scores, larger: Model, gain: float) -> float:
         """Chance of a gain in twice the log likelihood, less what chance gives the larger model's
         effects.
         """

@@ -51,8 +51,13 @@ RIVAL = 0.5
 
 @dataclass
 class Search(Moves):
-    """The search: from the base model to the model of all effects that the data show."""
+    """The search: from the base model to the model of all effects that the data show.
 
+    Attributes:
+        supported: the model that the data support as far as the search has come.
+    """
+
+    supported: Model | None = None
     _sketch: Search | None = None
 
     def run(self) -> Model:
@@ -63,6 +68,7 @@ class Search(Moves):
         """
         best = self.base
         for size in range(1, MOST_EFFECTS + 1):
+            self.supported = best
             # A further effect is looked for on stronger evidence than the first.
             if self.plain(best, DOUBTFUL if best.names else UNLIKELY):
                 break
@@ -77,10 +83,29 @@ class Search(Moves):
             # What is missing then is nothing of the library, and triples would only mimic it.
             if size > 1 and is_hopeless(self, larger):
                 break
+        self.supported = best
         return best
+
+    def so_far(self) -> Model:
+        """What a search that has to end here supports best; nothing is simulated for it.
+
+        A model that was fitted already takes the place of the one that was judged if its gain is
+        none of chance by the scores that there are.
+        """
+        best = self.models[frozenset((self.supported or self.base).names)]
+        larger = [m for m in self.models.values() if len(m.names) > len(best.names)]
+        scanned = self.scanned.get(frozenset(best.names))
+        if scanned is None or not larger:
+            return best
+        found = max(larger, key=lambda model: model.merit)
+        gain = found.likelihood.value - best.likelihood.value
+        real = self.gained(scanned.scores, found, gain) <= ALPHA
+        return found if real and found.merit > best.merit else best
 
     def _larger(self, best: Model, size: int) -> Model | None:
         """The model of so many effects, or fewer, to compare with the best one of fewer."""
+        if size > 1:
+            self.world.watch.grow()
         larger = self._grown(size)
         if larger is None:
             return None

@@ -126,21 +126,13 @@ def remains(models: Models, model: Model) -> Remains:
         model: the model.
     """
     world, stated = models.world, models.stated
-    sigma = model.likelihood.sigma
-    # A channel without samples has no sigma, and leaves nothing.
-    left = np.where(np.isfinite(sigma), sigma, 0.0)
-    excess = left / models.noise.sigma
-    channels = []
-    for c, name in enumerate(world.channels):
-        error = _error(models, model, c)
-        if is_loud(excess[c], error, stated[c]):
-            channels.append(name)
-    loud = tuple(channels)
+    quick = unasked(models, model)
     if Hat.name not in world.slots:
-        return Remains(1.0, "", excess, loud)
+        return quick
+    world.watch.look("a force of any shape")
     directions = hats(world, model)
     if not directions.probes:
-        return Remains(1.0, "", excess, loud)
+        return quick
     residual = models.residual(model.fit)
     surrogate = surrogates(residual, models.seen, SURROGATES, models.rng)
     weights = models.weights(model)
@@ -155,7 +147,21 @@ def remains(models: Models, model: Model) -> Remains:
     promise = scores.score - scores.chance
     where = scores.effects[int(np.argmax(promise))]
     level = level_of(bool(stated.all()))
-    return Remains(scores.p_value, where, excess, loud, level)
+    return Remains(scores.p_value, where, quick.excess, quick.loud, level)
+
+
+def unasked(models: Models, model: Model) -> Remains:
+    """What a fitted model leaves by its size alone, no force of any shape asked."""
+    sigma = model.likelihood.sigma
+    # A channel without samples has no sigma, and leaves nothing.
+    left = np.where(np.isfinite(sigma), sigma, 0.0)
+    excess = left / models.noise.sigma
+    channels = []
+    for c, name in enumerate(models.world.channels):
+        error = _error(models, model, c)
+        if is_loud(excess[c], error, models.stated[c]):
+            channels.append(name)
+    return Remains(1.0, "", excess, tuple(channels))
 
 
 def _error(models: Models, model: Model, channel: int) -> float:

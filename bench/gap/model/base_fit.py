@@ -66,12 +66,14 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
     thetas = _starts(world, given)
     starts = [Start((), theta, world.guess) for theta in thetas]
     # to simulate a start costs far less than to fit it, so the field is thinned first
+    world.watch.tell(f"base fit from {len(starts)} starts")
     if len(starts) > KEPT:
         order = np.argsort(_costs(world, noise, starts), kind="stable")
         starts = [starts[i] for i in order[:KEPT]]
 
     fits: list[Fit] = []
     for horizon in HORIZONS:
+        world.watch.tell(f"base fit, first {horizon.share:.0%} of the runs")
         fits = Fitter(world, noise, share=horizon.share).fit(starts, horizon.iterations)
         starts = [fit.start() for fit in fits]
     best = min(fits, key=lambda fit: fit.cost)

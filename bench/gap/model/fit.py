@@ -229,7 +229,8 @@ class Fitter:
             if race and iteration >= RACED:
                 _give_up(problems, reached)
             trials = list(self._trials(problems, seen))
-            if not trials:
+            # what comes after it sees that this was left off
+            if not trials or self.world.watch.leaves(iteration / iterations):
                 break
             points = self._points(trials, seen)
             for (problem, _), point in zip(trials, points, strict=True):

@@ -136,6 +136,7 @@ class Models:
                 with the best.
             race: give up what falls far behind.
         """
+        self.world.watch.look(f"refit of {_listed(starts)}")
         noise = noise or self.noise
         if patient:
             starts = self._sifted(starts, noise)
@@ -145,6 +146,8 @@ class Models:
         fitter = Fitter(self.world, noise, self.frozen)
         for fit in fitter.fit(starts, STEPS, race=race, reached=reached):
             self.enter(fit)
+        # One that was left off is kept, and not judged.
+        self.world.watch.check()
 
     def _sifted(self, starts: Sequence[Start], noise: Noise) -> list[Start]:
         """Where the best stand after all horizons but the last, which is the whole of the runs."""
@@ -186,6 +189,13 @@ class Models:
         # a channel without samples has no sigma, and its weight does not matter
         left = np.where(np.isfinite(sigma), sigma, 0.0)
         return Noise(np.maximum(self.noise.sigma, left), self.noise.phi)
+
+
+def _listed(starts: Sequence[Start]) -> str:
+    """The models that begin there, in a few words."""
+    names = list(dict.fromkeys(" + ".join(start.effects) or "the base model" for start in starts))
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    return f"{names[0]}{more}" if names else "nothing"
 
 
 def freedom(world: World, fit: Fit, noise: Noise) -> float:

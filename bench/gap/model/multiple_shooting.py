@@ -58,6 +58,7 @@ def pieces(world: World) -> World | None:
     # what is periodic goes on from piece to piece
     cut.longest = world.longest
     cut.travel = world.travel
+    cut.watch = world.watch
     return cut
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bench.gap.model.noise import Mask
 from bench.gap.model.tracks import Track, first_of, tracked
+from bench.gap.model.watch import Watch
 from sims import effects as library
 from sims.base import Array, InputError, Parameter, Scenario, unknown
 from sims.recording.recording import Recording, Run
@@ -69,6 +70,7 @@ class World:
         longest: duration of the longest run, seconds.
         travel: the largest range of the primary coordinate in one run.
         simulations: lanes simulated so far.
+        watch: says when fits have to leave off; never, unless another is put here.
 
     Args:
         kind: the simulator's class.
@@ -125,6 +127,7 @@ class World:
         self.longest = self._longest()
         self.travel = self._travel()
         self.simulations = 0
+        self.watch = Watch()
         self._parts: dict[float, list[Scenario]] = {}
 
     def _simulators(self) -> tuple[Simulated, Simulated]:

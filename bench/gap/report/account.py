@@ -10,6 +10,7 @@ from textwrap import wrap
 
 import numpy as np
 
+from bench.gap.model.watch import QUESTIONS
 from bench.gap.report.story import Place, Side, Story, Tuned
 from bench.gap.report.words import (
     clean,
@@ -24,7 +25,7 @@ from bench.gap.report.words import (
     sentence,
     with_unit,
 )
-from bench.gap.verdict import Cause, Heldout
+from bench.gap.verdict import Cause, Heldout, Verdict
 from sims.base import Array
 
 WIDTH = 100
@@ -94,6 +95,8 @@ def _says(cause: Cause) -> str:
 def headline(story: Story) -> str:
     """What is wrong with the simulator, in one sentence."""
     verdict, causes = story.verdict.verdict, story.verdict.causes
+    if story.verdict.cut is not None:
+        return _headline_of_cut(story.verdict)
     # No cause is said to be lacking where the verdict does not vouch for it.
     if verdict == "adequate":
         return "Nothing is missing from the simulation that these data can show."
@@ -112,6 +115,27 @@ def headline(story: Story) -> str:
     # With several causes the sentence would not end: what they do follows it.
     says = f": {_says(causes[0])}" if len(causes) == 1 else ""
     return f"The simulation lacks {names}{says}."
+
+
+def _headline_of_cut(verdict: Verdict) -> str:
+    """The same of a search that was ended early: what it has, and no more."""
+    if verdict.verdict == "partial":
+        return f"The simulation lacks {_sets(verdict.causes)}; what else, was not asked to the end."
+    nothing = "The search was ended before it could say what the simulation lacks"
+    if not verdict.causes:
+        return f"{nothing}."
+    return f"{nothing}; the best that it had come upon: {_sets(verdict.causes)}."
+
+
+def cut(story: Story) -> str:
+    """What ended the search, and what was not asked any more; empty where it came to its end."""
+    found = story.verdict.cut
+    if found is None:
+        return ""
+    by = {"budget": "its budget of time", "interrupt": "an interrupt"}[found.by]
+    open_ones = joined([QUESTIONS[name] for name in found.not_asked if name in QUESTIONS])
+    during = f"; looked at last: {clean(found.during, 80)}" if found.during else ""
+    return f"The search was ended by {by}{during}. Not asked to the end: {open_ones}."
 
 
 def _sets(causes: Sequence[Cause]) -> str:
@@ -142,6 +166,8 @@ def unfixed(story: Story) -> list[str]:
 def following(story: Story) -> Iterator[str]:
     """The sentences that follow the headline at once: the gain, and what the verdict owes."""
     verdict = story.verdict.verdict
+    if story.verdict.cut is not None:
+        yield cut(story)
     # To find nothing says little without what was looked for, and what could not have been seen.
     if verdict == "adequate":
         yield looked_for(story)
@@ -191,7 +217,7 @@ def interval(held_out: Heldout) -> str:
 def _closer(story: Story) -> str:
     """The beginning of the sentence that says how much of the gap is closed."""
     causes = story.verdict.causes
-    if story.verdict.verdict == "unknown":
+    if story.verdict.verdict == "unknown" and story.verdict.cut is None:
         names = joined([noun(cause.effect) for cause in causes])
         return f"The best of them, {names}, {'closes' if len(causes) == 1 else 'close'} only"
     if len(causes) > 1:
@@ -207,6 +233,9 @@ def _fitted_gain(story: Story) -> str:
     if story.verdict.causes:
         error += f" before and {number(after)} times after"
     caution = "No run is held out, so the gain is not measured independently"
+    found = story.verdict.cut
+    if found is not None and "held_out" in found.not_asked:
+        caution = "The gain was not measured on held-out runs"
     return f"{caution}; on the fitted runs {error}."
 
 

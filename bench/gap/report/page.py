@@ -35,6 +35,11 @@ _BADGES = {
     "unidentifiable": "unidentifiable: the data do not suffice",
 }
 """Every verdict in a few words."""
+_CUT = {
+    "partial": "partial: a cause is found; the search was ended early",
+    "unknown": "unknown: the search was ended early",
+}
+"""The same where the search was ended early."""
 _CAPTIONS = {
     "overview": (
         "Above: measured and simulated; below: the residual, what is measured less what is "
@@ -92,7 +97,9 @@ def _head(story: Story) -> Iterator[str]:
 def _opening(story: Story) -> Iterator[str]:
     """The ten seconds."""
     yield "<header>\n" + paragraph(safe(story.title), "recording")
-    yield paragraph(f'<span class="badge">{_BADGES[story.verdict.verdict]}</span>')
+    verdict = story.verdict
+    badge = _BADGES[verdict.verdict] if verdict.cut is None else _CUT[verdict.verdict]
+    yield paragraph(f'<span class="badge">{badge}</span>')
     yield f"<h1>{safe(headline(story))}</h1>"
     for text in following(story):
         # Longer than other texts may be: a sentence here lists causes and their numbers.

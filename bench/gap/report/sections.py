@@ -251,7 +251,8 @@ def remains(story: Story) -> Iterator[str]:
     # On held-out runs the residual owes nothing to the fit.
     side, name = (story.held_out, "held-out") if story.held_out else (story.fitting, "fitted")
     left = number(rms(story, side, "after"), 2)
-    what = _LEFT.get(story.verdict.verdict, "Nothing that stands out")
+    verdict = story.verdict.verdict if story.verdict.cut is None else "unidentifiable"
+    what = _LEFT.get(verdict, "Nothing that stands out")
     yield paragraph(f"{what}: the residual of the {name} runs is {left} times the noise.")
 
 

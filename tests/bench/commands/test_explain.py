@@ -1,10 +1,14 @@
 """`simgap explain` and `simgap score` as they are typed."""
 
+import io
 import json
+import signal
+import time
 
 import pytest
 
 from bench.cli import main
+from bench.commands.progress import Look
 from bench.registry import simulators
 from sims.extended import load, read
 from tests.bench.gap import schema
@@ -214,3 +218,78 @@ def test_help_says_what_the_commands_take(capsys):
         assert ended.value.code == 0
         out = capsys.readouterr().out
         assert all(word in out for word in words)
+
+
+def test_a_budget_that_is_over_leaves_an_answer_that_says_so(folder, capsys, tmp_path):
+    out = tmp_path / "out"
+    command = ["explain", str(folder / "swing.csv"), "--budget", "1e-3", "--out", str(out)]
+    assert main(command) == 0
+    found = schema.check((out / "verdict.json").read_text())
+    assert (found["verdict"], found["cut"]["by"]) == ("unknown", "budget")
+    assert "The search was ended by its budget of time" in " ".join(capsys.readouterr().out.split())
+    assert load(out / "extended.toml", simulators.get).name == "pendulum_extended"
+
+
+@pytest.mark.parametrize("budget", ["0", "-3", "nan", "soon"])
+def test_a_bad_budget_is_one_line(folder, budget, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["explain", str(folder / "swing.csv"), f"--budget={budget}"])
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"expected a number of seconds above 0, found '{budget}'" in line
+
+
+def interrupted(monkeypatch, times):
+    """Have Ctrl-C pressed so often as soon as something is shown."""
+    left = [times]
+
+    def show(*_):
+        while left[0]:
+            left[0] -= 1
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Look, "show", show)
+
+
+def test_ctrl_c_ends_with_what_there_is_and_is_an_interrupt(folder, capsys, tmp_path, monkeypatch):
+    interrupted(monkeypatch, 1)
+    out = tmp_path / "out"
+    assert main(["explain", str(folder / "swing.csv"), "--out", str(out)]) == 130
+    found = schema.check((out / "verdict.json").read_text())
+    assert found["cut"]["by"] == "interrupt"
+    told = capsys.readouterr()
+    assert "The search was ended by an interrupt" in told.out
+    assert "simgap: ending with what there is; Ctrl-C again ends at once" in told.err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_twice_ends_at_once_and_writes_nothing(folder, capsys, tmp_path, monkeypatch):
+    interrupted(monkeypatch, 2)
+    out = tmp_path / "out"
+    assert main(["explain", str(folder / "swing.csv"), "--out", str(out)]) == 130
+    assert not out.exists()
+    assert "interrupted before there was a result" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+class Terminal(io.StringIO):
+    """What a terminal would show."""
+
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_shows_a_bar_and_a_log_a_line_for_each_part(monkeypatch):
+    for stream, lines in ((Terminal(), 1), (io.StringIO(), 2)):
+        monkeypatch.setattr("sys.stderr", stream)
+        with Look() as look:
+            look.say("fitting")
+            look.show(0.5, "refit of drag.linear")
+            time.sleep(0.25)
+            look.show(0.4, "scores of the library")
+            look.say("measuring")
+        told = stream.getvalue()
+        assert told.count("\n") == (0 if stream.isatty() else lines)
+        assert (" 50%|" in told) == ("scores of the library" in told) == stream.isatty()
+        assert " 40%|" not in told, "a bar does not go back"
+        assert ("left, scores" in told) == stream.isatty()

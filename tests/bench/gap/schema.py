@@ -9,8 +9,9 @@ VERDICTS = {"adequate", "named", "ambiguous", "partial", "unknown", "unidentifia
 KEYS = {
     "verdict", "system", "engine", "causes", "parameters", "heldout", "candidates",
     "next_experiment", "simulations",
-    "seconds",
+    "seconds", "cut",
 }  # fmt: skip
+QUESTIONS = {"base_fit", "search", "rivals", "held_out", "structure", "alternatives"}
 CAUSE = {"effect", "alternatives", "says", "coefficients", "p_value"}
 HELD_OUT = {"rmse_base", "rmse_extended", "noise_floor", "gap_closed", "low", "high"}
 CANDIDATE = {"effect", "score", "p_value", "heldout_gain"}
@@ -78,6 +79,15 @@ def check(text):
     assert isinstance(found["simulations"], int)
     assert found["simulations"] >= 1
     number(found["seconds"], 0)
+    if found["cut"] is not None:
+        assert set(found["cut"]) == {"by", "during", "not_asked"}
+        assert found["cut"]["by"] in ("budget", "interrupt")
+        assert isinstance(found["cut"]["during"], str)
+        assert set(found["cut"]["not_asked"]) <= QUESTIONS
+        assert found["cut"]["not_asked"]
+        assert found["verdict"] in ("partial", "unknown"), "the vocabulary of what is not settled"
+        early = set(found["cut"]["not_asked"]) - {"structure", "alternatives"}
+        assert not early or found["verdict"] == "unknown"
     named, none = {"named", "ambiguous", "partial"}, {"adequate", "unidentifiable"}
     assert found["causes"] or found["verdict"] not in named, "a name needs a cause"
     assert not found["causes"] or found["verdict"] not in none

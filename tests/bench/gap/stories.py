@@ -130,6 +130,7 @@ def answer(verdict="named", **changes):
         "next_experiment": NEXT if verdict == "ambiguous" else None,
         "simulations": 1412,
         "seconds": 2.1,
+        "cut": None,
     }
     if verdict == "adequate":
         found["heldout"] = {

@@ -46,7 +46,8 @@ def test_the_document_is_that_of_verdict_json_in_its_order():
         ' "low": null, "high": null, "unit": "rad"}, "candidates": [{"effect": "drag.linear",'
         ' "score": 812.4, "p_value": 1e-09, "heldout_gain": 0.9}, {"effect": "wind", "score": 0.5,'
         ' "p_value": 1.0, "heldout_gain": null}], "next_experiment": {"says": "Record twice as'
-        ' long", "change": {"seconds": 8.0}, "apart": 4.0}, "simulations": 412, "seconds": 2.1}'
+        ' long", "change": {"seconds": 8.0}, "apart": 4.0}, "simulations": 412, "seconds": 2.1,'
+        ' "cut": null}'
     )
 
 

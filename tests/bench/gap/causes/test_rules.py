@@ -11,6 +11,7 @@ from bench.gap.causes.rules import State, VerdictName, verdict_of
 from tests.bench.gap import schema
 
 SIGMA = np.array([0.01, 0.1])
+QUESTIONS = ("base_fit", "search", "rivals", "held_out", "structure", "alternatives")
 
 
 def test_every_verdict_has_one_sentence_and_is_in_the_form_of_verdict_json():
@@ -154,3 +155,13 @@ def test_every_state_has_a_verdict_and_a_name_needs_a_cause():
         assert causes or verdict not in ("named", "ambiguous", "partial")
         if unexplained or missed:
             assert verdict not in ("adequate", "named", "ambiguous")
+
+
+@pytest.mark.parametrize("first", range(len(QUESTIONS)))
+@pytest.mark.parametrize("causes", [0, 2])
+@pytest.mark.parametrize("closed", [0.5, 0.95])
+def test_a_search_that_was_ended_early_names_nothing(first, causes, closed):
+    verdict = rules.verdict_of_cut(causes, closed, QUESTIONS[first:])
+    stood = first >= QUESTIONS.index("structure")
+    assert verdict == ("partial" if causes and closed > 0.7 and stood else "unknown")
+    assert set(rules.CUT) == {"partial", "unknown"}

@@ -282,3 +282,25 @@ def test_every_registered_effect_has_a_noun():
     from sims import effects
 
     assert [name for name in effects.names() if noun(name) == name and "." in name] == []
+
+
+CUT = {"by": "budget", "during": "refit of drag.linear and 3 more", "not_asked": ["rivals"]}
+
+
+def test_an_early_end_is_told_before_anything_else():
+    told = text(story("unknown", cut=CUT, causes=[DRAG]))
+    assert "The search was ended before it could say what the simulation lacks; the best" in told
+    assert "by its budget of time; looked at last: refit of drag.linear and 3 more. Not" in told
+    assert "none of the 6 known causes" not in told, "they were not all asked"
+    told = text(story("unknown", cut={**CUT, "by": "interrupt"}))
+    assert "before it could say what the simulation lacks. The search was ended by an in" in told
+    told = text(story("partial", cut={**CUT, "not_asked": ["structure"]}))
+    assert "lacks linear drag; what else, was not asked to the end." in told
+    assert "something else that no known cause explains" not in told
+
+
+def test_held_out_runs_that_were_not_asked_are_not_said_to_be_missing():
+    cut = {**CUT, "not_asked": ["held_out", "structure"]}
+    told = text(story("unknown", cut=cut, heldout=None))
+    assert "The gain was not measured on held-out runs" in told
+    assert "No run is held out" not in told

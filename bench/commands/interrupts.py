@@ -1,0 +1,39 @@
+"""Ctrl-C as a wish to end with what there is; once more, and it ends at once."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+
+INTERRUPTED = 130
+"""Exit code of what a person interrupted, as shells have it."""
+
+
+class Interrupts:
+    """While it is entered the first Ctrl-C is noted, and the second one is an interrupt as ever."""
+
+    def __init__(self) -> None:
+        self._asked = False
+
+    def asked(self) -> bool:
+        """Whether somebody wants an end."""
+        return self._asked
+
+    def __enter__(self) -> Interrupts:
+        # Python lets the main thread alone answer signals.
+        self._answers = threading.current_thread() is threading.main_thread()
+        # Who ignores them, as in the background of a shell, goes on doing so.
+        if self._answers and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, self._first)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._answers and signal.getsignal(signal.SIGINT) == self._first:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _first(self, *_: object) -> None:
+        self._asked = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        message = "ending with what there is; Ctrl-C again ends at once"
+        print(f"\nsimgap: {message}", file=sys.stderr, flush=True)
