@@ -48,12 +48,14 @@ class Plan:
         ends: (L, S) seconds since the start of the run at the end of each step.
         every: after this many steps the state is kept; the initial state is kept first.
         rows: (L, T) which of the kept states each sample shows.
+        alike: whether lanes of one run make the same steps.
     """
 
     steps: Array
     ends: Array
     every: int
     rows: Indices
+    alike: bool = False
 
 
 @dataclass(frozen=True)
@@ -80,21 +82,27 @@ class Runs:
 def make_runs(scenarios: Sequence[Scenario]) -> Runs:
     """Group scenarios (one a lane) with the same times and inputs."""
     # Told apart by object first: comparing contents costs more than most lanes' share of a step.
-    by_object: dict[int, int] = {}
+    objects, of = by_object(scenarios)
     by_content: dict[object, int] = {}
     distinct: list[Scenario] = []
-    of = np.empty(len(scenarios), dtype=np.intp)
-    for lane, scenario in enumerate(scenarios):
-        group = by_object.get(id(scenario))
-        if group is None:
-            signals = sorted(scenario.inputs.items())
-            content = scenario.times.tobytes(), *((name, u.tobytes()) for name, u in signals)
-            group = by_content.setdefault(content, len(distinct))
-            if group == len(distinct):
-                distinct.append(scenario)
-            by_object[id(scenario)] = group
-        of[lane] = group
-    return Runs(tuple(distinct), of)
+    groups = []
+    for scenario in objects:
+        signals = sorted(scenario.inputs.items())
+        content = scenario.times.tobytes(), *((name, u.tobytes()) for name, u in signals)
+        group = by_content.setdefault(content, len(distinct))
+        if group == len(distinct):
+            distinct.append(scenario)
+        groups.append(group)
+    return Runs(tuple(distinct), np.array(groups, dtype=np.intp)[of])
+
+
+def by_object(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], Indices]:
+    """The different objects among scenarios (one a lane), and which of them each lane has (L,)."""
+    # A lane costs one look into a dictionary, and there may be thousands.
+    objects = {id(scenario): scenario for scenario in scenarios}
+    place = {key: i for i, key in enumerate(objects)}
+    of = np.array([place[id(scenario)] for scenario in scenarios], dtype=np.intp)
+    return list(objects.values()), of
 
 
 Commands = Sequence[Mapping[str, Array]]
@@ -121,7 +129,7 @@ def make_plan(runs: Runs, commands: Commands, acting: Acting, largest_step: floa
         if (instants == instants[:1]).all():
             instants = instants[:1]
         steps, ends, every, rows = _divided(instants, largest_step)
-        return Plan(runs.spread(steps), runs.spread(ends), every, runs.spread(rows))
+        return Plan(runs.spread(steps), runs.spread(ends), every, runs.spread(rows), alike=True)
     instants = instants[runs.of]
     for effect, c in shifting:
         if isinstance(effect, Sensor):
@@ -236,18 +244,21 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
     felt = {}
     for name in others if effects else (first, *others):
         signals = [u[name] for u in commands]
-        felt[name] = _felt(runs, signals, begin, plan.ends)
+        felt[name] = _felt(runs, signals, begin, plan.ends, plan.alike)
     if not effects:
         return felt
     # Back from the plant to the command: the last effect asks the one before it for its instants.
     end = plan.ends
     for effect, c, on in reversed(effects):
         assert isinstance(effect, Input)
+        # Most effects leave instants as they are, and then nothing is asked of every single lane.
+        if not _shifts(effect):
+            continue
         begin = np.where(on, effect.times(c, begin), begin)
         end = np.where(on, effect.times(c, end), end)
     # And forward with the values.
     signals = [u[first] for u in commands]
-    means = _felt(runs, signals, begin, end)
+    means = _felt(runs, signals, begin, end, plan.alike)
     beginnings = np.array([signal[0] for signal in signals])
     return {first: _passed(effects, plan, means, beginnings[runs.of, None]), **felt}
 
@@ -268,14 +279,17 @@ def _passed(
     """
     lasting = _lasting(plan.steps)
     values = np.take_along_axis(means, lasting, axis=1)
-    nothing = np.zeros_like(start)
+    start = start.copy()
     for effect, c, on in effects:
         assert isinstance(effect, Input)
-        begun = effect.feel(c, Signal(start, nothing, start, nothing))
-        passed = effect.feel(c, Signal(values, plan.steps, start, plan.ends))
-        passed = np.take_along_axis(passed, lasting, axis=1)
-        values = np.where(on, passed, values)
-        start = np.where(on, begun, start)
+        # Of hundreds of lanes an effect may act in a few: the others are not asked.
+        lanes = np.flatnonzero(on)
+        own, begin = c[:, lanes], start[lanes]
+        nothing = np.zeros_like(begin)
+        signal = Signal(values[lanes], plan.steps[lanes], begin, plan.ends[lanes])
+        passed = effect.feel(own, signal)
+        values[lanes] = np.take_along_axis(passed, lasting[lanes], axis=1)
+        start[lanes] = effect.feel(own, Signal(begin, nothing, begin, nothing))
     return values
 
 
@@ -297,18 +311,19 @@ def _lasting(steps: Array) -> Indices:
     return last
 
 
-def _felt(runs: Runs, signals: Sequence[Array], begin: Array, end: Array) -> Array:
-    """Means (L, S) of each lane's signal from `begin` to `end` (L, S)."""
-    alike = begin.strides[0] == 0 and end.strides[0] == 0  # all lanes make the same steps
+def _felt(runs: Runs, signals: Sequence[Array], begin: Array, end: Array, alike: bool) -> Array:
+    """Means (L, S) of each lane's signal from `begin` to `end` (L, S); of lanes that are alike only
+    the first of each run is looked at.
+    """
     count = len(signals) if alike else len(begin)
     result = np.empty((count, begin.shape[1]))
-    # All lanes of a run in one call, and of lanes that step alike only the first.
+    # All lanes of a run in one call.
     by_run = np.argsort(runs.of, kind="stable")
     borders = np.flatnonzero(np.diff(runs.of[by_run])) + 1
     for lanes in np.split(by_run, borders):
         run = runs.of[lanes[0]]
         times = _since_start(runs.distinct[run])
-        to, of = (slice(run, run + 1), slice(1)) if alike else (lanes, lanes)
+        to, of = (slice(run, run + 1), lanes[:1]) if alike else (lanes, lanes)
         result[to] = _means(times, signals[run], begin[of], end[of])
     return runs.spread(result) if alike else result
 

@@ -12,7 +12,7 @@ from sims import effects as library
 from sims.base import Array, InputError, Parameter, Scenario, Simulator
 from sims.engines import engine_named
 from sims.limits import is_number
-from sims.plan import Plan, acts, felt_inputs, make_plan, make_runs
+from sims.plan import Plan, acts, by_object, felt_inputs, make_plan, make_runs
 from sims.system import (
     Acting,
     Contact,
@@ -155,7 +155,7 @@ class Simulated(Simulator):
             inputs = felt_inputs(plan, runs, commands, _of(acting, Input)) if self.inputs else {}
             sensors = tuple((effect, c) for effect, c in _of(acting, Sensor) if c.any())
             # A filter in a sensor sees every step; the others see the samples alone.
-            filtered = any(isinstance(effect, Sensor) and effect.filters for effect, _ in sensors)
+            filtered = any(_filters(effect) for effect, _ in sensors)
             every = 1 if filtered else plan.every
             own = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
             constants, x, v = self._known(scenarios, initial or {})
@@ -196,12 +196,7 @@ class Simulated(Simulator):
     ) -> tuple[dict[str, Array], Array, Array]:
         """Constants (L, 1) by name, initial positions and velocities (L, D)."""
         # Checked once for each scenario object and not for each lane: there are hundreds of lanes.
-        place: dict[int, int] = {}
-        distinct: list[Scenario] = []
-        for scenario in scenarios:
-            if place.setdefault(id(scenario), len(distinct)) == len(distinct):
-                distinct.append(scenario)
-        of = np.array([place[id(scenario)] for scenario in scenarios])
+        distinct, of = by_object(scenarios)
         known = [self.run_constants(s) for s in distinct]
         began = [self.run_initial(s) for s in distinct]
         constants = {name: values[of, None] for name, values in _columns(known).items()}
@@ -223,21 +218,37 @@ class Simulated(Simulator):
         observations = np.empty((*rows.shape, len(names)))
         for place, name in enumerate(names):
             values = channels[name]
-            start = channels[name][:, :1]
-            for effect, c in sensors:
-                assert isinstance(effect, Sensor)
-                # Sensors in a row: each reads what the one before gives, also at the start, in
-                # which the next begins. A gain or bias is that of one channel.
-                if effect.filters or name == valued:
-                    on = acts(c)
-                    nothing = np.zeros_like(start)
-                    begun = effect.read(c, Signal(start, nothing, start, nothing))
-                    read = effect.read(c, Signal(values, steps, start, times))
-                    values = np.where(on, read, values)
-                    start = np.where(on, begun, start)
+            # A gain or bias is that of one channel.
+            reading = [(e, c) for e, c in sensors if _filters(e) or name == valued]
+            if reading:
+                values = _sensed(reading, values, steps, times)
             observations[:, :, place] = _chosen(values, rows)
         observations += 0.0  # no zero is negative: whatever made it, it is the same zero
         return observations
+
+
+def _filters(effect: Effect) -> bool:
+    """Whether a sensor's effect must see every step."""
+    return isinstance(effect, Sensor) and effect.filters
+
+
+def _sensed(sensors: Acting, values: Array, steps: Array, times: Array) -> Array:
+    """(L, R) what sensors in a row make of a channel's values (L, R).
+
+    Each reads what the one before gives, also at the start, in which the next begins.
+    """
+    values = values.copy()
+    start = values[:, :1].copy()
+    for effect, c in sensors:
+        assert isinstance(effect, Sensor)
+        # Of hundreds of lanes an effect may act in a few: the others are not asked.
+        lanes = np.flatnonzero(acts(c))
+        own, begin = c[:, lanes], start[lanes]
+        nothing = np.zeros_like(begin)
+        signal = Signal(values[lanes], steps[lanes], begin, times[lanes])
+        values[lanes] = effect.read(own, signal)
+        start[lanes] = effect.read(own, Signal(begin, nothing, begin, nothing))
+    return values
 
 
 def _kept(plan: Plan, every: int) -> Array:

@@ -157,12 +157,13 @@ def _lagged(signal: Signal, lag: Array) -> Array:
 
 def _pushed(signal: Signal, half: Array) -> Array:
     """What is pushed to and fro (L, S) by (7), `half` (L, 1) the play to either side."""
-    low = signal.values - half
-    high = signal.values + half
-    result = np.empty_like(low)
+    # Step by step in rows, which lie together in memory.
+    low = np.ascontiguousarray((signal.values - half).T)
+    high = np.ascontiguousarray((signal.values + half).T)
     # where in its play a drive rests is not recorded: the middle favours neither direction
     state: Array = signal.start[:, 0]
-    for k in range(low.shape[1]):
-        state = np.clip(state, low[:, k], high[:, k])  # (7)
-        result[:, k] = state
-    return result
+    for below, above in zip(low, high, strict=True):
+        # (7), without the overhead of np.clip, in place: what was low is the result
+        np.maximum(state, below, out=below)
+        state = np.minimum(below, above, out=below)
+    return low.T

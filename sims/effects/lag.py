@@ -39,13 +39,15 @@ def response(steps: Array, lag: Array) -> tuple[Array, Array]:
 
 def recur(decay: Array, gained: Array, start: Array) -> Array:
     """y[k] = decay[k] y[k - 1] + gained[k], (L, S), from y[-1] = start (L, 1)."""
-    result = np.empty_like(gained)
-    state = start[:, 0]
+    # rows lie together in memory, and what was gained becomes the result
+    result = np.ascontiguousarray(gained.T)
+    kept = np.ascontiguousarray(decay.T)
+    state: Array = start[:, 0]
     # step by step: a closed form would divide by products of decays, which underflow
-    for k in range(gained.shape[1]):
-        state = decay[:, k] * state + gained[:, k]
-        result[:, k] = state
-    return result
+    for row, share in zip(result, kept, strict=True):
+        row += share * state
+        state = row
+    return result.T
 
 
 def before(values: Array, start: Array) -> Array:

@@ -11,7 +11,7 @@ from sims.effects.sensing import Delay as Late
 from sims.effects.sensing import Skew
 from sims.plan import Plan, felt_inputs, make_plan, make_runs
 from sims.slider.simulator import Slider
-from sims.system import Input
+from sims.system import Coefficient, Input, Sensor
 
 
 def coefficients(*values):
@@ -111,6 +111,33 @@ def test_input_effects_act_in_order_on_the_first_input_and_where_they_are_on():
     felt = felt_inputs(make_plan(runs, commands, acting, 0.01), runs, commands, acting)
     assert felt["u"].tolist() == [[4.0], [2.0], [2.0]]
     assert felt["w"].tolist() == [[7.0], [7.0], [7.0]]
+
+
+def test_effects_on_signals_are_asked_only_of_the_lanes_on_which_they_act():
+    asked = []
+
+    class Raised(Input):
+        name, says = "raised", ""
+        coefficients = (Coefficient("coefficient", ("N", "N", "N"), ((-1, 1),) * 3),)
+
+        def feel(self, c, signal):
+            asked.append(len(signal.values))
+            return signal.values + c[0]
+
+    class Shown(Sensor):
+        name, says = "shown", ""
+        coefficients = (Coefficient("coefficient", ("m", "m", "m"), ((-1, 1),) * 3),)
+
+        def read(self, c, signal):
+            asked.append(len(signal.values))
+            return signal.values + c[0]
+
+    slider = Slider(observe=["x"], engine="batch", effects=[Raised, Shown])
+    run = Scenario(np.arange(3) / 10, {}, {"u": np.zeros(3)})
+    theta = [[1.0, 0.0, 0.0], [1.0, 0.5, 0.0], [1.0, 0.0, 0.25], [1.0, 0.5, 0.5], [1.0, 0.5, 0.0]]
+    seen = slider.simulate_lanes(np.array(theta), [run] * 5)[:, 0, 0]
+    assert set(asked) == {3, 2}
+    assert seen.tolist() == [0.0, 0.0, 0.25, 0.5, 0.0]
 
 
 def test_waiting_feels_nothing_new():

@@ -285,11 +285,12 @@ def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
     """
     added = [(probe.effect, probe.c) for probe in probes]
     changed = simulate_with(world, at, added)
-    change = np.moveaxis(changed - at.simulated, 0, -1)
+    # These are the largest arrays of a search, so all is done in place.
+    changed -= at.simulated
     # A probe that the simulator cannot follow is a direction that changes nothing.
-    values = np.nan_to_num(change)
-    result: Array = values / _sizes(probes)  # (1)
-    return result
+    np.nan_to_num(changed, copy=False)
+    changed /= _sizes(probes)[:, None, None, None]  # (1)
+    return np.moveaxis(changed, 0, -1)
 
 
 def simulate_with(world: World, at: Fit, added: Sequence[tuple[str, Array]]) -> Array:
