@@ -219,7 +219,7 @@ class Simulated(Simulator):
         for place, name in enumerate(names):
             values = channels[name]
             # A gain or bias is that of one channel.
-            reading = [(e, c) for e, c in sensors if _filters(e) or name == valued]
+            reading = tuple((e, c) for e, c in sensors if _filters(e) or name == valued)
             if reading:
                 values = _sensed(reading, values, steps, times)
             observations[:, :, place] = _chosen(values, rows)
