@@ -91,13 +91,13 @@ def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
     # Only the first answers say which coefficients modify, and only of effects that act at all.
     modified = list(_modified(world, probes, acting))
     places = np.flatnonzero(acting)
-    probes = [probes[i] for i in places]
-    values = values[..., places]
+    probes = [probes[i] for i in places] + modified
+    # The largest array of explain: copied once, and only where something is left out or added.
     if modified:
-        more = _responses(world, at, modified)
-        probes += modified
-        values = np.concatenate([values, more], axis=3)
-    return Directions(tuple(probes), values)
+        values = np.concatenate([values[places], _responses(world, at, modified)])
+    elif not acting.all():
+        values = values[places]
+    return Directions(tuple(probes), np.moveaxis(values, 0, -1))
 
 
 def _first(world: World, name: str) -> Iterator[Probe]:
@@ -218,13 +218,14 @@ def _frequencies(low: float, high: float, extent: float) -> Array:
 
 
 def _acting(world: World, probes: Sequence[Probe], values: Array) -> Mask:
-    """(K,) which probes change more than rounding does."""
-    largest = np.abs(values).max(axis=(0, 1), initial=0.0)
-    changes = largest * np.abs(_sizes(probes))
-    sizes = np.nanmax(np.abs(world.observed), axis=(0, 1))
-    rounding = NOTHING * sizes
+    """(K,) which probes change more than rounding does, of what they change (K, R, T, C)."""
+    rounding = NOTHING * np.nanmax(np.abs(world.observed), axis=(0, 1))
     # One channel that moves is enough: a sensor's effects show in no other.
-    acting: Mask = (changes > rounding[:, None]).any(axis=0)
+    changes = [
+        bool((np.abs(size * value) > rounding).any())
+        for value, size in zip(values, _sizes(probes).tolist(), strict=True)
+    ]
+    acting: Mask = np.array(changes, dtype=bool)
     return acting
 
 
@@ -280,17 +281,19 @@ def _grid_points(world: World, first: Probe, modifiers: Sequence[Probe]) -> Iter
 
 
 def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
-    """(R, T, C, K): the change that each probe makes, per unit of its coefficient, or as it is
+    """(K, R, T, C): the change that each probe makes, per unit of its coefficient, or as it is
     where that is fixed.
     """
     added = [(probe.effect, probe.c) for probe in probes]
-    changed = simulate_with(world, at, added)
     # These are the largest arrays of a search, so all is done in place.
-    changed -= at.simulated
+    values = simulate_with(world, at, added)
+    values -= at.simulated
+    followed = np.isfinite(values)
     # A probe that the simulator cannot follow is a direction that changes nothing.
-    np.nan_to_num(changed, copy=False)
-    changed /= _sizes(probes)[:, None, None, None]  # (1)
-    return np.moveaxis(changed, 0, -1)
+    if not followed.all():
+        values[~followed] = 0.0
+    values /= _sizes(probes)[:, None, None, None]  # (1)
+    return values
 
 
 def simulate_with(world: World, at: Fit, added: Sequence[tuple[str, Array]]) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 from bench.gap.causes.candidates import Directions, directions
 from bench.gap.causes.nominate import nominated
 from bench.gap.causes.score_test import Scores, ScoreTest, tail
+from bench.gap.model.fit import Fit
 from bench.gap.model.models import Model, Models
 from bench.gap.model.noise import forgets, surrogates
 from sims.base import Array
@@ -33,9 +34,18 @@ this.
 """
 
 
-class Scanned(NamedTuple):
-    """What each effect would change about a model, the test of that, and its scores."""
+UNMOVED = 0.1
+"""A fit that has moved by less than so many sigmas, RMS, since its directions were simulated keeps
+them: they are derivatives, and have changed by as little.
+"""
 
+
+class Scanned(NamedTuple):
+    """What each effect would change about a model, the test of that, and its scores; the
+    directions are those at a fit.
+    """
+
+    at: Fit
     directions: Directions
     test: ScoreTest
     scores: Scores
@@ -48,10 +58,12 @@ class Scored(Models):
     Attributes:
         scanned: of each model that was scored, by its effects.
         tests: the p value of the best score about each, by its effects.
+        former: what was scored about models that have been fitted better since.
     """
 
     scanned: dict[frozenset[str], Scanned] = field(default_factory=dict)
     tests: dict[frozenset[str], float] = field(default_factory=dict)
+    former: dict[frozenset[str], Scanned] = field(default_factory=dict)
 
     @property
     def base(self) -> Model:
@@ -60,7 +72,8 @@ class Scored(Models):
 
     def replaced(self, key: frozenset[str]) -> None:
         """What was scored about the model before holds no longer."""
-        self.scanned.pop(key, None)
+        if key in self.scanned:
+            self.former[key] = self.scanned.pop(key)
 
     def scan(self, model: Model, against: Array | None = None) -> Scores:
         """Score every effect that the model lacks.
@@ -76,22 +89,34 @@ class Scored(Models):
         about = " + ".join(model.names) or "the base model"
         self.world.watch.look(f"scores of the library about {about}")
         # Directions cost a simulation of each candidate; other surrogates need no new ones.
-        if known is None:
-            candidates = self._lacking(model)
-            test = ScoreTest(model.fit, candidates, self.seen, self.weights(model))
-        else:
-            candidates, test, _ = known
+        at, candidates, test = self._prepared(model) if known is None else known[:3]
         residual = self.residual(model.fit)
         # The colour of noise is best known from a model that leaves less structure.
         meaningless = residual if against is None else against
         surrogate = surrogates(meaningless, self.seen, SURROGATES, self.rng)
         scores = test.scores(residual, surrogate)
-        self.scanned[key] = Scanned(candidates, test, scores)
+        self.scanned[key] = Scanned(at, candidates, test, scores)
         self.tests[key] = scores.p_value
         # Kept from the first scan, so that merits stay comparable when a better base fit turns up.
         if not key and not self.chances:
             self.chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         return scores
+
+    def _prepared(self, model: Model) -> tuple[Fit, Directions, ScoreTest]:
+        """Directions about a model with their test, and the fit that they are about: an earlier one
+        of the same effects where the model has hardly moved since.
+        """
+        former = self.former.pop(frozenset(model.names), None)
+        if former is not None and self._moved(former.at, model.fit) < UNMOVED:
+            return former[:3]
+        candidates = self._lacking(model)
+        test = ScoreTest(model.fit, candidates, self.seen, self.weights(model))
+        return model.fit, candidates, test
+
+    def _moved(self, one: Fit, other: Fit) -> float:
+        """How far two fits are apart where samples are, in sigmas, RMS."""
+        apart = (one.simulated - other.simulated) / self.noise.sigma
+        return float(np.sqrt(np.square(apart[self.seen]).mean()))
 
     def _lacking(self, model: Model) -> Directions:
         """Directions of the effects that a model lacks."""
@@ -112,15 +137,15 @@ class Scored(Models):
             # A better fit since then has taken its scores away.
             if key not in self.scanned:
                 self.scan(model)
-            candidates, _, scores = self.scanned[key]
+            known = self.scanned[key]
             # The model may have been fitted better since it was put into the beam.
             newest = self.models[key]
             further = nominated(
                 self.world,
                 self.noise,
                 newest,
-                candidates,
-                scores,
+                known.directions,
+                known.scores,
                 most,
                 patient,
             )

@@ -283,10 +283,16 @@ def surrogates(
 
 def _driven(weights: Array, innovations: Array) -> Array:
     """The autoregression (6) of innovations (T, ...), in their place."""
+    order = weights.size
+    if not order:
+        return innovations
+    flat = innovations.reshape(len(innovations), -1)
+    # the oldest first, as samples stand
+    backwards = weights[::-1]
     # a sample reads those before it, which are finished by then
-    for t in range(1, len(innovations)):
-        for k, weight in enumerate(weights[:t], start=1):
-            innovations[t] += weight * innovations[t - k]
+    for t in range(1, len(flat)):
+        before = flat[max(t - order, 0) : t]
+        flat[t] += backwards[order - len(before) :] @ before
     return innovations
 
 
