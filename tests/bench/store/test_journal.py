@@ -99,6 +99,8 @@ def test_killed_between_the_part_and_the_deletion_of_its_journal_doubles_nothing
     journal.close()
     assert not (tmp_path / FOLDER / "000001.journal").exists()
     (tmp_path / FOLDER / "000001.journal").write_bytes(kept)
+    # The next is begun after that.
+    (tmp_path / FOLDER / "000002.journal").unlink()
     (tmp_path / FOLDER / "000002.partial").write_bytes(b"half a part")
     again = Journal(tmp_path)
     assert everything(again) == expected([0, 1, 2, 3])
