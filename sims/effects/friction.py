@@ -79,4 +79,5 @@ class Load(Friction):
 def _falling(speed: Array, scale: Array) -> Array:
     """(L, 1) share of the extra friction of (2) that is left at a speed."""
     ratio = speed / np.maximum(scale, _SMALLEST)
-    return np.asarray(np.exp(-np.square(ratio)), dtype=np.float64)
+    left: Array = np.exp(-np.square(ratio))
+    return left

@@ -76,18 +76,17 @@ class Hat(Force):
     def force(self, c: Array, moment: Moment) -> Array:
         """Strength times a triangle around the centre."""
         strength, variable, centre, width, direction, slow = c
-        time = np.broadcast_to(moment.t, moment.speed.shape)
-        variables = np.concatenate([time, moment.speed, moment.x], axis=1)
-        value = np.take_along_axis(variables, variable.astype(np.intp), axis=1)
+        axes = moment.x.shape[1]
+        variables = [moment.t, moment.speed, *(moment.x[:, k, None] for k in range(axes))]
+        # The lanes of one call differ in what a hat follows, and every lane has exactly one.
+        value = sum(np.where(variable == i, one, 0.0) for i, one in enumerate(variables))
         # Off, a hat has no width either, and must not divide by it.
         reach = np.maximum(width, 1e-12)
         distance = np.abs(value - centre) / reach
         height = np.maximum(1.0 - distance, 0.0)  # (1)
         # Smooth in the speed, so that no step has to be shortened where the motion turns.
         dry = -moment.v / (moment.speed + np.maximum(slow, 1e-9))
-        axes = moment.x.shape[1]
         ways = [-moment.v, dry, *(np.eye(axes)[axis] for axis in range(axes))]
-        # The lanes of one call differ in direction, and every lane has exactly one.
         chosen = sum(np.where(direction == i, way, 0.0) for i, way in enumerate(ways))
         result: Array = strength * height * chosen
         return result
