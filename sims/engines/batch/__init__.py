@@ -7,14 +7,13 @@ a constant force acts fly in closed form (`parabola`); the others are stepped (`
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from sims.base import InputError
 from sims.engines.batch.field import Field, acts
 from sims.engines.batch.pace import TURN, divisions
 from sims.engines.batch.parabola import fly
+from sims.engines.batch.parts import joined, take
 from sims.engines.batch.stepping import Stepping
 from sims.engines.ground import Ground, Indices, Mask
 from sims.limits import cut, is_number
@@ -37,6 +36,9 @@ class Batch:
         patience: a lane is given up, and NaN, that needs so many times the planned steps; so a
             search through forces that bend sharply at every reversal never waits for what is no
             answer. Without a limit by default.
+        compiled: whether lanes are stepped by machine code (`sims.engines.compiled`) where there is
+            a compiler and what acts on them compiles; else in numpy, to the same numbers but for
+            rounding.
 
     Raises:
         InputError: a setting that is not a positive number.
@@ -46,7 +48,11 @@ class Batch:
     requires = REQUIRES
 
     def __init__(
-        self, time_step: float = TIME_STEP, turn: float = TURN, patience: float = np.inf
+        self,
+        time_step: float = TIME_STEP,
+        turn: float = TURN,
+        patience: float = np.inf,
+        compiled: bool = True,
     ) -> None:
         if not (is_number(time_step) and time_step > 0):
             raise InputError(
@@ -61,6 +67,7 @@ class Batch:
         self.largest_step = float(time_step)
         self._turn = float(turn)
         self._patience = float(patience)
+        self._compiled = compiled
 
     def integrate(self, lanes: Lanes) -> Motion:
         """Integrate every lane over its steps; a lane whose numbers overflow is NaN throughout."""
@@ -71,9 +78,12 @@ class Batch:
             else:
                 # Lanes in free flight apart from the others: in closed form they take no steps.
                 kinds = moved[order]
-                parts = [part for part in (order[~kinds], order[kinds]) if part.size]
-                motions = [(part, self._moved(_take(lanes, part))) for part in parts]
-                motion = _joined(motions, lanes)
+                flown = order[~kinds]
+                stepped = order[kinds]
+                motions = [(stepped, self._stepped(take(lanes, stepped)))]
+                if flown.size:
+                    motions.insert(0, (flown, self._moved(take(lanes, flown))))
+                motion = joined(motions, lanes)
         # What is not finite stays so, so the last state tells of the whole run.
         there = np.isfinite(motion.x[:, -1])
         moving = np.isfinite(motion.v[:, -1])
@@ -81,6 +91,23 @@ class Batch:
         if lost.any():
             for values in (motion.x, motion.v, motion.a):
                 values[lost] = np.nan
+        return motion
+
+    def _stepped(self, lanes: Lanes) -> Motion:
+        """The motion of lanes that are all stepped, sorted by what acts in them."""
+        # Loaded when something is stepped: the compiler's package is not for free.
+        from sims.engines.compiled import machine
+        from sims.engines.compiled.run import step
+
+        made = machine.machine() if self._compiled and lanes.steps.shape[1] else None
+        if made is None:
+            return self._moved(lanes)
+        motion, left = step(lanes, self._turn, self._patience, made)
+        if left.size:
+            # What does not compile is stepped here, beside what does.
+            part = self._moved(take(lanes, left))
+            for whole, values in ((motion.x, part.x), (motion.v, part.v), (motion.a, part.a)):
+                whole[left] = values
         return motion
 
     def _moved(self, lanes: Lanes) -> Motion:
@@ -97,8 +124,8 @@ class Batch:
         # Few lanes in many short steps would keep the others waiting in every one.
         if slow.any() and not slow.all():
             groups = np.flatnonzero(~slow), np.flatnonzero(slow)
-            motions = [(group, self._moved(_take(lanes, group))) for group in groups]
-            return _joined(motions, lanes)
+            motions = [(group, self._moved(take(lanes, group))) for group in groups]
+            return joined(motions, lanes)
         return Stepping(lanes, field, ground, spans, parts).run(self._patience)
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
@@ -115,9 +142,10 @@ def engine(
     time_step: float = TIME_STEP,
     turn: float = TURN,
     patience: float = np.inf,
+    compiled: bool = True,
 ) -> Batch:
     """A new engine; see `Batch`."""
-    return Batch(time_step, turn, patience)
+    return Batch(time_step, turn, patience, compiled)
 
 
 def _sorted(lanes: Lanes) -> tuple[Mask, Indices]:
@@ -131,36 +159,3 @@ def _sorted(lanes: Lanes) -> tuple[Mask, Indices]:
     # Lanes with the same effects lie together, so that each effect is asked for a short span.
     moved: Mask = np.any(forces, axis=0) | steps
     return moved, np.lexsort(forces)
-
-
-def _take(lanes: Lanes, i: Indices) -> Lanes:
-    """Some lanes, i (n,)."""
-    if i.size == len(lanes.x) and (i[1:] > i[:-1]).all():
-        return lanes
-    if lanes.steps.strides[0] == 0:  # shared by all lanes, and shared it stays
-        steps = np.broadcast_to(lanes.steps[0], (i.size, lanes.steps.shape[1]))
-    else:
-        steps = lanes.steps[i]
-    return replace(
-        lanes,
-        theta=lanes.theta[i],
-        constants={name: values[i] for name, values in lanes.constants.items()},
-        x=lanes.x[i],
-        v=lanes.v[i],
-        steps=steps,
-        inputs={name: values[i] for name, values in lanes.inputs.items()},
-        effects=tuple((effect, c[:, i]) for effect, c in lanes.effects),
-    )
-
-
-def _joined(parts: list[tuple[Indices, Motion]], lanes: Lanes) -> Motion:
-    """Motions of parts of the lanes put together in the lanes' own order."""
-    first, motion = parts[0]
-    if len(parts) == 1 and (first == np.arange(len(lanes.x))).all():
-        return motion
-    count, dim = lanes.x.shape
-    records = lanes.steps.shape[1] // lanes.every + 1
-    whole = np.empty((3, count, records, dim))
-    for i, motion in parts:
-        whole[:, i] = motion.x, motion.v, motion.a
-    return Motion(*whole)

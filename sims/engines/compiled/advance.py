@@ -1,0 +1,537 @@
+"""Steps the lanes of one program, a block of them side by side, each by its own clock.
+
+The method and its equations are those of `sims.engines.batch.stepping`. A lane that is done gives
+its slot to the next, so slots stay in use whatever the lanes need; what a lane does depends on no
+other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.engines.compiled.evaluate import execute, larger
+from sims.engines.compiled.events import (
+    FAINT,
+    FORCE_BEND,
+    FRICTION_BEND,
+    bent,
+    interrupted,
+    length,
+    reach,
+    strike,
+)
+from sims.engines.compiled.kinds import (
+    AFTER,
+    BEFORE,
+    BEGINS,
+    BEND,
+    BOUNCES,
+    BUSY,
+    DIMENSIONS,
+    DRY,
+    EVENTS,
+    F1,
+    F2,
+    F3,
+    F4,
+    FIRST,
+    FLOOR,
+    GOAL,
+    IDLE,
+    IN_P,
+    IN_T,
+    IN_U,
+    IN_V,
+    IN_X,
+    K1,
+    K2,
+    K3,
+    K4,
+    LANE,
+    LARGEST,
+    LEFT,
+    LEVEL,
+    LIMIT,
+    LONGEST,
+    MASS,
+    NEXT_V,
+    NEXT_X,
+    NOTHING,
+    OUT_LIMIT,
+    PEAK,
+    PLACE,
+    PUSHED,
+    RESTS,
+    RUBBED,
+    SPARE,
+    STARTS,
+    STEP,
+    STICKS,
+    TAKEN,
+    TRY,
+    WAY,
+    Block,
+    H,
+    Program,
+    T,
+    V,
+    Work,
+    X,
+)
+
+
+def advance(program: Program, work: Work, block: Block, w: int) -> None:
+    """All steps of all lanes, in w slots."""
+    begun = 0
+    alive = 0
+    for i in range(w):
+        block.n[PLACE, i] = -1
+        if begun < work.order.size:
+            load(program, work, block, i, begun)
+            begun += 1
+            alive += 1
+        else:
+            load(program, work, block, i, work.order.size - 1)  # of which nothing is read
+            block.n[PLACE, i] = -1
+    fresh = True
+    while alive > 0:
+        if fresh:
+            execute(program.code, program.ends[0], program.ends[1], block.r, w)
+            if program.flags[BOUNCES] != 0:
+                start_on(program, work, block, w)
+            fresh = False
+        present(program, block, w)
+        begin(program, block, w)
+        for i in range(w):
+            block.n[IDLE, i] = block.n[PLACE, i] < 0
+            if block.n[PLACE, i] >= 0 and not stays(program, work, block, i):
+                alive -= 1
+                block.n[PLACE, i] = -1
+                if begun < work.order.size:
+                    load(program, work, block, i, begun)
+                    begun += 1
+                    alive += 1
+                    fresh = True
+                block.n[IDLE, i] = 1
+            a = block.a
+            a[H, i] = min(min(a[LEFT, i], a[LIMIT, i]), a[TRY, i])
+            if block.n[IDLE, i] != 0:
+                a[H, i] = 0.0
+        attempt(program, block, w)
+        look(program, block, w)
+        make(program, work, block, w)
+        for i in range(w):
+            if block.n[BUSY, i] != 0 and block.n[IDLE, i] == 0:
+                settle(program, work, block, i)
+
+
+def load(program: Program, work: Work, block: Block, i: int, place: int) -> None:
+    """Put a lane into a slot, at the beginning of its run."""
+    a = block.a
+    n = block.n
+    d = program.flags[DIMENSIONS]
+    lane = work.order[place]
+    for row in range(FIRST):
+        a[row, i] = 0.0
+    n[:, i] = 0
+    n[PLACE, i] = place
+    n[LANE, i] = lane
+    n[GOAL, i] = NOTHING
+    n[BEGINS, i] = 1
+    for k in range(d):
+        a[X + k, i] = work.x[lane, k]
+        a[V + k, i] = work.v[lane, k]
+    a[LONGEST, i] = work.longest[lane]
+    a[LIMIT, i] = work.longest[lane]
+    a[TRY, i] = np.inf
+    a[MASS, i] = work.mass[lane]
+    a[LEVEL, i] = work.ground[FLOOR, lane]
+    a[LEFT, i] = work.steps[lane if work.steps.shape[0] > 1 else 0, 0]
+    first = program.rows[IN_P]
+    for p in range(work.parameters.shape[1]):
+        block.r[first + p, i] = work.parameters[place, p]
+    feel(program, work, block, i)
+
+
+def feel(program: Program, work: Work, block: Block, i: int) -> None:
+    """Set the inputs of the lane's step; behind the last step, the last."""
+    first = program.rows[IN_U]
+    step = min(block.n[STEP, i], work.steps.shape[1] - 1)
+    row = block.n[LANE, i] if work.inputs.shape[1] > 1 else 0
+    for u in range(work.inputs.shape[0]):
+        block.r[first + u, i] = work.inputs[u, row, step]
+
+
+def present(program: Program, block: Block, w: int) -> None:
+    """Let the registers show every lane's state, and compute forces there."""
+    d = program.flags[DIMENSIONS]
+    rows = program.rows
+    r = block.r
+    a = block.a
+    for i in range(w):
+        r[rows[IN_T], i] = a[T, i]
+    for k in range(d):
+        for i in range(w):
+            r[rows[IN_X] + k, i] = a[X + k, i]
+            r[rows[IN_V] + k, i] = a[V + k, i]
+    execute(program.code, program.ends[1], program.ends[2], r, w)
+
+
+def start_on(program: Program, work: Work, block: Block, w: int) -> None:
+    """Lift lanes that start in the ground onto it; throw back or lay to rest those that do not move
+    up.
+    """
+    a = block.a
+    n = block.n
+    d = program.flags[DIMENSIONS]
+    high = X + d - 1
+    up = V + d - 1
+    some = False
+    for i in range(w):
+        if is_new(block, i):
+            floor = work.ground[FLOOR, n[LANE, i]]
+            a[high, i] = larger(a[high, i], floor)
+            some |= a[high, i] <= floor and a[up, i] <= 0.0
+    if not some:
+        return
+    present(program, block, w)
+    begin(program, block, w)
+    for i in range(w):
+        if is_new(block, i):
+            floor = work.ground[FLOOR, n[LANE, i]]
+            if a[high, i] <= floor and a[up, i] < 0.0:
+                strike(program, work, block, i, K1)
+            elif a[high, i] <= floor and a[up, i] == 0.0:
+                n[RESTS, i] = 1
+
+
+def is_new(block: Block, i: int) -> bool:
+    """Whether a lane was just put into the slot."""
+    n = block.n
+    return bool(n[PLACE, i] >= 0 and n[STEP, i] == 0 and n[BEGINS, i] == 1)
+
+
+def begin(program: Program, block: Block, w: int) -> None:
+    """Accelerations at the beginning of a step: what sticks, and which way the rest moves."""
+    d = program.flags[DIMENSIONS]
+    if program.flags[DRY] == 0:
+        free(program, block, w, K1)
+        return
+    if d == 1 and program.flags[BOUNCES] == 0:
+        begin_on_a_line(program, block, w)
+        return
+    a = block.a
+    r = block.r
+    limits = program.rows[OUT_LIMIT]
+    for i in range(w):
+        limit = r[limits, i]
+        pulled(program, block, i, K1)
+        size = length(a, K1, d, i)
+        speed = length(a, V, d, i)
+        a[BEFORE, i] = size - limit
+        a[AFTER, i] = size - limit
+        still = speed == 0.0
+        sticks = still and size <= limit  # (2)
+        block.n[STICKS, i] = sticks
+        # (1) and (3): along the motion, or where there is none along what pulls.
+        divisor = speed
+        if still:
+            divisor = size if size > 0.0 else 1.0
+        for k in range(d):
+            pull = a[K1 + k, i]
+            way = (pull if still else a[V + k, i]) / divisor
+            rub = limit * way
+            a[WAY + k, i] = way
+            a[F1 + k, i] = rub
+            a[K1 + k, i] = 0.0 if sticks else (pull - rub) / a[MASS, i]
+
+
+def begin_on_a_line(program: Program, block: Block, w: int) -> None:
+    """`begin` for one coordinate and no ground: the same numbers, without branches."""
+    a = block.a
+    r = block.r
+    limits = program.rows[OUT_LIMIT]
+    force = program.out[0]
+    for i in range(w):
+        pull = r[force, i]
+        limit = r[limits, i]
+        v = a[V, i]
+        size = abs(pull)
+        excess = size - limit
+        still = v == 0.0
+        towards = pull if still else v
+        divisor = (size if size > 0.0 else 1.0) if still else abs(v)
+        way = towards / divisor
+        rub = limit * way
+        slips = (pull - rub) / a[MASS, i]
+        holds = still and size <= limit
+        a[BEFORE, i] = excess
+        a[AFTER, i] = excess
+        a[WAY, i] = way
+        a[F1, i] = rub
+        a[K1, i] = 0.0 if holds else slips
+        block.n[STICKS, i] = 1 if holds else 0
+
+
+def during_on_a_line(program: Program, block: Block, w: int, to: int, rub_to: int) -> None:
+    """`during` for one coordinate and no ground."""
+    a = block.a
+    r = block.r
+    limits = program.rows[OUT_LIMIT]
+    force = program.out[0]
+    for i in range(w):
+        pull = r[force, i]
+        limit = r[limits, i]
+        rub = limit * a[WAY, i]
+        slips = (pull - rub) / a[MASS, i]
+        a[AFTER, i] = abs(pull) - limit
+        a[rub_to, i] = rub
+        a[to, i] = 0.0 if block.n[STICKS, i] != 0 else slips
+
+
+def during(program: Program, block: Block, w: int, to: int, rub_to: int) -> None:
+    """Accelerations, into rows `to`, within the step that was begun last."""
+    execute(program.code, program.ends[1], program.ends[2], block.r, w)
+    if program.flags[DRY] == 0:
+        free(program, block, w, to)
+        return
+    if program.flags[DIMENSIONS] == 1 and program.flags[BOUNCES] == 0:
+        during_on_a_line(program, block, w, to, rub_to)
+        return
+    for i in range(w):
+        in_space(program, block, i, to, rub_to)
+
+
+def in_space(program: Program, block: Block, i: int, to: int, rub_to: int) -> None:
+    """`during` for a lane of several coordinates."""
+    a = block.a
+    d = program.flags[DIMENSIONS]
+    velocity = program.rows[IN_V]
+    limit = block.r[program.rows[OUT_LIMIT], i]
+    pulled(program, block, i, to)
+    a[AFTER, i] = length(a, to, d, i) - limit
+    # The direction may turn within the step, but not over to the other side: that is a reversal,
+    # which the step is cut for.
+    square = 0.0
+    for k in range(d):
+        square += block.r[velocity + k, i] * block.r[velocity + k, i]
+    speed = np.sqrt(square)
+    along = 0.0
+    for k in range(d):
+        way = a[WAY + k, i]
+        unit = block.r[velocity + k, i] / speed if speed > 0.0 else way
+        a[rub_to + k, i] = unit
+        along += unit * way
+    side = -1.0 if along < 0.0 else 1.0
+    for k in range(d):
+        rub = limit * (a[rub_to + k, i] * side)
+        a[rub_to + k, i] = rub
+        slips = (a[to + k, i] - rub) / a[MASS, i]
+        a[to + k, i] = 0.0 if block.n[STICKS, i] != 0 else slips
+
+
+def pulled(program: Program, block: Block, i: int, to: int) -> None:
+    """Forces but for dry friction, without what the ground takes."""
+    d = program.flags[DIMENSIONS]
+    for k in range(d):
+        block.a[to + k, i] = block.r[program.out[k], i]
+    if block.n[RESTS, i] != 0:
+        # The ground pushes and does not pull: what lifts the lane is left to it.
+        up = to + d - 1
+        block.a[up, i] = larger(block.a[up, i], 0.0)
+
+
+def free(program: Program, block: Block, w: int, to: int) -> None:
+    """Accelerations without dry friction, into rows `to`."""
+    a = block.a
+    d = program.flags[DIMENSIONS]
+    for k in range(d):
+        force = program.out[k]
+        row = to + k
+        for i in range(w):
+            a[row, i] = block.r[force, i] / a[MASS, i]
+    if program.flags[BOUNCES] != 0:
+        up = to + d - 1
+        for i in range(w):
+            if block.n[RESTS, i] != 0:
+                a[up, i] = larger(block.r[program.out[d - 1], i], 0.0) / a[MASS, i]
+
+
+def stays(program: Program, work: Work, block: Block, i: int) -> bool:
+    """Keep the state of a lane that begins a step behind a sample; whether it has more to do."""
+    a = block.a
+    n = block.n
+    d = program.flags[DIMENSIONS]
+    step = n[STEP, i]
+    if n[BEGINS, i] != 0:
+        n[BEGINS, i] = 0
+        if step % work.every == 0:
+            record = step // work.every
+            for k in range(d):
+                work.kept[n[LANE, i], record, k] = a[X + k, i]
+                work.kept[n[LANE, i], record, d + k] = a[V + k, i]
+                work.kept[n[LANE, i], record, 2 * d + k] = a[K1 + k, i]
+        if step == work.steps.shape[1]:
+            return False
+    if work.patience < np.inf and a[LEFT, i] > 0.0:
+        a[TAKEN, i] += 1.0
+        if a[TAKEN, i] > work.patience * work.planned[n[LANE, i]]:
+            # Lost lanes are told by the last state that was kept.
+            work.kept[n[LANE, i], work.kept.shape[1] - 1, :] = np.nan
+            return False
+    return True
+
+
+def attempt(program: Program, block: Block, w: int) -> None:
+    """A step of H seconds of every lane, into rows NEXT_X and NEXT_V; (2) to (6)."""
+    a = block.a
+    r = block.r
+    d = program.flags[DIMENSIONS]
+    t = program.rows[IN_T]
+    for stage in range(1, 4):
+        share = 0.5 if stage < 3 else 1.0
+        last = K1 + (stage - 1) * LARGEST
+        for i in range(w):
+            r[t, i] = a[T, i] + share * a[H, i]
+        for k in range(d):
+            x = program.rows[IN_X] + k
+            v = program.rows[IN_V] + k
+            if stage == 1:
+                for i in range(w):
+                    r[x, i] = a[X + k, i] + 0.5 * a[H, i] * a[V + k, i]  # (2)
+            elif stage == 2:
+                for i in range(w):
+                    half = 0.5 * a[H, i]
+                    r[x, i] = r[x, i] + (half * half) * a[K1 + k, i]  # (3)
+            else:
+                for i in range(w):
+                    r[x, i] = a[X + k, i] + a[H, i] * r[v, i]  # (4)
+            for i in range(w):
+                r[v, i] = a[V + k, i] + share * a[H, i] * a[last + k, i]
+        during(program, block, w, K1 + stage * LARGEST, F1 + stage * LARGEST)
+    for k in range(d):
+        for i in range(w):
+            h = a[H, i]
+            sixth = h / 6.0
+            inner = a[K2 + k, i] + a[K3 + k, i]
+            outer = a[K1 + k, i] + a[K4 + k, i]
+            v = a[V + k, i]
+            a[NEXT_X + k, i] = a[X + k, i] + h * (v + sixth * (a[K1 + k, i] + inner))  # (5)
+            a[NEXT_V + k, i] = v + sixth * (outer + 2.0 * inner)  # (6)
+
+
+def look(program: Program, block: Block, w: int) -> None:
+    """Tell the lanes to which something may have happened in the step just tried: they are busy."""
+    a = block.a
+    n = block.n
+    d = program.flags[DIMENSIONS]
+    for i in range(w):
+        n[BUSY, i] = 1 if n[IDLE, i] != 0 or n[GOAL, i] != NOTHING else 0
+    if program.flags[PUSHED] != 0 or program.flags[DRY] != 0:
+        for i in range(w):
+            a[BEND, i] = 0.0
+            a[SPARE, i] = 0.0
+        for k in range(d):
+            for i in range(w):
+                bend = (a[K1 + k, i] + a[K4 + k, i]) - (a[K2 + k, i] + a[K3 + k, i])
+                a[BEND, i] += bend * bend
+                a[SPARE, i] += a[K1 + k, i] * a[K1 + k, i]
+        for i in range(w):
+            a[PEAK, i] = larger(a[PEAK, i], a[SPARE, i])
+    if program.flags[PUSHED] != 0:
+        for i in range(w):
+            n[BUSY, i] |= 1 if a[BEND, i] > FORCE_BEND * a[PEAK, i] else 0
+    if program.flags[BOUNCES] != 0:
+        for i in range(w):
+            low = a[NEXT_X + d - 1, i] < a[LEVEL, i]
+            lifts = n[RESTS, i] != 0 and not a[NEXT_V + d - 1, i] <= 0.0
+            n[BUSY, i] |= 1 if low or lifts else 0
+    if program.flags[DRY] != 0:
+        look_at_friction(program, block, w)
+
+
+def look_at_friction(program: Program, block: Block, w: int) -> None:
+    """Of lanes with dry friction; in several dimensions all are busy."""
+    a = block.a
+    n = block.n
+    if program.flags[DIMENSIONS] > 1:
+        for i in range(w):
+            n[BUSY, i] = 1
+        return
+    for i in range(w):
+        a[RUBBED, i] = larger(a[RUBBED, i], larger(abs(a[F1, i]), abs(a[F4, i])))
+        a[SPARE, i] = FAINT * np.sqrt(a[PEAK, i]) * a[MASS, i]
+    for i in range(w):
+        bend = abs(a[F1, i] - a[F2, i] - a[F3, i] + a[F4, i])
+        sharp = bend > FRICTION_BEND * larger(a[RUBBED, i], a[SPARE, i])
+        turns = a[NEXT_V, i] * a[WAY, i] < 0.0
+        slips = 1 if sharp or turns else 0
+        loosens = 1 if a[AFTER, i] > 0.0 else 0
+        n[BUSY, i] |= loosens if n[STICKS, i] != 0 else slips
+
+
+def make(program: Program, work: Work, block: Block, w: int) -> None:
+    """Make the steps just tried of lanes that are not busy."""
+    a = block.a
+    n = block.n
+    for k in range(program.flags[DIMENSIONS]):
+        for i in range(w):
+            x = a[NEXT_X + k, i]
+            v = a[NEXT_V + k, i]
+            a[X + k, i] = a[X + k, i] if n[BUSY, i] != 0 else x
+            a[V + k, i] = a[V + k, i] if n[BUSY, i] != 0 else v
+    for i in range(w):
+        h = 0.0 if n[BUSY, i] != 0 else a[H, i]
+        left = a[LEFT, i] - h
+        grown = 2.0 * a[LIMIT, i]
+        grown = grown if grown < a[LONGEST, i] else a[LONGEST, i]
+        a[T, i] += h
+        # Steps add up to a little more than what was left; a rest below zero would run backwards.
+        a[LEFT, i] = left if left > 0.0 else 0.0
+        # The limit doubles with each step that is made at it: what bent may still be near.
+        a[LIMIT, i] = grown if n[BUSY, i] == 0 and h >= a[LIMIT, i] else a[LIMIT, i]
+    for i in range(w):
+        if a[LEFT, i] <= 0.0 and n[BUSY, i] == 0:
+            go_on(program, work, block, i)
+
+
+def settle(program: Program, work: Work, block: Block, i: int) -> None:
+    """Make the step just tried if nothing happens in it; else prepare to repeat it."""
+    a = block.a
+    n = block.n
+    d = program.flags[DIMENSIONS]
+    bends = program.flags[DRY] != 0 or program.flags[PUSHED] != 0
+    if bends and bent(program, block, i):
+        return
+    if (program.flags[DRY] != 0 or program.flags[BOUNCES] != 0) and interrupted(
+        program, work, block, i
+    ):
+        return
+    for k in range(d):
+        a[X + k, i] = a[NEXT_X + k, i]
+        a[V + k, i] = a[NEXT_V + k, i]
+    h = a[H, i]
+    a[T, i] += h
+    # Steps add up to a little more than what was left; a rest below zero would run backwards.
+    a[LEFT, i] = larger(a[LEFT, i] - h, 0.0)
+    if n[GOAL, i] != NOTHING:
+        reach(program, work, block, i)
+    if n[RESTS, i] != 0 and not a[V + d - 1, i] <= 0.0:
+        n[RESTS, i] = 0
+    if a[LEFT, i] <= 0.0:
+        go_on(program, work, block, i)
+
+
+def go_on(program: Program, work: Work, block: Block, i: int) -> None:
+    """The lane's next step."""
+    a = block.a
+    n = block.n
+    row = n[LANE, i] if work.steps.shape[0] > 1 else 0
+    step = n[STEP, i] + 1
+    n[STEP, i] = step
+    n[BEGINS, i] = 1
+    n[EVENTS, i] = 0
+    a[STARTS, i] += work.steps[row, step - 1]
+    a[T, i] = a[STARTS, i]
+    a[LEFT, i] = work.steps[row, step] if step < work.steps.shape[1] else 0.0
+    feel(program, work, block, i)

@@ -1,0 +1,93 @@
+"""The one function that is called from outside: pointers in, lanes stepped."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from sims.engines.compiled.advance import advance
+from sims.engines.compiled.kinds import ROWS, WHOLE, WIDTH, Block, Program, Work
+from sims.engines.compiled.pace import divide
+
+if TYPE_CHECKING:
+
+    def carray(pointer: Any, shape: Any) -> Any:
+        """The array at a pointer; the compiler's own."""
+
+
+SIZES = 13
+"""Whole numbers that come first: what they are, `integrate` says."""
+ARRAYS = 22
+"""Pointers behind them."""
+
+
+def integrate(
+    sizes_at: Any,
+    reals_at: Any,
+    code_at: Any,
+    ends_at: Any,
+    rows_at: Any,
+    out_at: Any,
+    flags_at: Any,
+    order_at: Any,
+    n_at: Any,
+    parameters_at: Any,
+    mass_at: Any,
+    x_at: Any,
+    v_at: Any,
+    steps_at: Any,
+    inputs_at: Any,
+    longest_at: Any,
+    planned_at: Any,
+    ground_at: Any,
+    kept_at: Any,
+    r_at: Any,
+    a_at: Any,
+    spans_at: Any,
+    parts_at: Any,
+) -> None:
+    """`divide`, or `advance`, with arrays by their addresses."""
+    sizes = carray(sizes_at, (SIZES,))
+    reals = carray(reals_at, (2,))
+    lanes = sizes[1]
+    chosen = sizes[2]
+    d = sizes[3]
+    program = Program(
+        carray(code_at, (sizes[4], 5)),
+        carray(ends_at, (4,)),
+        carray(rows_at, (11,)),
+        carray(out_at, (d,)),
+        carray(flags_at, (4,)),
+    )
+    work = Work(
+        carray(order_at, (chosen,)),
+        carray(parameters_at, (chosen, sizes[5])),
+        carray(mass_at, (lanes,)),
+        carray(x_at, (lanes, d)),
+        carray(v_at, (lanes, d)),
+        carray(steps_at, (sizes[6], sizes[7])),
+        carray(inputs_at, (sizes[8], sizes[9], sizes[7])),
+        carray(longest_at, (lanes,)),
+        carray(planned_at, (lanes,)),
+        carray(ground_at, (4, lanes)),
+        sizes[10],
+        reals[0],
+        carray(kept_at, (lanes, sizes[7] // sizes[10] + 1, 3 * d)),
+    )
+    block = Block(
+        carray(r_at, (sizes[11], WIDTH)),
+        carray(a_at, (ROWS, WIDTH)),
+        carray(n_at, (WHOLE, WIDTH)),
+    )
+    w = sizes[12]
+    if sizes[0] == 0:
+        divide(
+            program,
+            work,
+            block,
+            w,
+            carray(spans_at, (lanes,)),
+            reals[1],
+            carray(parts_at, (lanes,)),
+        )
+    else:
+        advance(program, work, block, w)

@@ -1,0 +1,250 @@
+"""Runs a program over the slots of a block: each instruction is one loop over lanes.
+
+Plain Python that a compiler takes as it stands (`sims.engines.compiled.build`); uncompiled it does
+the same, slowly. A register is a row, a slot a column. Sine, cosine and exponential are computed
+the same way for every lane, by the reductions and with the coefficients of fdlibm (Sun
+Microsystems, 1993): x = k pi/2 + r with |r| <= pi/4, and x = k ln 2 + r with |r| <= ln 2 / 2,
+
+    sin r = r + r^3 (S1 + ...),    cos r = 1 - r^2/2 + r^4 (C1 + ...)      (1)
+    exp r = 1 + r + r c / (2 - c),    c = r - r^2 (P1 + ...)               (2)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.engines.compiled.graph import CODES
+from sims.engines.compiled.kinds import Numbers, Table
+
+ROUNDER = 6755399441055744.0
+"""Added and taken away, it leaves the nearest whole number: 1.5 * 2^52."""
+TURNS = 2.0 / np.pi
+QUARTER_1 = 1.57079632673412561417e00
+"""The first 33 bits of pi/2; multiples up to 2^20 are exact."""
+QUARTER_2 = 6.07710050630396597660e-11
+"""The next 33 bits."""
+QUARTER_3 = 2.02226624879595063154e-21
+"""What is left of it."""
+FAR = 1e5
+"""Beyond this many radians the library's own sine is asked."""
+
+DOUBLINGS = 1.44269504088896338700e00
+"""1 / ln 2."""
+DOUBLING_1 = 6.93147180369123816490e-01
+"""The first 32 bits of ln 2."""
+DOUBLING_2 = 1.90821492927058770002e-10
+"""What is left of it."""
+STEEP = 700.0
+"""Beyond it the library's own exponential is asked."""
+EXPONENT = ROUNDER + 1023.0
+"""Added to a whole number k, it has the exponent of 2^k in its last bits."""
+
+ADD = CODES["add"]
+SUBTRACT = CODES["subtract"]
+MULTIPLY = CODES["multiply"]
+DIVIDE = CODES["divide"]
+NEGATIVE = CODES["negative"]
+ABSOLUTE = CODES["absolute"]
+SQRT = CODES["sqrt"]
+MAXIMUM = CODES["maximum"]
+MINIMUM = CODES["minimum"]
+WHERE = CODES["where"]
+SIN = CODES["sin"]
+COS = CODES["cos"]
+EXP = CODES["exp"]
+POWER = CODES["power"]
+LESS = CODES["less"]
+LESS_EQUAL = CODES["less_equal"]
+EQUAL = CODES["equal"]
+NOT_EQUAL = CODES["not_equal"]
+AND = CODES["logical_and"]
+OR = CODES["logical_or"]
+NOT = CODES["logical_not"]
+SIGN = CODES["sign"]
+TAN = CODES["tan"]
+TANH = CODES["tanh"]
+ARCTAN = CODES["arctan"]
+ARCTAN2 = CODES["arctan2"]
+LOG = CODES["log"]
+EXPM1 = CODES["expm1"]
+LOG1P = CODES["log1p"]
+FLOOR = CODES["floor"]
+CEIL = CODES["ceil"]
+RINT = CODES["rint"]
+SINH = CODES["sinh"]
+COSH = CODES["cosh"]
+ARCSIN = CODES["arcsin"]
+ARCCOS = CODES["arccos"]
+HYPOT = CODES["hypot"]
+COPYSIGN = CODES["copysign"]
+
+
+def larger(a: float, b: float) -> float:
+    """numpy.maximum: what is no number stays."""
+    return a if a >= b or a != a else b
+
+
+def smaller(a: float, b: float) -> float:
+    """numpy.minimum: what is no number stays."""
+    return a if a <= b or a != a else b
+
+
+def turn(r: Numbers, o: int, a: int, w: int, ahead: float) -> None:
+    """Row o = sin(row a + `ahead` quarter turns)."""
+    far = False
+    for i in range(w):
+        x = r[a, i]
+        k = (x * TURNS + ROUNDER) - ROUNDER
+        y = ((x - k * QUARTER_1) - k * QUARTER_2) - k * QUARTER_3
+        z = y * y
+        s = -2.50507602534068634195e-08 + z * 1.58969099521155010221e-10
+        s = -1.98412698298579493134e-04 + z * (2.75573137070700676789e-06 + z * s)
+        s = -1.66666666666666324348e-01 + z * (8.33333333332248946124e-03 + z * s)
+        sine = y + y * z * s
+        c = 2.08757232129817482790e-09 + z * -1.13596475577881948265e-11
+        c = 2.48015872894767294178e-05 + z * (-2.75573143513906633035e-07 + z * c)
+        c = 4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03 + z * c)
+        cosine = 1.0 - (0.5 * z - z * z * c)  # (1)
+        k = k + ahead
+        half = 0.5 * k
+        odd = half != (half + ROUNDER) - ROUNDER
+        quarter = k - 4.0 * ((0.25 * k + ROUNDER) - ROUNDER)  # -2 to 2
+        value = cosine if odd else sine
+        flips = quarter == 2.0 or quarter == -2.0 or quarter == -1.0
+        r[o, i] = -value if flips else value
+        far |= not abs(x) <= FAR
+    if far:
+        for i in range(w):
+            if not abs(r[a, i]) <= FAR:
+                r[o, i] = np.sin(r[a, i]) if ahead == 0.0 else np.cos(r[a, i])
+
+
+def grow(r: Numbers, o: int, a: int, w: int) -> None:
+    """Row o = exp(row a)."""
+    far = False
+    for i in range(w):
+        x = r[a, i]
+        k = (x * DOUBLINGS + ROUNDER) - ROUNDER
+        high = x - k * DOUBLING_1
+        low = k * DOUBLING_2
+        y = high - low
+        z = y * y
+        c = -1.65339022054652515390e-06 + z * 4.13813679705723846039e-08
+        c = -2.77777777770155933842e-03 + z * (6.61375632143793436117e-05 + z * c)
+        c = y - z * (1.66666666666666019037e-01 + z * c)
+        value = 1.0 - ((low - y * c / (2.0 - c)) - high)  # (2)
+        scale = np.int64(np.float64(k + EXPONENT).view(np.int64) << 52).view(np.float64)
+        r[o, i] = value * scale
+        far |= not abs(x) <= STEEP
+    if far:
+        for i in range(w):
+            if not abs(r[a, i]) <= STEEP:
+                r[o, i] = np.exp(r[a, i])
+
+
+def execute(code: Table, first: int, last: int, r: Numbers, w: int) -> None:
+    """Instructions first to last - 1 on the registers r, in w slots."""
+    for n in range(first, last):
+        op = code[n, 0]
+        o = code[n, 1]
+        a = code[n, 2]
+        b = code[n, 3]
+        c = code[n, 4]
+        if op == ADD:
+            for i in range(w):
+                r[o, i] = r[a, i] + r[b, i]
+        elif op == SUBTRACT:
+            for i in range(w):
+                r[o, i] = r[a, i] - r[b, i]
+        elif op == MULTIPLY:
+            for i in range(w):
+                r[o, i] = r[a, i] * r[b, i]
+        elif op == DIVIDE:
+            for i in range(w):
+                r[o, i] = r[a, i] / r[b, i]
+        elif op == NEGATIVE:
+            for i in range(w):
+                r[o, i] = -r[a, i]
+        elif op == ABSOLUTE:
+            for i in range(w):
+                r[o, i] = abs(r[a, i])
+        elif op == SQRT:
+            for i in range(w):
+                r[o, i] = np.sqrt(r[a, i])
+        elif op == MAXIMUM:
+            for i in range(w):
+                r[o, i] = larger(r[a, i], r[b, i])
+        elif op == MINIMUM:
+            for i in range(w):
+                r[o, i] = smaller(r[a, i], r[b, i])
+        elif op == WHERE:
+            for i in range(w):
+                yes = r[b, i]
+                no = r[c, i]
+                r[o, i] = yes if r[a, i] != 0.0 else no
+        elif op == SIN:
+            turn(r, o, a, w, 0.0)
+        elif op == COS:
+            turn(r, o, a, w, 1.0)
+        elif op == EXP:
+            grow(r, o, a, w)
+        else:
+            rarer(op, r, o, a, b, w)
+
+
+def rarer(op: int, r: Numbers, o: int, a: int, b: int, w: int) -> None:
+    """The other instructions."""
+    for i in range(w):
+        x = r[a, i]
+        y = r[b, i]
+        if op == POWER:
+            z = np.power(x, y)
+        elif op == LESS:
+            z = 1.0 if x < y else 0.0
+        elif op == LESS_EQUAL:
+            z = 1.0 if x <= y else 0.0
+        elif op == EQUAL:
+            z = 1.0 if x == y else 0.0
+        elif op == NOT_EQUAL:
+            z = 1.0 if x != y else 0.0
+        elif op == AND:
+            z = 1.0 if x != 0.0 and y != 0.0 else 0.0
+        elif op == OR:
+            z = 1.0 if x != 0.0 or y != 0.0 else 0.0
+        elif op == NOT:
+            z = 1.0 if x == 0.0 else 0.0
+        elif op == SIGN:
+            z = np.sign(x)
+        elif op == TAN:
+            z = np.tan(x)
+        elif op == TANH:
+            z = np.tanh(x)
+        elif op == ARCTAN:
+            z = np.arctan(x)
+        elif op == ARCTAN2:
+            z = np.arctan2(x, y)
+        elif op == LOG:
+            z = np.log(x)
+        elif op == EXPM1:
+            z = np.expm1(x)
+        elif op == LOG1P:
+            z = np.log1p(x)
+        elif op == FLOOR:
+            z = np.floor(x)
+        elif op == CEIL:
+            z = np.ceil(x)
+        elif op == RINT:
+            z = np.rint(x)
+        elif op == SINH:
+            z = np.sinh(x)
+        elif op == COSH:
+            z = np.cosh(x)
+        elif op == ARCSIN:
+            z = np.arcsin(x)
+        elif op == ARCCOS:
+            z = np.arccos(x)
+        elif op == HYPOT:
+            z = np.hypot(x, y)
+        else:
+            z = np.copysign(x, y)
+        r[o, i] = z

@@ -1,0 +1,134 @@
+"""Which systems and effects compile; those that do not are told once, and stepped in numpy."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sims.base import Array
+from sims.engines.batch.field import Field
+from sims.engines.batch.parts import take
+from sims.engines.compiled import evaluate
+from sims.engines.compiled.kinds import IN_P, IN_T, IN_U, IN_V, IN_X, OUT_LIMIT, room
+from sims.engines.compiled.program import Model, Names, Tracing
+from sims.engines.compiled.traced import UntracedError
+from sims.engines.ground import Indices
+from sims.system import Effect, Lanes, System
+
+_tracings: dict[tuple[type[System], Names], Tracing | None] = {}
+_effects: dict[tuple[type[System], Names, type[Effect]], bool] = {}
+_TOLERANCE = 1e-9
+"""Share of the largest number by which a program may differ from what it was traced from."""
+
+
+def model(lanes: Lanes, chosen: Indices, effects: Sequence[Effect]) -> Model | None:
+    """The program for the lanes `chosen`, on which these effects act; None if it does not
+    compile.
+    """
+    tracing = _traced(lanes, chosen)
+    if tracing is None:
+        return None
+    for effect in effects:
+        if not _compiles(tracing, effect, lanes, chosen):
+            return None
+    return tracing.model(effects)
+
+
+def _traced(lanes: Lanes, chosen: Indices) -> Tracing | None:
+    system = lanes.system
+    key = type(system), _names(lanes)
+    if key not in _tracings:
+        _tracings[key] = None
+        try:
+            tracing = Tracing(system, key[1])
+            _check(tracing.model([]), lanes, chosen, [], system)
+            _tracings[key] = tracing
+        # Whatever a user's system raises when it is asked with what is no array.
+        except Exception as reason:
+            _tell(f"system {system.name}", reason)
+    return _tracings[key]
+
+
+def _compiles(tracing: Tracing, effect: Effect, lanes: Lanes, chosen: Indices) -> bool:
+    key = type(lanes.system), _names(lanes), type(effect)
+    if key not in _effects:
+        _effects[key] = False
+        try:
+            _check(tracing.model([effect]), lanes, chosen, [effect], effect)
+            _effects[key] = True
+        except Exception as reason:
+            _tell(f"effect {effect.name}", reason)
+    return _effects[key]
+
+
+def _names(lanes: Lanes) -> Names:
+    return Names(
+        tuple(lanes.constants), tuple(lanes.inputs), lanes.theta.shape[1], lanes.x.shape[1]
+    )
+
+
+def _tell(what: str, reason: Exception) -> None:
+    """One line, once a process."""
+    text = str(reason) or type(reason).__name__
+    sys.stderr.write(f"simgap: {what} is stepped without the compiler: {text}\n")
+
+
+def _check(
+    made: Model, lanes: Lanes, chosen: Indices, effects: Sequence[Effect], of: System | Effect
+) -> None:
+    """See that the program gives what the arrays give, on one lane at two instants.
+
+    Raises:
+        UntracedError: it does not, or what was traced has a state of its own.
+    """
+    if getattr(of, "__dict__", None):
+        raise UntracedError("it has a state of its own")
+    one = take(lanes, chosen[:1])
+    there = tuple((effect, c) for effect, c in one.effects if effect in effects)
+    one = replace(one, effects=there)
+    inputs = {name: values[:, :1] for name, values in one.inputs.items()}
+    with np.errstate(all="ignore"):
+        field = Field(one)
+        field.feel(inputs)
+        r = _registers(made, one, inputs)
+        for t, moved in ((0.0, 0.0), (0.37, 0.1)):
+            x = one.x + moved
+            v = one.v - 2.0 * moved
+            force, limit = _at(made, r, t, x[0], v[0])
+            time = np.full((1, 1), t)
+            _same(force, field.force(time, x, v)[0])
+            if field.dry:
+                _same(limit, field.limit(time, x, v)[0])
+
+
+def _registers(made: Model, one: Lanes, inputs: Mapping[str, Array]) -> Array:
+    """The registers of a program, with all that one lane brings."""
+    rows = made.program.rows
+    r = room(made.registers).r
+    r[made.first : made.first + len(made.constants)] = made.constants
+    columns = [one.theta, *one.constants.values(), *(c[:, :, 0].T for _, c in one.effects)]
+    parameters = np.concatenate(columns, axis=1)[0]
+    r[rows[IN_P] : rows[IN_P] + parameters.size] = parameters[:, None]
+    for k, values in enumerate(inputs.values()):
+        r[rows[IN_U] + k] = values
+    evaluate.execute(made.program.code, made.program.ends[0], made.program.ends[1], r, 1)
+    return r
+
+
+def _at(made: Model, r: Array, t: float, x: Array, v: Array) -> tuple[Array, Array]:
+    """Force (D,) and limit of dry friction (1,) at an instant."""
+    rows = made.program.rows
+    r[rows[IN_T], 0] = t
+    r[rows[IN_X] : rows[IN_X] + x.size, 0] = x
+    r[rows[IN_V] : rows[IN_V] + v.size, 0] = v
+    evaluate.execute(made.program.code, made.program.ends[1], made.program.ends[2], r, 1)
+    return r[made.program.out, 0], r[rows[OUT_LIMIT], :1]
+
+
+def _same(found: Array, expected: Array) -> None:
+    largest = np.abs(expected).max()
+    if not np.allclose(found, expected, rtol=_TOLERANCE, atol=_TOLERANCE * largest, equal_nan=True):
+        raise UntracedError("compiled it gives other numbers")

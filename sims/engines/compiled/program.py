@@ -1,0 +1,254 @@
+"""What a system with some effects computes, traced once and written as instructions.
+
+A program has three parts: what a lane's parameters settle, computed when a lane begins; the forces
+and the limit of dry friction, computed at every instant; and what effects make of an impact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sims.engines.compiled.graph import CODES, IMPACT, LANE, MOMENT, Graph, Node
+from sims.engines.compiled.kinds import LARGEST, WIDTH, Numbers, Program
+from sims.engines.compiled.traced import Traced, UntracedError
+from sims.system import Contact, Effect, Force, Friction, Moment, System
+
+MOST = 4000
+"""Registers of a program."""
+MODELS = 2000
+"""Programs of a system that are kept."""
+
+
+class Model(NamedTuple):
+    """A program with its constants.
+
+    Attributes:
+        program: what is run.
+        constants: (C, WIDTH) registers from `first` on.
+        first: see `constants`.
+        registers: how many there are.
+    """
+
+    program: Program
+    constants: Numbers
+    first: int
+    registers: int
+
+
+class Names(NamedTuple):
+    """What lanes bring, in the order of the parameters: names of constants and inputs, number of
+    the system's parameters, of coordinates.
+    """
+
+    constants: tuple[str, ...]
+    inputs: tuple[str, ...]
+    parameters: int
+    coordinates: int
+
+
+class Piece(NamedTuple):
+    """An effect's part in a program.
+
+    Attributes:
+        coefficients: (K, 1, 1) what goes in.
+        force: (1, D), of a force.
+        limit: (1, 1), of a friction.
+    """
+
+    coefficients: Any
+    force: Traced | None
+    limit: Traced | None
+
+
+class Tracing:
+    """A system, traced, and what acts on it, as it is asked for.
+
+    Raises:
+        UntracedError: the system cannot be traced.
+    """
+
+    def __init__(self, system: System, names: Names) -> None:
+        if not 1 <= names.coordinates <= LARGEST:
+            raise UntracedError(f"it has {names.coordinates} coordinates")
+        graph = Graph()
+        self.graph = graph
+        self.bounces = system.bounces
+        self.t = _vector(graph, 1, MOMENT)
+        self.x = _vector(graph, names.coordinates, MOMENT)
+        self.v = _vector(graph, names.coordinates, MOMENT)
+        self.u: dict[str, Any] = {name: _vector(graph, 1, MOMENT) for name in names.inputs}
+        theta = _vector(graph, names.parameters, LANE)
+        constants: dict[str, Any] = {name: _vector(graph, 1, LANE) for name in names.constants}
+        self.e: Any
+        self.mu: Any
+        self.speed: Any
+        self.e, self.mu, self.speed = (_vector(graph, 1, IMPACT) for _ in range(3))
+        self.parameters = _nodes(theta, *constants.values())
+        self._moment = Moment(system, theta, constants, self.t, self.x, self.v, self.u)
+        self._shape = 1, names.coordinates
+        self._force = self._shaped(system.force(self._moment), self._shape)
+        self._pieces: dict[type[Effect], Piece] = {}
+        self._models: dict[tuple[type[Effect], ...], Model] = {}
+
+    def model(self, effects: Sequence[Effect]) -> Model:
+        """The program of the system with these effects.
+
+        Raises:
+            UntracedError: one cannot be traced.
+        """
+        key = tuple(map(type, effects))
+        if key not in self._models:
+            if len(self._models) == MODELS:
+                self._models.clear()
+            self._models[key] = _Writer(self._composed(effects)).model()
+        return self._models[key]
+
+    def piece(self, effect: Effect) -> Piece:
+        """The effect's part.
+
+        Raises:
+            UntracedError: it cannot be traced.
+        """
+        kind = type(effect)
+        if kind not in self._pieces:
+            count = len(effect.coefficients)
+            c = _vector(self.graph, count, LANE).T[:, :, None]
+            force = limit = None
+            if isinstance(effect, Force):
+                force = self._shaped(effect.force(c, self._moment), self._shape)
+            elif isinstance(effect, Friction):
+                limit = self._shaped(effect.limit(c, self._moment), (1, 1))
+            self._pieces[kind] = Piece(c, force, limit)
+        return self._pieces[kind]
+
+    def _composed(self, effects: Sequence[Effect]) -> _Composed:
+        force: Any = self._force
+        limit: Any = None
+        e: Any = self.e
+        mu: Any = self.mu
+        parameters = list(self.parameters)
+        for effect in effects:
+            c, own, rubs = self.piece(effect)
+            parameters += _nodes(c)
+            if own is not None:
+                force = force + own
+            if rubs is not None:
+                limit = rubs if limit is None else limit + rubs
+            if isinstance(effect, Contact):
+                e = self._shaped(effect.restitution(c, e, self.speed), (1, 1))
+                mu = self._shaped(mu + effect.friction(c), (1, 1))
+        has = [any(isinstance(effect, kind) for effect in effects) for kind in (Friction, Force)]
+        return _Composed(
+            inputs=[
+                *(_nodes(self.t), _nodes(self.x), _nodes(self.v), _nodes(*self.u.values())),
+                *(parameters, _nodes(self.e), _nodes(self.mu), _nodes(self.speed)),
+            ],
+            force=_nodes(force),
+            limit=[] if limit is None else _nodes(limit),
+            impact=_nodes(e, mu),
+            flags=[self._shape[1], has[0], has[1], self.bounces],
+        )
+
+    def _shaped(self, values: Any, shape: tuple[int, int]) -> Traced:
+        """What an array function gave back, in the shape that it should have."""
+        if not isinstance(values, Traced):
+            values = Traced(self.graph, _constants(self.graph, values))
+        return Traced(self.graph, np.broadcast_to(values.nodes, shape))
+
+
+class _Composed(NamedTuple):
+    """What goes into a program, in order, and what comes out."""
+
+    inputs: list[list[Node]]
+    force: list[Node]
+    limit: list[Node]
+    impact: list[Node]
+    flags: list[int]
+
+
+class _Writer:
+    """Lays expressions out as instructions."""
+
+    def __init__(self, composed: _Composed) -> None:
+        self.given = composed
+        self.place: dict[Node, int] = {}
+        self.rows: list[int] = []
+        for group in composed.inputs:
+            self.rows.append(len(self.place))
+            for node in group:
+                self.place[node] = len(self.place)
+        self.first = len(self.place)
+        self.values: list[float] = []
+        self.parts: dict[int, list[list[int]]] = {LANE: [], MOMENT: [], IMPACT: []}
+
+    def model(self) -> Model:
+        """The program."""
+        given = self.given
+        outputs = [*given.force, *given.limit, *given.impact]
+        order = _ordered(outputs)
+        # Constants lie together, so that they are set by one assignment.
+        for node in order:
+            if node.operation == "constant":
+                self.place[node] = len(self.place)
+                self.values.append(node.value)
+        for node in order:
+            if node.args:
+                self._write(node)
+        if len(self.place) > MOST:
+            raise UntracedError("it computes too much")
+        limit = self.place[given.limit[0]] if given.limit else -1
+        rows = [*self.rows, limit, *(self.place[node] for node in given.impact)]
+        lines = [line for part in self.parts.values() for line in part]
+        ends = np.cumsum([0, *(len(part) for part in self.parts.values())])
+        program = Program(
+            code=np.array(lines, dtype=np.int64).reshape(-1, 5),
+            ends=ends.astype(np.int64),
+            rows=np.array(rows, dtype=np.int64),
+            out=np.array([self.place[node] for node in given.force], dtype=np.int64),
+            flags=np.array(given.flags, dtype=np.int64),
+        )
+        constants = np.repeat(np.array(self.values).reshape(-1, 1), WIDTH, axis=1)
+        return Model(program, constants, self.first, len(self.place))
+
+    def _write(self, node: Node) -> None:
+        self.place[node] = len(self.place)
+        args = [self.place[arg] for arg in node.args]
+        args += [args[0]] * (3 - len(args))
+        self.parts[node.changes].append([CODES[node.operation], self.place[node], *args])
+
+
+def _ordered(outputs: Sequence[Node]) -> list[Node]:
+    """All that the outputs are computed from, and they themselves, each behind its arguments."""
+    order: dict[Node, None] = {}
+    stack = [(node, False) for node in reversed(outputs)]
+    while stack:
+        node, ready = stack.pop()
+        if ready:
+            order[node] = None
+        elif node not in order:
+            stack.append((node, True))
+            stack += [(arg, False) for arg in reversed(node.args)]
+    return list(order)
+
+
+def _vector(graph: Graph, size: int, changes: int) -> Any:
+    """(1, size) inputs, in the place of arrays."""
+    nodes = np.empty((1, size), dtype=object)
+    for k in range(size):
+        nodes[0, k] = graph.input(changes)
+    return Traced(graph, nodes)
+
+
+def _constants(graph: Graph, values: Any) -> Any:
+    numbers = np.asarray(values, dtype=np.float64)
+    nodes = np.empty(numbers.shape, dtype=object)
+    for place in np.ndindex(numbers.shape):
+        nodes[place] = graph.constant(float(numbers[place]))
+    return nodes
+
+
+def _nodes(*arrays: Traced) -> list[Node]:
+    return [node for array in arrays for node in array.nodes.ravel()]

@@ -1,0 +1,150 @@
+"""Steps lanes with the compiled engine: groups them by what acts, and lays out what it needs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sims.base import Array
+from sims.engines.batch.field import acts
+from sims.engines.compiled import known
+from sims.engines.compiled.kinds import WIDTH, Work, room
+from sims.engines.compiled.machine import Machine
+from sims.engines.ground import Indices
+from sims.system import Contact, Effect, Force, Friction, Lanes, Motion
+
+_EIGHT = 8
+"""Slots are used in eights, as machines compute them."""
+
+
+class _Job:
+    """Lanes that are all stepped, by compiled code.
+
+    Args:
+        lanes: all of them.
+        turn: see `sims.engines.batch.pace`.
+        patience: see `sims.engines.batch.Batch`.
+        machine: the compiled functions.
+    """
+
+    def __init__(self, lanes: Lanes, turn: float, patience: float, machine: Machine) -> None:
+        self._lanes = lanes
+        self._turn = turn
+        self._patience = patience
+        self._machine = machine
+        count, dimensions = lanes.x.shape
+        shared = lanes.steps.strides[0] == 0
+        self._steps = np.ascontiguousarray(lanes.steps[:1] if shared else lanes.steps)
+        ones = np.ones(count)
+        self._spans = self._steps.max(axis=1, initial=0.0) * ones
+        self._planned = np.count_nonzero(self._steps, axis=1) * ones
+        self._inputs = _stacked(list(lanes.inputs.values()), self._steps.shape[1])
+        self._mass = _column(lanes.system.mass(lanes.theta, lanes.constants), count)
+        self._ground = _ground(lanes)
+        records = self._steps.shape[1] // lanes.every + 1
+        self._kept = np.empty((count, records, 3 * dimensions))
+        self._parts = ones
+        self._longest = np.empty(count)
+        self._x = np.ascontiguousarray(lanes.x, dtype=np.float64)
+        self._v = np.ascontiguousarray(lanes.v, dtype=np.float64)
+
+    def motion(self) -> Motion:
+        """What was kept."""
+        x, v, a = np.split(self._kept, 3, axis=2)
+        return Motion(x, v, a)
+
+    def step(self, chosen: Indices, effects: Sequence[tuple[Effect, Array]]) -> bool:
+        """Make all steps of the lanes `chosen`, on which exactly these effects act, if that
+        compiles.
+        """
+        lanes = self._lanes
+        made = known.model(lanes, chosen, [effect for effect, _ in effects])
+        if made is None:
+            return False
+        columns = [lanes.theta[chosen], *(c[chosen] for c in lanes.constants.values())]
+        columns += [c[:, chosen, 0].T for _, c in effects]
+        parameters = np.concatenate(columns, axis=1)
+        block = room(made.registers)
+        block.r[made.first : made.first + len(made.constants)] = made.constants
+        width = min(WIDTH, -(-chosen.size // _EIGHT) * _EIGHT)
+        work = Work(
+            order=chosen.astype(np.int64),
+            parameters=np.ascontiguousarray(parameters),
+            mass=self._mass,
+            x=self._x,
+            v=self._v,
+            steps=self._steps,
+            inputs=self._inputs,
+            longest=self._longest,
+            planned=self._planned,
+            ground=self._ground,
+            every=lanes.every,
+            patience=self._patience,
+            kept=self._kept,
+        )
+        self._machine.divide(made.program, work, block, width, self._spans, self._turn, self._parts)
+        parts = self._parts[chosen]
+        spans = self._spans[chosen]
+        # A hair longer than the part, so that rounding does not leave a crumb behind the last one.
+        self._longest[chosen] = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
+        if parts.min() < parts.max():
+            # Those that need many steps first: the others fill the slots beside them.
+            order = np.argsort(-parts, kind="stable")
+            work = work._replace(order=work.order[order], parameters=work.parameters[order])
+        self._machine.advance(made.program, work, block, width)
+        return True
+
+
+def _column(values: Array, count: int) -> Array:
+    return np.ascontiguousarray(np.broadcast_to(values, (count, 1))[:, 0], dtype=np.float64)
+
+
+def _stacked(values: list[Array], steps: int) -> Array:
+    """(U, L or 1, S), one row where all lanes share it."""
+    if not values:
+        return np.zeros((0, 1, steps))
+    if all(value.strides[0] == 0 for value in values):
+        values = [value[:1] for value in values]
+    return np.ascontiguousarray(np.stack(values), dtype=np.float64)
+
+
+def _ground(lanes: Lanes) -> Array:
+    """(4, L) rows as in `sims.engines.compiled.kinds`."""
+    count = len(lanes.x)
+    ground = np.zeros((4, count))
+    system = lanes.system
+    if system.bounces:
+        friction = system.friction(lanes.constants)
+        grip = system.grip(lanes.constants)
+        ground[0] = _column(system.floor(lanes.constants), count)
+        ground[1] = _column(system.restitution(lanes.theta), count)
+        if friction is not None:
+            ground[2] = _column(friction, count)
+        if grip is not None:
+            ground[3] = 1.0 - _column(grip, count)
+    return ground
+
+
+def step(lanes: Lanes, turn: float, patience: float, machine: Machine) -> tuple[Motion, Indices]:
+    """The motion of lanes that are all stepped, and which of them were left out as what acts on
+    them does not compile.
+    """
+    job = _Job(lanes, turn, patience, machine)
+    left = [chosen for chosen, effects in _groups(lanes) if not job.step(chosen, effects)]
+    return job.motion(), np.sort(np.concatenate([np.empty(0, dtype=np.intp), *left]))
+
+
+def _groups(lanes: Lanes) -> list[tuple[Indices, list[tuple[Effect, Array]]]]:
+    """Lanes (n,) on which the same effects act, with these effects."""
+    hooks = (Force, Friction, Contact)
+    there: list[tuple[Effect, Array]] = [(e, c) for e, c in lanes.effects if isinstance(e, hooks)]
+    on = [acts(c) for _, c in there]
+    if not on:
+        return [(np.arange(len(lanes.x)), [])]
+    patterns, which = np.unique(np.array(on).T, axis=0, return_inverse=True)
+    groups: list[tuple[Indices, list[tuple[Effect, Array]]]] = []
+    for k, pattern in enumerate(patterns):
+        effects = [pair for pair, is_on in zip(there, pattern, strict=True) if is_on]
+        groups.append((np.flatnonzero(which.ravel() == k), effects))
+    return groups

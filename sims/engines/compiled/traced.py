@@ -1,0 +1,321 @@
+"""Arrays that note what is done to them: so an effect written for arrays becomes an expression.
+
+A traced array has the shape that one lane has, and a node where an array has a number. Functions of
+numpy that compute element by element, and those that only move elements, work on it; what asks for
+a value (``if``, `float`, `numpy.asarray`) or a function that is not here raises `UntracedError`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
+
+from sims.engines.compiled.graph import CODES, Graph, Node
+
+_OTHERWISE_NAMED = {
+    "true_divide": "divide",
+    "fabs": "absolute",
+    "bitwise_and": "logical_and",
+    "bitwise_or": "logical_or",
+    "invert": "logical_not",
+    "fmax": "maximum",
+    "fmin": "minimum",
+    "float_power": "power",
+}
+"""Functions that do the same to what is traced, but for where there is no number."""
+_SWAPPED = {"greater": "less", "greater_equal": "less_equal"}
+_MASKS = {
+    *("less", "less_equal", "equal", "not_equal", "logical_and", "logical_or", "logical_not"),
+}
+_MOVING = {
+    *("concatenate", "stack", "hstack", "vstack", "column_stack", "broadcast_to", "reshape"),
+    *("transpose", "moveaxis", "squeeze", "expand_dims", "copy", "tile", "repeat", "roll", "flip"),
+    *("split", "atleast_1d", "atleast_2d", "take", "broadcast_arrays", "swapaxes", "ravel"),
+}
+"""Functions that move elements and do nothing else."""
+
+
+class UntracedError(TypeError):
+    """Something that cannot be traced."""
+
+
+class Traced(NDArrayOperatorsMixin):
+    """An array of nodes of one graph.
+
+    Args:
+        graph: where its nodes are made.
+        nodes: any shape, dtype object.
+        mask: whether it holds truth values.
+    """
+
+    def __init__(self, graph: Graph, nodes: Any, mask: bool = False) -> None:
+        self.graph = graph
+        self.nodes = nodes
+        self.mask = mask
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """As an array's."""
+        shape: tuple[int, ...] = self.nodes.shape
+        return shape
+
+    @property
+    def ndim(self) -> int:
+        """As an array's."""
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        """As an array's."""
+        return int(self.nodes.size)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """As an array's."""
+        return np.dtype(bool if self.mask else float)
+
+    @property
+    def T(self) -> Traced:  # noqa: N802
+        """As an array's."""
+        return self._like(self.nodes.T)
+
+    def reshape(self, *shape: Any) -> Traced:
+        """As an array's."""
+        return self._like(self.nodes.reshape(*shape))
+
+    def copy(self) -> Traced:
+        """As an array's."""
+        return self._like(self.nodes.copy())
+
+    def astype(self, kind: Any, **_: Any) -> Traced:
+        """As an array's, to numbers."""
+        if np.dtype(kind) != np.float64:
+            raise UntracedError(f"numbers as {np.dtype(kind)} are not traced")
+        return Traced(self.graph, self.nodes)
+
+    def sum(self, axis: Any = None, keepdims: bool = False, **_: Any) -> Traced:
+        """As an array's."""
+        return self._reduced("add", axis, keepdims)
+
+    def max(self, axis: Any = None, keepdims: bool = False, **_: Any) -> Traced:
+        """As an array's."""
+        return self._reduced("maximum", axis, keepdims)
+
+    def min(self, axis: Any = None, keepdims: bool = False, **_: Any) -> Traced:
+        """As an array's."""
+        return self._reduced("minimum", axis, keepdims)
+
+    def clip(self, low: Any, high: Any) -> Traced:
+        """As an array's."""
+        return _clip(self, low, high)
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def __iter__(self) -> Iterator[Traced]:
+        return (self[i] for i in range(len(self)))
+
+    def __getitem__(self, place: Any) -> Traced:
+        _check_place(place)
+        found = self.nodes[place]
+        if isinstance(found, Node):
+            found = _one(found)
+        return self._like(found)
+
+    def __setitem__(self, place: Any, value: Any) -> None:
+        _check_place(place)
+        self.nodes[place] = _lifted(self.graph, value)
+
+    def __bool__(self) -> bool:
+        raise UntracedError("it asks whether a number is true, which differs from lane to lane")
+
+    def __float__(self) -> float:
+        raise UntracedError("it asks for a number's value, which differs from lane to lane")
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        raise UntracedError("it turns what it is given into an array of its own")
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *args: Any, **kwargs: Any) -> Traced:
+        if method == "reduce" and ufunc.__name__ in {"add", "maximum", "minimum"}:
+            axis = kwargs.get("axis", 0)
+            result = args[0]._reduced(ufunc.__name__, axis, bool(kwargs.get("keepdims")))
+            assert isinstance(result, Traced)
+            return result
+        out = kwargs.pop("out", None)
+        if method != "__call__" or kwargs or (out and not isinstance(out[0], Traced)):
+            raise UntracedError(f"numpy.{ufunc.__name__} is traced in its plain form only")
+        result = _elementwise(self.graph, ufunc.__name__, args)
+        if not out:
+            return result
+        target = out[0]
+        assert isinstance(target, Traced)
+        target.nodes[...] = result.nodes
+        return target
+
+    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
+        name = func.__name__
+        if name in _MOVING:
+            return _wrapped(self.graph, func(*_bare(self.graph, args), **kwargs))
+        known = _FUNCTIONS.get(name)
+        if known is None:
+            raise UntracedError(f"numpy.{name} is not traced")
+        return known(*args, **kwargs)
+
+    def _like(self, nodes: Any) -> Traced:
+        return Traced(self.graph, nodes, self.mask)
+
+    def _reduced(self, operation: str, axis: Any, keepdims: bool) -> Traced:
+        if axis is None:
+            whole = self.reshape(-1)._reduced(operation, 0, False)
+            return whole.reshape((1,) * self.ndim) if keepdims else whole
+        parts = list(np.moveaxis(self.nodes, axis, 0))
+        total = Traced(self.graph, _array(parts[0]))
+        for part in parts[1:]:
+            total = _elementwise(self.graph, operation, (total, Traced(self.graph, _array(part))))
+        if keepdims:
+            total = total._like(np.expand_dims(total.nodes, axis))
+        return total
+
+
+def _one(node: Node) -> Any:
+    """A node as an array without dimensions."""
+    result = np.empty((), dtype=object)
+    result[()] = node
+    return result
+
+
+def _array(nodes: Any) -> Any:
+    return _one(nodes) if isinstance(nodes, Node) else nodes
+
+
+def _check_place(place: Any) -> None:
+    """Refuse choosing by what is traced: how much is chosen would differ from lane to lane."""
+    for part in place if isinstance(place, tuple) else (place,):
+        if isinstance(part, Traced):
+            raise UntracedError("it chooses elements by what it computes")
+
+
+def _lifted(graph: Graph, value: Any) -> Any:
+    """Numbers as nodes."""
+    if isinstance(value, Traced):
+        return value.nodes
+    numbers = np.asarray(value)
+    if numbers.dtype.kind not in "biuf":
+        raise UntracedError(f"{type(value).__name__} is not traced")
+    result = np.empty(numbers.shape, dtype=object)
+    for place in np.ndindex(numbers.shape):
+        result[place] = graph.constant(float(numbers[place]))
+    return result
+
+
+def _elementwise(graph: Graph, name: str, args: Sequence[Any]) -> Traced:
+    if name == "positive":
+        return Traced(graph, _lifted(graph, args[0]))
+    if name == "square":
+        return _elementwise(graph, "multiply", (args[0], args[0]))
+    if name == "reciprocal":
+        return _elementwise(graph, "divide", (1.0, args[0]))
+    if name == "power" and not isinstance(args[1], Traced) and np.ndim(args[1]) == 0:
+        short = _power(graph, args[0], float(args[1]))
+        if short is not None:
+            return short
+    if name in _SWAPPED:
+        return _elementwise(graph, _SWAPPED[name], args[::-1])
+    name = _OTHERWISE_NAMED.get(name, name)
+    if name not in CODES:
+        raise UntracedError(f"numpy.{name} is not traced")
+    masks = [isinstance(arg, Traced) and arg.mask for arg in args]
+    if all(masks) and name not in _MASKS:
+        raise UntracedError(f"numpy.{name} of truth values is not traced")
+    lifted: Any = np.broadcast_arrays(*(_array(_lifted(graph, arg)) for arg in args))
+    result = np.empty(lifted[0].shape, dtype=object)
+    for place in np.ndindex(result.shape):
+        result[place] = graph.apply(name, *(nodes[place] for nodes in lifted))
+    return Traced(graph, result, name in _MASKS)
+
+
+def _power(graph: Graph, base: Any, exponent: float) -> Traced | None:
+    """The powers that numpy computes otherwise."""
+    if exponent == 2.0:
+        return _elementwise(graph, "multiply", (base, base))
+    if exponent == 0.5:
+        return _elementwise(graph, "sqrt", (base,))
+    if exponent == -1.0:
+        return _elementwise(graph, "divide", (1.0, base))
+    return Traced(graph, _lifted(graph, base)) if exponent == 1.0 else None
+
+
+def _bare(graph: Graph, args: Any) -> list[Any]:
+    """Arguments with nodes in place of what is traced, and of the numbers beside it."""
+
+    def bare(arg: Any) -> Any:
+        if isinstance(arg, Traced):
+            return arg.nodes
+        if isinstance(arg, list | tuple) and any(isinstance(part, Traced) for part in arg):
+            return [_lifted(graph, part) for part in arg]
+        return arg
+
+    return [bare(arg) for arg in args]
+
+
+def _wrapped(graph: Graph, result: Any) -> Any:
+    if isinstance(result, list | tuple):
+        return type(result)(_wrapped(graph, part) for part in result)
+    return Traced(graph, _array(result))
+
+
+def _graph_of(*args: Any) -> Graph:
+    return next(arg.graph for arg in args if isinstance(arg, Traced))
+
+
+def _where(condition: Any, *values: Any) -> Traced:
+    if len(values) != 2:
+        raise UntracedError("numpy.where with a condition alone is not traced")
+    graph = _graph_of(condition, *values)
+    return _elementwise(graph, "where", (condition, *values))
+
+
+def _clip(x: Any, low: Any, high: Any) -> Traced:
+    graph = _graph_of(x, low, high)
+    result = x
+    if low is not None:
+        result = _elementwise(graph, "maximum", (result, low))
+    if high is not None:
+        result = _elementwise(graph, "minimum", (result, high))
+    return result if isinstance(result, Traced) else Traced(graph, _lifted(graph, result))
+
+
+def _filled(x: Traced, value: float) -> Traced:
+    nodes = np.empty(x.shape, dtype=object)
+    nodes[...] = x.graph.constant(value)
+    return Traced(x.graph, nodes)
+
+
+def _summed(x: Traced, axis: Any = None, keepdims: bool = False, **_: Any) -> Traced:
+    return x.sum(axis, keepdims)
+
+
+def _norm(x: Traced, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Traced:  # noqa: A002
+    if ord is not None:
+        raise UntracedError("numpy.linalg.norm of a kind of its own is not traced")
+    squares = _elementwise(x.graph, "multiply", (x, x)).sum(axis, keepdims)
+    return _elementwise(x.graph, "sqrt", (squares,))
+
+
+_FUNCTIONS: dict[str, Callable[..., Traced]] = {
+    "where": _where,
+    "clip": _clip,
+    "sum": _summed,
+    "norm": _norm,
+    "max": lambda x, axis=None, keepdims=False, **_: x.max(axis, keepdims),
+    "min": lambda x, axis=None, keepdims=False, **_: x.min(axis, keepdims),
+    "amax": lambda x, axis=None, keepdims=False, **_: x.max(axis, keepdims),
+    "amin": lambda x, axis=None, keepdims=False, **_: x.min(axis, keepdims),
+    "zeros_like": lambda x, **_: _filled(x, 0.0),
+    "empty_like": lambda x, **_: _filled(x, 0.0),
+    "ones_like": lambda x, **_: _filled(x, 1.0),
+    "full_like": lambda x, value, **_: _filled(x, float(value)),
+}
