@@ -17,6 +17,14 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background; c
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_configure(config):
+    """Machine code is made before there are workers that would each wait for it."""
+    if not hasattr(config, "workerinput"):
+        from sims.engines.compiled import machine
+
+        machine.machine()
+
+
 @pytest.fixture(scope="session")
 def spring():
     """The test simulator, registered."""

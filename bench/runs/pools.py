@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from bench.runs.guard import initialise
 from bench.sealing.ended import how_it_ended
 from sims.base import InputError
+from sims.engines import stepping
 
 if TYPE_CHECKING:
     from bench.runs.survey import Plugin
@@ -214,6 +215,8 @@ class LocalPool:
             InputError: workers die before they do anything.
         """
         limit = None if math.isinf(seconds) else seconds + GRACE
+        if not self._slots:
+            stepping()  # made here: a worker says nothing of what it waits for
         self._slots = self._slots or [_Slot(self._plugins) for _ in range(self._jobs)]
         following = deque(_Given(place) for place in range(len(calls)))
         pace = _Pace()

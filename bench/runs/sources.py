@@ -25,6 +25,7 @@ from bench.problem.experiment import Experiment
 from bench.problem.recorded import find_recording
 from sims import effects
 from sims.base import InputError
+from sims.engines.compiled import kept
 
 ROOT = Path(__file__).resolve().parents[2]
 """Where this project's packages lie."""
@@ -36,8 +37,10 @@ PACKAGES = (
     "av",
     "botorch",
     "cma",
+    "llvmlite",
     "mujoco",
     "nlopt",
+    "numba",
     "numpy",
     "opencv-python-headless",
     "pybullet",
@@ -85,7 +88,8 @@ def _contents(folder: Path, root: Path) -> list[tuple[str, bytes]]:
 @cache
 def versions() -> str:
     """Hash of the versions of Python and the packages that compute."""
-    return digest(platform.python_version(), [package_version(name) for name in PACKAGES])
+    packages = [package_version(name) for name in PACKAGES]
+    return digest(platform.python_version(), packages, kept.is_off())
 
 
 def package_version(name: str) -> str:

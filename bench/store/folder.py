@@ -23,6 +23,7 @@ from bench.store.segments import FOLDER, read_plan
 from bench.store.sound import check_table, checked_files
 from bench.store.status import STATUS_COLUMNS
 from sims.base import InputError
+from sims.engines import stepping
 from sims.files import first_line, fresh_folder, refuse_full, replacing, stamped, write
 from sims.user_toml import entries, read_toml, shown
 
@@ -100,6 +101,7 @@ def create(
         "machine": platform.machine(),
         "processors": os.cpu_count(),
         "fingerprint": configuration.fingerprint,
+        "stepping": stepping(),
         "packages": dict(sorted({d.metadata["Name"]: d.version for d in distributions()}.items())),
     }
     try:

@@ -247,10 +247,11 @@ ENVIRONMENT: Mapping[str, Any] = {
     "machine": str,
     "processors": int,
     "fingerprint": Mapping[str, str],
+    "stepping": str,
     "packages": Mapping[str, str],
 }
 """environment.json: by key what its value is; a file may have others beside them."""
-OLDER = ("fingerprint", "seals")
+OLDER = ("fingerprint", "seals", "stepping")
 """Keys that folders of an older simgap lack."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import sys
 from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
@@ -17,6 +18,20 @@ NAMES = {
     "pybullet": "sims.engines.bullet",
 }
 """Modules of the engines; one is imported when it is asked for, and says what it requires."""
+
+
+def stepping() -> str:
+    """How the engine `batch` steps here, for a record: ``machine code``, ``numpy``, or ``none``
+    where it is not in use.
+
+    Machine code is made if it is not there, once after an install; so ask before there are
+    processes that would each wait for it.
+    """
+    if NAMES["batch"] not in sys.modules:
+        return "none"
+    from sims.engines.compiled import machine
+
+    return "numpy" if machine.machine() is None else "machine code"
 
 
 def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -> Engine:

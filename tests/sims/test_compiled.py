@@ -12,8 +12,9 @@ from sims.base import Scenario
 from sims.engines.batch.parts import take
 from sims.engines.compiled import advance, evaluate, known, machine, pace
 from sims.engines.compiled.graph import LANE, Graph
+from sims.engines.compiled.nodes import UntracedError
 from sims.engines.compiled.run import step
-from sims.engines.compiled.traced import Traced, UntracedError
+from sims.engines.compiled.traced import Traced
 from sims.pendulum.simulator import Pendulum
 from sims.slider.simulator import Slider
 from sims.system import Coefficient, Force, Friction
@@ -182,6 +183,24 @@ def test_a_lane_depends_on_itself_alone(monkeypatch):
         assert one.x[0].tobytes() == np.ascontiguousarray(together.x[lane]).tobytes()
 
 
+def test_how_long_steps_may_be_depends_on_the_lane_alone(monkeypatch):
+    """Inputs that decide it are asked for in every lane, not in the first slots' alone."""
+    t = np.arange(12) / 50
+    on = np.where(t > 0.1, 1.0, 0.0)  # a servo that is let go first has nothing that is fast
+    run = Scenario(t, {"q": 0.5}, {"goal": 0.3 + 0.0 * t, "torque_enable": on})
+    simulator = SIMULATORS["servo"](engine="batch", compiled=False)
+    theta = np.array([[1.3 * p.nominal for p in simulator.parameters]] * 40)
+    lanes = lanes_of(simulator, theta, [run] * 40, monkeypatch)
+    longest = []
+    plain = SimpleNamespace(
+        divide=pace.divide,
+        advance=lambda program, work, block, w: longest.extend(work.longest[work.order]),
+    )
+    step(lanes, simulator.engine._turn, np.inf, plain)
+    assert len(set(longest)) == 1
+    assert longest[0] < 1 / 50
+
+
 def test_elementary_functions_to_the_last_bits():
     rng = np.random.default_rng(1)
     r = np.zeros((4, 3000))
@@ -217,17 +236,6 @@ needs_compiler = pytest.mark.skipif(machine.machine() is None, reason="no compil
 
 
 @needs_compiler
-def test_machine_code_is_kept_whole_or_made_anew(tmp_path, monkeypatch):
-    path = machine._folder() / f"stepping-{machine._key()}.bin"
-    data = path.read_bytes()
-    assert machine._read(path) == data[machine._DIGEST :]
-    damaged = tmp_path / "damaged.bin"
-    damaged.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    assert machine._read(damaged) is None
-    assert machine._read(tmp_path / "missing.bin") is None
-
-
-@needs_compiler
 @pytest.mark.parametrize("system", list(SIMULATORS))
 def test_machine_code_gives_what_the_functions_give(system, monkeypatch):
     simulator, lanes = two_lanes(system, 7, monkeypatch)
@@ -236,11 +244,6 @@ def test_machine_code_gives_what_the_functions_give(system, monkeypatch):
         expected = step(lanes, simulator.engine._turn, np.inf, PLAIN)[0]
     np.testing.assert_array_equal(found.x, expected.x)
     np.testing.assert_array_equal(found.a, expected.a)
-
-
-def test_without_a_compiler_all_is_stepped_in_numpy(monkeypatch):
-    monkeypatch.setenv("SIMGAP_COMPILED", "off")
-    assert machine.machine.__wrapped__() is None
 
 
 class Rubbing(Friction):

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.engines.compiled.clock import go_on, load, stays
+from sims.engines.compiled.dynamics import begin, during, present
 from sims.engines.compiled.evaluate import execute, larger
 from sims.engines.compiled.events import (
     FAINT,
@@ -16,31 +18,25 @@ from sims.engines.compiled.events import (
     FRICTION_BEND,
     bent,
     interrupted,
-    length,
     reach,
     strike,
 )
 from sims.engines.compiled.kinds import (
     AFTER,
-    BEFORE,
     BEGINS,
     BEND,
     BOUNCES,
     BUSY,
     DIMENSIONS,
     DRY,
-    EVENTS,
     F1,
     F2,
     F3,
     F4,
-    FIRST,
     FLOOR,
     GOAL,
     IDLE,
-    IN_P,
     IN_T,
-    IN_U,
     IN_V,
     IN_X,
     K1,
@@ -57,17 +53,14 @@ from sims.engines.compiled.kinds import (
     NEXT_V,
     NEXT_X,
     NOTHING,
-    OUT_LIMIT,
     PEAK,
     PLACE,
     PUSHED,
     RESTS,
     RUBBED,
     SPARE,
-    STARTS,
     STEP,
     STICKS,
-    TAKEN,
     TRY,
     WAY,
     Block,
@@ -125,58 +118,6 @@ def advance(program: Program, work: Work, block: Block, w: int) -> None:
                 settle(program, work, block, i)
 
 
-def load(program: Program, work: Work, block: Block, i: int, place: int) -> None:
-    """Put a lane into a slot, at the beginning of its run."""
-    a = block.a
-    n = block.n
-    d = program.flags[DIMENSIONS]
-    lane = work.order[place]
-    for row in range(FIRST):
-        a[row, i] = 0.0
-    n[:, i] = 0
-    n[PLACE, i] = place
-    n[LANE, i] = lane
-    n[GOAL, i] = NOTHING
-    n[BEGINS, i] = 1
-    for k in range(d):
-        a[X + k, i] = work.x[lane, k]
-        a[V + k, i] = work.v[lane, k]
-    a[LONGEST, i] = work.longest[lane]
-    a[LIMIT, i] = work.longest[lane]
-    a[TRY, i] = np.inf
-    a[MASS, i] = work.mass[lane]
-    a[LEVEL, i] = work.ground[FLOOR, lane]
-    a[LEFT, i] = work.steps[lane if work.steps.shape[0] > 1 else 0, 0]
-    first = program.rows[IN_P]
-    for p in range(work.parameters.shape[1]):
-        block.r[first + p, i] = work.parameters[place, p]
-    feel(program, work, block, i)
-
-
-def feel(program: Program, work: Work, block: Block, i: int) -> None:
-    """Set the inputs of the lane's step; behind the last step, the last."""
-    first = program.rows[IN_U]
-    step = min(block.n[STEP, i], work.steps.shape[1] - 1)
-    row = block.n[LANE, i] if work.inputs.shape[1] > 1 else 0
-    for u in range(work.inputs.shape[0]):
-        block.r[first + u, i] = work.inputs[u, row, step]
-
-
-def present(program: Program, block: Block, w: int) -> None:
-    """Let the registers show every lane's state, and compute forces there."""
-    d = program.flags[DIMENSIONS]
-    rows = program.rows
-    r = block.r
-    a = block.a
-    for i in range(w):
-        r[rows[IN_T], i] = a[T, i]
-    for k in range(d):
-        for i in range(w):
-            r[rows[IN_X] + k, i] = a[X + k, i]
-            r[rows[IN_V] + k, i] = a[V + k, i]
-    execute(program.code, program.ends[1], program.ends[2], r, w)
-
-
 def start_on(program: Program, work: Work, block: Block, w: int) -> None:
     """Lift lanes that start in the ground onto it; throw back or lay to rest those that do not move
     up.
@@ -209,177 +150,6 @@ def is_new(block: Block, i: int) -> bool:
     """Whether a lane was just put into the slot."""
     n = block.n
     return bool(n[PLACE, i] >= 0 and n[STEP, i] == 0 and n[BEGINS, i] == 1)
-
-
-def begin(program: Program, block: Block, w: int) -> None:
-    """Accelerations at the beginning of a step: what sticks, and which way the rest moves."""
-    d = program.flags[DIMENSIONS]
-    if program.flags[DRY] == 0:
-        free(program, block, w, K1)
-        return
-    if d == 1 and program.flags[BOUNCES] == 0:
-        begin_on_a_line(program, block, w)
-        return
-    a = block.a
-    r = block.r
-    limits = program.rows[OUT_LIMIT]
-    for i in range(w):
-        limit = r[limits, i]
-        pulled(program, block, i, K1)
-        size = length(a, K1, d, i)
-        speed = length(a, V, d, i)
-        a[BEFORE, i] = size - limit
-        a[AFTER, i] = size - limit
-        still = speed == 0.0
-        sticks = still and size <= limit  # (2)
-        block.n[STICKS, i] = sticks
-        # (1) and (3): along the motion, or where there is none along what pulls.
-        divisor = speed
-        if still:
-            divisor = size if size > 0.0 else 1.0
-        for k in range(d):
-            pull = a[K1 + k, i]
-            way = (pull if still else a[V + k, i]) / divisor
-            rub = limit * way
-            a[WAY + k, i] = way
-            a[F1 + k, i] = rub
-            a[K1 + k, i] = 0.0 if sticks else (pull - rub) / a[MASS, i]
-
-
-def begin_on_a_line(program: Program, block: Block, w: int) -> None:
-    """`begin` for one coordinate and no ground: the same numbers, without branches."""
-    a = block.a
-    r = block.r
-    limits = program.rows[OUT_LIMIT]
-    force = program.out[0]
-    for i in range(w):
-        pull = r[force, i]
-        limit = r[limits, i]
-        v = a[V, i]
-        size = abs(pull)
-        excess = size - limit
-        still = v == 0.0
-        towards = pull if still else v
-        divisor = (size if size > 0.0 else 1.0) if still else abs(v)
-        way = towards / divisor
-        rub = limit * way
-        slips = (pull - rub) / a[MASS, i]
-        holds = still and size <= limit
-        a[BEFORE, i] = excess
-        a[AFTER, i] = excess
-        a[WAY, i] = way
-        a[F1, i] = rub
-        a[K1, i] = 0.0 if holds else slips
-        block.n[STICKS, i] = 1 if holds else 0
-
-
-def during_on_a_line(program: Program, block: Block, w: int, to: int, rub_to: int) -> None:
-    """`during` for one coordinate and no ground."""
-    a = block.a
-    r = block.r
-    limits = program.rows[OUT_LIMIT]
-    force = program.out[0]
-    for i in range(w):
-        pull = r[force, i]
-        limit = r[limits, i]
-        rub = limit * a[WAY, i]
-        slips = (pull - rub) / a[MASS, i]
-        a[AFTER, i] = abs(pull) - limit
-        a[rub_to, i] = rub
-        a[to, i] = 0.0 if block.n[STICKS, i] != 0 else slips
-
-
-def during(program: Program, block: Block, w: int, to: int, rub_to: int) -> None:
-    """Accelerations, into rows `to`, within the step that was begun last."""
-    execute(program.code, program.ends[1], program.ends[2], block.r, w)
-    if program.flags[DRY] == 0:
-        free(program, block, w, to)
-        return
-    if program.flags[DIMENSIONS] == 1 and program.flags[BOUNCES] == 0:
-        during_on_a_line(program, block, w, to, rub_to)
-        return
-    for i in range(w):
-        in_space(program, block, i, to, rub_to)
-
-
-def in_space(program: Program, block: Block, i: int, to: int, rub_to: int) -> None:
-    """`during` for a lane of several coordinates."""
-    a = block.a
-    d = program.flags[DIMENSIONS]
-    velocity = program.rows[IN_V]
-    limit = block.r[program.rows[OUT_LIMIT], i]
-    pulled(program, block, i, to)
-    a[AFTER, i] = length(a, to, d, i) - limit
-    # The direction may turn within the step, but not over to the other side: that is a reversal,
-    # which the step is cut for.
-    square = 0.0
-    for k in range(d):
-        square += block.r[velocity + k, i] * block.r[velocity + k, i]
-    speed = np.sqrt(square)
-    along = 0.0
-    for k in range(d):
-        way = a[WAY + k, i]
-        unit = block.r[velocity + k, i] / speed if speed > 0.0 else way
-        a[rub_to + k, i] = unit
-        along += unit * way
-    side = -1.0 if along < 0.0 else 1.0
-    for k in range(d):
-        rub = limit * (a[rub_to + k, i] * side)
-        a[rub_to + k, i] = rub
-        slips = (a[to + k, i] - rub) / a[MASS, i]
-        a[to + k, i] = 0.0 if block.n[STICKS, i] != 0 else slips
-
-
-def pulled(program: Program, block: Block, i: int, to: int) -> None:
-    """Forces but for dry friction, without what the ground takes."""
-    d = program.flags[DIMENSIONS]
-    for k in range(d):
-        block.a[to + k, i] = block.r[program.out[k], i]
-    if block.n[RESTS, i] != 0:
-        # The ground pushes and does not pull: what lifts the lane is left to it.
-        up = to + d - 1
-        block.a[up, i] = larger(block.a[up, i], 0.0)
-
-
-def free(program: Program, block: Block, w: int, to: int) -> None:
-    """Accelerations without dry friction, into rows `to`."""
-    a = block.a
-    d = program.flags[DIMENSIONS]
-    for k in range(d):
-        force = program.out[k]
-        row = to + k
-        for i in range(w):
-            a[row, i] = block.r[force, i] / a[MASS, i]
-    if program.flags[BOUNCES] != 0:
-        up = to + d - 1
-        for i in range(w):
-            if block.n[RESTS, i] != 0:
-                a[up, i] = larger(block.r[program.out[d - 1], i], 0.0) / a[MASS, i]
-
-
-def stays(program: Program, work: Work, block: Block, i: int) -> bool:
-    """Keep the state of a lane that begins a step behind a sample; whether it has more to do."""
-    a = block.a
-    n = block.n
-    d = program.flags[DIMENSIONS]
-    step = n[STEP, i]
-    if n[BEGINS, i] != 0:
-        n[BEGINS, i] = 0
-        if step % work.every == 0:
-            record = step // work.every
-            for k in range(d):
-                work.kept[n[LANE, i], record, k] = a[X + k, i]
-                work.kept[n[LANE, i], record, d + k] = a[V + k, i]
-                work.kept[n[LANE, i], record, 2 * d + k] = a[K1 + k, i]
-        if step == work.steps.shape[1]:
-            return False
-    if work.patience < np.inf and a[LEFT, i] > 0.0:
-        a[TAKEN, i] += 1.0
-        if a[TAKEN, i] > work.patience * work.planned[n[LANE, i]]:
-            # Lost lanes are told by the last state that was kept.
-            work.kept[n[LANE, i], work.kept.shape[1] - 1, :] = np.nan
-            return False
-    return True
 
 
 def attempt(program: Program, block: Block, w: int) -> None:
@@ -520,18 +290,3 @@ def settle(program: Program, work: Work, block: Block, i: int) -> None:
         n[RESTS, i] = 0
     if a[LEFT, i] <= 0.0:
         go_on(program, work, block, i)
-
-
-def go_on(program: Program, work: Work, block: Block, i: int) -> None:
-    """The lane's next step."""
-    a = block.a
-    n = block.n
-    row = n[LANE, i] if work.steps.shape[0] > 1 else 0
-    step = n[STEP, i] + 1
-    n[STEP, i] = step
-    n[BEGINS, i] = 1
-    n[EVENTS, i] = 0
-    a[STARTS, i] += work.steps[row, step - 1]
-    a[T, i] = a[STARTS, i]
-    a[LEFT, i] = work.steps[row, step] if step < work.steps.shape[1] else 0.0
-    feel(program, work, block, i)

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Numbers = NDArray[np.float64]
+Row = NDArray[np.float64]
+"""One number a lane."""
 Table = NDArray[np.int64]
 
 WIDTH = 32
@@ -125,3 +127,43 @@ def room(registers: int) -> Block:
     """A block of this size."""
     r = np.zeros((registers, WIDTH))
     return Block(r, np.zeros((ROWS, WIDTH)), np.zeros((WHOLE, WIDTH), dtype=np.int64))
+
+
+def check(
+    program: Program, work: Work, block: Block, w: int, spans: Numbers, parts: Numbers
+) -> None:
+    """See that all arrays are as their classes say, for code that does not look.
+
+    Raises:
+        ValueError: one is not.
+    """
+    lanes, d = work.x.shape
+    chosen, columns = work.parameters.shape
+    steps = work.steps.shape[1]
+    rows = program.rows
+    whole = [
+        *((program.code, (len(program.code), 5)), (program.ends, (4,)), (rows, (11,))),
+        *((program.out, (d,)), (program.flags, (4,))),
+        *((work.order, (chosen,)), (block.n, (WHOLE, WIDTH))),
+    ]
+    real = [
+        *((work.parameters, (chosen, columns)), (work.x, (lanes, d)), (work.v, (lanes, d))),
+        *((work.mass, (lanes,)), (work.longest, (lanes,)), (work.planned, (lanes,))),
+        *((spans, (lanes,)), (parts, (lanes,)), (work.ground, (4, lanes))),
+        (work.steps, (1 if len(work.steps) == 1 else lanes, steps)),
+        (work.inputs, (len(work.inputs), 1 if work.inputs.shape[1] == 1 else lanes, steps)),
+        (work.kept, (lanes, steps // work.every + 1, 3 * d)),
+        *((block.r, (len(block.r), WIDTH)), (block.a, (ROWS, WIDTH))),
+    ]
+    for arrays, kind in ((whole, np.int64), (real, np.float64)):
+        for array, shape in arrays:
+            if array.shape != shape or array.dtype != kind or not array.flags.c_contiguous:
+                raise ValueError(f"expected {shape} {kind.__name__}, found {array.shape}")
+    groups = rows[IN_V] - rows[IN_X], rows[IN_P] - rows[IN_U], rows[IN_E] - rows[IN_P]
+    if (
+        groups != (d, len(work.inputs), columns)
+        or not (1 <= w <= WIDTH and 1 <= d <= LARGEST and chosen and steps)
+        or not 0 <= work.order.min() <= work.order.max() < lanes
+        or program.code.max(initial=0) >= len(block.r)
+    ):
+        raise ValueError("the program is not one for these lanes")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from threading import Lock
 
 import numpy as np
 
@@ -12,29 +13,47 @@ from sims.base import Array
 from sims.engines.batch.field import Field
 from sims.engines.batch.parts import take
 from sims.engines.compiled import evaluate
-from sims.engines.compiled.kinds import IN_P, IN_T, IN_U, IN_V, IN_X, OUT_LIMIT, room
+from sims.engines.compiled.kinds import (
+    IN_E,
+    IN_MU,
+    IN_P,
+    IN_SPEED,
+    IN_T,
+    IN_U,
+    IN_V,
+    IN_X,
+    OUT_E,
+    OUT_LIMIT,
+    OUT_MU,
+    room,
+)
+from sims.engines.compiled.nodes import UntracedError
 from sims.engines.compiled.program import Model, Names, Tracing
-from sims.engines.compiled.traced import UntracedError
 from sims.engines.ground import Indices
-from sims.system import Effect, Lanes, System
+from sims.system import Contact, Effect, Lanes, System
 
 _tracings: dict[tuple[type[System], Names], Tracing | None] = {}
 _effects: dict[tuple[type[System], Names, type[Effect]], bool] = {}
+_lock = Lock()
 _TOLERANCE = 1e-9
 """Share of the largest number by which a program may differ from what it was traced from."""
+_PLAIN = 0.6, 0.2
+"""Restitution and friction of the ground, to ask effects with."""
 
 
 def model(lanes: Lanes, chosen: Indices, effects: Sequence[Effect]) -> Model | None:
     """The program for the lanes `chosen`, on which these effects act; None if it does not
     compile.
     """
-    tracing = _traced(lanes, chosen)
-    if tracing is None:
-        return None
-    for effect in effects:
-        if not _compiles(tracing, effect, lanes, chosen):
+    # One thread at a time: what another has half traced must not pass for what does not compile.
+    with _lock:
+        tracing = _traced(lanes, chosen)
+        if tracing is None:
             return None
-    return tracing.model(effects)
+        for effect in effects:
+            if not _compiles(tracing, effect, lanes, chosen):
+                return None
+        return tracing.model(effects)
 
 
 def _traced(lanes: Lanes, chosen: Indices) -> Tracing | None:
@@ -102,6 +121,8 @@ def _check(
             _same(force, field.force(time, x, v)[0])
             if field.dry:
                 _same(limit, field.limit(time, x, v)[0])
+        for speed in (0.3, 2.0):
+            _same(_struck(made, r, speed), _strikes(there, speed))
 
 
 def _registers(made: Model, one: Lanes, inputs: Mapping[str, Array]) -> Array:
@@ -111,6 +132,8 @@ def _registers(made: Model, one: Lanes, inputs: Mapping[str, Array]) -> Array:
     r[made.first : made.first + len(made.constants)] = made.constants
     columns = [one.theta, *one.constants.values(), *(c[:, :, 0].T for _, c in one.effects)]
     parameters = np.concatenate(columns, axis=1)[0]
+    if parameters.size != rows[IN_E] - rows[IN_P]:
+        raise UntracedError("its constants or coefficients are not one number each")
     r[rows[IN_P] : rows[IN_P] + parameters.size] = parameters[:, None]
     for k, values in enumerate(inputs.values()):
         r[rows[IN_U] + k] = values
@@ -126,6 +149,27 @@ def _at(made: Model, r: Array, t: float, x: Array, v: Array) -> tuple[Array, Arr
     r[rows[IN_V] : rows[IN_V] + v.size, 0] = v
     evaluate.execute(made.program.code, made.program.ends[1], made.program.ends[2], r, 1)
     return r[made.program.out, 0], r[rows[OUT_LIMIT], :1]
+
+
+def _struck(made: Model, r: Array, speed: float) -> Array:
+    """Restitution and friction (2,) of an impact, by the program."""
+    rows = made.program.rows
+    r[rows[IN_E]], r[rows[IN_MU]], r[rows[IN_SPEED]] = *_PLAIN, speed
+    evaluate.execute(made.program.code, made.program.ends[2], made.program.ends[3], r, 1)
+    found: Array = r[rows[[OUT_E, OUT_MU]], 0]
+    return found
+
+
+def _strikes(effects: Sequence[tuple[Effect, Array]], speed: float) -> Array:
+    """The same by the arrays."""
+    e, mu = (np.full((1, 1), value) for value in _PLAIN)
+    for effect, c in effects:
+        if isinstance(effect, Contact):
+            own = c[:, :1]
+            e = effect.restitution(own, e, np.full((1, 1), speed))
+            mu = mu + effect.friction(own)
+    found: Array = np.concatenate([e, mu], axis=1)[0]
+    return found
 
 
 def _same(found: Array, expected: Array) -> None:

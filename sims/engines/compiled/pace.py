@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from sims.engines.batch import pace
-from sims.engines.compiled.advance import load, present
+from sims.engines.compiled.clock import load
+from sims.engines.compiled.dynamics import present
 from sims.engines.compiled.evaluate import execute, larger
 from sims.engines.compiled.kinds import (
     ASKED,
@@ -19,8 +20,8 @@ from sims.engines.compiled.kinds import (
     PEAK,
     RUBBED,
     Block,
-    Numbers,
     Program,
+    Row,
     V,
     Work,
     X,
@@ -33,7 +34,7 @@ SHARE = pace.TURN / pace.DECAY
 
 
 def divide(
-    program: Program, work: Work, block: Block, w: int, spans: Numbers, turn: float, parts: Numbers
+    program: Program, work: Work, block: Block, w: int, spans: Row, turn: float, parts: Row
 ) -> None:
     """Raise `parts` (L,) to those in which steps of `spans` (L,) seconds must be made; w slots."""
     instants = INSTANTS if work.inputs.shape[0] > 0 else 1
@@ -41,7 +42,7 @@ def divide(
         for i in range(w):
             load(program, work, block, i, min(first + i, work.order.size - 1))
             if instants > 1:
-                choose(work, block, i, first == 0)
+                choose(work, block, i)
         execute(program.code, program.ends[0], program.ends[1], block.r, w)
         for instant in range(instants):
             if instants > 1:
@@ -58,11 +59,11 @@ def divide(
                         parts[lane] = min(needed, DIVISIONS)
 
 
-def choose(work: Work, block: Block, i: int, first: bool) -> None:
+def choose(work: Work, block: Block, i: int) -> None:
     """Set at which steps of its own a lane's inputs are asked for; waiting does not count."""
     n = block.n
     shared = work.steps.shape[0] == 1
-    if shared and not (first and i == 0):
+    if shared and i > 0:
         for k in range(INSTANTS):
             n[ASKED + k, i] = n[ASKED + k, 0]
         return

@@ -13,7 +13,8 @@ import numpy as np
 
 from sims.engines.compiled.graph import CODES, IMPACT, LANE, MOMENT, Graph, Node
 from sims.engines.compiled.kinds import LARGEST, WIDTH, Numbers, Program
-from sims.engines.compiled.traced import Traced, UntracedError
+from sims.engines.compiled.nodes import UntracedError, constants
+from sims.engines.compiled.traced import Traced
 from sims.system import Contact, Effect, Force, Friction, Moment, System
 
 MOST = 4000
@@ -155,7 +156,7 @@ class Tracing:
     def _shaped(self, values: Any, shape: tuple[int, int]) -> Traced:
         """What an array function gave back, in the shape that it should have."""
         if not isinstance(values, Traced):
-            values = Traced(self.graph, _constants(self.graph, values))
+            values = Traced(self.graph, constants(self.graph, values))
         return Traced(self.graph, np.broadcast_to(values.nodes, shape))
 
 
@@ -240,14 +241,6 @@ def _vector(graph: Graph, size: int, changes: int) -> Any:
     for k in range(size):
         nodes[0, k] = graph.input(changes)
     return Traced(graph, nodes)
-
-
-def _constants(graph: Graph, values: Any) -> Any:
-    numbers = np.asarray(values, dtype=np.float64)
-    nodes = np.empty(numbers.shape, dtype=object)
-    for place in np.ndindex(numbers.shape):
-        nodes[place] = graph.constant(float(numbers[place]))
-    return nodes
 
 
 def _nodes(*arrays: Traced) -> list[Node]:

@@ -35,7 +35,8 @@ class _Job:
         self._machine = machine
         count, dimensions = lanes.x.shape
         shared = lanes.steps.strides[0] == 0
-        self._steps = np.ascontiguousarray(lanes.steps[:1] if shared else lanes.steps)
+        steps = lanes.steps[:1] if shared else lanes.steps
+        self._steps = np.ascontiguousarray(steps, dtype=np.float64)
         ones = np.ones(count)
         self._spans = self._steps.max(axis=1, initial=0.0) * ones
         self._planned = np.count_nonzero(self._steps, axis=1) * ones
@@ -70,7 +71,7 @@ class _Job:
         width = min(WIDTH, -(-chosen.size // _EIGHT) * _EIGHT)
         work = Work(
             order=chosen.astype(np.int64),
-            parameters=np.ascontiguousarray(parameters),
+            parameters=np.ascontiguousarray(parameters, dtype=np.float64),
             mass=self._mass,
             x=self._x,
             v=self._v,

@@ -13,33 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from sims.engines.compiled.graph import CODES, Graph, Node
-
-_OTHERWISE_NAMED = {
-    "true_divide": "divide",
-    "fabs": "absolute",
-    "bitwise_and": "logical_and",
-    "bitwise_or": "logical_or",
-    "invert": "logical_not",
-    "fmax": "maximum",
-    "fmin": "minimum",
-    "float_power": "power",
-}
-"""Functions that do the same to what is traced, but for where there is no number."""
-_SWAPPED = {"greater": "less", "greater_equal": "less_equal"}
-_MASKS = {
-    *("less", "less_equal", "equal", "not_equal", "logical_and", "logical_or", "logical_not"),
-}
-_MOVING = {
-    *("concatenate", "stack", "hstack", "vstack", "column_stack", "broadcast_to", "reshape"),
-    *("transpose", "moveaxis", "squeeze", "expand_dims", "copy", "tile", "repeat", "roll", "flip"),
-    *("split", "atleast_1d", "atleast_2d", "take", "broadcast_arrays", "swapaxes", "ravel"),
-}
-"""Functions that move elements and do nothing else."""
-
-
-class UntracedError(TypeError):
-    """Something that cannot be traced."""
+from sims.engines.compiled.graph import Graph, Node
+from sims.engines.compiled.nodes import (
+    MASKS,
+    MOVING,
+    OTHERWISE_NAMED,
+    SWAPPED,
+    UntracedError,
+    array,
+    combined,
+    constants,
+    one,
+)
 
 
 class Traced(NDArrayOperatorsMixin):
@@ -122,7 +107,7 @@ class Traced(NDArrayOperatorsMixin):
         _check_place(place)
         found = self.nodes[place]
         if isinstance(found, Node):
-            found = _one(found)
+            found = one(found)
         return self._like(found)
 
     def __setitem__(self, place: Any, value: Any) -> None:
@@ -157,7 +142,7 @@ class Traced(NDArrayOperatorsMixin):
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         name = func.__name__
-        if name in _MOVING:
+        if name in MOVING:
             return _wrapped(self.graph, func(*_bare(self.graph, args), **kwargs))
         known = _FUNCTIONS.get(name)
         if known is None:
@@ -172,23 +157,12 @@ class Traced(NDArrayOperatorsMixin):
             whole = self.reshape(-1)._reduced(operation, 0, False)
             return whole.reshape((1,) * self.ndim) if keepdims else whole
         parts = list(np.moveaxis(self.nodes, axis, 0))
-        total = Traced(self.graph, _array(parts[0]))
+        total = Traced(self.graph, array(parts[0]))
         for part in parts[1:]:
-            total = _elementwise(self.graph, operation, (total, Traced(self.graph, _array(part))))
+            total = _elementwise(self.graph, operation, (total, Traced(self.graph, array(part))))
         if keepdims:
             total = total._like(np.expand_dims(total.nodes, axis))
         return total
-
-
-def _one(node: Node) -> Any:
-    """A node as an array without dimensions."""
-    result = np.empty((), dtype=object)
-    result[()] = node
-    return result
-
-
-def _array(nodes: Any) -> Any:
-    return _one(nodes) if isinstance(nodes, Node) else nodes
 
 
 def _check_place(place: Any) -> None:
@@ -199,16 +173,8 @@ def _check_place(place: Any) -> None:
 
 
 def _lifted(graph: Graph, value: Any) -> Any:
-    """Numbers as nodes."""
-    if isinstance(value, Traced):
-        return value.nodes
-    numbers = np.asarray(value)
-    if numbers.dtype.kind not in "biuf":
-        raise UntracedError(f"{type(value).__name__} is not traced")
-    result = np.empty(numbers.shape, dtype=object)
-    for place in np.ndindex(numbers.shape):
-        result[place] = graph.constant(float(numbers[place]))
-    return result
+    """What is traced, or numbers, as nodes."""
+    return value.nodes if isinstance(value, Traced) else constants(graph, value)
 
 
 def _elementwise(graph: Graph, name: str, args: Sequence[Any]) -> Traced:
@@ -222,19 +188,14 @@ def _elementwise(graph: Graph, name: str, args: Sequence[Any]) -> Traced:
         short = _power(graph, args[0], float(args[1]))
         if short is not None:
             return short
-    if name in _SWAPPED:
-        return _elementwise(graph, _SWAPPED[name], args[::-1])
-    name = _OTHERWISE_NAMED.get(name, name)
-    if name not in CODES:
-        raise UntracedError(f"numpy.{name} is not traced")
+    if name in SWAPPED:
+        return _elementwise(graph, SWAPPED[name], args[::-1])
+    name = OTHERWISE_NAMED.get(name, name)
     masks = [isinstance(arg, Traced) and arg.mask for arg in args]
-    if all(masks) and name not in _MASKS:
+    if all(masks) and name not in MASKS:
         raise UntracedError(f"numpy.{name} of truth values is not traced")
-    lifted: Any = np.broadcast_arrays(*(_array(_lifted(graph, arg)) for arg in args))
-    result = np.empty(lifted[0].shape, dtype=object)
-    for place in np.ndindex(result.shape):
-        result[place] = graph.apply(name, *(nodes[place] for nodes in lifted))
-    return Traced(graph, result, name in _MASKS)
+    lifted = [array(_lifted(graph, arg)) for arg in args]
+    return Traced(graph, combined(graph, name, lifted), name in MASKS)
 
 
 def _power(graph: Graph, base: Any, exponent: float) -> Traced | None:
@@ -264,7 +225,7 @@ def _bare(graph: Graph, args: Any) -> list[Any]:
 def _wrapped(graph: Graph, result: Any) -> Any:
     if isinstance(result, list | tuple):
         return type(result)(_wrapped(graph, part) for part in result)
-    return Traced(graph, _array(result))
+    return Traced(graph, array(result))
 
 
 def _graph_of(*args: Any) -> Graph:

@@ -1,0 +1,112 @@
+"""A lane's run in its slot: which step it is in, what it feels there, which states are kept."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.engines.compiled.kinds import (
+    BEGINS,
+    DIMENSIONS,
+    EVENTS,
+    FIRST,
+    FLOOR,
+    GOAL,
+    IN_P,
+    IN_U,
+    K1,
+    LANE,
+    LEFT,
+    LEVEL,
+    LIMIT,
+    LONGEST,
+    MASS,
+    NOTHING,
+    PLACE,
+    STARTS,
+    STEP,
+    TAKEN,
+    TRY,
+    Block,
+    Program,
+    T,
+    V,
+    Work,
+    X,
+)
+
+
+def load(program: Program, work: Work, block: Block, i: int, place: int) -> None:
+    """Put a lane into a slot, at the beginning of its run."""
+    a = block.a
+    n = block.n
+    d = program.flags[DIMENSIONS]
+    lane = work.order[place]
+    for row in range(FIRST):
+        a[row, i] = 0.0
+    n[:, i] = 0
+    n[PLACE, i] = place
+    n[LANE, i] = lane
+    n[GOAL, i] = NOTHING
+    n[BEGINS, i] = 1
+    for k in range(d):
+        a[X + k, i] = work.x[lane, k]
+        a[V + k, i] = work.v[lane, k]
+    a[LONGEST, i] = work.longest[lane]
+    a[LIMIT, i] = work.longest[lane]
+    a[TRY, i] = np.inf
+    a[MASS, i] = work.mass[lane]
+    a[LEVEL, i] = work.ground[FLOOR, lane]
+    a[LEFT, i] = work.steps[lane if work.steps.shape[0] > 1 else 0, 0]
+    first = program.rows[IN_P]
+    for p in range(work.parameters.shape[1]):
+        block.r[first + p, i] = work.parameters[place, p]
+    feel(program, work, block, i)
+
+
+def feel(program: Program, work: Work, block: Block, i: int) -> None:
+    """Set the inputs of the lane's step; behind the last step, the last."""
+    first = program.rows[IN_U]
+    step = min(block.n[STEP, i], work.steps.shape[1] - 1)
+    row = block.n[LANE, i] if work.inputs.shape[1] > 1 else 0
+    for u in range(work.inputs.shape[0]):
+        block.r[first + u, i] = work.inputs[u, row, step]
+
+
+def stays(program: Program, work: Work, block: Block, i: int) -> bool:
+    """Keep the state of a lane that begins a step behind a sample; whether it has more to do."""
+    a = block.a
+    n = block.n
+    d = program.flags[DIMENSIONS]
+    step = n[STEP, i]
+    if n[BEGINS, i] != 0:
+        n[BEGINS, i] = 0
+        if step % work.every == 0:
+            record = step // work.every
+            for k in range(d):
+                work.kept[n[LANE, i], record, k] = a[X + k, i]
+                work.kept[n[LANE, i], record, d + k] = a[V + k, i]
+                work.kept[n[LANE, i], record, 2 * d + k] = a[K1 + k, i]
+        if step == work.steps.shape[1]:
+            return False
+    if work.patience < np.inf and a[LEFT, i] > 0.0:
+        a[TAKEN, i] += 1.0
+        if a[TAKEN, i] > work.patience * work.planned[n[LANE, i]]:
+            # Lost lanes are told by the last state that was kept.
+            work.kept[n[LANE, i], work.kept.shape[1] - 1, :] = np.nan
+            return False
+    return True
+
+
+def go_on(program: Program, work: Work, block: Block, i: int) -> None:
+    """The lane's next step."""
+    a = block.a
+    n = block.n
+    row = n[LANE, i] if work.steps.shape[0] > 1 else 0
+    step = n[STEP, i] + 1
+    n[STEP, i] = step
+    n[BEGINS, i] = 1
+    n[EVENTS, i] = 0
+    a[STARTS, i] += work.steps[row, step - 1]
+    a[T, i] = a[STARTS, i]
+    a[LEFT, i] = work.steps[row, step] if step < work.steps.shape[1] else 0.0
+    feel(program, work, block, i)
