@@ -70,9 +70,11 @@ def main() -> None:
 
 def translated() -> tuple[str, str]:
     """The machine's intermediate code and the name of the function in it."""
-    import numba
-    from numba import types
+    import numba as typed
 
+    # Half of it has types, and says of the other half that it has none.
+    numba: Any = typed
+    types = numba.types
     space: dict[str, Any] = {}
     for module in (*MODULES, entry):
         space.update({k: v for k, v in vars(module).items() if not k.startswith("__")})
