@@ -1,39 +1,113 @@
-"""How the cost of explain grows: ``python -m tests.benchmarks.explain_cost [--out DIR]``.
+"""How the cost of explain grows: ``OMP_NUM_THREADS=1 python -m tests.benchmarks.explain_cost [--out
+DIR] [--score]``.
 
-Seconds of processor time on one core against runs, samples and candidates, of recordings with a
-hidden friction; slopes are of a line through the logarithms, so 1 is proportional. Writes cost.csv
-and the figure cost.png|pdf.
+Seconds of processor time on one core against samples, runs and candidates: of the score alone, with
+its surrogates, on made-up directions (two of each candidate), and of a whole diagnosis of
+recordings with a hidden friction. Exponents are slopes of a line through the logarithms of the
+larger half of each row, so 1 is proportional. Writes cost.csv and the figure cost.png|pdf;
+``--score`` measures the score alone.
 """
 
 import argparse
+import gc
 import tempfile
 import time
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from bench.gap import explain as explaining
+from bench.gap.causes.candidates import Directions, Probe
+from bench.gap.causes.score_test import ScoreTest
+from bench.gap.model.noise import Noise
+from bench.gap.model.surrogates import surrogates
 from bench.gap.model.world import World
 from sims import effects
+from sims.slider.system import SliderSystem
+from tests.bench.gap.made import linear_fit
 from tests.wishes import Wish, write
 
 USUAL = Wish(
     "slider", effects=["friction.coulomb=0.3"], noise=["0.005"], observe=["x"], engine="mujoco"
 )
-RUNS, SAMPLES, CANDIDATES = (3, 6, 12, 24), (100, 200, 400, 800), (6, 12, 18, 24)
+SCORED = {
+    "samples": (100, 300, 1_000, 3_000, 10_000, 30_000, 100_000),
+    "candidates": (5, 10, 30, 100, 300),
+    "runs": (1, 3, 10, 30, 100),
+}
+EXPLAINED = {
+    "samples": (100, 400, 1_600, 6_400, 25_600, 100_000),
+    "candidates": (6, 12, 18, 24),
+    "runs": (3, 10, 30, 100),
+}
+RUNS, SAMPLES, CANDIDATES, SURROGATES = 4, 1_600, 24, 120
 
 
-def seconds(wish, candidates=None):
-    """Processor seconds of explain on a recording, the least of two."""
+def problem(samples, candidates, runs):
+    """A fit with a parameter and two initial states a run, two smooth directions of each candidate,
+    and residuals that remember.
+    """
+    rng = np.random.default_rng(0)
+    length = samples // runs
+    times = np.linspace(0.0, 1.0, length)
+    jacobian = np.stack([times**2, np.ones(length), times], axis=1)
+    jacobian = np.tile(jacobian[None, :, None], (runs, 1, 1, 1))
+    jacobian[..., 0] *= rng.normal(size=(runs, 1, 1))
+    rates = np.linspace(1.0, 30.0, candidates)
+    waves = [turn(rate * times) for rate in rates for turn in (np.sin, np.cos)]
+    values = (
+        rng.normal(size=(len(waves), runs))[:, :, None, None] * np.stack(waves)[:, None, :, None]
+    )
+    probes = [Probe(f"effect {k // 2}", 0, k % 2, np.ones(2), True) for k in range(len(waves))]
+    residual = np.cumsum(rng.normal(size=(runs, length, 1)), axis=1)
+    residual -= residual.mean(axis=1, keepdims=True)
+    return linear_fit(jacobian, 1), Directions(tuple(probes), np.moveaxis(values, 0, -1)), residual
+
+
+def scoring(samples=SAMPLES, candidates=CANDIDATES, runs=RUNS):
+    """Processor seconds of scoring once, with surrogates: the least of three."""
+    fit, directions, residual = problem(samples, candidates, runs)
+    best = np.inf
+    for _ in range(3):
+        gc.collect()
+        begin = time.process_time()
+        _scored(fit, directions, residual)
+        best = min(best, time.process_time() - begin)
+    return best
+
+
+def _scored(fit, directions, residual):
+    seen = np.ones(residual.shape, dtype=bool)
+    meaningless = surrogates(residual, seen, SURROGATES, np.random.default_rng(1))
+    test = ScoreTest(fit, directions, seen, Noise(np.ones(1), np.zeros(1)))
+    return test.scores(residual, meaningless)
+
+
+def memory(samples, candidates):
+    """Megabytes of the directions, and what scoring takes on top at most."""
+    fit, directions, residual = problem(samples, candidates, RUNS)
+    tracemalloc.start()
+    _scored(fit, directions, residual)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return directions.values.nbytes / 1e6, peak / 1e6
+
+
+def explained(samples=SAMPLES, candidates=None, runs=RUNS):
+    """Processor seconds of explain on a recording: the least of two, of a long one the only."""
     usual, best = explaining.World, np.inf
     if candidates is not None:
-        explaining.World = lambda *given, **more: World(*given, **more, candidates=candidates)
+        names = [n for n in effects.names() if effects.get(n).fits(SliderSystem)]
+        names.sort(key=lambda name: name != "friction.coulomb")
+        chosen = names[:candidates]
+        explaining.World = lambda *given, **more: World(*given, **more, candidates=chosen)
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "data.csv"
-            write(wish, path)
-            for _ in range(2):
+            write(replace(USUAL, runs=runs, seconds=samples / runs / 100.0), path)
+            for _ in range(2 if samples < 10 * SAMPLES else 1):
                 begin = time.process_time()
                 explaining.explain(path)
                 best = min(best, time.process_time() - begin)
@@ -42,39 +116,48 @@ def seconds(wish, candidates=None):
     return best
 
 
-def measured():
-    """Rows (what, how much, seconds)."""
-    rows = [("runs", n, seconds(replace(USUAL, runs=n))) for n in RUNS]
-    rows += [("samples a run", n, seconds(replace(USUAL, seconds=n / 100.0))) for n in SAMPLES]
-    names = [n for n in effects.names() if effects.get(n).fits(_slider())]
-    names.sort(key=lambda n: n != "friction.coulomb")
-    rows += [("candidates", n, seconds(USUAL, names[:n])) for n in CANDIDATES]
-    return rows
-
-
-def _slider():
-    from sims.slider.system import SliderSystem
-
-    return SliderSystem
+def measured(score_alone):
+    """Rows (of what, against what, how much, seconds); more runs are of the usual length."""
+    asked = [("score", scoring, SCORED)]
+    if not score_alone:
+        explained()  # the first call loads and traces
+        asked.append(("explain", explained, EXPLAINED))
+    for part, cost, counts in asked:
+        for what, numbers in counts.items():
+            for number in numbers:
+                given = {what: number}
+                if what == "runs":
+                    given["samples"] = SAMPLES // RUNS * number
+                row = part, what, number, cost(**given)
+                print(*row[:3], f"{row[3]:.4f} s", flush=True)
+                yield row
 
 
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--out", type=Path, default=Path("results/reference/explain-cost"))
-    out = parser.parse_args().out
-    out.mkdir(parents=True, exist_ok=True)
-    rows = measured()
-    (out / "cost.csv").write_text(
-        "what,count,seconds\n" + "".join(f"{w},{n},{s:.3f}\n" for w, n, s in rows)
-    )
-    _draw(rows, out)
-    for what in dict.fromkeys(w for w, _, _ in rows):
-        print(f"{what}: slope {_slope(rows, what):.2f}")
+    parser.add_argument("--score", action="store_true", help="the score alone")
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    rows = list(measured(given.score))
+    lines = [f"{part},{what},{count},{seconds:.5f}\n" for part, what, count, seconds in rows]
+    (given.out / "cost.csv").write_text("part,what,count,seconds\n" + "".join(lines))
+    _draw(rows, given.out)
+    for part, what in dict.fromkeys(row[:2] for row in rows):
+        print(f"{part} against {what}: exponent {_slope(rows, part, what):.2f}")
+    held, peak = memory(100_000, 300)
+    print(f"100,000 samples, 300 candidates: directions {held:.0f} MB, scoring {peak:.0f} MB more")
 
 
-def _slope(rows, what):
-    counts, costs = np.array([(n, s) for w, n, s in rows if w == what]).T
-    return float(np.polyfit(np.log(counts), np.log(costs), 1)[0])
+def _of(rows, part, what):
+    return np.array([(n, s) for p, w, n, s in rows if (p, w) == (part, what)]).T
+
+
+def _slope(rows, part, what):
+    """Of the larger half: below it what every call costs hides how the rest grows."""
+    counts, costs = _of(rows, part, what)
+    upper = slice(counts.size // 2, None)
+    return float(np.polyfit(np.log(counts[upper]), np.log(costs[upper]), 1)[0])
 
 
 def _draw(rows, out):
@@ -83,19 +166,20 @@ def _draw(rows, out):
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    kinds = list(dict.fromkeys(w for w, _, _ in rows))
-    figure, axes = plt.subplots(1, len(kinds), figsize=(10, 3.2), sharey=True, layout="constrained")
+    kinds = list(dict.fromkeys(what for _, what, _, _ in rows))
+    figure, axes = plt.subplots(1, len(kinds), figsize=(10, 3.4), sharey=True, layout="constrained")
+    parts = list(dict.fromkeys(part for part, *_ in rows))
     for axis, what in zip(axes, kinds, strict=True):
-        counts, costs = np.array([(n, s) for w, n, s in rows if w == what]).T
-        axis.loglog(counts, costs, "ko-", markersize=5)
-        axis.loglog(counts, costs[0] * counts / counts[0], "k:", linewidth=1)
-        axis.set_xticks(counts, [f"{n:g}" for n in counts])
-        axis.minorticks_off()
+        for part, marker in zip(parts, "os", strict=False):
+            counts, costs = _of(rows, part, what)
+            label = f"{part}, exponent {_slope(rows, part, what):.2f}"
+            axis.loglog(counts, costs, f"k{marker}-", markersize=4, label=label)
+            axis.loglog(counts, costs[-1] * counts / counts[-1], "k:", linewidth=1)
         axis.set_xlabel(what)
-        axis.set_title(f"slope {_slope(rows, what):.2f}", fontsize=10)
+        axis.legend(frameon=False, fontsize=8)
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("processor time [s]")
-    figure.suptitle("Cost of explain, one core; dotted: proportional", fontsize=11)
+    figure.suptitle("Cost of a score and of explain, one core; dotted: proportional", fontsize=11)
     for ending in ("png", "pdf"):
         figure.savefig(out / f"cost.{ending}", dpi=150)
     plt.close(figure)

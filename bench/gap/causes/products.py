@@ -207,6 +207,32 @@ class Design:
             _gather(cross, some, left, place)
         return squares, shared, cross
 
+    def left(self, residuals: Array) -> Array:
+        """What a fit of all that the model may absorb, by least squares, leaves of residuals
+        (S, R, T, C).
+        """
+        known = self.reduced(0.0)
+        q = self._own
+        weighted = self._jacobian * self._weights
+        shared = np.stack(
+            [
+                _flat(own) @ _flat(residuals[:, run] * self._weights[run]).T
+                for run, own in enumerate(np.moveaxis(weighted, 1, 0))
+            ]
+        )
+        by_states, by_own = _taken(known, shared)
+        # Backwards: coefficients of the parameters, then of each run's initial states.
+        parameters = known.own @ by_own
+        rest = by_states - known.by_states[:, :q] @ parameters
+        runs, size, _ = known.states.shape
+        states = known.states @ rest.reshape(runs, size, len(residuals))
+        result = np.empty_like(residuals)
+        for run in range(runs):
+            coefficients = np.concatenate([parameters, states[run]])
+            followed = coefficients.T @ _flat(self._jacobian[:, run])
+            result[:, run] = residuals[:, run] - followed.reshape(residuals[:, run].shape)
+        return np.where(self._weights > 0, result, 0.0)
+
     def reduced(self, phi: float) -> _Reduced:
         """Whitened by a correlation, without what is absorbed; kept for the next residuals."""
         if phi not in self._known:
@@ -269,11 +295,7 @@ class Products:
         """
         known = self._design.reduced(phi)
         q = len(known.own)
-        shared = self._shared.at(phi)
-        # (2) with the initial states of each run for J, then with the parameters.
-        by_states = _absorbed(known.states, shared[:, q:])
-        left = shared[:, :q].sum(axis=0) - known.by_states[:, :q].T @ by_states
-        by_own = known.own.T @ left
+        by_states, by_own = _taken(known, self._shared.at(phi))
         taken = np.concatenate([by_states, by_own])
         total = self._squares.at(phi) - np.einsum("as,as->s", taken, taken)
         others = np.concatenate([known.by_states[:, q:], known.by_own])
@@ -308,6 +330,22 @@ def _squares(parts: Parts, some: _Columns, place: _Place) -> None:
     parts.whole[...] += np.einsum("kn,kn->k", some.now, some.now)
     parts.mixed[...] += np.einsum("kn,kn->k", some.near, some.now)
     parts.ends[...] += np.einsum("km,km,m->k", some.edge, some.edge, place.lacking)
+
+
+def _flat(values: Array) -> Array:
+    """Rows (k, T, C) with all channels in a row."""
+    return values.reshape(len(values), -1)
+
+
+def _taken(known: _Reduced, shared: Array) -> tuple[Array, Array]:
+    """L'J'e of eq. (2) for initial states (R s, S) and for parameters (q, S), of the products
+    (R, q + s, S) of the Jacobian with residuals.
+    """
+    q = len(known.own)
+    # With the initial states of each run for J, then with the parameters.
+    by_states = _absorbed(known.states, shared[:, q:])
+    left = shared[:, :q].sum(axis=0) - known.by_states[:, :q].T @ by_states
+    return by_states, known.own.T @ left
 
 
 def _absorbed(roots: Array, products: Array) -> Array:

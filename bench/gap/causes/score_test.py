@@ -104,6 +104,10 @@ class ScoreTest:
             phi: 2.0 * log_determinant(seen, np.full(seen.shape[2], phi)) for phi in GRID
         }
 
+    def left(self, residuals: Array) -> Array:
+        """What a fit of the model's own freedom leaves of residuals (S, R, T, C)."""
+        return self._design.left(residuals)
+
     def scores(self, residual: Array, surrogate: Array | None = None) -> Scores:
         """Score a residual.
 
@@ -171,7 +175,8 @@ class _Table:
         """Take a correlation into account, with log det W'W and <e, e> (S,) of eq. (3)."""
         self._phi, self._determinant, self._total = phi, determinant, total
         self._gains[...] = 0.0
-        self._without = np.maximum(self._without, self._value(self._total, self._total))
+        nothing = self._value(total, total)
+        self._without = np.maximum(self._without, nothing)
 
     def _value(self, left: Array, total: Array) -> Array:
         """Eq. (3) of what is left of sums of squares."""

@@ -17,7 +17,8 @@ from bench.gap.causes.nominate import nominated
 from bench.gap.causes.score_test import Scores, ScoreTest, tail
 from bench.gap.model.fit import Fit
 from bench.gap.model.models import Model, Models
-from bench.gap.model.noise import forgets, surrogates
+from bench.gap.model.noise import forgets
+from bench.gap.model.surrogates import surrogates
 from sims.base import Array
 
 SURROGATES = 120
@@ -93,7 +94,7 @@ class Scored(Models):
         residual = self.residual(model.fit)
         # The colour of noise is best known from a model that leaves less structure.
         meaningless = residual if against is None else against
-        surrogate = surrogates(meaningless, self.seen, SURROGATES, self.rng)
+        surrogate = surrogates(meaningless, self.seen, SURROGATES, self.rng, left=test.left)
         scores = test.scores(residual, surrogate)
         self.scanned[key] = Scanned(at, candidates, test, scores)
         self.tests[key] = scores.p_value

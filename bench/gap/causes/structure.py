@@ -27,9 +27,9 @@ import numpy as np
 
 from bench.gap.causes.candidates import Directions, Probe, simulate_with
 from bench.gap.causes.rules import CHANCE, has_structure, is_loud, level_of
-from bench.gap.causes.score_test import score
+from bench.gap.causes.score_test import ScoreTest
 from bench.gap.model.models import Model, Models
-from bench.gap.model.noise import surrogates
+from bench.gap.model.surrogates import surrogates
 from bench.gap.model.world import World
 from sims.base import Array
 from sims.system import Coefficient, Force, Moment
@@ -133,15 +133,10 @@ def remains(models: Models, model: Model) -> Remains:
     if not directions.probes:
         return quick
     residual = models.residual(model.fit)
-    surrogate = surrogates(residual, models.seen, SURROGATES, models.rng)
-    weights = models.weights(model)
-    scores = score(
-        model.fit,
+    test = ScoreTest(model.fit, directions, models.seen, models.weights(model))
+    scores = test.scores(
         residual,
-        directions,
-        models.seen,
-        weights,
-        surrogate,
+        surrogates(residual, models.seen, SURROGATES, models.rng, left=test.left),
     )
     promise = scores.score - scores.chance
     where = scores.effects[int(np.argmax(promise))]

@@ -1,5 +1,4 @@
-"""Sensor noise that remembers: first-order autoregression, how it is taken out, how surrogates of
-it are made.
+"""Sensor noise that remembers: first-order autoregression, and how it is taken out.
 
 Noise e of a channel has variance σ² and correlation φ between neighbouring samples (G. E. P. Box,
 G. M. Jenkins, Time Series Analysis, chapter 3), u being independent of one sample to the next:
@@ -45,16 +44,6 @@ LEAST_SHARE = 0.1
 LAGS = 20
 """Correlations that the portmanteau test adds up."""
 
-BURN_IN = 200
-"""Samples that a surrogate is driven by before it counts, to forget that it began with nothing."""
-RIDGE = 1e-9
-"""Share of the variance added to the Yule-Walker matrix, which a pure tone makes singular."""
-STATIONARY = 0.999
-"""Largest root of an autoregression that is taken, in magnitude: from 1 on it does not die away."""
-GAINED = 1e-9
-"""An order must lower Akaike's criterion by more than this, else rounding would choose it."""
-FEWEST = 10
-"""Innovations from which surrogates are drawn at least; of fewer the samples themselves are."""
 TINY = 1e-300
 """Stands for a variance of zero, whose logarithm and reciprocal there are not."""
 
@@ -245,132 +234,3 @@ def _correlated(w: Array, count: int) -> float:
         # each run has a beginning of its own: so many pairs are lost in every one
         total += correlation**2 / max(count - lag * runs, 1)
     return total
-
-
-def surrogates(
-    residual: Array,
-    seen: Mask,
-    count: int,
-    rng: np.random.Generator,
-    largest: int = 6,
-) -> Array:
-    """Residuals (count, R, T, C) of the same spectrum that mean nothing: a sieve bootstrap.
-
-    Each channel is fitted by an autoregression whose order Akaike's criterion picks, and driven
-    again by its own resampled innovations (P. Buhlmann, Bernoulli 3(2), 123, 1997,
-    doi:10.2307/3318584):
-
-        e_t = Σ_k a_k e_{t-k} + u_t                                                              (6)
-
-    Args:
-        residual: (R, T, C) what a model leaves, zero where nothing was seen.
-        seen: (R, T, C) which samples there are; the surrogates are zero elsewhere.
-        count: how many.
-        rng: draws the innovations.
-        largest: order that an autoregression has at most.
-    """
-    runs, length, channels = residual.shape
-    result = np.zeros((count, runs, length, channels))
-    for c in range(channels):
-        here = seen[:, :, c]
-        weights, innovations = _autoregression(residual[:, :, c], here, largest)
-        drawn = rng.choice(innovations, size=(length + BURN_IN, count, runs))
-        # time comes first in what is driven, and last here
-        driven = np.moveaxis(_driven(weights, drawn)[BURN_IN:], 0, 2)
-        result[:, :, :, c] = np.where(here, driven, 0.0)
-    return result
-
-
-def _driven(weights: Array, innovations: Array) -> Array:
-    """The autoregression (6) of innovations (T, ...), in their place."""
-    order = weights.size
-    if not order:
-        return innovations
-    flat = innovations.reshape(len(innovations), -1)
-    # the oldest first, as samples stand
-    backwards = weights[::-1]
-    # a sample reads those before it, which are finished by then
-    for t in range(1, len(flat)):
-        before = flat[max(t - order, 0) : t]
-        flat[t] += backwards[order - len(before) :] @ before
-    return innovations
-
-
-def _autoregression(values: Array, seen: Mask, largest: int) -> tuple[Array, Array]:
-    """Weights (p,) of an autoregression of values (R, T), and its centred innovations."""
-    filled = np.where(seen, values, 0.0)
-    covariances = _autocovariances(filled, seen, min(largest, seen.shape[1] - 1))
-    weights = _most_plausible(covariances, int(seen.sum()))
-    innovations = _innovations(filled, seen, weights)
-    if innovations.size < FEWEST:
-        samples = filled[seen] if seen.any() else np.zeros(1)
-        return np.zeros(0), samples
-    # a mean of theirs would add up to an offset of the surrogates
-    return weights, innovations - innovations.mean()
-
-
-def _autocovariances(filled: Array, seen: Mask, largest: int) -> Array:
-    """(largest + 1,) covariances of values (R, T) with those so many samples later, lag 0 first."""
-    length = seen.shape[1]
-    covariances = []
-    for lag in range(largest + 1):
-        former, latter = slice(0, length - lag), slice(lag, length)
-        # what is missing adds nothing to the sum, so it must not count either
-        pairs = seen[:, latter] & seen[:, former]
-        products = filled[:, latter] * filled[:, former]
-        covariances.append(float(products.sum()) / max(int(pairs.sum()), 1))
-    return np.array(covariances)
-
-
-def _most_plausible(covariances: Array, count: int) -> Array:
-    """Weights (p,) of the order p that H. Akaike's criterion (1974) picks, n log var u + 2 p."""
-    best = np.inf
-    weights = np.zeros(0)
-    for order in range(len(covariances)):
-        solved, variance = _yule_walker(covariances, order)
-        criterion = count * np.log(max(variance, TINY)) + 2.0 * order
-        if criterion < best - GAINED:
-            best = criterion
-            weights = solved
-    return weights
-
-
-def _innovations(filled: Array, seen: Mask, weights: Array) -> Array:
-    """(n,) the u of (6), where all samples are there that it needs."""
-    order, length = weights.size, seen.shape[1]
-    predicted = np.zeros(1)
-    # a sample and all that it is predicted from
-    complete = seen[:, order:]
-    for k, weight in enumerate(weights, start=1):
-        earlier = slice(order - k, length - k)
-        predicted = predicted + weight * filled[:, earlier]
-        complete = complete & seen[:, earlier]
-    innovations: Array = (filled[:, order:] - predicted)[complete]
-    return innovations
-
-
-def _yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
-    """Weights (p,) of an autoregression from covariances γ, and the variance of its innovations.
-
-    The equations of Yule and Walker (Box & Jenkins, chapter 3):
-
-        Σ_l γ_|k-l| a_l = γ_k,   var u = γ_0 - Σ_k a_k γ_k                                       (7)
-
-    The variance is infinite where (6) would not die away, so that nothing prefers it.
-    """
-    power = covariances[0]
-    # white, or nothing at all
-    if order == 0 or power <= 0:
-        return np.zeros(0), float(power)
-    numbers = np.arange(order)
-    lags = np.abs(numbers[:, None] - numbers)
-    later = covariances[1 : order + 1]
-    # (7), the matrix first
-    matrix = covariances[lags] + RIDGE * power * np.eye(order)
-    weights = np.linalg.solve(matrix, later)
-    variance = float(power - weights @ later)
-    # what (6) makes of one innovation is a sum of powers of these
-    roots = np.roots(np.concatenate([[1.0], -weights]))
-    if variance <= 0 or np.abs(roots).max(initial=0.0) > STATIONARY:
-        return np.zeros(0), np.inf
-    return weights, variance

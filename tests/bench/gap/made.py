@@ -116,3 +116,20 @@ def covariance_of(seen, phi):
         if phi
         else np.eye(time.size)
     )
+
+
+def everything(values):
+    """A mask of samples that are all there."""
+    return np.ones(values.shape, dtype=bool)
+
+
+def holes(shape, share, seed):
+    """A mask of which so large a share is missing."""
+    return np.random.default_rng(seed).random(shape) > share
+
+
+def autocorrelation(values, lag):
+    """Of values (..., T, C), those so many samples apart."""
+    length = values.shape[-2]
+    here, later = values[..., : length - lag, :], values[..., lag:, :]
+    return float((here * later).mean() / np.square(values).mean())

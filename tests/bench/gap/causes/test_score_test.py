@@ -8,7 +8,8 @@ from bench.gap.causes.candidates import Directions, Probe
 from bench.gap.causes.gains import explained, groups
 from bench.gap.causes.products import Design, Products
 from bench.gap.causes.score_test import score, tail
-from bench.gap.model.noise import GRID, Noise, surrogates
+from bench.gap.model.noise import GRID, Noise
+from bench.gap.model.surrogates import surrogates
 from tests.bench.gap.made import correlated, covariance_of, linear_fit
 
 SIGMA = np.array([0.5, 2.0])
@@ -74,6 +75,20 @@ def test_products_are_those_of_whole_matrices(phi, holes):
     assert total[0] == pytest.approx(r @ r, rel=1e-9)
     np.testing.assert_allclose(gram, d.T @ d, rtol=1e-8, atol=1e-9 * np.abs(d.T @ d).max())
     np.testing.assert_allclose(cross[:, 0], d.T @ r, rtol=1e-7)
+
+
+@pytest.mark.parametrize("holes", [0.0, 0.2])
+def test_what_the_models_own_freedom_leaves_is_what_least_squares_leave(holes):
+    jacobian, directions, residual, seen = problem(10, holes)
+    jacobian = np.where(seen[..., None], jacobian, 0.0)
+    design = Design(linear_fit(jacobian, Q), directions, seen, SIGMA, [])
+    noises = np.stack([residual, np.where(seen, residual[::-1], 0.0)])
+    left = design.left(noises)
+    assert (left[:, ~seen] == 0).all()
+    # The long way runs through the samples run by run and channel by channel.
+    order = [left[:, r, seen[r, :, c], c] / SIGMA[c] for r in range(RUNS) for c in range(2)]
+    expected = dense(jacobian, seen, 0.0, np.moveaxis(noises, 0, -1))[0]
+    np.testing.assert_allclose(np.concatenate(order, axis=1).T, expected, atol=1e-9)
 
 
 def probes(signed=True):

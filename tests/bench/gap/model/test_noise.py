@@ -2,22 +2,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from bench.gap.model.noise import Noise, forgets, likelihood, log_determinant, surrogates, whitened
-from tests.bench.gap.made import correlated, covariance_of
-
-
-def everything(values):
-    return np.ones(values.shape, dtype=bool)
-
-
-def holes(shape, share, seed):
-    return np.random.default_rng(seed).random(shape) > share
-
-
-def autocorrelation(values, lag):
-    length = values.shape[-2]
-    here, later = values[..., : length - lag, :], values[..., lag:, :]
-    return float((here * later).mean() / np.square(values).mean())
+from bench.gap.model.noise import Noise, forgets, likelihood, log_determinant, whitened
+from tests.bench.gap.made import autocorrelation, correlated, covariance_of, everything, holes
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.4, 0.9, -0.3])
@@ -121,59 +107,6 @@ def test_a_channel_without_samples_is_left_out():
     assert found.value == likelihood(made[..., :1], seen[..., :1]).value
     assert np.isnan(found.sigma[1])
     assert np.isfinite(found.sigma[0])
-
-
-def test_surrogates_keep_variance_and_autocorrelation():
-    rng = np.random.default_rng(12)
-    made = rng.standard_normal((6, 700, 2))
-    # a second-order autoregression that rings, and white noise beside it
-    ringing = made[:, :, 0]
-    for t in range(2, 700):
-        ringing[:, t] += 1.2 * ringing[:, t - 1] - 0.6 * ringing[:, t - 2]
-    made *= [0.01, 5.0]
-    like = surrogates(made, everything(made), 60, np.random.default_rng(0))
-    assert like.shape == (60, 6, 700, 2)
-    spread = like.std(axis=(0, 1, 2))
-    np.testing.assert_allclose(spread, made.std(axis=(0, 1)), rtol=0.05)
-    for lag in range(1, 9):
-        for c in range(2):
-            kept = autocorrelation(like[..., [c]], lag)
-            own = autocorrelation(made[..., [c]], lag)
-            assert kept == pytest.approx(own, abs=0.05), (lag, c)
-    apart = np.corrcoef(like[:, 0, :, 0])[np.triu_indices(60, 1)]
-    assert abs(apart.mean()) < 0.01, "one surrogate tells nothing of another"
-
-
-def test_surrogates_are_the_same_for_a_seed_and_zero_where_nothing_was_seen():
-    made = correlated(np.random.default_rng(13), 0.6, 1.0, (3, 100, 1))
-    seen = holes(made.shape, 0.2, 14)
-    residual = np.where(seen, made, 0.0)
-    generators = [np.random.default_rng(seed) for seed in (5, 5, 6)]
-    one, two, other = (surrogates(residual, seen, 7, rng) for rng in generators)
-    np.testing.assert_array_equal(one, two)
-    assert not np.array_equal(one, other)
-    assert (one[:, ~seen] == 0).all()
-    assert (one[:, seen] != 0).all()
-
-
-def test_surrogates_have_no_offset_whatever_the_residual_has():
-    made = correlated(np.random.default_rng(15), 0.8, 1.0, (4, 300, 1)) + 2.0
-    like = surrogates(made, everything(made), 80, np.random.default_rng(0))
-    # of 80 x 4 x 300 samples that remember for about nine each
-    assert abs(like.mean()) < 4 * like.std() * 3 / np.sqrt(like.size)
-
-
-def test_surrogates_of_nothing_are_nothing():
-    seen = np.ones((1, 30, 1), dtype=bool)
-    nothing = np.zeros((1, 30, 1))
-    assert not surrogates(nothing, seen, 5, np.random.default_rng(0)).any()
-
-
-def test_surrogates_of_few_samples_are_those_samples():
-    seen = np.ones((1, 3, 1), dtype=bool)
-    values = np.array([1.0, -2.0, 3.0]).reshape(1, 3, 1)
-    few = surrogates(values, seen, 9, np.random.default_rng(0))
-    assert set(np.abs(few).ravel()) <= {1.0, 2.0, 3.0}
 
 
 @pytest.mark.parametrize(("phi", "wave"), [(0.0, 0.5), (0.6, 2.0)])
