@@ -14,6 +14,7 @@ import numpy as np
 
 from bench.gap.causes import rules
 from bench.gap.causes.alternatives import Alternatives, Evidence
+from bench.gap.causes.foresee import sought
 from bench.gap.causes.rules import State, VerdictName, verdict_of, verdict_of_cut
 from bench.gap.causes.search import Search
 from bench.gap.causes.settle import rivals, settle
@@ -102,7 +103,7 @@ class _Inquiry:
             left = remains(search, base)
             return Finding(verdict_of(State(fixed=False)), base, base, (), left, vague)
         self._watch.begin("search")
-        self._model = search.run()
+        self._model = sought(search)
         self._watch.begin("rivals")
         self._model = settle(search, self._model)
         self._try()

@@ -55,9 +55,12 @@ class Search(Moves):
 
     Attributes:
         supported: the model that the data support as far as the search has come.
+        settled: effects of a model that was compared with all its neighbours already, on fewer
+            samples.
     """
 
     supported: Model | None = None
+    settled: frozenset[str] | None = None
     _sketch: Search | None = None
 
     def run(self) -> Model:

@@ -28,13 +28,14 @@ def settle(search: Search, model: Model) -> Model:
     left, which is none and would pull the fit away from the data.
     """
     size = len(model.names)
-    model = _among_all(search, model)
+    if search.settled != frozenset(model.names):
+        model = _among_all(search, model)
     around = list(neighbours(search.world, model.fit))
     # What repeats has minima by the dozen.
     if around:
         search.from_pieces(size)
     near = rivals(search, model)
-    parts = _smaller(search, model)
+    parts = smaller(search, model)
     noise = _noise_of(search, model)
     judged = [model]
     # Where structure is left merits only compare how each model mimics it, so none takes its place.
@@ -81,7 +82,7 @@ def _is_near(search: Search, other: Model, model: Model) -> bool:
     return search.excess(other) < NEARLY * search.excess(model)
 
 
-def _smaller(search: Search, model: Model) -> list[Model]:
+def smaller(search: Search, model: Model) -> list[Model]:
     """The models without one of the effects: the gain of each is measured against them."""
     names = set(model.names)
     size = len(names) - 1

@@ -25,6 +25,8 @@ Indices = NDArray[np.intp]
 LANE_SAMPLES = 400_000
 """Samples simulated in one call of the engine: beyond it more lanes cost memory and gain nothing.
 """
+LEAST_LANES = 64
+"""But so many lanes go together however long they are: the engine steps them side by side."""
 TIME_STEP = 0.01
 """Longest step of the batch engine, seconds; it shortens its steps itself where motion or forces
 ask for it.
@@ -240,14 +242,14 @@ class World:
         """
         self.simulations += len(theta)
         _, length, channels = self.observed.shape
-        result = np.full((len(theta), length, channels), np.nan)
+        result = np.empty((len(theta), length, channels))
 
         # the slowest lane of a call sets its steps: those that need many do not go with the others
         active = theta != 0
         shifting = active[:, self._shifting].any(axis=1)
         filtering = active[:, self._filtering].any(axis=1)
         kinds = shifting + 2 * filtering
-        size = max(1, LANE_SAMPLES // length)
+        size = max(LEAST_LANES, LANE_SAMPLES // length)
         for kind in np.unique(kinds):
             simulator = self._fine if kind >= 2 else self.simulator
             lanes = np.flatnonzero(kinds == kind)
@@ -255,7 +257,9 @@ class World:
                 part = lanes[begin : begin + size]
                 scenarios = self._scenarios(theta[part], runs[part], share)
                 simulated = self._simulated(simulator, theta[part], scenarios, states[part])
-                result[part, : simulated.shape[1]] = simulated
+                last = simulated.shape[1]
+                result[part, :last] = simulated
+                result[part, last:] = np.nan
         return result
 
     def _scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:

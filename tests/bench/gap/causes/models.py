@@ -23,6 +23,7 @@ def search_of(*models, excess=None):
     excesses = excess or {}
     return SimpleNamespace(
         models=table,
+        settled=None,
         excess=lambda m: excesses.get(m.names, 0.0),
         without=lambda m, name: table[frozenset(m.names) - {name}],
     )
