@@ -15,7 +15,7 @@ from typing import Any, cast
 from sims import bullet
 from sims.base import InputError
 from sims.engines import flight, joint, native
-from sims.engines.external import Lane, Path, checked_time_step, integrate
+from sims.engines.external import Lane, Path, checked_time_step, in_turn, integrate
 from sims.engines.point import State, Vector
 from sims.engines.worlds import (
     BulletBallModule,
@@ -120,7 +120,9 @@ class BulletEngine:
     def integrate(self, lanes: Lanes) -> Motion:
         """See `Engine`."""
         assert self._rollout is not None, "a system that the engine refuses"
-        return integrate(lanes, self._rollout, self._world.discard)
+        return integrate(
+            lanes, partial(in_turn, self._rollout, self._world.discard), self._world.discard
+        )
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
         """See `Engine`."""

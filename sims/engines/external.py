@@ -16,16 +16,13 @@ doi:10.1017/S0962492902000144), with a(x) the acceleration there:
 `sims.engines.joint` and `sims.engines.flight` read it so: they choose F such that the engine's
 velocity ends where half a step's force takes the velocity at x.
 
-Dry friction of limit L leaves of a force F, at velocity v,
-
-    F - L sign(v)                      where v is not 0                    (4)
-    F - L sign(F), or 0 if |F| <= L    where v is 0                        (5)
+What acts beside the engine is asked for by `sims.engines.forces`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +30,7 @@ from numpy.typing import NDArray
 
 from sims.base import Array, InputError
 from sims.limits import cut, is_number
-from sims.system import Acting, Contact, Force, Friction, Lanes, Moment, Motion, System
+from sims.system import Acting, Contact, Effect, Lanes, Moment, Motion, System
 
 TIME_TOLERANCE = 1e-6
 """Share of an interval by which sample times may miss the engine's steps: recordings round their
@@ -60,6 +57,7 @@ class Lane:
         steps: (S,) seconds, all > 0: where a lane waits is left out.
         inputs: (S,) by name, at least one value.
         effects: those that act, with coefficients (K, 1, 1).
+        declared: all effects of the call in their order, also those that act on other lanes alone.
         kept: (N,) increasing numbers of steps, from 0, after which the state is kept.
     """
 
@@ -71,6 +69,7 @@ class Lane:
     steps: Array
     inputs: Mapping[str, Array]
     effects: Acting
+    declared: tuple[Effect, ...]
     kept: Places
 
     @property
@@ -91,93 +90,17 @@ class Lane:
         return Moment(self.system, theta, known, t, x, v, inputs)
 
 
-class Forces:
-    """The forces on one lane from outside the engine: the effects' and the system's own but for
-    gravity.
-
-    Args:
-        lane: whose.
-        rows: how many velocities to ask for at once.
-    """
-
-    def __init__(self, lane: Lane, rows: int) -> None:
-        shape = (rows, lane.x.size)
-        inputs = {name: np.full((rows, 1), signal[0]) for name, signal in lane.inputs.items()}
-        t = np.zeros((rows, 1))
-        self.moment = lane.moment(t, np.zeros(shape), np.zeros(shape), inputs)
-        self._system = lane.system
-        self._inputs = inputs
-        # Most systems have no passive force but gravity, which the engine applies by itself.
-        self._more = type(lane.system).passive is not System.passive
-        self._driven = bool(inputs) or self._more
-        # Every velocity is asked for at once, a row each: a call costs more than its rows.
-        acting = [(effect, np.repeat(c, rows, axis=1)) for effect, c in lane.effects]
-        self._forces = [(effect, c) for effect, c in acting if isinstance(effect, Force)]
-        self._frictions = [(effect, c) for effect, c in acting if isinstance(effect, Friction)]
-        self._nothing = np.zeros(shape)
-        self.any = bool(self._forces or self._frictions or self._driven)
-
-    def feel(self, inputs: Mapping[str, float]) -> None:
-        """Set the inputs."""
-        for name, value in inputs.items():
-            self._inputs[name].fill(value)
-
-    def force(self) -> Array:
-        """(rows, D) generalised force at `moment`, friction apart."""
-        total = self._system.drive(self.moment) if self._driven else self._nothing
-        if self._more:
-            # What the drive works against, less the gravity that is the engine's own.
-            total = total - self._system.passive(self.moment) - self._system.weight(self.moment)
-        for effect, c in self._forces:
-            total = total + effect.force(c, self.moment)
-        return total
-
-    def limit(self) -> float:
-        """Largest friction at the first row of `moment`."""
-        limits = [effect.limit(c, self.moment) for effect, c in self._frictions]
-        return sum(float(limit[0, 0]) for limit in limits)
+Rollouts = Callable[[Sequence[Lane]], Iterable[Path]]
+"""Integrates lanes; the rows of each path are those of `Lane.kept`, NaN where it failed."""
 
 
-def rate(velocity: float, force: float, limit: float) -> float:
-    """The force that is left of `force` when dry friction has taken what it can."""
-    if not limit:
-        return force
-    if velocity:
-        return force - math.copysign(limit, velocity)  # (4)
-    return force - math.copysign(limit, force) if abs(force) > limit else 0.0  # (5)
-
-
-def kick(velocity: float, force: float, limit: float, inverse: float, duration: float) -> float:
-    """The velocity after a constant force and dry friction have acted for `duration`.
-
-    Exact: friction opposes the motion until it stops, then holds it still if it can.
-
-    Args:
-        velocity: before.
-        force: without friction.
-        limit: largest friction.
-        inverse: one over the inertia.
-        duration: seconds.
-    """
-    if velocity and limit:
-        slope = rate(velocity, force, limit) * inverse
-        after = velocity + slope * duration
-        if after * velocity >= 0:
-            return after
-        # It came to rest on the way, -v / slope after the beginning; the time left begins there.
-        duration += velocity / slope
-        velocity = 0.0
-    return velocity + rate(velocity, force, limit) * inverse * duration
-
-
-def integrate(lanes: Lanes, rollout: Callable[[Lane], Path], discard: Callable[[], None]) -> Motion:
-    """Lane after lane through `rollout`.
+def integrate(lanes: Lanes, rollouts: Rollouts, discard: Callable[[], None]) -> Motion:
+    """All lanes through `rollouts`.
 
     Args:
         lanes: the work.
-        rollout: integrates one lane; its rows are those of `Lane.kept`.
-        discard: called after a rollout that failed; it may have left the engine's world in any
-            state.
+        rollouts: integrates those that can be.
+        discard: called where it is interrupted; it may have left the engine's world in any state.
 
     Returns:
         The motion. A lane with a non-finite number or result is all NaN.
@@ -186,25 +109,42 @@ def integrate(lanes: Lanes, rollout: Callable[[Lane], Path], discard: Callable[[
     shape = (len(lanes.theta), count, lanes.x.shape[1])
     x = np.full(shape, np.nan)
     motion = Motion(x, x.copy(), x.copy())
+    work: list[Lane] = []
+    places: list[tuple[int, Places]] = []
     for i in range(len(lanes.theta)):
         # Lanes of one run follow each other and make the same steps.
         if i == 0 or not np.array_equal(lanes.steps[i], lanes.steps[i - 1]):
             timing = _timing(lanes.steps[i], lanes.every)
         lane = _lane(lanes, i, *timing[:3])
         # A rollout that must fail would cost the engine its world.
-        if not all(np.isfinite(values).all() for values in _given(lane)):
-            continue
-        try:
-            path = rollout(lane)
-        except BaseException:  # an interrupted rollout leaves forces behind
-            discard()
-            raise
-        if all(np.isfinite(values).all() for values in path):
-            for result, values in zip((motion.x, motion.v, motion.a), path, strict=True):
-                result[i] = values[timing[3]]
-        else:
-            discard()
+        if all(np.isfinite(values).all() for values in _given(lane)):
+            work.append(lane)
+            places.append((i, timing[3]))
+    try:
+        for (i, rows), path in zip(places, rollouts(work), strict=True):
+            if finite(path):
+                for result, values in zip((motion.x, motion.v, motion.a), path, strict=True):
+                    result[i] = values[rows]
+    except BaseException:  # an interrupted rollout leaves forces behind
+        discard()
+        raise
     return motion
+
+
+def in_turn(
+    rollout: Callable[[Lane], Path], discard: Callable[[], None], lanes: Sequence[Lane]
+) -> Iterator[Path]:
+    """One lane after the other; `discard` is called behind one that failed."""
+    for lane in lanes:
+        path = rollout(lane)
+        if not finite(path):
+            discard()
+        yield path
+
+
+def finite(path: Path) -> bool:
+    """Whether all numbers of a path are."""
+    return all(bool(np.isfinite(values).all()) for values in path)
 
 
 def _timing(steps: Array, every: int) -> tuple[Places, Array, Places, Places]:
@@ -235,6 +175,7 @@ def _lane(lanes: Lanes, i: int, moving: Places, steps: Array, kept: Places) -> L
         steps,
         inputs,
         effects,
+        tuple(effect for effect, _ in lanes.effects),
         kept,
     )
 

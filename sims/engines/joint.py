@@ -13,7 +13,7 @@ where (1) is put in as one force over the step,
 
 and (3) is solved for v' by one Newton step, so that damping, however strong, is stable (the two
 halves together are the trapezoidal rule in v), and dry friction is exact in each half
-(`external.kick`).
+(`forces.kick`).
 
 Where nothing acts but inputs and viscous damping c, the engine's own joint damping carries it,
 explicit in w, and the engine need not be interrupted. With J = M + h c / 2 in place of M,
@@ -35,18 +35,17 @@ and where the input goes from u to u', the step has half a kick of each: w' - w 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from sims.base import Array
-from sims.engines.external import Forces, Lane, Path, kick, legs, rate
+from sims.engines.external import Lane, Path, legs
+from sims.engines.forces import kick
+from sims.engines.joint_felt import Asked, Felt, Known, drive_of
 from sims.engines.scalar import Resistance, is_library, resistance
-
-_NUDGE = 1e-3
-"""Change of velocity (m/s or rad/s) over which the slope of the force is taken."""
 
 
 class Joint(Protocol):
@@ -88,15 +87,34 @@ def rollout(joint: Joint, lane: Lane) -> Path:
     """Integrate one lane; NaN where the engine cannot represent it."""
     joint.start(lane.numbers)
     inertia = float(lane.system.mass(lane.theta, lane.constants)[0, 0])
-    # Three ways, the quickest that carries all that acts: asking the effects for their force takes
-    # longer than the engine's own step.
-    opposing = resistance(lane) if joint.open_loop else None
-    if opposing is None:
-        return _driven(joint, lane, inertia, _Asked(joint, lane, inertia))
-    damping = _carried(lane)
-    if damping is None:
-        return _driven(joint, lane, inertia, _Known(joint, lane, inertia, opposing))
-    return _open(joint, lane, inertia, damping)
+    way = way_of(lane, joint.open_loop)
+    if way.damping is not None:
+        return _open(joint, lane, inertia, way.damping)
+    if way.opposing is not None:
+        return _driven(joint, lane, inertia, Known(joint.gravity, lane, inertia, way.opposing))
+    return _driven(joint, lane, inertia, Asked(joint.gravity, lane, inertia))
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a lane is integrated: the quickest way of three that carries all that acts, since asking
+    effects for their force takes longer than the engine's own step.
+
+    Attributes:
+        damping: the viscous damping that is all that acts beside inputs; the engine runs on its
+            own. None where more acts.
+        opposing: what depends on speed alone and is written in plain numbers; None where more acts,
+            and all must be asked.
+    """
+
+    damping: float | None
+    opposing: Resistance | None
+
+
+def way_of(lane: Lane, open_loop: bool) -> Way:
+    """The quickest way; `open_loop` says whether the drive depends on the inputs alone."""
+    opposing = resistance(lane) if open_loop else None
+    return Way(None if opposing is None else _carried(lane), opposing)
 
 
 def _carried(lane: Lane) -> float | None:
@@ -113,7 +131,7 @@ def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
     """No feedback from the motion but viscous damping: the engine runs on its own while the input
     is constant.
     """
-    drive = _drive(lane)
+    drive = drive_of(lane)
     forces = drive.tolist()
     steps = lane.steps.tolist()
     kept = set(lane.kept.tolist())
@@ -130,13 +148,12 @@ def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
         if h != step:
             # The velocity half a step before is another one for another step.
             if begin:
-                v = _whole(w, joint.gravity(x) + felt, inertia, damping, step)
+                v = whole(w, joint.gravity(x) + felt, inertia, damping, step)
             if not joint.pace(h, inertia + 0.5 * h * damping, damping):  # (5)
                 break
-            half = 0.5 * h / inertia
-            joint.place(x, (1.0 + half * damping) * v - half * (joint.gravity(x) + u))  # (7)
+            joint.place(x, halfway(v, joint.gravity(x) + u, inertia, damping, h))
         elif u != felt:
-            joint.advance(u + (0.5 - 0.25 * h * damping / inertia) * (felt - u))  # (8)
+            joint.advance(turning(felt, u, inertia, damping, h))
             counts[0] -= 1
         states = joint.glide(u, counts)
         x, w = states[-1]
@@ -149,25 +166,50 @@ def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
             states.pop()
         rows.extend((*state, h, u) for state in states)
     if len(rows) < lane.kept.size:
-        return _failed(lane)
-    # Velocities are read off at the end, all at once: the engine ran without interruption.
-    positions, w_at, step_at, felt_at = np.array(rows).T
+        return failed(lane)
+    return read_off(lane, np.array(rows), inertia, damping)
+
+
+def read_off(lane: Lane, rows: Array, inertia: float, damping: float) -> Path:
+    """The motion from what a run without interruption left behind.
+
+    Args:
+        lane: that was integrated.
+        rows: (N, 4) position, the engine's velocity, step and force of the inputs at each state to
+            keep.
+        inertia: generalised.
+        damping: viscous.
+    """
+    positions, w_at, step_at, felt_at = rows.T
     force = _weights(lane, positions) + felt_at
-    rates = _whole(w_at, force, inertia, damping, step_at)
+    rates = whole(w_at, force, inertia, damping, step_at)
     rates[0] = lane.v[0]
     accelerations = (force - damping * rates) / inertia
     return positions[:, None], rates[:, None], accelerations[:, None]
 
 
-def _whole(w: Any, force: Any, inertia: float, damping: float, step: Any) -> Any:
+def whole(w: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
     """The velocity at the time of the position, from the engine's half a step before and the force
-    on the position.
+    on the position; numbers or arrays.
     """
     half = 0.5 * step / inertia
     return (w + half * force) / (1.0 + half * damping)  # (6)
 
 
-def _driven(joint: Joint, lane: Lane, inertia: float, forces: _Forces) -> Path:
+def halfway(v: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
+    """The engine's velocity, half a step before the position, from that at its time; back from
+    `whole`.
+    """
+    half = 0.5 * step / inertia
+    return (1.0 + half * damping) * v - half * force  # (7)
+
+
+def turning(felt: Any, u: Any, inertia: Any, damping: Any, step: Any) -> Any:
+    """The force over the step in which the input goes from `felt` to `u`."""
+    return u + (0.5 - 0.25 * step * damping / inertia) * (felt - u)  # (8)
+
+
+def _driven(joint: Joint, lane: Lane, inertia: float, forces: Felt) -> Path:
     """Whatever acts, asked for at each step."""
     x = float(lane.x[0])
     v = float(lane.v[0])
@@ -200,117 +242,9 @@ def _driven(joint: Joint, lane: Lane, inertia: float, forces: _Forces) -> Path:
         if i + 1 in kept:
             rows.append((x, v, forces.acceleration(v)))
     if len(rows) < lane.kept.size:
-        return _failed(lane)
+        return failed(lane)
     x_at, v_at, a_at = np.array(rows).T[:, :, None]
     return x_at, v_at, a_at
-
-
-class _Forces(ABC):
-    """The forces on one coordinate, linear in the velocity about the last look.
-
-    Attributes:
-        weight: the engine's own, where last looked.
-        limit: of dry friction.
-    """
-
-    def __init__(self, joint: Joint, inertia: float) -> None:
-        self._gravity = joint.gravity
-        self._inertia = inertia
-        self.weight = self.limit = self._at = self._force = self._slope = 0.0
-
-    @abstractmethod
-    def feel(self, i: int) -> bool:
-        """Set the inputs of step i; whether any differs from the step before."""
-
-    @abstractmethod
-    def look(self, t: float, x: float, v: float) -> None:
-        """Ask for all forces at this instant."""
-
-    def force(self, v: float) -> float:
-        """Gravity and all but friction, at a velocity near the one looked at."""
-        return self._force + self._slope * (v - self._at)
-
-    def end(self, w: float, step: float) -> float:
-        """The velocity half a step after `w`, the force being the one at its end; a growing force
-        is taken as is.
-        """
-        # (3) with f linear in v about the last look: its slope goes over to the inertia's side,
-        # which a growing force would make smaller, down to nothing.
-        slope = min(self._slope, 0.0)
-        force = self._force + slope * (w - self._at)
-        return kick(w, force, self.limit, 1.0 / (self._inertia - 0.5 * step * slope), 0.5 * step)
-
-    def acceleration(self, v: float) -> float:
-        """Of the smooth motion; zero where friction holds."""
-        return rate(v, self.force(v), self.limit) / self._inertia
-
-
-class _Asked(_Forces):
-    """Whatever the system and the effects say, at two velocities for the slope between them."""
-
-    def __init__(self, joint: Joint, lane: Lane, inertia: float) -> None:
-        super().__init__(joint, inertia)
-        self._ask = Forces(lane, 2)
-        self._signals = {name: values.tolist() for name, values in lane.inputs.items()}
-
-    def feel(self, i: int) -> bool:
-        """See `_Forces`."""
-        # The first step has none before it, not even an equal one.
-        changed = i == 0 or any(values[i] != values[i - 1] for values in self._signals.values())
-        if changed:
-            self._ask.feel({name: values[i] for name, values in self._signals.items()})
-        return changed
-
-    def look(self, t: float, x: float, v: float) -> None:
-        """See `_Forces`."""
-        moment = self._ask.moment
-        moment.t.fill(t)
-        moment.x.fill(x)
-        moment.v[0, 0] = v
-        moment.v[1, 0] = v + _NUDGE
-        force, nudged = self._ask.force()[:, 0].tolist()
-        self.weight = self._gravity(x)
-        self.limit = self._ask.limit()
-        self._at = v
-        self._force = self.weight + force
-        self._slope = (nudged - force) / _NUDGE
-
-
-class _Known(_Forces):
-    """An input that acts as it is, and what opposes motion in plain numbers."""
-
-    def __init__(self, joint: Joint, lane: Lane, inertia: float, opposing: Resistance) -> None:
-        super().__init__(joint, inertia)
-        self._drive: list[float] = _drive(lane).tolist()
-        self._felt = self._drive[0]
-        self._resistance = opposing.at
-        self.limit = opposing.limit
-
-    def feel(self, i: int) -> bool:
-        """See `_Forces`."""
-        before = self._felt
-        self._felt = self._drive[i]
-        return bool(self._felt != before)
-
-    def look(self, t: float, x: float, v: float) -> None:  # noqa: ARG002
-        """See `_Forces`."""
-        opposed, slope = self._resistance(abs(v))
-        self.weight = self._gravity(x)
-        self._at = v
-        self._force = self.weight + self._felt - opposed * v
-        self._slope = -slope
-
-
-def _drive(lane: Lane) -> Array:
-    """(S,) generalised force of the inputs over each step, at least one value."""
-    if not lane.inputs:
-        return np.zeros(max(lane.steps.size, 1))
-    signals = {name: values[:, None] for name, values in lane.inputs.items()}
-    size = len(next(iter(signals.values())))
-    nothing = np.zeros((size, 1))
-    moment = lane.moment(nothing, nothing, nothing, signals)
-    drive: Array = lane.system.drive(moment)[:, 0]
-    return drive
 
 
 def _weights(lane: Lane, x: Array) -> Array:
@@ -321,6 +255,7 @@ def _weights(lane: Lane, x: Array) -> Array:
     return weights
 
 
-def _failed(lane: Lane) -> Path:
+def failed(lane: Lane) -> Path:
+    """No motion."""
     nothing = np.full((lane.kept.size, 1), np.nan)
     return nothing, nothing, nothing

@@ -13,16 +13,18 @@ from functools import partial
 from typing import cast
 
 from sims.base import InputError
-from sims.engines import flight, joint, native
-from sims.engines.external import Lane, Path, checked_time_step, integrate
+from sims.engines import flight, joint, mujoco_batch, native, together
+from sims.engines.external import Lane, Path, Rollouts, checked_time_step, in_turn, integrate
 from sims.engines.mujoco_bodies import CompiledWorld, Joint, MujocoBall, SoftBall, library
 from sims.engines.worlds import MujocoJointModule, MujocoModule, world_module
+from sims.limits import cut
 from sims.system import Engine, Lanes, Motion, System
 
 REQUIRES = ("mujoco",)
 
 _STIFFNESS = 1e5
 """1/s^2, of `native_contact` where the user sets none: contacts then last 10 ms."""
+_MOST_THREADS = 1024
 _OWN_STEP = 2e-3
 """Seconds: the step that MuJoCo takes by default."""
 
@@ -33,6 +35,7 @@ def engine(
     time_step: float | None = None,
     native_contact: bool = False,
     stiffness: float | None = None,
+    threads: int = 1,
 ) -> Engine:
     """The engine for one simulator.
 
@@ -44,6 +47,8 @@ def engine(
             way, whose damping is chosen for the restitution; stepped and read at first order
             (`sims.engines.native`).
         stiffness: with `native_contact`: of the contact, 1/s^2 (1e5, that is contacts of 10 ms).
+        threads: over which lanes of a system of one coordinate are spread; results do not depend on
+            it. One is right where other processes use the other cores.
 
     Raises:
         InputError: an impossible setting.
@@ -51,13 +56,17 @@ def engine(
     if native_contact and time_step is None:
         time_step = _OWN_STEP
     step = checked_time_step(time_step, system)
+    if not (isinstance(threads, int) and 1 <= threads <= _MOST_THREADS):
+        raise InputError(
+            f"threads must be a whole number from 1 to {_MOST_THREADS}, found {cut(str(threads))}"
+        )
     if not native_contact:
         if stiffness is not None:
             raise InputError(
                 "setting stiffness belongs to MuJoCo's contact as it comes: set"
                 " native_contact = true"
             )
-        return MujocoEngine(system, step)
+        return MujocoEngine(system, step, threads=threads)
     if not system.bounces:
         raise InputError(f"system {system.name} does not bounce: leave native_contact out")
     if stiffness is not None and not 0 < stiffness < math.inf:
@@ -66,35 +75,53 @@ def engine(
 
 
 class MujocoEngine:
-    """MuJoCo, one lane after the other in one world."""
+    """MuJoCo: lanes of one coordinate together where there is `mujoco.batch`, the others one after
+    the other in one world.
+    """
 
     name: str = "mujoco"
     requires: tuple[str, ...] = REQUIRES
 
     def __init__(
-        self, system: type[System], largest_step: float, stiffness: float | None = None
+        self,
+        system: type[System],
+        largest_step: float,
+        stiffness: float | None = None,
+        threads: int = 1,
     ) -> None:
         self.largest_step = largest_step
-        self._rollout: Callable[[Lane], Path] | None = None
+        self._rollouts: Rollouts | None = None
+        self._many: mujoco_batch.Joints | None = None
         asked = MujocoModule if system.bounces else MujocoJointModule
         module, self._reason = world_module(system, "mujoco_world", asked)
         if module is None:
             return
         self._world = CompiledWorld(cast(MujocoModule, module).model)
         if stiffness is not None:
-            self._rollout = partial(native.rollout, SoftBall(self._world, stiffness))
+            self._alone(partial(native.rollout, SoftBall(self._world, stiffness)))
         elif system.bounces:
-            self._rollout = partial(flight.rollout, MujocoBall(self._world))
+            self._alone(partial(flight.rollout, MujocoBall(self._world)))
         else:
-            self._rollout = partial(
-                joint.rollout, Joint(self._world, cast(MujocoJointModule, module))
-            )
+            self._joints(cast(MujocoJointModule, module), threads)
+
+    def _alone(self, rollout: Callable[[Lane], Path]) -> None:
+        """Integrate lane after lane."""
+        self._rollouts = partial(in_turn, rollout, self.close)
+
+    def _joints(self, module: MujocoJointModule, threads: int) -> None:
+        """Integrate bodies on joints."""
+        alone = Joint(self._world, module)
+        if not mujoco_batch.there():
+            self._alone(partial(joint.rollout, alone))
+            return
+        self._many = mujoco_batch.Joints(self._world, module, threads)
+        self._rollouts = partial(together.rollouts, alone, self._many, self.close)
 
     def integrate(self, lanes: Lanes) -> Motion:
         """See `Engine`."""
-        assert self._rollout is not None, "a system that the engine refuses"
+        assert self._rollouts is not None, "a system that the engine refuses"
         with _quiet():
-            return integrate(lanes, self._rollout, self._world.close)
+            return integrate(lanes, self._rollouts, self.close)
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
         """See `Engine`."""
@@ -102,8 +129,10 @@ class MujocoEngine:
 
     def close(self) -> None:
         """Give back the MuJoCo world; the next integration makes a new one."""
-        if self._rollout is not None:
+        if self._rollouts is not None:
             self._world.close()
+        if self._many is not None:
+            self._many.close()
 
 
 @contextlib.contextmanager

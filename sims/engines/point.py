@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sims.engines.external import Forces, Lane, Path
+from sims.engines.external import Lane, Path
+from sims.engines.forces import Forces
 from sims.engines.ground import PATIENCE, SHORT, SHORTEST
 from sims.engines.scalar import resistance
 
@@ -38,7 +39,7 @@ class Pull:
     """What effects add to gravity."""
 
     def __init__(self, lane: Lane) -> None:
-        self._ask = Forces(lane, 1)
+        self._ask = Forces([lane], 1)
         self._opposing = resistance(lane)
         self.any = self._ask.any
 

@@ -7,15 +7,19 @@ both.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+
+from sims.base import Array
 from sims.engines.external import Lane
 from sims.system import Contact, Effect
 
-Law = Callable[[float, float], tuple[float, float]]
-"""Coefficient and speed -> resistance r in force = -r v, and by how much r times speed grows with
-speed.
+Law = Callable[[Any, Any], tuple[Any, Any]]
+"""Coefficient and speed (numbers, or arrays alike) -> resistance r in force = -r v, and by how much
+r times speed grows with speed.
 """
 
 _LAWS: Mapping[str, Law] = {
@@ -44,6 +48,50 @@ class Resistance:
             resistance += more
             slope += steeper
         return resistance, slope
+
+
+@dataclass(frozen=True)
+class Resistances:
+    """`Resistance` of many lanes.
+
+    Attributes:
+        laws: those that act on any lane, with their coefficients (n,).
+        limit: (n,) of dry friction; None where no lane has any.
+    """
+
+    laws: tuple[tuple[Law, Array], ...]
+    limit: Array | None
+
+    def at(self, speed: Array) -> tuple[Array, Array]:
+        """The sums of all laws at these speeds (n,); see `Law`."""
+        if not self.laws:
+            return np.zeros(speed.size), np.zeros(speed.size)
+        (law, c), *others = self.laws
+        resistance, slope = law(c, speed)
+        for law, c in others:
+            more, steeper = law(c, speed)
+            resistance = resistance + more
+            slope = slope + steeper
+        return resistance, slope
+
+    def first(self, count: int) -> Resistances:
+        """Of the first lanes."""
+        laws = tuple((law, c[:count]) for law, c in self.laws)
+        return Resistances(laws, None if self.limit is None else self.limit[:count])
+
+
+def resistances(lanes: Sequence[Lane]) -> Resistances:
+    """All effects of lanes for each of which `resistance` is not None."""
+    found = [resistance(lane) for lane in lanes]
+    limits = np.array([one.limit if one else 0.0 for one in found])
+    laws = []
+    for effect in lanes[0].declared:
+        law = _LAWS.get(effect.name)
+        if law is not None:
+            own = [dict(one.laws).get(law, 0.0) if one else 0.0 for one in found]
+            if any(own):
+                laws.append((law, np.array(own)))
+    return Resistances(tuple(laws), limits if limits.any() else None)
 
 
 def resistance(lane: Lane) -> Resistance | None:

@@ -1,0 +1,298 @@
+"""Many lanes of one coordinate at once: `sims.engines.joint` with arrays in place of numbers.
+
+What each lane comes to is the same as alone, to the bit. Lanes stand in the order of their number
+of steps, most first, so that those which are still under way are the first ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.base import Array
+from sims.engines.external import Lane, Path, Places
+from sims.engines.forces import kicks, rates
+from sims.engines.joint import Way, failed, halfway, read_off, turning, whole
+from sims.engines.joint_felt import drive_of
+from sims.engines.joints_felt import Asked, Felt, Known
+from sims.engines.timetable import Table, filled
+
+Mask = NDArray[np.bool_]
+
+
+class Joints(Protocol):
+    """As many bodies as there are lanes, each on one hinge or guide, in an engine that steps them
+    together.
+    """
+
+    open_loop: bool
+    """Whether the system's drive depends on its inputs alone."""
+
+    def start(self, constants: dict[str, float], count: int) -> None:
+        """Make the world ready for this many lanes of the same constants."""
+        ...
+
+    def gravity(self, x: Array) -> Array:
+        """(n,) the generalised force that the engine itself applies at positions (n,)."""
+        ...
+
+    def pace(self, lanes: Places, step: Array, inertia: Array, damping: Array) -> Mask:
+        """Set step, generalised inertia and damping, (n,), of some lanes; False where the engine
+        cannot represent the inertia.
+
+        Raises:
+            ApartError: these lanes cannot share a world.
+        """
+        ...
+
+    def place(self, lanes: Places, x: Array, w: Array) -> None:
+        """Set position and the engine's velocity of some lanes."""
+        ...
+
+    def state(self, count: int) -> tuple[Array, Array]:
+        """Positions and velocities (n,) of the first lanes; they follow what the engine does."""
+        ...
+
+    def advance(self, force: Array) -> None:
+        """Let the first lanes take one step with these forces (n,) beside gravity."""
+        ...
+
+    def run(self, force: Array) -> tuple[Array, Array]:
+        """Let the first lanes take steps with forces (n, k); positions and velocities (n, k) after
+        each.
+        """
+        ...
+
+    def stopped(self) -> Mask:
+        """(L,) which lanes `run` has not taken to their end, since the engine warned of them."""
+        ...
+
+
+class ApartError(Exception):
+    """Lanes that cannot share a world."""
+
+
+def rollouts(joints: Joints, lanes: Sequence[Lane], ways: Sequence[Way]) -> list[Path | None]:
+    """Integrate lanes of the same constants and the same kind of way, each of at least one step.
+
+    Returns:
+        The motion of each; None where it must be integrated by itself.
+
+    Raises:
+        ApartError: they must be integrated one by one.
+    """
+    order = sorted(range(len(lanes)), key=lambda i: -lanes[i].steps.size)
+    sorted_lanes = [lanes[i] for i in order]
+    joints.start(sorted_lanes[0].numbers, len(lanes))
+    dampings = [ways[i].damping for i in order]
+    opposing = [ways[i].opposing for i in order]
+    felt: Felt
+    if all(damping is not None for damping in dampings):
+        run: _Run = _Open(joints, sorted_lanes, np.array(dampings, dtype=np.float64))
+    elif all(law is not None for law in opposing):
+        felt = Known(joints.gravity, sorted_lanes)
+        run = _Driven(joints, sorted_lanes, felt)
+    else:
+        felt = Asked(joints.gravity, sorted_lanes)
+        run = _Driven(joints, sorted_lanes, felt)
+    paths = run.paths()
+    return [paths[place] for place in np.argsort(order)]
+
+
+class _Run(Protocol):
+    """An integration of lanes."""
+
+    def paths(self) -> list[Path | None]:
+        """The motion of each, or None; see `rollouts`."""
+        ...
+
+
+class _Open:
+    """No feedback from the motion but viscous damping; see `joint`.
+
+    The engine gets all steps of one length at once.
+    """
+
+    def __init__(self, joints: Joints, lanes: Sequence[Lane], damping: Array) -> None:
+        self._joints = joints
+        self._lanes = lanes
+        self._table = Table(lanes)
+        self._drive = filled([drive_of(lane) for lane in lanes])
+        self._inertia = _inertia(lanes)
+        self._damping = damping
+        self._failed = np.zeros(len(lanes), dtype=bool)
+        self._rows = np.full((self._table.kept, len(lanes), 4), np.nan)
+        self._rows[0, :, 0] = [lane.x[0] for lane in lanes]
+        self._rows[0, :, 3] = self._drive[:, 0]
+
+    def paths(self) -> list[Path | None]:
+        """See `_Run`."""
+        for begin, end, count in self._table.phases():
+            borders = begin + np.flatnonzero(self._table.paced[begin:end])
+            ends = [*borders[borders > begin].tolist(), end]
+            for first, last in zip([begin, *ends], ends, strict=False):
+                self._stretch(first, last, count)
+        stopped = self._joints.stopped()
+        return [None if stopped[i] else self._path(i) for i in range(len(self._lanes))]
+
+    def _stretch(self, begin: int, end: int, count: int) -> None:
+        """Steps in which no lane's length of step changes."""
+        u = self._drive[:count, begin:end]
+        before = self._drive[:count, max(begin - 1, 0) : end - 1]
+        if not begin:
+            before = np.concatenate([u[:, :1], before], axis=1)
+        some = slice(count)
+        step = self._table.steps[some, begin, None]
+        turned = turning(before, u, self._inertia[some, None], self._damping[some, None], step)
+        force = np.where(u == before, u, turned)
+        if self._table.paced[begin]:
+            new = self._pace(begin, count)
+            force[new, 0] = u[new, 0]  # a lane that is placed anew has no step behind it
+        x, w = self._joints.run(force)
+        rows = self._table.rows[begin + 1 : end + 1]
+        kept = np.flatnonzero(rows >= 0)
+        to = self._rows[rows[kept], :count]
+        to[:, :, 0] = x[:, kept].T
+        to[:, :, 1] = w[:, kept].T
+        to[:, :, 2] = step[:, 0]
+        to[:, :, 3] = u[:, kept].T
+        self._rows[rows[kept], :count] = to
+
+    def _pace(self, begin: int, count: int) -> Places:
+        """Set the lengths of step that are new; whose they are."""
+        h = self._table.steps[:count, begin]
+        inertia = self._inertia[:count]
+        damping = self._damping[:count]
+        if begin:
+            old = self._table.steps[:count, begin - 1]
+            new = np.flatnonzero(h != old)
+            x, w = (values[new] for values in self._joints.state(count))
+            # What has failed is put back to where it began, and is not looked at again.
+            bad = ~np.isfinite(x + w)
+            self._failed[new[bad]] = True
+            x = np.where(bad, self._rows[0, new, 0], x)
+            w = np.where(bad, 0.0, w)
+            force = self._joints.gravity(x) + self._drive[new, begin - 1]
+            v = whole(w, force, inertia[new], damping[new], old[new])
+        else:
+            new = np.arange(count)
+            x = self._rows[0, :, 0]
+            v = np.array([lane.v[0] for lane in self._lanes])
+        h, inertia, damping = h[new], inertia[new], damping[new]
+        carried = inertia + 0.5 * h * damping
+        self._failed[new[~self._joints.pace(new, h, carried, damping)]] = True
+        force = self._joints.gravity(x) + self._drive[new, begin]
+        self._joints.place(new, x, halfway(v, force, inertia, damping, h))
+        return new
+
+    def _path(self, i: int) -> Path:
+        lane = self._lanes[i]
+        if self._failed[i]:
+            return failed(lane)
+        rows = self._rows[self._table.rows[lane.kept], i]
+        return read_off(lane, rows, float(self._inertia[i]), float(self._damping[i]))
+
+
+class _Driven:
+    """Whatever acts, asked for at each step; see `joint`."""
+
+    def __init__(self, joints: Joints, lanes: Sequence[Lane], felt: Felt) -> None:
+        self._joints = joints
+        self._lanes = lanes
+        self._table = Table(lanes)
+        self._felt = felt
+        self._start = np.array([lane.x[0] for lane in lanes])
+        self._v = np.array([lane.v[0] for lane in lanes])
+        self._t = np.zeros(len(lanes))
+        self._inertia = _inertia(lanes)
+        self._inverse = 1.0 / self._inertia
+        self._h = self._half = np.zeros(len(lanes))
+        self._failed = np.zeros(len(lanes), dtype=bool)
+        self._rows = np.full((3, self._table.kept, len(lanes)), np.nan)
+
+    def paths(self) -> list[Path | None]:
+        """See `_Run`."""
+        every = np.arange(len(self._lanes))
+        self._joints.place(every, self._start, np.zeros(every.size))
+        self._felt.look(self._t, self._start, self._v)
+        self._keep(0, self._start)
+        for begin, end, count in self._table.phases():
+            self._only(count)
+            for k in range(begin, end):
+                self._step(k)
+        return [self._path(i) for i in range(len(self._lanes))]
+
+    def _only(self, count: int) -> None:
+        """Go on with the first lanes."""
+        self._x, self._w = self._joints.state(count)
+        self._v = self._v[:count]
+        self._t = self._t[:count]
+        self._inertia = self._inertia[:count]
+        self._inverse = self._inverse[:count]
+        self._h = self._h[:count]
+        self._half = self._half[:count]
+        self._felt.only(count)
+
+    def _step(self, k: int) -> None:
+        felt = self._felt
+        felt.feel(k, self._t, self._x, self._v)
+        if self._table.paced[k]:
+            self._h = self._table.steps[: self._t.size, k]
+            self._half = 0.5 * self._h
+        start = kicks(self._v, felt.force(self._v), felt.limit, self._inverse, self._half)  # (1)
+        if self._table.paced[k]:
+            self._pace(k, start)
+        push = (start - self._w) * self._inertia / self._h - felt.weight  # (4)
+        self._joints.advance(push)  # (2)
+        # Any number that is not finite makes this product one that is not.
+        if not math.isfinite(np.dot(self._x, self._w)):
+            self._set_aside()
+        self._t = self._t + self._h
+        felt.look(self._t, self._x, 2.0 * self._w - self._v)
+        self._v = felt.end(self._w, self._half, self._inertia)  # (3)
+        if self._table.rows[k + 1] >= 0:
+            self._keep(self._table.rows[k + 1], self._x)
+
+    def _pace(self, k: int, start: Array) -> None:
+        """Set the lengths of step that are new."""
+        new = np.arange(self._t.size)
+        if k:
+            new = np.flatnonzero(self._h != self._table.steps[: self._t.size, k - 1])
+        inertia = self._inertia[new]
+        able = self._joints.pace(new, self._h[new], inertia, np.zeros(new.size))
+        self._failed[new[~able]] = True
+        # So that the force put in is the force there is.
+        self._joints.place(new, self._x[new], 2.0 * self._v[new] - start[new])
+
+    def _set_aside(self) -> None:
+        """Put what has failed back to where it began: effects are asked about nothing that is no
+        number, and what becomes of it is not looked at.
+        """
+        bad = np.flatnonzero(~np.isfinite(self._x + self._w))
+        self._failed[bad] = True
+        self._v[bad] = 0.0
+        self._joints.place(bad, self._start[bad], np.zeros(bad.size))
+
+    def _keep(self, row: int, x: Array) -> None:
+        felt = self._felt
+        force = felt.force(self._v)
+        left = force if felt.limit is None else rates(self._v, force, felt.limit)
+        count = self._v.size
+        self._rows[0, row, :count] = x
+        self._rows[1, row, :count] = self._v
+        self._rows[2, row, :count] = left / self._inertia
+
+    def _path(self, i: int) -> Path:
+        lane = self._lanes[i]
+        if self._failed[i]:
+            return failed(lane)
+        x, v, a = self._rows[:, self._table.rows[lane.kept], i, None]
+        return x, v, a
+
+
+def _inertia(lanes: Sequence[Lane]) -> Array:
+    return np.array([float(lane.system.mass(lane.theta, lane.constants)[0, 0]) for lane in lanes])

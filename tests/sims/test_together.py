@@ -1,0 +1,259 @@
+"""Lanes integrated together come out as one by one, to the bit; so do those that fail, and what
+stands beside them.
+"""
+
+import numpy as np
+import pytest
+
+from sims import effects
+from sims.base import InputError, Scenario
+from sims.engines import joint, joints, mujoco_batch, together
+from sims.engines.forces import kick, kicks, rate, rates
+from sims.pendulum import mujoco_world
+from sims.system import Coefficient, Force
+from tests.sims.agreement import SIMULATORS, THETA
+
+pytest.importorskip("mujoco.batch")
+
+EFFECTS = {
+    "none": {},
+    "damping": {"drag.linear": 2e-3},
+    "known": {"drag.quadratic": 3e-4, "friction.coulomb": 0.015, "drag.linear": 1e-3},
+    "asked": {"force.bias": 0.02, "friction.stribeck": [0.01, 0.01, 0.5], "spring.linear": 0.1},
+    "input": {"input.delay": 0.017, "friction.load": 0.05},
+}
+ALWAYS = dict.fromkeys(together.FEWEST, 1)
+NEVER = dict.fromkeys(together.FEWEST, 10**9)
+
+
+@pytest.fixture
+def split(monkeypatch):
+    """Sets from how many lanes on they are integrated together."""
+
+    def choose(fewest):
+        for kind, count in fewest.items():
+            monkeypatch.setitem(together.FEWEST, kind, count)
+
+    return choose
+
+
+def signals(kind, count, seed):
+    """An input that changes at some samples."""
+    rng = np.random.default_rng(seed)
+    held = np.repeat(rng.uniform(-1.0, 1.0, count), 5)[:count]
+    return {c.name: held if place == 0 else np.ones(count) for place, c in enumerate(kind.inputs)}
+
+
+def runs(kind):
+    """Runs of three lengths: even, longer steps, uneven steps."""
+    position, velocity = list(kind.states)[:2]
+    uneven = np.cumsum(np.where(np.arange(24) % 7, 0.01, 0.013))
+    times = (np.arange(40) / 100, np.arange(30) / 90, uneven)
+    return [
+        Scenario(t, {position: 0.3 + k, velocity: -1.0}, signals(kind, t.size, k))
+        for k, t in enumerate(times)
+    ]
+
+
+def lanes(name, chosen, per_run=2):
+    """A simulator, and lanes on which each effect acts on some only."""
+    kind = SIMULATORS[name]
+    simulator = kind(engine="mujoco", effects=list(chosen))
+    values = np.concatenate([np.ravel(c) for c in chosen.values()] or [[]])
+    wanted = len(simulator.parameters) - len(THETA[name])
+    rng = np.random.default_rng(len(chosen))
+    scale = rng.uniform(0.7, 1.3, (3 * per_run, 1))
+    on = rng.random((3 * per_run, wanted)) < 0.7
+    theta = np.hstack([np.array(THETA[name]) * scale, values[:wanted] * scale * on])
+    return simulator, theta, runs(kind) * per_run
+
+
+@pytest.mark.parametrize("case", EFFECTS)
+@pytest.mark.parametrize("name", ["pendulum", "slider", "servo"])
+def test_together_is_one_by_one_to_the_bit(name, case, split):
+    simulator, theta, scenarios = lanes(name, EFFECTS[case])
+    split(NEVER)
+    alone = simulator.simulate_lanes(theta, scenarios)
+    split(ALWAYS)
+    assert np.isfinite(alone[:, 0]).all()
+    for _ in range(2):  # made anew, and used
+        np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), alone)
+
+
+@pytest.mark.parametrize("case", ["none", "known", "asked"])
+def test_constants_that_differ_and_other_numbers_of_lanes(case, split):
+    simulator, theta, scenarios = lanes("pendulum", EFFECTS[case])
+    split(ALWAYS)
+    heavy = [Scenario(s.times, s.initial, s.inputs, {"mass": 0.7}) for s in scenarios]
+    mixed = [pair[k % 2] for k, pair in enumerate(zip(scenarios, heavy, strict=True))]
+    found = simulator.simulate_lanes(theta, mixed)
+    for i in range(len(theta)):
+        own = simulator.simulate_lanes(theta[i : i + 1], mixed[i : i + 1])[0]
+        np.testing.assert_array_equal(found[i, : len(own)], own)
+
+
+@pytest.mark.parametrize("case", ["none", "known", "asked"])
+def test_a_lane_that_fails_is_nan_silently_and_harms_no_other(
+    case, split, tmp_path, monkeypatch, capfd
+):
+    monkeypatch.chdir(tmp_path)
+    simulator, theta, scenarios = lanes("pendulum", EFFECTS[case])
+    split(ALWAYS)
+    healthy = simulator.simulate_lanes(theta, scenarios)
+    wild, light = 1, 3
+    broken = scenarios.copy()
+    broken[wild] = Scenario(scenarios[wild].times, {"q": 0.3, "qd": 1e300}, scenarios[wild].inputs)
+    theta = theta.copy()
+    theta[light, 0] = 1e-9  # less than MuJoCo can represent
+    found = simulator.simulate_lanes(theta, broken)
+    assert np.isnan(found[[wild, light]]).all()
+    others = [0, 2, 4, 5]
+    np.testing.assert_array_equal(found[others], healthy[others])
+    split(NEVER)
+    np.testing.assert_array_equal(found, simulator.simulate_lanes(theta, broken))
+    assert capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_mujoco_only_warns_of_is_as_alone(split):
+    # Beyond 1e10 rad/s MuJoCo warns, and goes on.
+    pendulum = SIMULATORS["pendulum"](engine="mujoco")
+    theta = np.full((2, 1), THETA["pendulum"])
+    fast = [Scenario(np.arange(5) / 100, {"qd": qd}) for qd in (1.0, 3e10)]
+    split(NEVER)
+    alone = pendulum.simulate_lanes(theta, fast)
+    assert np.isfinite(alone).all()
+    split(ALWAYS)
+    np.testing.assert_array_equal(pendulum.simulate_lanes(theta, fast), alone)
+
+
+def test_a_warning_is_forgotten(split, monkeypatch):
+    pendulum = SIMULATORS["pendulum"](engine="mujoco")
+    theta = np.full((2, 1), THETA["pendulum"])
+    split(ALWAYS)
+    wild = Scenario(np.arange(5) / 100, {"qd": 3e10})
+    assert np.isfinite(pendulum.simulate(theta, wild)).all()
+    monkeypatch.setattr(joint, "rollout", lambda *_: pytest.fail("integrated by itself"))
+    assert np.isfinite(pendulum.simulate(theta, Scenario(wild.times))).all()
+
+
+class Picky(Force):
+    """A force that can be asked about numbers only, as a table can."""
+
+    name, says = "test.picky", "there is a table"
+    coefficients = (Coefficient("size", (None, "N", "N*m"), ((0, 1), (0, 1), (0, 1))),)
+
+    def force(self, c, moment):
+        assert np.isfinite(moment.x).all()
+        return c[0] * np.sign(moment.x)
+
+
+def test_effects_are_asked_about_numbers_alone(split, fresh_registries):
+    effects.register(Picky)
+    pendulum = SIMULATORS["pendulum"](engine="mujoco", fixed={"test.picky": 0.1})
+    split(ALWAYS)
+    theta = np.full((2, 1), THETA["pendulum"])
+    both = [Scenario(np.arange(20) / 100, {"qd": qd}) for qd in (1.0, 1e300)]
+    found = pendulum.simulate_lanes(theta, both)
+    assert np.isfinite(found[0]).all()
+    assert np.isnan(found[1]).all()
+
+
+@pytest.mark.parametrize(("case", "called"), [("none", "rollout"), ("asked", "step")])
+def test_an_interrupt_leaves_nothing_behind(case, called, split, monkeypatch):
+    from mujoco import batch
+
+    split(ALWAYS)
+    simulator, theta, scenarios = lanes("servo" if case == "asked" else "slider", EFFECTS[case])
+    expected = simulator.simulate_lanes(theta, scenarios)
+    real, calls = getattr(batch.Batch, called), []
+
+    def interrupted(*arguments, **more):
+        calls.append(called)
+        if len(calls) > 5:
+            raise KeyboardInterrupt
+        return real(*arguments, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(batch.Batch, called, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            simulator.simulate_lanes(theta, scenarios)
+    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
+
+
+def test_a_long_stretch_is_handed_over_in_parts(split, monkeypatch):
+    split(ALWAYS)
+    simulator, theta, scenarios = lanes("slider", {})
+    expected = simulator.simulate_lanes(theta, scenarios)
+    monkeypatch.setattr(mujoco_batch, "_UNINTERRUPTED", 20)  # three steps of six lanes
+    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
+    monkeypatch.setattr(together, "_STEPS", 400)  # lanes in parts
+    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
+
+
+@pytest.mark.parametrize("case", ["none", "asked"])
+def test_threads_and_a_mujoco_without_batches_change_no_bit(case, split, monkeypatch):
+    split(ALWAYS)
+    simulator, theta, scenarios = lanes("slider", EFFECTS[case])
+    expected = simulator.simulate_lanes(theta, scenarios)
+    kind = SIMULATORS["slider"]
+    threaded = kind(engine="mujoco", effects=list(EFFECTS[case]), threads=2)
+    np.testing.assert_array_equal(threaded.simulate_lanes(theta, scenarios), expected)
+    monkeypatch.setattr(mujoco_batch, "there", lambda: False)
+    old = kind(engine="mujoco", effects=list(EFFECTS[case]))
+    np.testing.assert_array_equal(old.simulate_lanes(theta, scenarios), expected)
+
+
+@pytest.mark.parametrize("threads", [0, 1.5, "all", 10**6])
+def test_impossible_threads(threads):
+    with pytest.raises(InputError, match="threads must be a whole number from 1 to"):
+        SIMULATORS["slider"](engine="mujoco", threads=threads)
+
+
+def test_a_world_that_writes_what_lanes_share_is_stepped_one_by_one(split, monkeypatch):
+    load, tried = mujoco_world.load, []
+
+    def shared(model, inertia, constants):
+        model.opt.gravity[0] = -inertia
+        return load(model, inertia, constants)
+
+    monkeypatch.setattr(mujoco_world, "load", shared)
+    simulator, theta, scenarios = lanes("pendulum", {})
+    split(NEVER)
+    expected = simulator.simulate_lanes(theta, scenarios)
+    split(ALWAYS)
+    real = joints.rollouts
+    monkeypatch.setattr(joints, "rollouts", lambda *a: tried.append(1) or real(*a))
+    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
+    assert tried
+
+
+def test_all_that_a_world_writes_reaches_its_lane(split, monkeypatch):
+    load = mujoco_world.load
+
+    def more(model, inertia, constants):
+        model.jnt_stiffness[0] = 30.0 * inertia
+        model.qpos_spring[0] = 0.1 if inertia > THETA["pendulum"][0] else 0.0
+        return load(model, inertia, constants)
+
+    monkeypatch.setattr(mujoco_world, "load", more)
+    simulator, theta, scenarios = lanes("pendulum", EFFECTS["known"])
+    split(NEVER)
+    expected = simulator.simulate_lanes(theta, scenarios)
+    split(ALWAYS)
+    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
+
+
+def test_arrays_of_kicks_are_kicks():
+    rng = np.random.default_rng(4)
+    choices = np.array([-3.0, -1.0, -0.2, -0.0, 0.0, 0.1, 0.5, 2.0])
+    v, force = rng.choice(choices, (2, 2000)) * rng.choice([1.0, rng.random()], (2, 2000))
+    limit = np.abs(rng.choice(choices, 2000))
+    inverse, duration = rng.uniform(0.1, 3.0, (2, 2000))
+    each = list(zip(v.tolist(), force.tolist(), limit.tolist(), strict=True))
+    np.testing.assert_array_equal(rates(v, force, limit), [rate(*numbers) for numbers in each])
+    rest = list(zip(inverse.tolist(), duration.tolist(), strict=True))
+    expected = [kick(*one, *two) for one, two in zip(each, rest, strict=True)]
+    np.testing.assert_array_equal(kicks(v, force, limit, inverse, duration), expected)
+    free = [kick(a, f, 0.0, *two) for (a, f, _), two in zip(each, rest, strict=True)]
+    np.testing.assert_array_equal(kicks(v, force, None, inverse, duration), free)
