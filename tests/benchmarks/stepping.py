@@ -2,11 +2,12 @@
 
 Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.stepping``; prints a table. Runs of 4 s at
 100 Hz; processor time of the engine's own work, the best of some repetitions by turns, so that both
-see the same machine.
+see the same machine. Behind them what MuJoCo takes by itself, of which nothing is read out.
 """
 
 from __future__ import annotations
 
+from itertools import chain
 from time import process_time
 
 import numpy as np
@@ -16,6 +17,7 @@ from sims.base import Scenario
 from sims.pendulum.simulator import Pendulum
 from sims.servo.simulator import Servo
 from sims.slider.simulator import Slider
+from tests.benchmarks.mujoco_lanes import native, once
 
 LANES = (1, 16, 256, 1024)
 REPEATS = 4
@@ -100,8 +102,16 @@ def table():
             )
 
 
+def yardsticks():
+    """Rows of MuJoCo's own stepping."""
+    for lanes in LANES:
+        work = native(lanes)
+        least = min(once(work, lanes)[0] for _ in range(REPEATS))
+        yield f"| MuJoCo itself: pendulum, dry friction | {lanes:,} | | {least:.2f} | | |"
+
+
 def main():
-    for row in table():
+    for row in chain(table(), yardsticks()):
         print(row, flush=True)
 
 
