@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.gap.causes.candidates import Directions, directions
 from bench.gap.causes.nominate import nominated
-from bench.gap.causes.score_test import Scores, ScoreTest, tail
+from bench.gap.causes.score_test import Scores, ScoreTest, calibrated, tail
 from bench.gap.model.fit import Fit
 from bench.gap.model.models import Model, Models
 from bench.gap.model.noise import forgets
@@ -94,8 +94,12 @@ class Scored(Models):
         residual = self.residual(model.fit)
         # The colour of noise is best known from a model that leaves less structure.
         meaningless = residual if against is None else against
-        surrogate = surrogates(meaningless, self.seen, SURROGATES, self.rng, left=test.left)
-        scores = test.scores(residual, surrogate)
+        scores = calibrated(
+            test,
+            residual,
+            lambda count: surrogates(meaningless, self.seen, count, self.rng, left=test.left),
+            SURROGATES,
+        )
         self.scanned[key] = Scanned(at, candidates, test, scores)
         self.tests[key] = scores.p_value
         # Kept from the first scan, so that merits stay comparable when a better base fit turns up.

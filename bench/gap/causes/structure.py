@@ -27,7 +27,7 @@ import numpy as np
 
 from bench.gap.causes.candidates import Directions, Probe, simulate_with
 from bench.gap.causes.rules import CHANCE, has_structure, is_loud, level_of
-from bench.gap.causes.score_test import ScoreTest
+from bench.gap.causes.score_test import ScoreTest, calibrated
 from bench.gap.model.models import Model, Models
 from bench.gap.model.surrogates import surrogates
 from bench.gap.model.world import World
@@ -134,9 +134,11 @@ def remains(models: Models, model: Model) -> Remains:
         return quick
     residual = models.residual(model.fit)
     test = ScoreTest(model.fit, directions, models.seen, models.weights(model))
-    scores = test.scores(
+    scores = calibrated(
+        test,
         residual,
-        surrogates(residual, models.seen, SURROGATES, models.rng, left=test.left),
+        lambda count: surrogates(residual, models.seen, count, models.rng, left=test.left),
+        SURROGATES,
     )
     promise = scores.score - scores.chance
     where = scores.effects[int(np.argmax(promise))]

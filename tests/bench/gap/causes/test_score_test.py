@@ -1,5 +1,7 @@
 """Scores against generalised least squares done the long way, with whole matrices."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.optimize import nnls
@@ -7,7 +9,7 @@ from scipy.optimize import nnls
 from bench.gap.causes.candidates import Directions, Probe
 from bench.gap.causes.gains import explained, groups
 from bench.gap.causes.products import Design, Products
-from bench.gap.causes.score_test import score, tail
+from bench.gap.causes.score_test import calibrated, score, tail
 from bench.gap.model.noise import GRID, Noise
 from bench.gap.model.surrogates import surrogates
 from tests.bench.gap.made import correlated, covariance_of, linear_fit
@@ -263,6 +265,18 @@ def test_a_cause_has_a_small_p_value():
     assert caused.p_value < 1e-4
     assert caused.by_chance.shape == (4, 100)
     np.testing.assert_allclose(np.quantile(caused.by_chance, 0.9, axis=1), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("first", "drawn"), [(0.5, [100]), (0.02, [100, 400]), (0.001, [100, 400]), (1e-5, [100])]
+)
+def test_a_chance_near_those_that_decide_is_found_from_more_surrogates(first, drawn):
+    asked = []
+    chances = iter([first, 0.3])
+    test = SimpleNamespace(scores=lambda *given: SimpleNamespace(p_value=next(chances)))
+    found = calibrated(test, np.zeros((1, 9, 1)), asked.append, 100)
+    assert asked == drawn
+    assert found.p_value == (first if len(drawn) == 1 else 0.3)
 
 
 def test_the_tail_beyond_the_surrogates_is_exponential():
