@@ -10,7 +10,7 @@ import pytest
 
 from sims.base import Scenario
 from sims.engines.batch.parts import take
-from sims.engines.compiled import advance, evaluate, known, machine, pace
+from sims.engines.compiled import advance, evaluate, known, lockstep, machine, pace
 from sims.engines.compiled.graph import LANE, Graph
 from sims.engines.compiled.nodes import UntracedError
 from sims.engines.compiled.run import step
@@ -21,7 +21,7 @@ from sims.system import Coefficient, Force, Friction
 from tests.benchmarks import stepping
 from tests.sims.cases import FORCES, SIMULATORS, drawn, random_case, steps
 
-PLAIN = SimpleNamespace(divide=pace.divide, advance=advance.advance)
+PLAIN = SimpleNamespace(divide=pace.divide, advance=advance.advance, march=lockstep.march)
 
 
 def lanes_of(simulator, theta, scenarios, monkeypatch):
@@ -192,13 +192,41 @@ def test_how_long_steps_may_be_depends_on_the_lane_alone(monkeypatch):
     theta = np.array([[1.3 * p.nominal for p in simulator.parameters]] * 40)
     lanes = lanes_of(simulator, theta, [run] * 40, monkeypatch)
     longest = []
-    plain = SimpleNamespace(
-        divide=pace.divide,
-        advance=lambda program, work, block, w: longest.extend(work.longest[work.order]),
-    )
+
+    def noted(program, work, block, w):
+        longest.extend(work.longest[work.order])
+
+    plain = SimpleNamespace(divide=pace.divide, advance=noted, march=noted)
     step(lanes, simulator.engine._turn, np.inf, plain)
     assert len(set(longest)) == 1
     assert longest[0] < 1 / 50
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_lanes_in_lockstep_do_what_they_do_apart(shared, monkeypatch):
+    rng = np.random.default_rng(5)
+    simulator = SIMULATORS["servo"](engine="batch", compiled=False)
+    low, high = np.array([p.bounds for p in simulator.parameters]).T
+    theta = rng.uniform(low, high, (35, low.size))
+    t = np.arange(14) / 100
+    on = np.where(t < 0.1, 1.0, 0.0)
+    goals = [steps(rng, t.size, 1.0) for _ in range(35)]
+    runs = [Scenario(t, {"q": 0.1}, {"goal": goal, "torque_enable": on}) for goal in goals]
+    lanes = lanes_of(simulator, theta, runs[:1] * 35 if shared else runs, monkeypatch)
+    assert (lanes.inputs["goal"].strides[0] == 0) == shared
+    ways = []
+
+    def noted(way, name):
+        return lambda *given: ways.extend([name] * len(given[1].order)) or way(*given)
+
+    machine_of = {k: noted(v, k) for k, v in vars(PLAIN).items() if k != "divide"}
+    found = [
+        step(lanes, 0.07, np.inf, SimpleNamespace(**{**vars(PLAIN), **machine_of, **other}))[0]
+        for other in ({}, {"march": advance.advance})
+    ]
+    assert ways.count("march") > 10
+    assert found[0].x.tobytes() == found[1].x.tobytes()
+    assert found[0].a.tobytes() == found[1].a.tobytes()
 
 
 def test_elementary_functions_to_the_last_bits():
@@ -259,6 +287,17 @@ def test_a_plugin_friction_sticks_and_slips(monkeypatch):
     found, left = step(lanes, engine._turn, np.inf, PLAIN)
     assert not left.size
     np.testing.assert_allclose(found.x, engine._moved(lanes).x, atol=1e-13)
+
+
+@needs_compiler
+def test_threads_change_no_bit():
+    names = ("drag.linear", "friction.coulomb")
+    _, theta, runs = stepping.work(Pendulum, names, 600)
+    seen = [
+        Pendulum(engine="batch", effects=names, jobs=jobs).simulate_lanes(theta, runs)
+        for jobs in (1, 2, 7)
+    ]
+    assert seen[0].tobytes() == seen[1].tobytes() == seen[2].tobytes()
 
 
 @needs_compiler

@@ -39,6 +39,7 @@ class Batch:
         compiled: whether lanes are stepped by machine code (`sims.engines.compiled`) where there is
             a compiler and what acts on them compiles; else in numpy, to the same numbers but for
             rounding.
+        jobs: threads on which machine code steps many lanes; the numbers do not depend on it.
 
     Raises:
         InputError: a setting that is not a positive number.
@@ -53,6 +54,7 @@ class Batch:
         turn: float = TURN,
         patience: float = np.inf,
         compiled: bool = True,
+        jobs: int = 1,
     ) -> None:
         if not (is_number(time_step) and time_step > 0):
             raise InputError(
@@ -64,10 +66,15 @@ class Batch:
                 raise InputError(
                     f"engine batch: {name} must be a positive number, found {cut(str(value))}"
                 )
+        if not (isinstance(jobs, int) and jobs >= 1):
+            raise InputError(
+                f"engine batch: jobs must be a number of threads, found {cut(str(jobs))}"
+            )
         self.largest_step = float(time_step)
         self._turn = float(turn)
         self._patience = float(patience)
         self._compiled = compiled
+        self._jobs = jobs
 
     def integrate(self, lanes: Lanes) -> Motion:
         """Integrate every lane over its steps; a lane whose numbers overflow is NaN throughout."""
@@ -102,7 +109,7 @@ class Batch:
         made = machine.machine() if self._compiled and lanes.steps.shape[1] else None
         if made is None:
             return self._moved(lanes)
-        motion, left = step(lanes, self._turn, self._patience, made)
+        motion, left = step(lanes, self._turn, self._patience, made, self._jobs)
         if left.size:
             # What does not compile is stepped here, beside what does.
             part = self._moved(take(lanes, left))
@@ -143,9 +150,10 @@ def engine(
     turn: float = TURN,
     patience: float = np.inf,
     compiled: bool = True,
+    jobs: int = 1,
 ) -> Batch:
     """A new engine; see `Batch`."""
-    return Batch(time_step, turn, patience, compiled)
+    return Batch(time_step, turn, patience, compiled, jobs)
 
 
 def _sorted(lanes: Lanes) -> tuple[Mask, Indices]:

@@ -24,16 +24,25 @@ from sims.engines.compiled import (
     evaluate,
     events,
     kinds,
+    lockstep,
     native,
     pace,
 )
 
-MODULES: tuple[ModuleType, ...] = (evaluate, events, clock, dynamics, advance, pace)
+MODULES: tuple[ModuleType, ...] = (
+    evaluate,
+    events,
+    clock,
+    dynamics,
+    advance,
+    lockstep,
+    pace,
+)
 """Where the functions are."""
 _WRITTEN_OUT = frozenset(
     {
         *("present", "begin", "during", "pulled", "free", "attempt", "make", "go_on", "feel"),
-        *("stays", "look", "look_at_friction", "bent", "is_open", "larger", "smaller"),
+        *("stays", "look", "look_at_friction", "bent", "is_open", "larger", "smaller", "keep"),
         *("dot", "length", "begin_on_a_line", "during_on_a_line"),
     }
 )

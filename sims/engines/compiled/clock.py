@@ -76,16 +76,11 @@ def stays(program: Program, work: Work, block: Block, i: int) -> bool:
     """Keep the state of a lane that begins a step behind a sample; whether it has more to do."""
     a = block.a
     n = block.n
-    d = program.flags[DIMENSIONS]
     step = n[STEP, i]
     if n[BEGINS, i] != 0:
         n[BEGINS, i] = 0
         if step % work.every == 0:
-            record = step // work.every
-            for k in range(d):
-                work.kept[n[LANE, i], record, k] = a[X + k, i]
-                work.kept[n[LANE, i], record, d + k] = a[V + k, i]
-                work.kept[n[LANE, i], record, 2 * d + k] = a[K1 + k, i]
+            keep(program, work, block, i, step // work.every)
         if step == work.steps.shape[1]:
             return False
     if work.patience < np.inf and a[LEFT, i] > 0.0:
@@ -95,6 +90,17 @@ def stays(program: Program, work: Work, block: Block, i: int) -> bool:
             work.kept[n[LANE, i], work.kept.shape[1] - 1, :] = np.nan
             return False
     return True
+
+
+def keep(program: Program, work: Work, block: Block, i: int, record: int) -> None:
+    """Keep the lane's state."""
+    a = block.a
+    d = program.flags[DIMENSIONS]
+    lane = block.n[LANE, i]
+    for k in range(d):
+        work.kept[lane, record, k] = a[X + k, i]
+        work.kept[lane, record, d + k] = a[V + k, i]
+        work.kept[lane, record, 2 * d + k] = a[K1 + k, i]
 
 
 def go_on(program: Program, work: Work, block: Block, i: int) -> None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from sims.engines.compiled.advance import advance
 from sims.engines.compiled.kinds import ROWS, WHOLE, WIDTH, Block, Program, Work
+from sims.engines.compiled.lockstep import march
 from sims.engines.compiled.pace import divide
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def integrate(
     spans_at: Any,
     parts_at: Any,
 ) -> None:
-    """`divide`, or `advance`, with arrays by their addresses."""
+    """`divide`, `advance` or `march`, with arrays by their addresses."""
     sizes = carray(sizes_at, (SIZES,))
     reals = carray(reals_at, (2,))
     lanes = sizes[1]
@@ -89,5 +90,7 @@ def integrate(
             reals[1],
             carray(parts_at, (lanes,)),
         )
-    else:
+    elif sizes[0] == 1:
         advance(program, work, block, w)
+    else:
+        march(program, work, block, w)

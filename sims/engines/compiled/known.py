@@ -25,7 +25,6 @@ from sims.engines.compiled.kinds import (
     OUT_E,
     OUT_LIMIT,
     OUT_MU,
-    room,
 )
 from sims.engines.compiled.nodes import UntracedError
 from sims.engines.compiled.program import Model, Names, Tracing
@@ -128,8 +127,7 @@ def _check(
 def _registers(made: Model, one: Lanes, inputs: Mapping[str, Array]) -> Array:
     """The registers of a program, with all that one lane brings."""
     rows = made.program.rows
-    r = room(made.registers).r
-    r[made.first : made.first + len(made.constants)] = made.constants
+    r = made.room().r
     columns = [one.theta, *one.constants.values(), *(c[:, :, 0].T for _, c in one.effects)]
     parameters = np.concatenate(columns, axis=1)[0]
     if parameters.size != rows[IN_E] - rows[IN_P]:

@@ -20,7 +20,7 @@ from sims.engines.compiled.kinds import Block, Numbers, Program, Work, check
 
 PARTS = (
     *("advance", "build", "clock", "dynamics", "entry", "evaluate", "events", "graph", "kinds"),
-    *("native", "pace"),
+    *("lockstep", "native", "pace"),
 )
 """Modules of this room on which the code depends."""
 RULES = ("batch/stepping.py", "batch/pace.py", "ground.py")
@@ -50,6 +50,10 @@ class Machine:
     def advance(self, program: Program, work: Work, block: Block, w: int) -> None:
         """See `sims.engines.compiled.advance`."""
         self._call(1, program, work, block, w, work.mass, 1.0, work.mass)
+
+    def march(self, program: Program, work: Work, block: Block, w: int) -> None:
+        """See `sims.engines.compiled.lockstep`."""
+        self._call(2, program, work, block, w, work.mass, 1.0, work.mass)
 
     def _call(
         self, what: int, program: Program, work: Work, block: Block, w: int, spans: Numbers,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.engines.compiled.graph import CODES, IMPACT, LANE, MOMENT, Graph, Node
-from sims.engines.compiled.kinds import LARGEST, WIDTH, Numbers, Program
+from sims.engines.compiled.kinds import DRY, LARGEST, WIDTH, Block, Numbers, Program, room
 from sims.engines.compiled.nodes import UntracedError, constants
 from sims.engines.compiled.traced import Traced
 from sims.system import Contact, Effect, Force, Friction, Moment, System
@@ -37,6 +37,17 @@ class Model(NamedTuple):
     constants: Numbers
     first: int
     registers: int
+
+    @property
+    def is_smooth(self) -> bool:
+        """Whether nothing can happen to a lane within a step."""
+        return not self.program.flags[DRY:].any()
+
+    def room(self) -> Block:
+        """Room to run it in."""
+        block = room(self.registers)
+        block.r[self.first : self.first + len(self.constants)] = self.constants
+        return block
 
 
 class Names(NamedTuple):

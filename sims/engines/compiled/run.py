@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from sims.base import Array
 from sims.engines.batch.field import acts
 from sims.engines.compiled import known
-from sims.engines.compiled.kinds import WIDTH, Work, room
+from sims.engines.compiled.kinds import WIDTH, Work
 from sims.engines.compiled.machine import Machine
+from sims.engines.compiled.program import Model
 from sims.engines.ground import Indices
 from sims.system import Contact, Effect, Force, Friction, Lanes, Motion
 
 _EIGHT = 8
 """Slots are used in eights, as machines compute them."""
+_SHARE = 256
+"""Lanes that a thread has at least."""
 
 
 class _Job:
@@ -26,9 +30,13 @@ class _Job:
         turn: see `sims.engines.batch.pace`.
         patience: see `sims.engines.batch.Batch`.
         machine: the compiled functions.
+        jobs: threads.
     """
 
-    def __init__(self, lanes: Lanes, turn: float, patience: float, machine: Machine) -> None:
+    def __init__(
+        self, lanes: Lanes, turn: float, patience: float, machine: Machine, jobs: int
+    ) -> None:
+        self._jobs = jobs
         self._lanes = lanes
         self._turn = turn
         self._patience = patience
@@ -66,9 +74,6 @@ class _Job:
         columns = [lanes.theta[chosen], *(c[chosen] for c in lanes.constants.values())]
         columns += [c[:, chosen, 0].T for _, c in effects]
         parameters = np.concatenate(columns, axis=1)
-        block = room(made.registers)
-        block.r[made.first : made.first + len(made.constants)] = made.constants
-        width = min(WIDTH, -(-chosen.size // _EIGHT) * _EIGHT)
         work = Work(
             order=chosen.astype(np.int64),
             parameters=np.ascontiguousarray(parameters, dtype=np.float64),
@@ -84,17 +89,49 @@ class _Job:
             patience=self._patience,
             kept=self._kept,
         )
-        self._machine.divide(made.program, work, block, width, self._spans, self._turn, self._parts)
+        self._machine.divide(
+            made.program, work, made.room(), _width(work), self._spans, self._turn, self._parts
+        )
         parts = self._parts[chosen]
         spans = self._spans[chosen]
         # A hair longer than the part, so that rounding does not leave a crumb behind the last one.
         self._longest[chosen] = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
-        if parts.min() < parts.max():
-            # Those that need many steps first: the others fill the slots beside them.
-            order = np.argsort(-parts, kind="stable")
-            work = work._replace(order=work.order[order], parameters=work.parameters[order])
-        self._machine.advance(made.program, work, block, width)
+        # Those that need many steps first: the others fill the slots beside them.
+        order = np.argsort(-parts, kind="stable")
+        apart = len(order)
+        if made.is_smooth and len(self._steps) == 1 and self._patience >= 1.0:
+            apart = int(np.count_nonzero(parts > 1))
+        self._shared(self._machine.advance, made, _some(work, order[:apart]))
+        self._shared(self._machine.march, made, _some(work, order[apart:]))
         return True
+
+    def _shared(self, way: Callable[..., None], made: Model, work: Work) -> None:
+        """All steps, on several cores where that pays."""
+        lanes = len(work.order)
+        count = min(self._jobs, max(lanes // _SHARE, 1))
+        # Every thread has some that need many steps, and room of its own; no two write the same
+        # lane, and what a lane does depends on no other.
+        works = [_some(work, np.arange(k, lanes, count)) for k in range(count)] if lanes else []
+        if count == 1:
+            for part in works:
+                way(made.program, part, made.room(), _width(part))
+            return
+        with ThreadPoolExecutor(count) as threads:
+            done = [
+                threads.submit(way, made.program, part, made.room(), _width(part)) for part in works
+            ]
+        for one in done:
+            one.result()
+
+
+def _some(work: Work, places: Indices) -> Work:
+    """The work on the lanes at these places of its order."""
+    return work._replace(order=work.order[places], parameters=work.parameters[places])
+
+
+def _width(work: Work) -> int:
+    """Slots that are used."""
+    return min(WIDTH, -(-len(work.order) // _EIGHT) * _EIGHT)
 
 
 def _column(values: Array, count: int) -> Array:
@@ -127,11 +164,13 @@ def _ground(lanes: Lanes) -> Array:
     return ground
 
 
-def step(lanes: Lanes, turn: float, patience: float, machine: Machine) -> tuple[Motion, Indices]:
+def step(
+    lanes: Lanes, turn: float, patience: float, machine: Machine, jobs: int = 1
+) -> tuple[Motion, Indices]:
     """The motion of lanes that are all stepped, and which of them were left out as what acts on
     them does not compile.
     """
-    job = _Job(lanes, turn, patience, machine)
+    job = _Job(lanes, turn, patience, machine, jobs)
     left = [chosen for chosen, effects in _groups(lanes) if not job.step(chosen, effects)]
     return job.motion(), np.sort(np.concatenate([np.empty(0, dtype=np.intp), *left]))
 
