@@ -8,14 +8,14 @@ The world that carries a system is built by the module ``bullet_world`` beside t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 from sims import bullet
 from sims.base import InputError
-from sims.engines import flight, joint, native
-from sims.engines.external import Lane, Path, checked_time_step, in_turn, integrate
+from sims.engines import bullet_joints, flight, native, together
+from sims.engines.external import Rollouts, checked_time_step, in_turn, integrate
 from sims.engines.point import State, Vector
 from sims.engines.worlds import (
     BulletBallModule,
@@ -89,7 +89,9 @@ def engine(
 
 
 class BulletEngine:
-    """Bullet, one lane after the other in one world."""
+    """Bullet: lanes one after the other in one world, or several bodies in one where effects are
+    asked.
+    """
 
     name: str = "pybullet"
     requires: tuple[str, ...] = REQUIRES
@@ -98,7 +100,8 @@ class BulletEngine:
         self, system: type[System], largest_step: float, own: Mapping[str, float] | None = None
     ) -> None:
         self.largest_step = largest_step
-        self._rollout: Callable[[Lane], Path] | None = None
+        self._rollouts: Rollouts | None = None
+        self._many: bullet_joints.Joints | None = None
         asked = BulletModule if system.bounces else BulletJointModule
         if own is not None:
             asked = BulletBallModule
@@ -108,21 +111,29 @@ class BulletEngine:
         if own is not None:
             build = partial(cast(BulletBallModule, module).build_native, settings=own)
             self._world = bullet.PersistentWorld(build)
-            self._rollout = partial(native.rollout, NativeBall(self._world, own))
+            rollout = partial(native.rollout, NativeBall(self._world, own))
+            self._rollouts = partial(in_turn, rollout, self._world.discard)
         elif system.bounces:
             self._world = bullet.PersistentWorld(cast(BulletModule, module).build)
-            self._rollout = partial(flight.rollout, BulletBall(self._world))
+            ball = partial(flight.rollout, BulletBall(self._world))
+            self._rollouts = partial(in_turn, ball, self._world.discard)
         else:
             body = cast(BulletJointModule, module)
             self._world = bullet.PersistentWorld(body.build)
-            self._rollout = partial(joint.rollout, Joint(self._world, body))
+            alone = bullet_joints.Joint(self._world, body)
+            self._many = bullet_joints.Joints(body)
+            self._rollouts = partial(together.rollouts, alone, self._many, self._world.discard)
 
     def integrate(self, lanes: Lanes) -> Motion:
         """See `Engine`."""
-        assert self._rollout is not None, "a system that the engine refuses"
-        return integrate(
-            lanes, partial(in_turn, self._rollout, self._world.discard), self._world.discard
-        )
+        assert self._rollouts is not None, "a system that the engine refuses"
+        return integrate(lanes, self._rollouts, self._discard)
+
+    def _discard(self) -> None:
+        """Build afresh before the next rollout."""
+        self._world.discard()
+        if self._many is not None:
+            self._many.discard()
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
         """See `Engine`."""
@@ -130,62 +141,10 @@ class BulletEngine:
 
     def close(self) -> None:
         """Give back the Bullet world; the next integration opens a new one."""
-        if self._rollout is not None:
+        if self._rollouts is not None:
             self._world.close()
-
-
-class Joint:
-    """A body on one hinge or guide; see `sims.engines.joint.Joint`."""
-
-    def __init__(self, world: bullet.PersistentWorld, module: BulletJointModule) -> None:
-        self._world = world
-        self._load = module.load
-        self._gravity = module.gravity
-        self.open_loop: bool = module.OPEN_LOOP
-
-    def start(self, constants: dict[str, float]) -> None:
-        """A world for these constants; all else that matters is set by `pace` and `place`."""
-        self._constants, self.gravity = constants, self._gravity(constants)
-        self._client, self._body = self._world.body(constants)
-
-    def pace(self, step: float, inertia: float, damping: float) -> bool:
-        """Step in seconds, generalised inertia, joint damping."""
-        p = bullet.engine()
-        if not self._load(self._client, self._body, inertia, self._constants):
-            return False
-        p.setTimeStep(step, self._client)
-        p.changeDynamics(self._body, 0, jointDamping=damping, physicsClientId=self._client)
-        return True
-
-    def place(self, x: float, w: float) -> None:
-        """The joint's position and velocity."""
-        bullet.engine().resetJointState(self._body, 0, x, w, self._client)
-
-    def advance(self, force: float) -> tuple[float, float]:
-        """One step."""
-        return self.glide(force, (1,))[0]
-
-    def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
-        """Steps with a force or torque at the joint."""
-        p = bullet.engine()
-        client = self._client
-        body = self._body
-        # Looked up once: a rollout has thousands of each.
-        step = p.stepSimulation
-        push = p.setJointMotorControl2
-        torque = p.TORQUE_CONTROL
-        read = p.getJointState
-        states = []
-        for count in counts:
-            for _ in range(count):
-                if force:  # Bullet forgets applied torques after each step
-                    push(body, 0, torque, force=force, physicsClientId=client)
-                step(client)
-            states.append(read(body, 0, client)[:2])
-        return states
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity", "open_loop")}
+        if self._many is not None:
+            self._many.close()
 
 
 class _Mover:

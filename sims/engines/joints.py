@@ -7,14 +7,14 @@ of steps, most first, so that those which are still under way are the first ones
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sims.base import Array
-from sims.engines.external import Lane, Path, Places
+from sims.engines.external import Lane, Path, Places, finite
 from sims.engines.forces import kicks, rates
 from sims.engines.joint import Way, failed, halfway, read_off, turning, whole
 from sims.engines.joint_felt import drive_of
@@ -31,6 +31,15 @@ class Joints(Protocol):
 
     open_loop: bool
     """Whether the system's drive depends on its inputs alone."""
+    fewest: Mapping[str, int]
+    """Lanes from which on together is quicker, by what acts: ``open``, where the engine runs on its
+    own over all of the run; ``stretches``, where it does so between changes of the step; ``known``,
+    where forces are written out; ``asked``, where effects are asked. It never is where none is
+    said."""
+    most: int
+    """Lanes of which together no more are quicker."""
+    alike: bool
+    """Whether lanes can be together only if they make the same steps."""
 
     def start(self, constants: dict[str, float], count: int) -> None:
         """Make the world ready for this many lanes of the same constants."""
@@ -67,8 +76,10 @@ class Joints(Protocol):
         """
         ...
 
-    def stopped(self) -> Mask:
-        """(L,) which lanes `run` has not taken to their end, since the engine warned of them."""
+    def again(self, failed: Mask) -> Mask:
+        """(L,) which lanes must be integrated by themselves for what has come about, where those
+        `failed` (L,) came to nothing.
+        """
         ...
 
 
@@ -100,14 +111,15 @@ def rollouts(joints: Joints, lanes: Sequence[Lane], ways: Sequence[Way]) -> list
         felt = Asked(joints.gravity, sorted_lanes)
         run = _Driven(joints, sorted_lanes, felt)
     paths = run.paths()
-    return [paths[place] for place in np.argsort(order)]
+    again = joints.again(np.array([not finite(path) for path in paths]))
+    return [None if again[place] else paths[place] for place in np.argsort(order)]
 
 
 class _Run(Protocol):
     """An integration of lanes."""
 
-    def paths(self) -> list[Path | None]:
-        """The motion of each, or None; see `rollouts`."""
+    def paths(self) -> list[Path]:
+        """The motion of each."""
         ...
 
 
@@ -129,15 +141,14 @@ class _Open:
         self._rows[0, :, 0] = [lane.x[0] for lane in lanes]
         self._rows[0, :, 3] = self._drive[:, 0]
 
-    def paths(self) -> list[Path | None]:
+    def paths(self) -> list[Path]:
         """See `_Run`."""
         for begin, end, count in self._table.phases():
             borders = begin + np.flatnonzero(self._table.paced[begin:end])
             ends = [*borders[borders > begin].tolist(), end]
             for first, last in zip([begin, *ends], ends, strict=False):
                 self._stretch(first, last, count)
-        stopped = self._joints.stopped()
-        return [None if stopped[i] else self._path(i) for i in range(len(self._lanes))]
+        return [self._path(i) for i in range(len(self._lanes))]
 
     def _stretch(self, begin: int, end: int, count: int) -> None:
         """Steps in which no lane's length of step changes."""
@@ -214,7 +225,7 @@ class _Driven:
         self._failed = np.zeros(len(lanes), dtype=bool)
         self._rows = np.full((3, self._table.kept, len(lanes)), np.nan)
 
-    def paths(self) -> list[Path | None]:
+    def paths(self) -> list[Path]:
         """See `_Run`."""
         every = np.arange(len(self._lanes))
         self._joints.place(every, self._start, np.zeros(every.size))

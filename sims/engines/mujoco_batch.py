@@ -8,6 +8,7 @@ the batch keeps for each lane.
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import Any
 
@@ -23,6 +24,9 @@ from sims.engines.worlds import MujocoJointModule
 _UNINTERRUPTED = 40_000
 """Steps of all lanes together in one call: a tenth of a second, after which Ctrl-C is heard."""
 
+FEWEST = {"open": 1, "stretches": 16, "known": 24, "asked": 5}
+MOST = 256
+"""Lanes of a batch: of more, what is held for them leaves the processor's cache."""
 _KEPT = 4
 """Worlds of other constants or numbers of lanes that are kept."""
 
@@ -43,6 +47,10 @@ class Joints:
         module: the system's ``mujoco_world``.
         threads: over which lanes are spread; the results do not depend on it.
     """
+
+    fewest: Mapping[str, int] = FEWEST
+    most = MOST
+    alike = False
 
     def __init__(self, world: CompiledWorld, module: MujocoJointModule, threads: int) -> None:
         self._world = world
@@ -65,6 +73,7 @@ class Joints:
         world = self._worlds[key]
         world.reset()
         self._now = world
+        self._ran = False
         self._count = count
 
     def gravity(self, x: Array) -> Array:
@@ -101,6 +110,7 @@ class Joints:
 
     def run(self, force: Array) -> tuple[Array, Array]:
         """See `sims.engines.joints.Joints`."""
+        self._ran = True
         lanes, steps = force.shape
         x = np.empty(force.shape)
         w = np.empty(force.shape)
@@ -116,8 +126,11 @@ class Joints:
             w[:, part] = done["qvel"][:, :, 0]
         return x, w
 
-    def stopped(self) -> Mask:
+    def again(self, failed: Mask) -> Mask:
         """See `sims.engines.joints.Joints`."""
+        if not self._ran:
+            return np.zeros(failed.size, dtype=bool)
+        # A run ends where MuJoCo warns, though it might go on.
         warned: Mask = (self._now.batch.warning[:, :, 1] > 0).any(axis=1)
         return warned
 

@@ -6,6 +6,7 @@ Both come to the same, bit for bit; together costs less where there are lanes en
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
@@ -13,11 +14,6 @@ from sims.engines import joint, joints
 from sims.engines.external import Lane, Path, in_turn
 from sims.engines.joint import Joint, Way, way_of
 
-FEWEST = {"open": 1, "stretches": 16, "known": 24, "asked": 5}
-"""Lanes from which on together is quicker: where the engine runs on its own over all of the run, or
-over stretches between changes of the step; where forces are written out; where they are asked."""
-_MOST = 256
-"""Lanes together: of more, what is held for them leaves the processor's cache."""
 _STEPS = 2_000_000
 """Steps of all lanes together: what is held for them takes some dozens of bytes each."""
 
@@ -34,7 +30,7 @@ def rollouts(
         lanes: the work.
     """
     paths: dict[int, Path] = {}
-    for group in _groups(lanes, many.open_loop):
+    for group in _groups(lanes, many):
         chosen = [lanes[i] for i in group]
         # Lanes that cannot share a world are integrated by themselves.
         with contextlib.suppress(joints.ApartError):
@@ -51,25 +47,26 @@ def rollouts(
         yield paths[i] if i in paths else next(left)
 
 
-def _groups(lanes: Sequence[Lane], open_loop: bool) -> list[list[int]]:
+def _groups(lanes: Sequence[Lane], many: joints.Joints) -> list[list[int]]:
     """Numbers of lanes that are to be integrated together."""
     groups: dict[tuple[object, str], list[int]] = {}
     for i, lane in enumerate(lanes):
         if lane.steps.size:
-            way = way_of(lane, open_loop)
-            key = (tuple(lane.numbers.items()), _kind(lane, way))
-            groups.setdefault(key, []).append(i)
+            kind = _kind(lane, way_of(lane, many.open_loop))
+            steps = lane.steps.tobytes() if many.alike else b""
+            groups.setdefault(((*lane.numbers.items(), steps), kind), []).append(i)
     parts = []
     for (_, kind), group in groups.items():
-        if len(group) >= FEWEST[kind]:
+        if len(group) >= many.fewest.get(kind, math.inf):
             longest = max(lanes[i].steps.size for i in group)
-            size = max(min(_MOST, _STEPS // longest), 1)
-            parts += [group[k : k + size] for k in range(0, len(group), size)]
+            count = -(-len(group) // max(min(many.most, _STEPS // longest), 1))
+            # As many in each part, or one less.
+            parts += [group[k::count] for k in range(count)]
     return parts
 
 
 def _kind(lane: Lane, way: Way) -> str:
-    """Of the integration, as in `FEWEST`."""
+    """Of the integration; see `joints.Joints`."""
     if way.damping is not None:
         even = bool((lane.steps == lane.steps[0]).all())
         return "open" if even else "stretches"

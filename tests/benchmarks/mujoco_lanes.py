@@ -14,7 +14,7 @@ from time import perf_counter, process_time
 import numpy as np
 
 from sims.base import Scenario
-from sims.engines import together
+from sims.engines import mujoco_batch
 from sims.pendulum.simulator import Pendulum
 
 LANES = (1, 16, 256, 1024)
@@ -77,12 +77,12 @@ def ours(effects: tuple[str, ...], lanes: int, **settings: int) -> Callable[[], 
 @contextmanager
 def one_by_one() -> Iterator[None]:
     """Lanes one after the other, as where MuJoCo has no batches."""
-    before = dict(together.FEWEST)
-    together.FEWEST.update(dict.fromkeys(before, 10**9))
+    before = dict(mujoco_batch.FEWEST)
+    mujoco_batch.FEWEST.update(dict.fromkeys(before, 10**9))
     try:
         yield
     finally:
-        together.FEWEST.update(before)
+        mujoco_batch.FEWEST.update(before)
 
 
 def once(work: Callable[[], None], lanes: int) -> Cost:

@@ -5,13 +5,13 @@ stands beside them.
 import numpy as np
 import pytest
 
-from sims import effects
+from sims import bullet, effects
 from sims.base import InputError, Scenario
-from sims.engines import joint, joints, mujoco_batch, together
+from sims.engines import bullet_joints, joint, joints, mujoco_batch, together
 from sims.engines.forces import kick, kicks, rate, rates
-from sims.pendulum import mujoco_world
+from sims.pendulum import bullet_world, mujoco_world
 from sims.system import Coefficient, Force
-from tests.sims.agreement import SIMULATORS, THETA
+from tests.sims.agreement import OTHERS, SIMULATORS, THETA
 
 pytest.importorskip("mujoco.batch")
 
@@ -22,8 +22,8 @@ EFFECTS = {
     "asked": {"force.bias": 0.02, "friction.stribeck": [0.01, 0.01, 0.5], "spring.linear": 0.1},
     "input": {"input.delay": 0.017, "friction.load": 0.05},
 }
-ALWAYS = dict.fromkeys(together.FEWEST, 1)
-NEVER = dict.fromkeys(together.FEWEST, 10**9)
+ALWAYS = dict.fromkeys(mujoco_batch.FEWEST, 1)
+NEVER = dict.fromkeys(mujoco_batch.FEWEST, 10**9)
 
 
 @pytest.fixture
@@ -31,8 +31,9 @@ def split(monkeypatch):
     """Sets from how many lanes on they are integrated together."""
 
     def choose(fewest):
-        for kind, count in fewest.items():
-            monkeypatch.setitem(together.FEWEST, kind, count)
+        for engine in (mujoco_batch, bullet_joints):
+            for kind, count in fewest.items():
+                monkeypatch.setitem(engine.FEWEST, kind, count)
 
     return choose
 
@@ -55,10 +56,10 @@ def runs(kind):
     ]
 
 
-def lanes(name, chosen, per_run=2):
+def lanes(name, chosen, per_run=2, engine="mujoco"):
     """A simulator, and lanes on which each effect acts on some only."""
     kind = SIMULATORS[name]
-    simulator = kind(engine="mujoco", effects=list(chosen))
+    simulator = kind(engine=engine, effects=list(chosen))
     values = np.concatenate([np.ravel(c) for c in chosen.values()] or [[]])
     wanted = len(simulator.parameters) - len(THETA[name])
     rng = np.random.default_rng(len(chosen))
@@ -68,10 +69,11 @@ def lanes(name, chosen, per_run=2):
     return simulator, theta, runs(kind) * per_run
 
 
+@pytest.mark.parametrize("engine", OTHERS)
 @pytest.mark.parametrize("case", EFFECTS)
 @pytest.mark.parametrize("name", ["pendulum", "slider", "servo"])
-def test_together_is_one_by_one_to_the_bit(name, case, split):
-    simulator, theta, scenarios = lanes(name, EFFECTS[case])
+def test_together_is_one_by_one_to_the_bit(name, case, engine, split):
+    simulator, theta, scenarios = lanes(name, EFFECTS[case], engine=engine)
     split(NEVER)
     alone = simulator.simulate_lanes(theta, scenarios)
     split(ALWAYS)
@@ -92,12 +94,13 @@ def test_constants_that_differ_and_other_numbers_of_lanes(case, split):
         np.testing.assert_array_equal(found[i, : len(own)], own)
 
 
+@pytest.mark.parametrize("engine", OTHERS)
 @pytest.mark.parametrize("case", ["none", "known", "asked"])
 def test_a_lane_that_fails_is_nan_silently_and_harms_no_other(
-    case, split, tmp_path, monkeypatch, capfd
+    case, engine, split, tmp_path, monkeypatch, capfd
 ):
     monkeypatch.chdir(tmp_path)
-    simulator, theta, scenarios = lanes("pendulum", EFFECTS[case])
+    simulator, theta, scenarios = lanes("pendulum", EFFECTS[case], engine=engine)
     split(ALWAYS)
     healthy = simulator.simulate_lanes(theta, scenarios)
     wild, light = 1, 3
@@ -226,6 +229,28 @@ def test_a_world_that_writes_what_lanes_share_is_stepped_one_by_one(split, monke
     monkeypatch.setattr(joints, "rollouts", lambda *a: tried.append(1) or real(*a))
     np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
     assert tried
+
+
+def test_a_bullet_world_whose_bodies_may_meet_is_stepped_one_by_one(split, monkeypatch):
+    build, built = bullet_world.build, []
+
+    def shaped(client, constants):
+        p = bullet.engine()
+        p.createMultiBody(1.0, p.createCollisionShape(p.GEOM_SPHERE, physicsClientId=client),
+                          basePosition=(9.0, 9.0, 9.0), physicsClientId=client)  # fmt: skip
+        built.append(client)
+        return build(client, constants)
+
+    simulator, theta, scenarios = lanes("pendulum", EFFECTS["asked"], engine="pybullet")
+    split(NEVER)
+    expected = simulator.simulate_lanes(theta, scenarios)
+    simulator.close()
+    monkeypatch.setattr(bullet_world, "build", shaped)
+    crowded = SIMULATORS["pendulum"](engine="pybullet", effects=list(EFFECTS["asked"]))
+    split(ALWAYS)
+    np.testing.assert_array_equal(crowded.simulate_lanes(theta, scenarios), expected)
+    assert len(built) == 1 + 3  # the world of each lane by itself, and a try for each run
+    crowded.close()
 
 
 def test_all_that_a_world_writes_reaches_its_lane(split, monkeypatch):

@@ -1,0 +1,211 @@
+"""Bodies on joints in Bullet, several in one world, where nothing in it can touch.
+
+Bullet takes little less for several bodies than for one at a time; what is gained is that effects
+are asked once a step for all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sims import bullet
+from sims.base import Array
+from sims.engines.external import Places
+from sims.engines.joints import ApartError, Mask
+from sims.engines.worlds import BulletJointModule
+
+FEWEST: dict[str, int] = {"asked": 8}
+MOST = 16
+"""Bodies in one world: of more, each takes Bullet longer."""
+
+
+class Joint:
+    """A body on one hinge or guide; see `sims.engines.joint.Joint`."""
+
+    def __init__(self, world: bullet.PersistentWorld, module: BulletJointModule) -> None:
+        self._world = world
+        self._load = module.load
+        self._gravity = module.gravity
+        self.open_loop: bool = module.OPEN_LOOP
+
+    def start(self, constants: dict[str, float]) -> None:
+        """A world for these constants; all else that matters is set by `pace` and `place`."""
+        self._constants, self.gravity = constants, self._gravity(constants)
+        self._client, self._body = self._world.body(constants)
+
+    def pace(self, step: float, inertia: float, damping: float) -> bool:
+        """Step in seconds, generalised inertia, joint damping."""
+        p = bullet.engine()
+        if not self._load(self._client, self._body, inertia, self._constants):
+            return False
+        p.setTimeStep(step, self._client)
+        p.changeDynamics(self._body, 0, jointDamping=damping, physicsClientId=self._client)
+        return True
+
+    def place(self, x: float, w: float) -> None:
+        """The joint's position and velocity."""
+        bullet.engine().resetJointState(self._body, 0, x, w, self._client)
+
+    def advance(self, force: float) -> tuple[float, float]:
+        """One step."""
+        return self.glide(force, (1,))[0]
+
+    def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
+        """Steps with a force or torque at the joint."""
+        p = bullet.engine()
+        client = self._client
+        body = self._body
+        # Looked up once: a rollout has thousands of each.
+        step = p.stepSimulation
+        push = p.setJointMotorControl2
+        torque = p.TORQUE_CONTROL
+        read = p.getJointState
+        states = []
+        for count in counts:
+            for _ in range(count):
+                if force:  # Bullet forgets applied torques after each step
+                    push(body, 0, torque, force=force, physicsClientId=client)
+                step(client)
+            states.append(read(body, 0, client)[:2])
+        return states
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity", "open_loop")}
+
+
+class Joints:
+    """Bodies on one hinge or guide each; see `sims.engines.joints.Joints`.
+
+    Lanes of one world make the same steps.
+    """
+
+    fewest: Mapping[str, int] = FEWEST
+    most = MOST
+    alike = True
+
+    def __init__(self, module: BulletJointModule) -> None:
+        self._several = _Several(module.build)
+        self._world = bullet.PersistentWorld(self._several.build)
+        self._load = module.load
+        self._gravity = module.gravity
+        self.open_loop: bool = module.OPEN_LOOP
+
+    def start(self, constants: dict[str, float], count: int) -> None:
+        """A world for these constants; all else that matters is set by `pace` and `place`."""
+        self._constants = constants
+        self._weigh = self._gravity(constants)
+        if count != self._several.wanted:
+            self._several.wanted = count
+            self._world.discard()
+        self._client, _ = self._world.body(constants)
+        self._bodies = self._several.bodies
+        self._x = np.zeros(count)
+        self._w = np.zeros(count)
+
+    def gravity(self, x: Array) -> Array:
+        """See `sims.engines.joints.Joints`."""
+        return np.array([self._weigh(value) for value in x.tolist()])
+
+    def pace(self, lanes: Places, step: Array, inertia: Array, damping: Array) -> Mask:
+        """See `sims.engines.joints.Joints`."""
+        p = bullet.engine()
+        p.setTimeStep(float(step[0]), self._client)
+        able = np.ones(lanes.size, dtype=bool)
+        for place, lane in enumerate(lanes.tolist()):
+            body = self._bodies[lane]
+            able[place] = self._load(self._client, body, float(inertia[place]), self._constants)
+            p.changeDynamics(
+                body, 0, jointDamping=float(damping[place]), physicsClientId=self._client
+            )
+        return able
+
+    def place(self, lanes: Places, x: Array, w: Array) -> None:
+        """See `sims.engines.joints.Joints`."""
+        reset = bullet.engine().resetJointState
+        self._x[lanes] = x
+        self._w[lanes] = w
+        for place, lane in enumerate(lanes.tolist()):
+            reset(self._bodies[lane], 0, float(x[place]), float(w[place]), self._client)
+
+    def state(self, count: int) -> tuple[Array, Array]:
+        """See `sims.engines.joints.Joints`."""
+        return self._x[:count], self._w[:count]
+
+    def advance(self, force: Array) -> None:
+        """See `sims.engines.joints.Joints`."""
+        p = bullet.engine()
+        client = self._client
+        push = p.setJointMotorControl2
+        torque = p.TORQUE_CONTROL
+        read = p.getJointState
+        for body, value in zip(self._bodies, force.tolist(), strict=True):
+            if value:  # Bullet forgets applied torques after each step
+                push(body, 0, torque, force=value, physicsClientId=client)
+        p.stepSimulation(client)
+        states = [read(body, 0, client)[:2] for body in self._bodies]
+        self._x[:], self._w[:] = np.array(states).T
+
+    def run(self, force: Array) -> tuple[Array, Array]:
+        """See `sims.engines.joints.Joints`."""
+        x = np.empty(force.shape)
+        w = np.empty(force.shape)
+        for k in range(force.shape[1]):
+            self.advance(force[:, k])
+            x[:, k] = self._x
+            w[:, k] = self._w
+        return x, w
+
+    def again(self, failed: Mask) -> Mask:
+        """See `sims.engines.joints.Joints`."""
+        # A body that has failed may have left the world of the others in any state.
+        if failed.any():
+            self._world.discard()
+        return np.full(failed.size, failed.any())
+
+    def discard(self) -> None:
+        """Build afresh before the next integration."""
+        self._world.discard()
+
+    def close(self) -> None:
+        """Give back the world."""
+        self._world.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        kept = ("_world", "_several", "_load", "_gravity", "open_loop")
+        return {name: self.__dict__[name] for name in kept}
+
+
+class _Several:
+    """Builds several bodies in one world.
+
+    Attributes:
+        wanted: how many to build.
+        bodies: their ids, when built.
+    """
+
+    def __init__(self, build: Callable[[int, Mapping[str, float]], int]) -> None:
+        self._build = build
+        self.wanted = 0
+        self.bodies: list[int] = []
+
+    def build(self, client: int, constants: Mapping[str, float]) -> int:
+        """Build them in an empty world; returns the first one's id.
+
+        Raises:
+            ApartError: they might meet.
+        """
+        p = bullet.engine()
+        first = self._build(client, constants)
+        links = range(-1, p.getNumJoints(first, client))
+        shaped = any(p.getCollisionShapeData(first, link, client) for link in links)
+        if shaped or p.getNumBodies(client) > 1 or p.getNumConstraints(client):
+            raise ApartError("bodies of this world may meet")
+        self.bodies = [first, *(self._build(client, constants) for _ in range(self.wanted - 1))]
+        # Bodies without a shape cannot meet, but Bullet would look at every pair of them.
+        for body in self.bodies:
+            for link in links:
+                p.setCollisionFilterGroupMask(body, link, 0, 0, physicsClientId=client)
+        return first
