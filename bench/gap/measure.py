@@ -26,7 +26,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.gap.model.arrow import schur_complement
+from bench.gap.model.arrow import held, schur_complement
 from bench.gap.model.fit import Fit, Fitter, Start, difference_steps, prior_of
 from bench.gap.model.models import Model, Models, freedom
 from bench.gap.model.noise import Mask, Noise, likelihood, whitened
@@ -218,11 +218,13 @@ def _curvatures(models: Models, model: Model) -> tuple[Array, Array]:
     j = jacobian.reshape(runs, -1, size)
     normal = np.matmul(j.transpose(0, 2, 1), j)
     own = normal[:, :q, :q].sum(axis=0)
-    # An initial state that is known is not fitted, so it takes nothing away.
-    known = world.known[:, None, :]
-    cross = np.where(known, 0.0, normal[:, :q, q:])
     precision = 1.0 / prior_of(world) ** 2
-    inner = normal[:, q:, q:] + np.diag(precision)
+    # An initial state that is known is not fitted, so it takes nothing away.
+    inner, cross = held(
+        normal[:, q:, q:] + np.diag(precision),
+        normal[:, :q, q:],
+        world.known,
+    )
     # The theorem by which a step of the fit is solved eliminates them here, too.
     left, _ = schur_complement(own, cross, inner)
     return own, left

@@ -112,6 +112,16 @@ def schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, 
     return schur, inverse_cross
 
 
+def held(inner: Array, cross: Array, known: Mask) -> tuple[Array, Array]:
+    """Every V_i (R, s, s) and W_i (R, q, s) with known initial states (R, s) held where they are: no
+    parameter leads to them, and neither does another state.
+    """
+    # a known state's equation reads: its step is zero
+    touched = known[:, :, None] | known[:, None, :]
+    alone = np.where(touched, np.eye(inner.shape[1]), inner)
+    return alone, np.where(known[:, None, :], 0.0, cross)
+
+
 def arrow_step(
     residual: Array,
     jacobian: Array,
@@ -167,15 +177,10 @@ def _normal(
 
 def _damped(arrow: _Arrow, damping: float, known: Mask) -> _Arrow:
     """The equations damped, and with initial states that do not move where they are known."""
-    identity = np.eye(arrow.inner.shape[1])
     diagonal = np.einsum("rii->ri", arrow.inner)
-    inner = arrow.inner + damping * diagonal[:, :, None] * identity
-    # a known state's equation reads: its step is zero
-    touched = known[:, :, None] | known[:, None, :]
-    inner = np.where(touched, identity, inner)
+    inner = arrow.inner + damping * diagonal[:, :, None] * np.eye(arrow.inner.shape[1])
+    inner, cross = held(inner, arrow.cross, known)
     pull = np.where(known, 0.0, arrow.pull)
-    # and W must not lead from it to the parameters
-    cross = np.where(known[:, None, :], 0.0, arrow.cross)
 
     scale = np.maximum(np.diagonal(arrow.shared), LEAST_POWER)
     shared = arrow.shared + np.diag(damping * scale + RIDGE * scale + LEAST_POWER)

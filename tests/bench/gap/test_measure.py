@@ -1,3 +1,4 @@
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,16 @@ from bench.gap.model.fit import Fitter, Start
 from bench.gap.model.noise import Noise, likelihood
 from sims.pendulum.simulator import Pendulum
 from sims.slider.simulator import Slider
-from tests.bench.gap.made import correlated, marked, recorded, recording, searched, white, world
+from tests.bench.gap.made import (
+    correlated,
+    marked,
+    recorded,
+    recording,
+    searched,
+    white,
+    with_runs,
+    world,
+)
 
 
 def errors(rmse, runs=6, samples=200, seed=0):
@@ -125,8 +135,10 @@ def test_intervals_cover_the_truth(phi):
     assert (np.mean(held, axis=0) >= 0.85).all()
 
 
-def test_the_covariance_is_that_of_all_unknowns_at_once():
+@pytest.mark.parametrize("told", [{}, {"qd": 0.0}])
+def test_the_covariance_is_that_of_all_unknowns_at_once(told):
     made = recording(runs=2, seconds=0.8, rate=50, noise=["q=0.003", "qd=0.02"], seed=3)
+    made = with_runs(made, [replace(made.runs[0], initial=told), made.runs[1]])
     search, model = searched(made, [0.003, 0.02], candidates=[])
     sigma = model.likelihood.sigma
     assert np.allclose(model.likelihood.phi, 0, atol=0.3)
@@ -140,14 +152,41 @@ def test_the_covariance_is_that_of_all_unknowns_at_once():
         flattened = jacobian[r].reshape(-1, 3)
         rows[r, :, 0], rows[r, :, 1 + 2 * r : 3 + 2 * r] = flattened[:, 0], flattened[:, 1:]
     normal = np.einsum("rnk,rnl->kl", rows, rows) + np.diag([0, *[1e-4] * 4])
+    # What is told is no unknown.
+    unknown = [0, *(1 + np.flatnonzero(~search.world.known))]
+    inverse = np.linalg.inv(normal[np.ix_(unknown, unknown)])
     # Squared kg m^2 are far below any absolute tolerance, so the ratio is asked.
     known = covariance(search, model)[0, 0]
-    assert known * 1e12 == pytest.approx(np.linalg.inv(normal)[0, 0] * 1e12, rel=1e-6)
-    assert known > 3.0 / normal[0, 0], "initial states take most of what is known of it"
+    assert known * 1e12 == pytest.approx(inverse[0, 0] * 1e12, rel=1e-6)
+    least = 1.0 if told else 3.0
+    assert known > least / normal[0, 0], "initial states take most of what is known of it"
     value, low, high = intervals(search, model)[0]
     assert value == model.fit.theta[0]
     for reach in (value - low, high - value):
         assert reach / np.sqrt(known) == pytest.approx(1.959964, rel=1e-6)
+
+
+def test_a_coordinate_that_is_not_recorded_hides_no_coefficient_of_the_others():
+    """Where a ball drifts sideways is not known; how its spin lifts it is."""
+    made = recording(
+        "ball",
+        effects=["lift.magnus=0.25"],
+        initial=["vx=4", "z=1.5", "vz=3"],
+        noise=["x=0.003", "z=0.003"],
+        observe=["x", "z"],
+        runs=2,
+        seconds=1.0,
+        rate=60,
+        seed=5,
+    )
+    there = world(made, candidates=["lift.magnus"])
+    noise = white(there, 0.003)
+    theta = np.array([0.5, 0.2, -0.02])
+    fit = Fitter(there, noise).fit([Start(("lift.magnus",), theta, there.guess)], 8)[0]
+    search = Search(there, noise, frozenset(), np.random.default_rng(0), marked(there, True))
+    _, low, high = intervals(search, search.enter(fit))[1]
+    assert low < 0.25 < high
+    assert high - low < 0.05
 
 
 def test_parameters_that_act_alike_have_no_interval():
