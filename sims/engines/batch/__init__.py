@@ -7,6 +7,8 @@ a constant force acts fly in closed form (`parabola`); the others are stepped (`
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sims.base import InputError
@@ -18,6 +20,9 @@ from sims.engines.batch.stepping import Stepping
 from sims.engines.ground import Ground, Indices, Mask
 from sims.limits import cut, is_number
 from sims.system import Force, Friction, Lanes, Motion, System
+
+if TYPE_CHECKING:
+    from sims.engines.compiled.machine import Machine
 
 REQUIRES: tuple[str, ...] = ()
 TIME_STEP = 5e-3
@@ -83,6 +88,9 @@ class Batch:
             if not moved.any():
                 motion = self._moved(lanes)
             else:
+                if self._machine(lanes) is not None:
+                    # Machine code groups lanes itself: in their own order none has to be copied.
+                    order = np.arange(moved.size)
                 # Lanes in free flight apart from the others: in closed form they take no steps.
                 kinds = moved[order]
                 flown = order[~kinds]
@@ -102,13 +110,11 @@ class Batch:
 
     def _stepped(self, lanes: Lanes) -> Motion:
         """The motion of lanes that are all stepped, sorted by what acts in them."""
-        # Loaded when something is stepped: the compiler's package is not for free.
-        from sims.engines.compiled import machine
-        from sims.engines.compiled.run import step
-
-        made = machine.machine() if self._compiled and lanes.steps.shape[1] else None
+        made = self._machine(lanes)
         if made is None:
             return self._moved(lanes)
+        from sims.engines.compiled.run import step
+
         motion, left = step(lanes, self._turn, self._patience, made, self._jobs)
         if left.size:
             # What does not compile is stepped here, beside what does.
@@ -116,6 +122,15 @@ class Batch:
             for whole, values in ((motion.x, part.x), (motion.v, part.v), (motion.a, part.a)):
                 whole[left] = values
         return motion
+
+    def _machine(self, lanes: Lanes) -> Machine | None:
+        """The machine code that steps lanes; None where numpy does."""
+        if not (self._compiled and lanes.steps.shape[1]):
+            return None
+        # Loaded when something is stepped: the compiler's package is not for free.
+        from sims.engines.compiled import machine
+
+        return machine.machine()
 
     def _moved(self, lanes: Lanes) -> Motion:
         """The motion of lanes that are all stepped or all in free flight."""
