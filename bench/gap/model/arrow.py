@@ -113,8 +113,8 @@ def schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, 
 
 
 def held(inner: Array, cross: Array, known: Mask) -> tuple[Array, Array]:
-    """Every V_i (R, s, s) and W_i (R, q, s) with known initial states (R, s) held where they are: no
-    parameter leads to them, and neither does another state.
+    """Every V_i (R, s, s) and W_i (R, q, s) with known initial states (R, s) held where they are:
+    no parameter leads to them, and neither does another state.
     """
     # a known state's equation reads: its step is zero
     touched = known[:, :, None] | known[:, None, :]
