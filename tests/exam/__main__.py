@@ -16,6 +16,7 @@ import sys
 from concurrent.futures import as_completed
 from pathlib import Path
 
+from sims.engines.compiled import machine
 from tests.exam import answers, questions, report
 
 LIMIT = 600  # seconds for drawing, writing, explaining and marking one item
@@ -95,6 +96,7 @@ def _ask(asked, path, known, drawn, given):
 
     for name in ALONE:
         os.environ[name] = "1"
+    machine.machine()  # compiled, if it never was, before it takes a question's time
     context = multiprocessing.get_context("spawn")
     with ProcessPool(max_workers=given.jobs, context=context) as pool, path.open("a") as file:
         running = {
