@@ -30,7 +30,9 @@ def sought(search: Search) -> Model:
     few = thinned(search.world)
     if few is None:
         return search.run()
-    sketch = Search(few, search.noise, search.frozen, search.rng, search.stated)
+    sketch = Search(
+        few, search.noise, search.frozen, search.drawing("fewer samples"), search.stated
+    )
     sketch.refit([search.base.fit.start()])
     try:
         found = settle(sketch, sketch.run())

@@ -94,10 +94,11 @@ class Scored(Models):
         residual = self.residual(model.fit)
         # The colour of noise is best known from a model that leaves less structure.
         meaningless = residual if against is None else against
+        rng = self.drawing("library", model.names)
         scores = calibrated(
             test,
             residual,
-            lambda count: surrogates(meaningless, self.seen, count, self.rng, left=test.left),
+            lambda count: surrogates(meaningless, self.seen, count, rng, left=test.left),
             SURROGATES,
         )
         self.scanned[key] = Scanned(at, candidates, test, scores)

@@ -146,7 +146,7 @@ class Search(Moves):
             return
         # One search over pieces serves every size; it decides nothing, and finds where to begin.
         if self._sketch is None:
-            self._sketch = Search(cut, self.noise, self.frozen, self.rng, self.stated)
+            self._sketch = Search(cut, self.noise, self.frozen, self.drawing("pieces"), self.stated)
             self._sketch.refit([Start((), self.base.fit.theta, cut.guess)])
         sketch = self._sketch
         sketch.extend(beam(sketch, size - 1), NOMINATED)

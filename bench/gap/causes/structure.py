@@ -134,10 +134,11 @@ def remains(models: Models, model: Model) -> Remains:
         return quick
     residual = models.residual(model.fit)
     test = ScoreTest(model.fit, directions, models.seen, models.weights(model))
+    rng = models.drawing("structure", model.names)
     scores = calibrated(
         test,
         residual,
-        lambda count: surrogates(residual, models.seen, count, models.rng, left=test.left),
+        lambda count: surrogates(residual, models.seen, count, rng, left=test.left),
         SURROGATES,
     )
     promise = scores.score - scores.chance

@@ -12,7 +12,7 @@ coefficients have paid of that already.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,6 +21,7 @@ from bench.gap.model.base_fit import HORIZONS
 from bench.gap.model.fit import Fit, Fitter, Start, prior_of
 from bench.gap.model.noise import Likelihood, Mask, Noise, likelihood
 from bench.gap.model.world import World
+from bench.problem.seeds import rng_for
 from sims.base import Array
 
 Names = tuple[str, ...]
@@ -29,6 +30,8 @@ SIFTED = (12, 8)
 """Of models that are fitted with patience so many go on from each horizon to the next."""
 STEPS = 24
 """Steps of each fit, at most."""
+LARGEST_DRAWN = 2**62
+"""Whole numbers below it tell streams of random numbers apart."""
 FEWEST = 2
 """Samples that there are taken to be at least: the logarithm of one prices nothing."""
 
@@ -62,7 +65,7 @@ class Models:
         world: the runs for fitting.
         noise: of the sensors.
         frozen: parameters that the data do not touch.
-        rng: draws surrogates.
+        rng: what all that is drawn follows from.
         stated: (C,) whether the recording states the noise of each channel.
         models: what was fitted.
         chances: what each effect gains by chance about the base model.
@@ -75,6 +78,16 @@ class Models:
     stated: Mask
     models: dict[frozenset[str], Model] = field(default_factory=dict)
     chances: dict[str, float] = field(default_factory=dict)
+    _drawn: int = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._drawn = int(self.rng.integers(LARGEST_DRAWN))
+
+    def drawing(self, question: str, names: Iterable[str] = ()) -> np.random.Generator:
+        """The random numbers of a question about a model with these effects: the same whenever it
+        is asked, so that an answer does not hang on what was asked before.
+        """
+        return rng_for(self._drawn, question, *sorted(names))
 
     @property
     def seen(self) -> Mask:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.gap.causes.structure import remains
 from tests.bench.gap.made import recording, searched
 
 
@@ -28,3 +29,24 @@ def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
     np.testing.assert_array_equal(
         search.scanned[frozenset()].at.simulated, (shifted if anew else base.fit).simulated
     )
+
+
+def test_scores_of_a_model_do_not_hang_on_what_was_scored_before():
+    recorded = recording(
+        "slider", effects=["friction.coulomb=0.1"], noise=["0.01"], observe=["x"], runs=2, rate=50.0
+    )
+    chances = []
+    for first in (True, False):
+        search, base = searched(
+            recorded, 0.01, candidates=["friction.coulomb", "spring.linear", "drag.linear"]
+        )
+        start = replace(base.fit.start(), effects=("drag.linear",))
+        search.refit([start])
+        larger = search.models[frozenset(["drag.linear"])]
+        models = [base, larger] if first else [larger, base]
+        for model in models:
+            search.scan(model)
+            remains(search, model)
+        chances.append([*search.scan(base).chance, *search.scan(larger).chance])
+        chances[-1].append(remains(search, larger).p_value)
+    assert chances[0] == chances[1]
