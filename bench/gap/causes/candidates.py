@@ -92,11 +92,13 @@ def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
     modified = list(_modified(world, probes, acting))
     places = np.flatnonzero(acting)
     probes = [probes[i] for i in places] + modified
-    # The largest array of explain: copied once, and only where something is left out or added.
+    # The largest array of explain: what acts moves up in its place.
+    for row, place in enumerate(places.tolist()):
+        if row < place:
+            values[row] = values[place]
+    values = values[: places.size]
     if modified:
-        values = np.concatenate([values[places], _responses(world, at, modified)])
-    elif not acting.all():
-        values = values[places]
+        values = np.concatenate([values, _responses(world, at, modified)])
     return Directions(tuple(probes), np.moveaxis(values, 0, -1))
 
 

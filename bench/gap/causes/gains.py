@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -101,19 +102,37 @@ def explained(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Arra
         return _jointly(gram, cross)
     best = np.zeros((number, samples))
     coefficients = np.zeros((number, count))
+    rest = np.arange(number)
+    # Nothing is held of most effects, and all columns together explain most.
+    if not any(positive):
+        solved = _solved(gram, cross, list(range(count)))
+        best[solved.groups] = solved.gain
+        coefficients[solved.groups] = solved.own
+        rest = np.setdiff1d(rest, solved.groups)
+    if rest.size:
+        best[rest], coefficients[rest] = _chosen(gram[rest], cross[rest], positive)
+    return best, coefficients
+
+
+def _chosen(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Array, Array]:
+    """The same by the best of all choices of columns."""
+    number, count, samples = cross.shape
+    best = np.zeros((number, samples))
+    coefficients = np.zeros((number, count))
     for chosen in _choices(count):
-        solvable, gain, c = _solved(gram, cross, chosen)
+        solved = _solved(gram, cross, chosen)
         held = [place for place, i in enumerate(chosen) if positive[i]]
-        allowed = (c[:, held] >= 0).all(axis=1)
-        former = best[solvable]
+        former = best[solved.groups]
         # More columns must explain more than rounding: else the fewer stand.
-        better = allowed & (gain > former * (1.0 + 1e-9))
-        best[solvable] = np.where(better, gain, former)
+        better = solved.gain > former * (1.0 + 1e-9)
+        if held:
+            better &= (solved.scaled[:, held] >= 0).all(axis=1)
+        best[solved.groups] = np.where(better, solved.gain, former)
         # Columns that are not chosen have no part in it.
         improved = better[:, 0]
-        rows = solvable[improved]
+        rows = solved.groups[improved]
         coefficients[rows] = 0.0
-        coefficients[rows[:, None], chosen] = c[improved, :, 0]
+        coefficients[rows[:, None], chosen] = solved.own[improved]
     return best, coefficients
 
 
@@ -124,10 +143,24 @@ def _choices(count: int) -> Iterator[list[int]]:
             yield list(chosen)
 
 
-def _solved(gram: Array, cross: Array, chosen: list[int]) -> tuple[Indices, Array, Array]:
-    """Of some columns of each group: which groups (m,) they can be solved of, neither absorbed nor
-    alike; there h'G^-1 h (m, S) and G^-1 h (m, k, S).
+class _Solved(NamedTuple):
+    """What some columns of groups explain by themselves.
+
+    Attributes:
+        groups: (m,) those in which they are neither absorbed nor alike.
+        gain: (m, S) h'G^-1 h.
+        scaled: (m, k, S) G^-1 h in units of the columns' lengths.
+        own: (m, k) G^-1 h of the first residual.
     """
+
+    groups: Indices
+    gain: Array
+    scaled: Array
+    own: Array
+
+
+def _solved(gram: Array, cross: Array, chosen: list[int]) -> _Solved:
+    """Solve for some columns of each group."""
     products = gram[:, chosen][:, :, chosen]
     lengths = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
     acting = np.flatnonzero((lengths > 0).all(axis=1))
@@ -137,10 +170,11 @@ def _solved(gram: Array, cross: Array, chosen: list[int]) -> tuple[Indices, Arra
     apart = np.linalg.eigvalsh(normal)[:, 0] >= RANK
     solvable = acting[apart]
     scale = scale[apart]
-    right = cross[solvable][:, chosen] / scale
-    scaled = np.linalg.solve(normal[apart], right) if len(chosen) > 1 else right
+    right = cross[solvable[:, None], chosen] / scale
+    # For hundreds of right sides inverses are quicker, and these matrices have unit diagonals.
+    scaled = np.linalg.inv(normal[apart]) @ right
     gain = np.einsum("nks,nks->ns", scaled, right)
-    return solvable, gain, scaled / scale
+    return _Solved(solvable, gain, scaled, scaled[:, :, 0] / scale[:, :, 0])
 
 
 def _jointly(gram: Array, cross: Array) -> tuple[Array, Array]:

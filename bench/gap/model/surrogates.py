@@ -33,6 +33,14 @@ GAINED = 1e-9
 """An order must lower Akaike's criterion by more than this, else rounding would choose it."""
 SHARES = tuple(share / 20.0 for share in range(20, 0, -1))
 """Shares of a bias that are taken out, the largest first that leaves noise which dies away."""
+PILOTS = (20, 100)
+"""Surrogates of the first set, at least and at most."""
+PILOTED = 20_000
+"""So many samples of theirs say what the bias is: it is less than their error where it is small."""
+NUMBERS = 500_000
+"""Numbers that are driven at once: more would not stay in the cache."""
+WIDTH = 1_000
+"""But so many side by side at least, or each step would cost more than its numbers."""
 FEWEST = 10
 """Innovations from which surrogates are drawn at least; of fewer the samples themselves are."""
 
@@ -57,13 +65,12 @@ def surrogates(
     """
     channels = residual.shape[2]
     weights = [_autoregression(residual[..., c], seen[..., c], largest) for c in range(channels)]
-    drawn = _drawn(residual, seen, weights, count, rng)
     # White noise has nothing to remember less of.
-    if left is None or not any(w.size for w in weights):
-        return drawn
-    leavings = left(drawn)
-    for c in range(channels):
-        weights[c] = _unbiased(weights[c], leavings[..., c], seen[..., c])
+    if left is not None and any(w.size for w in weights):
+        pilots = int(np.clip(PILOTED // max(int(seen.sum()), 1), *PILOTS))
+        leavings = left(_drawn(residual, seen, weights, pilots, rng))
+        for c in range(channels):
+            weights[c] = _unbiased(weights[c], leavings[..., c], seen[..., c])
     return _drawn(residual, seen, weights, count, rng)
 
 
@@ -79,10 +86,13 @@ def _drawn(
         here = seen[:, :, c]
         filled = np.where(here, residual[:, :, c], 0.0)
         innovations = _centred(filled, here, own)
-        drawn = rng.choice(innovations, size=(length + BURN_IN, count, runs))
-        # time comes first in what is driven, and last here
-        driven = np.moveaxis(_driven(own, drawn)[BURN_IN:], 0, 2)
-        result[:, :, :, c] = np.where(here, driven, 0.0)
+        step = max(NUMBERS // ((length + BURN_IN) * runs), WIDTH // runs, 1)
+        for first in range(0, count, step):
+            some = result[first : first + step, :, :, c]
+            drawn = rng.choice(innovations, size=(length + BURN_IN, len(some), runs))
+            # time comes first in what is driven, and last here
+            driven = np.moveaxis(_driven(own, drawn)[BURN_IN:], 0, 2)
+            some[...] = np.where(here, driven, 0.0)
     return result
 
 

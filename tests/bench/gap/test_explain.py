@@ -1,6 +1,8 @@
 """Odd recordings: a verdict or one clear line, never a traceback, never a confident wrong name."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -293,3 +295,9 @@ def test_a_recording_is_not_changed(tmp_path):
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
     assert one.extended == two.extended
     assert replace(one.answer, seconds=0) == replace(two.answer, seconds=0)
+
+
+def test_what_only_tables_need_is_not_loaded():
+    code = "import sys, bench.gap.explain; print('pandas' in sys.modules, 'scipy' in sys.modules)"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert printed.stdout.split() == ["False", "False"], printed.stderr
