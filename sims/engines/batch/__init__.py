@@ -84,13 +84,10 @@ class Batch:
     def integrate(self, lanes: Lanes) -> Motion:
         """Integrate every lane over its steps; a lane whose numbers overflow is NaN throughout."""
         with np.errstate(all="ignore"):
-            moved, order = _sorted(lanes)
+            moved, order = _sorted(lanes, self._machine(lanes) is None)
             if not moved.any():
                 motion = self._moved(lanes)
             else:
-                if self._machine(lanes) is not None:
-                    # Machine code groups lanes itself: in their own order none has to be copied.
-                    order = np.arange(moved.size)
                 # Lanes in free flight apart from the others: in closed form they take no steps.
                 kinds = moved[order]
                 flown = order[~kinds]
@@ -171,14 +168,16 @@ def engine(
     return Batch(time_step, turn, patience, compiled, jobs)
 
 
-def _sorted(lanes: Lanes) -> tuple[Mask, Indices]:
+def _sorted(lanes: Lanes, for_numpy: bool) -> tuple[Mask, Indices]:
     """(L,) whether more than a constant force acts in a lane; lanes in the order of what acts in
-    them.
+    them where numpy steps them.
     """
     forces = [acts(c) for effect, c in lanes.effects if isinstance(effect, (Force, Friction))]
     steps = not lanes.system.uniform
+    own = np.arange(len(lanes.x))
     if not forces:
-        return np.full(len(lanes.x), steps), np.arange(len(lanes.x))
-    # Lanes with the same effects lie together, so that each effect is asked for a short span.
+        return np.full(len(own), steps), own
     moved: Mask = np.any(forces, axis=0) | steps
-    return moved, np.lexsort(forces)
+    # In numpy lanes with the same effects lie together, so that each effect is asked for a short
+    # span; machine code groups lanes itself, and in their own order none has to be copied.
+    return moved, np.lexsort(forces) if for_numpy else own

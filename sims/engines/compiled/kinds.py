@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[Any]
 Numbers = NDArray[np.float64]
 Row = NDArray[np.float64]
 """One number a lane."""

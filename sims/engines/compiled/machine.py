@@ -16,7 +16,7 @@ from pathlib import Path
 from threading import Lock
 
 from sims.engines.compiled import entry, kept, native
-from sims.engines.compiled.kinds import Block, Numbers, Program, Work, check
+from sims.engines.compiled.kinds import Array, Block, Numbers, Program, Work, check
 
 PARTS = (
     *("advance", "build", "clock", "dynamics", "entry", "evaluate", "events", "graph", "kinds"),
@@ -76,8 +76,18 @@ class Machine:
         self._function(
             ctypes.byref((ctypes.c_int64 * entry.SIZES)(*sizes)),
             ctypes.byref(reals),
-            *(array.ctypes.data for array in arrays),
+            *map(_address, arrays),
         )
+
+
+_Nothing = ctypes.c_char * 0
+
+
+def _address(array: Array) -> int:
+    """Where an array begins; numpy's own way takes four times as long, and there are many."""
+    if array.flags.writeable:
+        return ctypes.addressof(_Nothing.from_buffer(array))
+    return int(array.ctypes.data)
 
 
 def machine() -> Machine | None:

@@ -126,6 +126,8 @@ class _Job:
 
 def _some(work: Work, places: Indices) -> Work:
     """The work on the lanes at these places of its order."""
+    if len(places) == len(work.order) and (places == np.arange(len(places))).all():
+        return work
     return work._replace(order=work.order[places], parameters=work.parameters[places])
 
 
@@ -182,9 +184,16 @@ def _groups(lanes: Lanes) -> list[tuple[Indices, list[tuple[Effect, Array]]]]:
     on = [acts(c) for _, c in there]
     if not on:
         return [(np.arange(len(lanes.x)), [])]
-    patterns, which = np.unique(np.array(on).T, axis=0, return_inverse=True)
-    groups: list[tuple[Indices, list[tuple[Effect, Array]]]] = []
-    for k, pattern in enumerate(patterns):
-        effects = [pair for pair, is_on in zip(there, pattern, strict=True) if is_on]
-        groups.append((np.flatnonzero(which.ravel() == k), effects))
-    return groups
+    patterns = np.ascontiguousarray(np.array(on).T)
+    # Most calls have one group, and numpy's search for equal rows costs as much as a few lanes.
+    if (patterns == patterns[0]).all():
+        groups = {0: np.arange(len(patterns))}
+    else:
+        lanes_of: dict[bytes, list[int]] = {}
+        for lane, pattern in enumerate(patterns):
+            lanes_of.setdefault(pattern.tobytes(), []).append(lane)
+        groups = {members[0]: np.array(members) for members in lanes_of.values()}
+    return [
+        (members, [pair for pair, is_on in zip(there, patterns[first], strict=True) if is_on])
+        for first, members in groups.items()
+    ]
