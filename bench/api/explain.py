@@ -8,6 +8,7 @@ from typing import Any
 
 from bench.gap import explain as explaining
 from bench.gap.explanation import Explanation
+from bench.gap.model.crew import cores
 from bench.gap.model.watch import Watch
 from bench.gap.score_model import scored
 from bench.recordings.simulate import SimulatedRecording
@@ -25,6 +26,7 @@ def explain(
     seed: int = 0,
     force: bool = False,
     budget: float | None = None,
+    jobs: int | None = None,
     say: Callable[[str], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float, str], None] | None = None,
@@ -41,6 +43,8 @@ def explain(
         force: explain what needs more than this machine has, or has stamps that cannot be seconds.
         budget: seconds of the clock after which the search ends with what it has then; the
             answer's ``cut`` says what was not asked any more. None: it comes to its end.
+        jobs: processes that work at once, where that pays; None: one for each core. The answer does
+            not depend on it.
         say: told what is being done.
         stop: asked between two steps of the search; True ends it as a budget does.
         progress: told the share that is done, as far as can be known, and what is looked at.
@@ -53,8 +57,11 @@ def explain(
         recording = recording.recording
     if budget is not None and not budget > 0:
         raise InputError(f"budget: expected a number of seconds above 0, found {budget!r}")
+    if jobs is not None and jobs < 1:
+        raise InputError(f"jobs: expected a whole number of at least 1, found {jobs!r}")
     watch = Watch(budget, stop, progress)
-    return explaining.explain(recording, system, engine, seed, free, tuner, say, force, watch)
+    given = system, engine, seed, free, tuner, say, force
+    return explaining.explain(recording, *given, watch, jobs or cores())
 
 
 def score(

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from bench.commands.interrupts import INTERRUPTED, Interrupts
-from bench.commands.options import add_force, add_plugin, names, place, seconds
+from bench.commands.options import add_force, add_plugin, names, place, positive, seconds
 
 
 def add_explain(parser: argparse.ArgumentParser) -> None:
@@ -50,6 +50,13 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="seconds after which the search ends with what it has (default: it comes to its end); "
         "Ctrl-C ends it likewise",
+    )
+    parser.add_argument(
+        "--jobs",
+        type=positive,
+        metavar="N",
+        help="processes that work at once, where that pays; the answer is the same with any number "
+        "(default: one for each core)",
     )
     add_plugin(parser, "systems")
     add_force(parser)
@@ -98,6 +105,7 @@ def _explain(options: argparse.Namespace) -> int:
             seed=options.seed,
             force=options.force,
             budget=options.budget,
+            jobs=options.jobs,
             say=look.say,
             stop=interrupts.asked,
             progress=look.show,

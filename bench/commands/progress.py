@@ -74,6 +74,8 @@ class Look:
     def _drawn(self) -> tqdm[NoReturn]:
         from tqdm import tqdm
 
+        # The thread that would watch over idle bars: a process with threads cannot fork workers.
+        tqdm.monitor_interval = 0
         # A search does not go at an even pace: the estimate is of its mean pace so far.
         return tqdm(
             total=1.0,

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from bench.gap.causes.structure import Hat
 from bench.gap.explanation import Explanation
 from bench.gap.measure import HeldOutRuns
 from bench.gap.model.base_fit import fit_base
+from bench.gap.model.crew import Crew
 from bench.gap.model.floor import Floor, noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.watch import Watch
@@ -53,6 +55,7 @@ def explain(
     say: Say = lambda _: None,
     force: bool = False,
     watch: Watch | None = None,
+    jobs: int = 1,
 ) -> Explanation:
     """Explain a recording.
 
@@ -66,13 +69,15 @@ def explain(
         say: told what is being done.
         force: whether the user insists on a recording that is refused otherwise.
         watch: says when the search has to end, and is told how far it is.
+        jobs: processes that work at once; the answer does not depend on it.
 
     Raises:
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
             or the search was ended before anything could be simulated.
     """
-    watch = watch or Watch()
-    return _Explainer(recording, system, engine, seed, tuple(free), tuner, say, force, watch).run()
+    with closing(Crew(jobs)) as crew:
+        given = seed, tuple(free), tuner, say, force
+        return _Explainer(recording, system, engine, *given, watch or Watch(), crew).run()
 
 
 class _Explainer:
@@ -87,6 +92,7 @@ class _Explainer:
         say: Say,
         force: bool,
         watch: Watch,
+        crew: Crew,
     ) -> None:
         self.started = time.perf_counter()
         self.seed = seed
@@ -118,6 +124,7 @@ class _Explainer:
         for part in (self.fitting, self.measuring):
             if part is not None:
                 part.watch = watch
+                part.crew = crew
         # White to begin with: each likelihood finds the memory of the noise for itself.
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
         self.assessor = Assessor(

@@ -6,7 +6,7 @@ then asked of that score and of the size of what it leaves.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -17,8 +17,9 @@ from bench.gap.causes.nominate import nominated
 from bench.gap.causes.score_test import Scores, ScoreTest, calibrated, tail
 from bench.gap.model.fit import Fit
 from bench.gap.model.models import Model, Models
-from bench.gap.model.noise import forgets
+from bench.gap.model.noise import Mask, Noise, forgets
 from bench.gap.model.surrogates import surrogates
+from bench.gap.model.world import World
 from sims.base import Array
 
 SURROGATES = 120
@@ -85,64 +86,76 @@ class Scored(Models):
         """
         key = frozenset(model.names)
         known = self.scanned.get(key)
-        if known is not None and against is None:
+        if known is None:
+            self._survey([model])
+            known = self.scanned[key]
+        if against is None:
             return known.scores
+        self._look(model)
+        # Directions cost a simulation of each candidate; other surrogates need no new ones. The
+        # colour of noise is best known from a model that leaves less structure.
+        residual = self.residual(model.fit)
+        stream = self.drawing("library", model.names)
+        scores = _scored(known.test, residual, against, self.seen, stream)
+        self._take(key, known._replace(scores=scores))
+        return scores
+
+    def _survey(self, models: Sequence[Model]) -> None:
+        """Score every effect that models lack, each for itself."""
+        calls, keys = [], []
+        for model in models:
+            self._look(model)
+            key = frozenset(model.names)
+            residual, stream = self.residual(model.fit), self.drawing("library", model.names)
+            former = self.former.pop(key, None)
+            # What has hardly moved keeps its directions, which nobody else has.
+            if former is not None and self._moved(former.at, model.fit) < UNMOVED:
+                scores = _scored(former.test, residual, residual, self.seen, stream)
+                self._take(key, former._replace(scores=scores))
+                continue
+            keys.append(key)
+            calls.append(
+                (model.fit, self._lacking(model), self.weights(model), residual, self.seen, stream)
+            )
+        found = self.world.crew.map(self.world, _scanned, calls)
+        for key, scanned in zip(keys, found, strict=True):
+            self._take(key, scanned)
+
+    def _look(self, model: Model) -> None:
         about = " + ".join(model.names) or "the base model"
         self.world.watch.look(f"scores of the library about {about}")
-        # Directions cost a simulation of each candidate; other surrogates need no new ones.
-        at, candidates, test = self._prepared(model) if known is None else known[:3]
-        residual = self.residual(model.fit)
-        # The colour of noise is best known from a model that leaves less structure.
-        meaningless = residual if against is None else against
-        rng = self.drawing("library", model.names)
-        scores = calibrated(
-            test,
-            residual,
-            lambda count: surrogates(meaningless, self.seen, count, rng, left=test.left),
-            SURROGATES,
-        )
-        self.scanned[key] = Scanned(at, candidates, test, scores)
+
+    def _take(self, key: frozenset[str], scanned: Scanned) -> None:
+        self.scanned[key] = scanned
+        scores = scanned.scores
         self.tests[key] = scores.p_value
         # Kept from the first scan, so that merits stay comparable when a better base fit turns up.
         if not key and not self.chances:
             self.chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
-        return scores
-
-    def _prepared(self, model: Model) -> tuple[Fit, Directions, ScoreTest]:
-        """Directions about a model with their test, and the fit that they are about: an earlier one
-        of the same effects where the model has hardly moved since.
-        """
-        former = self.former.pop(frozenset(model.names), None)
-        if former is not None and self._moved(former.at, model.fit) < UNMOVED:
-            return former[:3]
-        candidates = self._lacking(model)
-        test = ScoreTest(model.fit, candidates, self.seen, self.weights(model))
-        return model.fit, candidates, test
 
     def _moved(self, one: Fit, other: Fit) -> float:
         """How far two fits are apart where samples are, in sigmas, RMS."""
         apart = (one.simulated - other.simulated) / self.noise.sigma
         return float(np.sqrt(np.square(apart[self.seen]).mean()))
 
-    def _lacking(self, model: Model) -> Directions:
-        """Directions of the effects that a model lacks."""
+    def _lacking(self, model: Model) -> list[str]:
+        """The effects that a model lacks."""
         held = set(model.names)
         # Of an effect and one that it contains nothing would fix how they share what they explain.
         for name in model.names:
             held.update(self.world.effects[name].contains)
-        lacking = [name for name in self.world.library if name not in held]
-        return directions(self.world, model.fit, lacking)
+        return [name for name in self.world.library if name not in held]
 
     def extend(self, beam: Iterable[Model], most: int, patient: bool = False) -> None:
         """Refit the most promising extensions of some models; those that are known already only
         with patience.
         """
         starts = []
-        for model in beam:
+        models = list(beam)
+        # A better fit since then has taken the scores of some away.
+        self._survey([model for model in models if frozenset(model.names) not in self.scanned])
+        for model in models:
             key = frozenset(model.names)
-            # A better fit since then has taken its scores away.
-            if key not in self.scanned:
-                self.scan(model)
             known = self.scanned[key]
             # The model may have been fitted better since it was put into the beam.
             newest = self.models[key]
@@ -211,3 +224,30 @@ class Scored(Models):
         # The test of Ljung and Box, eq. (5) of `bench.gap.model.noise`.
         residual = self.residual(model.fit)
         return forgets(residual, self.seen, model.likelihood) > FORGOT
+
+
+def _scanned(
+    world: World,
+    at: Fit,
+    lacking: Sequence[str],
+    weights: Noise,
+    residual: Array,
+    seen: Mask,
+    stream: np.random.Generator,
+) -> Scanned:
+    """A model scored, whoever does it."""
+    candidates = directions(world, at, lacking)
+    test = ScoreTest(at, candidates, seen, weights)
+    return Scanned(at, candidates, test, _scored(test, residual, residual, seen, stream))
+
+
+def _scored(
+    test: ScoreTest, residual: Array, against: Array, seen: Mask, stream: np.random.Generator
+) -> Scores:
+    """Scores of a residual, with surrogates of the colour of another one."""
+    return calibrated(
+        test,
+        residual,
+        lambda count: surrogates(against, seen, count, stream, left=test.left),
+        SURROGATES,
+    )

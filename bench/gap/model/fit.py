@@ -20,13 +20,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bench.gap.model.arrow import arrow_step
 from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.noise import Mask, Noise, whitened
-from bench.gap.model.world import Indices, World
+from bench.gap.model.world import FEWEST_LANES, Indices, World
 from sims.base import Array
 
 RESPONSE = 0.1
@@ -49,6 +50,12 @@ MEASURED = 100.0
 
 RACED = 4
 """Steps after which a model can be so far behind that it is given up."""
+LEG = 3
+"""Steps after which those who race hear of each other."""
+GROUP = 60_000
+"""What a group of models costs in a step, about, in samples that are simulated."""
+ALGEBRA = 8_000
+"""What the equations of one model cost in the same unit."""
 BEATEN = 100.0
 """A model is given up whose sum of squares, less what may be hoped for, is so much above the best
 one's.
@@ -181,6 +188,14 @@ class _Problem:
         self.growth = GROWTH * self.growth
 
 
+class _Leg(NamedTuple):
+    """Steps from the first until the last, which is not made any more, of so many in all."""
+
+    first: int
+    last: int
+    all: int
+
+
 _Trial = tuple[_Problem, Start]
 """A model, and where it may go next."""
 
@@ -219,23 +234,70 @@ class Fitter:
             reached: what other models have come down to.
         """
         problems = [self._problem(start) for start in starts]
+        for leg in _legs(iterations, race):
+            # who is not done goes on, in groups that know nothing of each other within a leg
+            going = [i for i, problem in enumerate(problems) if not problem.done]
+            if not going or (leg.first and self.world.watch.leaves(leg.first / iterations)):
+                break
+            best = min(reached, *(problem.point.cost for problem in problems))
+            groups = self._groups(problems, going)
+            calls = [(self._terms(), [problems[i] for i in g], leg, race, best) for g in groups]
+            gone = self.world.crew.map(self.world, _gone, calls)
+            for group, members in zip(groups, gone, strict=True):
+                for i, problem in zip(group, members, strict=True):
+                    problems[i] = problem
+        return [p.fit() for p in problems]
+
+    def _terms(self) -> tuple[Any, ...]:
+        """All but the world."""
+        return self.noise, self.frozen, self.share, self.parameters
+
+    def _groups(self, problems: Sequence[_Problem], going: Sequence[int]) -> list[list[int]]:
+        """Those that go on, in groups of about `GROUP` samples to simulate, of one kind each as far
+        as may be; one group where more lanes of a call cost less.
+        """
+        world = self.world
+        if not world.apart:
+            return [list(going)]
+        runs, length, _ = world.observed.shape
+        lanes = sum(1 + problems[i].steps.size for i in going) * runs
+        cost = lanes * length * self.share + ALGEBRA * len(going)
+        # compiled lanes are stepped side by side, however long they are
+        count = int(np.ceil(min(cost / GROUP, lanes / FEWEST_LANES)))
+        kinds = world.kinds(np.stack([problems[i].point.start.theta for i in going]))
+        order = [going[i] for i in np.argsort(kinds, kind="stable")]
+        parts = np.array_split(order, min(count, len(order)))
+        return [part.tolist() for part in parts]
+
+    def go(
+        self, problems: Sequence[_Problem], leg: _Leg, race: bool, reached: float
+    ) -> list[_Problem]:
+        """Some problems after a leg of their way.
+
+        Args:
+            problems: where they stand.
+            leg: which steps to make.
+            race: as in `fit`.
+            reached: likewise, those of other groups among them.
+        """
         # the samples that count, (R, T, C)
         seen = self.world.counted(self.share)
-        begun = self._points([(p, p.point.start) for p in problems], seen)
-        for problem, point in zip(problems, begun, strict=True):
-            self._take(problem, point)
-        for iteration in range(iterations):
+        if not leg.first:
+            begun = self._points([(p, p.point.start) for p in problems], seen)
+            for problem, point in zip(problems, begun, strict=True):
+                self._take(problem, point)
+        for iteration in range(leg.first, leg.last):
             # in its first steps even the right model may be far behind
             if race and iteration >= RACED:
                 _give_up(problems, reached)
             trials = list(self._trials(problems, seen))
             # what comes after it sees that this was left off
-            if not trials or self.world.watch.leaves(iteration / iterations):
+            if not trials or self.world.watch.leaves(iteration / leg.all):
                 break
             points = self._points(trials, seen)
             for (problem, _), point in zip(trials, points, strict=True):
                 self._judge(problem, point)
-        return [p.fit() for p in problems]
+        return list(problems)
 
     def _problem(self, start: Start) -> _Problem:
         """What of a model is fitted, and how far it may go."""
@@ -382,6 +444,24 @@ class Fitter:
             problem.taken(gained, point.cost)
         else:
             problem.refused()
+
+
+def _gone(world: World, terms: tuple[Any, ...], *call: Any) -> list[_Problem]:
+    """A group after a leg, whoever goes it."""
+    return Fitter(world, *terms).go(*call)
+
+
+def _legs(iterations: int, race: bool) -> Iterator[_Leg]:
+    """The way of a fit: in legs where models race, who hear of each other between them."""
+    first = 0
+    while first < iterations or not first:
+        last = iterations
+        if race:
+            last = min(iterations, first + LEG if first else RACED)
+        yield _Leg(first, last, max(iterations, 1))
+        if not iterations:
+            return
+        first = last
 
 
 def _give_up(problems: Sequence[_Problem], reached: float) -> None:

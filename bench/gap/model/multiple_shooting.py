@@ -59,6 +59,7 @@ def pieces(world: World) -> World | None:
     cut.longest = world.longest
     cut.travel = world.travel
     cut.watch = world.watch
+    cut.crew = world.crew
     return cut
 
 

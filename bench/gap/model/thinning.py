@@ -49,6 +49,7 @@ def thinned(world: World) -> World | None:
         candidates=world.library,
     )
     few.watch = world.watch
+    few.crew = world.crew
     # the same grids of shapes, so that what is found here is what would be found there
     few.longest = world.longest
     few.travel = world.travel

@@ -73,6 +73,9 @@ class EndedError(Exception):
 class Watch:
     """Watches over one search.
 
+    Attributes:
+        deadline: on the clock `time.monotonic`, the same in all processes; None without an end.
+
     Args:
         budget: seconds of the clock after which it ends; None without an end.
         stop: asked between two steps: whether somebody wants an end.
@@ -85,7 +88,7 @@ class Watch:
         stop: Stop = lambda: False,
         progress: Progress | None = None,
     ) -> None:
-        self._deadline = None if budget is None else time.monotonic() + budget
+        self.deadline = None if budget is None else time.monotonic() + budget
         self._stop = stop
         self._progress = progress
         self._by: By | None = None
@@ -101,7 +104,7 @@ class Watch:
         """Whether the search has to end; once it has, it does."""
         if self._by is None and self._stop():
             self._by = "interrupt"
-        if self._by is None and self._deadline is not None and time.monotonic() >= self._deadline:
+        if self._by is None and self.deadline is not None and time.monotonic() >= self.deadline:
             self._by = "budget"
         return self._by is not None
 
@@ -154,6 +157,10 @@ class Watch:
         self._advance(share)
         self._left |= self.over()
         return self._left
+
+    def left_off(self, left: bool) -> None:
+        """Take into account that a fit was left off in another process."""
+        self._left |= left
 
     def left(self) -> bool:
         """Whether any fit was left off."""

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.gap.model.crew import Crew
 from bench.gap.model.noise import Mask
 from bench.gap.model.tracks import Track, first_of, tracked
 from bench.gap.model.watch import Watch
@@ -27,6 +29,10 @@ LANE_SAMPLES = 400_000
 """
 LEAST_LANES = 64
 """But so many lanes go together however long they are: the engine steps them side by side."""
+PIECE = 80_000
+"""The same where calls of compiled steps are pieces for several cores."""
+FEWEST_LANES = 32
+"""But so many lanes make a piece."""
 TIME_STEP = 0.01
 """Longest step of the batch engine, seconds; it shortens its steps itself where motion or forces
 ask for it.
@@ -73,6 +79,7 @@ class World:
         travel: the largest range of the primary coordinate in one run.
         simulations: lanes simulated so far.
         watch: says when fits have to leave off; never, unless another is put here.
+        crew: who simulates and fits; this process alone, unless another is put here.
 
     Args:
         kind: the simulator's class.
@@ -130,6 +137,7 @@ class World:
         self.travel = self._travel()
         self.simulations = 0
         self.watch = Watch()
+        self.crew = Crew()
         self._parts: dict[float, list[Scenario]] = {}
 
     def _simulators(self) -> tuple[Simulated, Simulated]:
@@ -245,22 +253,39 @@ class World:
         result = np.empty((len(theta), length, channels))
 
         # the slowest lane of a call sets its steps: those that need many do not go with the others
+        kinds = self.kinds(theta)
+        together = max(LEAST_LANES, LANE_SAMPLES // length)
+        if self.apart:
+            together = min(together, max(FEWEST_LANES, int(PIECE / (share * length))))
+        parts, calls = [], []
+        for kind in np.unique(kinds):
+            lanes = np.flatnonzero(kinds == kind)
+            for part in np.array_split(lanes, -(-lanes.size // together)):
+                parts.append(part)
+                calls.append((bool(kind >= 2), theta[part], runs[part], states[part], share))
+        for number, simulated in self.crew.each(self, _simulated, calls):
+            last = simulated.shape[1]
+            result[parts[number], :last] = simulated
+            result[parts[number], last:] = np.nan
+        return result
+
+    def kinds(self, theta: Array) -> Indices:
+        """(L,) which lanes of parameters (L, P) can be simulated together: those of one number."""
         active = theta != 0
         shifting = active[:, self._shifting].any(axis=1)
         filtering = active[:, self._filtering].any(axis=1)
-        kinds = shifting + 2 * filtering
-        size = max(LEAST_LANES, LANE_SAMPLES // length)
-        for kind in np.unique(kinds):
-            simulator = self._fine if kind >= 2 else self.simulator
-            lanes = np.flatnonzero(kinds == kind)
-            for begin in range(0, lanes.size, size):
-                part = lanes[begin : begin + size]
-                scenarios = self._scenarios(theta[part], runs[part], share)
-                simulated = self._simulated(simulator, theta[part], scenarios, states[part])
-                last = simulated.shape[1]
-                result[part, :last] = simulated
-                result[part, last:] = np.nan
-        return result
+        kinds: Indices = shifting + 2 * filtering
+        return kinds
+
+    @cached_property
+    def apart(self) -> bool:
+        """Whether lanes cost as much in several calls as in one: where steps are compiled."""
+        if self.engine != "batch":
+            return False
+        # loaded when something is simulated: the compiler's package is not for free
+        from sims.engines.compiled import machine
+
+        return machine.machine() is not None
 
     def _scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:
         """The first share of each lane's run, with the constants that its parameters (L, P) set."""
@@ -281,10 +306,20 @@ class World:
             for scenario, row in zip(scenarios, values, strict=True)
         ]
 
-    def _simulated(
-        self, simulator: Simulated, theta: Array, scenarios: Sequence[Scenario], states: Array
+    def together(
+        self, fine: bool, theta: Array, runs: Indices, states: Array, share: float
     ) -> Array:
-        """Observations of lanes that one simulator can take together."""
+        """Observations (L, T', C) of lanes of one kind, in one call of the engine.
+
+        Args:
+            fine: in the steps that a filter needs.
+            theta: (L, P) as in `simulate`, and so the others.
+            runs: (L,).
+            states: (L, s).
+            share: of each run.
+        """
+        simulator = self._fine if fine else self.simulator
+        scenarios = self._scenarios(theta, runs, share)
         # to the simulator a freed constant is none of its parameters
         freed = np.arange(self.own, self.base.size)
         lanes = np.delete(theta, freed, axis=1)
@@ -292,9 +327,15 @@ class World:
         return simulator.simulate_lanes(lanes, scenarios, initial)
 
     def close(self) -> None:
-        """Give back what the engine holds."""
+        """Give back what the engine and the crew hold."""
+        self.crew.dismiss(self)
         self.simulator.close()
         self._fine.close()
+
+
+def _simulated(world: World, *call: Any) -> Array:
+    """A call of the engine, whoever makes it."""
+    return world.together(*call)
 
 
 def _freed(name: str, simulator: Simulated, recording: Recording) -> Parameter:

@@ -1,0 +1,294 @@
+"""Independent pieces of work on all cores, in processes that inherit what they work on.
+
+A piece is the same whoever does it: what is cut into pieces, and how, never depends on the number
+of workers, so that the answer is the same to the last bit with one and with many. Workers are
+forked when there has been enough to do that they pay. They know the world as it was then, get small
+messages, and end with the crew, with their parent (by a signal of the kernel's, and by the end of
+their pipe), and not by Ctrl-C, which is the parent's to answer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import mmap
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing import connection
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from bench.gap.model.watch import Watch
+from bench.sealing.kernel import PR_SET_PDEATHSIG, prctl
+from sims.base import Array
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+    from multiprocessing.process import BaseProcess
+
+    from bench.gap.model.world import World
+
+PAYS = 0.15
+"""Seconds of work that could have been shared after which workers are started."""
+LOOK = 0.05
+"""Seconds between two looks at whether the search has to end."""
+
+Result = TypeVar("Result")
+Task = Callable[..., Result]
+"""A function of a module: the world comes first, then what a message brings."""
+
+
+class _Worker(NamedTuple):
+    process: BaseProcess
+    pipe: Connection
+
+
+class _Answer(NamedTuple):
+    """What a worker sends back: a result or what went wrong, and what it takes to account for."""
+
+    result: Any
+    error: Exception | None
+    simulations: int
+    left: bool
+
+
+class Crew:
+    """Works with up to so many processes.
+
+    Args:
+        jobs: how many; 1 is this process alone.
+    """
+
+    def __init__(self, jobs: int = 1) -> None:
+        self._jobs = jobs
+        self._spent = 0.0
+        # With the world itself, so that no other can have its number.
+        self._teams: dict[int, tuple[World, list[_Worker]]] = {}
+        self._ending: mmap.mmap | None = None
+
+    def map(
+        self, world: World, task: Task[Result], items: Sequence[tuple[Any, ...]]
+    ) -> list[Result]:
+        """What a task makes of each item, in their order; arguments as those of `each`."""
+        results = dict(self.each(world, task, items))
+        return [results[number] for number in range(len(items))]
+
+    def each(
+        self, world: World, task: Task[Result], items: Sequence[tuple[Any, ...]]
+    ) -> Iterator[tuple[int, Result]]:
+        """What a task makes of each item, by the item's number, in the order in which they come.
+
+        Args:
+            world: the task's first argument; workers know it as it was when they were started.
+            task: a function of a module.
+            items: its further arguments.
+        """
+        several = self._jobs > 1 and len(items) > 1
+        team = self._team(world) if several and self._spent >= PAYS else []
+        if team:
+            yield from self._shared(team, world, task, items)
+            return
+        for number, item in enumerate(items):
+            begun = time.perf_counter()
+            result = task(world, *item)
+            if several:
+                self._spent += time.perf_counter() - begun
+            yield number, result
+
+    def dismiss(self, world: World) -> None:
+        """End the workers of a world, whatever they are at."""
+        _, team = self._teams.pop(id(world), (world, []))
+        for worker in team:
+            worker.process.kill()
+        for worker in team:
+            worker.process.join()
+            worker.pipe.close()
+
+    def close(self) -> None:
+        """End all workers, and do without."""
+        for world, _ in list(self._teams.values()):
+            self.dismiss(world)
+        self._jobs = 1
+
+    def _team(self, world: World) -> list[_Worker]:
+        """The workers of a world that are alive."""
+        if id(world) not in self._teams:
+            # Asked now, as threads come and go.
+            team = self._started(world) if can_fork() else []
+            self._teams[id(world)] = world, team
+        return self._teams[id(world)][1]
+
+    def _started(self, world: World) -> list[_Worker]:
+        if self._ending is None:
+            self._ending = mmap.mmap(-1, 1)
+        context = multiprocessing.get_context("fork")
+        team: list[_Worker] = []
+        for _ in range(self._jobs):
+            mine, theirs = context.Pipe()
+            # Ends of other pipes that a worker held would keep those workers alive.
+            others = [worker.pipe for _, workers in self._teams.values() for worker in workers]
+            others += [worker.pipe for worker in team]
+            told = (world, theirs, [*others, mine], self._ending, os.getpid())
+            process = context.Process(target=_work, args=told, daemon=True, name="explain")
+            process.start()
+            theirs.close()
+            team.append(_Worker(process, mine))
+        return team
+
+    def _shared(
+        self,
+        team: list[_Worker],
+        world: World,
+        task: Task[Result],
+        items: Sequence[tuple[Any, ...]],
+    ) -> Iterator[tuple[int, Result]]:
+        errors: dict[int, Exception] = {}
+        waiting = list(range(len(items)))[::-1]
+        busy: dict[Connection, int] = {}
+        free = [worker.pipe for worker in team]
+        while waiting or busy:
+            while free and waiting:
+                pipe = free.pop()
+                number = waiting.pop()
+                if _sent(pipe, (task, items[number])):
+                    busy[pipe] = number
+                else:
+                    self._lost(team, pipe)
+                    waiting.append(number)
+            # All are gone: what is left is done here.
+            if not busy:
+                yield from ((number, task(world, *items[number])) for number in waiting)
+                break
+            for pipe in self._heard(list(busy), world):
+                number = busy.pop(pipe)
+                answer = _received(pipe)
+                if answer is None:
+                    # A worker that died, for want of memory perhaps: its work is done again.
+                    self._lost(team, pipe)
+                    waiting.append(number)
+                    continue
+                free.append(pipe)
+                world.simulations += answer.simulations
+                world.watch.left_off(answer.left)
+                if answer.error is not None:
+                    errors[number] = answer.error
+                else:
+                    yield number, answer.result
+        # The first in order, whichever came first.
+        for number in sorted(errors):
+            raise errors[number]
+
+    def _heard(self, pipes: list[Connection], world: World) -> list[Any]:
+        """Pipes on which something has come; workers are told meanwhile if the search must end."""
+        while True:
+            ready = connection.wait(pipes, LOOK)
+            if self._ending is not None and world.watch.over():
+                self._ending[0] = 1
+            if ready:
+                return ready
+
+    def _lost(self, team: list[_Worker], pipe: Connection) -> None:
+        """Do without a worker."""
+        for worker in list(team):
+            if worker.pipe is pipe:
+                team.remove(worker)
+                worker.process.kill()
+                worker.process.join()
+                pipe.close()
+
+
+def cores() -> int:
+    """How many this process may use."""
+    # On some systems nobody can say which they are.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def can_fork() -> bool:
+    """Whether workers can inherit what there is: on Linux, without other threads, whose locks would
+    stay locked for ever, and in a process that may have children.
+    """
+    alone = threading.active_count() == 1
+    return sys.platform == "linux" and alone and not multiprocessing.current_process().daemon
+
+
+class _Pickler(pickle.Pickler):
+    """Keeps the order of arrays in memory: sums depend on it, to the last bit."""
+
+    def reducer_override(self, thing: Any) -> Any:
+        if type(thing) is not np.ndarray or thing.ndim < 2 or thing.flags.c_contiguous:
+            return NotImplemented
+        order = np.argsort([-abs(stride) for stride in thing.strides], kind="stable")
+        return _turned, (np.ascontiguousarray(thing.transpose(order)), np.argsort(order))
+
+
+def _turned(values: Array, order: Array) -> Array:
+    """An array with its axes in another order, as it was before it was sent."""
+    return values.transpose(order)
+
+
+def packed(message: Any) -> bytes:
+    """A message for a pipe."""
+    buffer = io.BytesIO()
+    _Pickler(buffer, protocol=pickle.HIGHEST_PROTOCOL).dump(message)
+    return buffer.getvalue()
+
+
+def _sent(pipe: Connection, message: Any) -> bool:
+    try:
+        pipe.send_bytes(packed(message))
+    except OSError:
+        return False
+    return True
+
+
+def _received(pipe: Connection) -> _Answer | None:
+    """What a worker says; None if it is gone."""
+    try:
+        answer: _Answer = pickle.loads(pipe.recv_bytes())
+    except (EOFError, OSError):
+        return None
+    return answer
+
+
+def _work(
+    world: World, pipe: Connection, others: list[Connection], ending: mmap.mmap, parent: int
+) -> None:
+    """What a worker does until its pipe ends."""
+    # A terminal's Ctrl-C reaches every process of the group; the parent alone answers it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with contextlib.suppress(OSError):
+        prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    # It may have ended before the kernel was asked.
+    if os.getppid() != parent:
+        return
+    for other in others:
+        other.close()
+    world.crew = Crew()
+    deadline = world.watch.deadline
+    while True:
+        try:
+            task, item = pickle.loads(pipe.recv_bytes())
+        except (EOFError, OSError):
+            return
+        world.watch = Watch(stop=lambda: ending[0] != 0)
+        world.watch.deadline = deadline
+        before = world.simulations
+        result, error = None, None
+        try:
+            result = task(world, *item)
+        except Exception as raised:
+            raised.add_note(traceback.format_exc())
+            error = raised
+        count = world.simulations - before
+        if not _sent(pipe, _Answer(result, error, count, world.watch.left())):
+            return

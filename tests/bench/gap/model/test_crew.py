@@ -1,0 +1,171 @@
+"""Work on several cores: the same to the last bit, whoever does it, and nobody left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from contextlib import closing
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench.gap.model import crew as crews
+from bench.gap.model.crew import Crew, can_fork, cores, packed
+from bench.gap.model.watch import Watch
+
+pytestmark = pytest.mark.skipif(not can_fork(), reason="workers cannot be forked here")
+
+
+def world(**watch):
+    """What a crew needs to know of a world."""
+    return SimpleNamespace(simulations=0, watch=Watch(**watch), crew=None, factor=3)
+
+
+@pytest.fixture(autouse=True)
+def eager(monkeypatch):
+    """Workers are started at once, however little there is to do."""
+    monkeypatch.setattr(crews, "PAYS", 0.0)
+
+
+def times(there, number):
+    there.simulations += number
+    return there.factor * number, os.getpid()
+
+
+def dies(there, number):
+    if number == 2 and os.getpid() != PARENT:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def fails(there, number):
+    if number:
+        raise ValueError(f"no {number}")
+
+
+def waits(there, number):
+    while not there.watch.leaves(0.0):
+        time.sleep(0.01)
+    return number
+
+
+def summed(there, values):
+    return float(values.sum()), values.strides, values
+
+
+PARENT = os.getpid()
+
+
+def alive(numbers):
+    return [n for n in numbers if os.path.exists(f"/proc/{n}")]
+
+
+@pytest.mark.parametrize("jobs", [2, 5])
+def test_results_come_in_order_from_other_processes_and_are_accounted_for(jobs):
+    there = world()
+    with closing(Crew(jobs)) as crew:
+        results = crew.map(there, times, [(n,) for n in range(20)])
+    assert [value for value, _ in results] == [3 * n for n in range(20)]
+    workers = {process for _, process in results}
+    assert os.getpid() not in workers
+    assert 1 <= len(workers) <= jobs
+    assert there.simulations == sum(range(20))
+    assert not alive(workers)
+
+
+def test_one_job_and_one_item_stay_here():
+    there = world()
+    with closing(Crew(1)) as crew:
+        assert {process for _, process in crew.map(there, times, [(1,), (2,)])} == {os.getpid()}
+    with closing(Crew(2)) as crew:
+        assert crew.map(there, times, [(1,)])[0][1] == os.getpid()
+
+
+def test_little_work_starts_nobody(monkeypatch):
+    monkeypatch.setattr(crews, "PAYS", 60.0)
+    with closing(Crew(2)) as crew:
+        for _ in range(3):
+            results = crew.map(world(), times, [(1,), (2,)])
+            assert {process for _, process in results} == {os.getpid()}
+
+
+def test_beside_a_thread_nobody_is_forked():
+    done = threading.Event()
+    thread = threading.Thread(target=done.wait)
+    thread.start()
+    try:
+        with closing(Crew(2)) as crew:
+            results = crew.map(world(), times, [(1,), (2,)])
+    finally:
+        done.set()
+        thread.join()
+    assert {process for _, process in results} == {os.getpid()}
+
+
+def test_what_a_worker_that_died_was_at_is_done_again():
+    there = world()
+    with closing(Crew(2)) as crew:
+        # Each that takes number 2 dies of it, until nobody is left but this process.
+        assert crew.map(there, dies, [(n,) for n in range(6)]) == list(range(6))
+        assert crew.map(there, times, [(1,), (2,)])[0] == (3, os.getpid())
+
+
+def test_a_fault_is_raised_here():
+    with closing(Crew(2)) as crew, pytest.raises(ValueError, match="no 1") as raised:
+        crew.map(world(), fails, [(n,) for n in range(3)])
+    assert "in fails" in "".join(raised.value.__notes__)
+
+
+def test_workers_leave_off_when_the_search_has_to_end():
+    wanted = []
+    there = world(stop=lambda: bool(wanted) or wanted.append(1))
+    with closing(Crew(2)) as crew:
+        assert crew.map(there, waits, [(1,), (2,)]) == [1, 2]
+    assert there.watch.left()
+    there = world(budget=0.2)
+    with closing(Crew(2)) as crew:
+        assert crew.map(there, waits, [(1,), (2,)]) == [1, 2]
+
+
+def test_a_message_keeps_the_order_of_arrays_in_memory():
+    rng = np.random.default_rng(0)
+    values = np.moveaxis(rng.standard_normal((7, 11, 13)), 0, -1)
+    with closing(Crew(2)) as crew:
+        found = crew.map(world(), summed, [(values,), (values.T,)])
+    for (total, strides, back), sent in zip(found, (values, values.T), strict=True):
+        assert total == float(sent.sum())
+        assert strides == back.strides == sent.strides
+        assert np.array_equal(back, sent)
+    assert len(packed(values)) < 1.1 * values.nbytes
+
+
+def test_workers_end_with_a_parent_that_is_killed():
+    code = textwrap.dedent("""
+        import os, time
+        from types import SimpleNamespace
+        from bench.gap.model import crew
+        from bench.gap.model.watch import Watch
+        def task(world, number):
+            print(os.getpid(), flush=True)
+            time.sleep(60)
+        crew.PAYS = 0.0
+        world = SimpleNamespace(simulations=0, watch=Watch(), crew=None)
+        crew.Crew(2).map(world, task, [(1,), (2,)])
+    """)
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:
+        workers = [int(parent.stdout.readline()) for _ in range(2)]
+        assert len(alive(workers)) == 2
+        parent.kill()
+    for _ in range(200):
+        if not alive(workers):
+            break
+        time.sleep(0.02)
+    assert not alive(workers)
+
+
+def test_there_is_a_core():
+    assert cores() >= 1

@@ -1,0 +1,41 @@
+"""The answer does not depend on how many processes work."""
+
+import json
+
+import pytest
+
+from bench.gap.explain import explain
+from bench.gap.model import crew, fit, world
+from bench.gap.model.crew import Crew, can_fork
+from bench.gap.model.world import World
+from tests.bench.gap.made import recording
+
+
+@pytest.mark.skipif(not can_fork(), reason="workers cannot be forked here")
+def test_the_answer_is_the_same_to_the_last_bit_with_one_two_and_eight(monkeypatch):
+    # Small pieces of a small search, all of them given to workers.
+    monkeypatch.setattr(World, "apart", True)
+    monkeypatch.setattr(fit, "GROUP", 10_000)
+    monkeypatch.setattr(world, "PIECE", 4_000)
+    monkeypatch.setattr(crew, "PAYS", 0.0)
+    shared = []
+    usual = Crew._shared
+
+    def counted(self, team, *given):
+        shared.append(len(team))
+        return usual(self, team, *given)
+
+    monkeypatch.setattr(Crew, "_shared", counted)
+    swing = recording(
+        effects=["drag.linear=1e-3", "friction.coulomb=2e-3"], noise=["q=0.003", "qd=0.02"],
+        runs=3, seconds=1.0, rate=60.0,
+    )  # fmt: skip
+    documents = []
+    for jobs in (1, 2, 8):
+        shared.clear()
+        document = explain(swing, jobs=jobs).answer.document()
+        document.pop("seconds")
+        documents.append(json.dumps(document))
+        assert set(shared) == ({jobs} if jobs > 1 else set())
+        assert jobs == 1 or len(shared) > 10
+    assert documents[0] == documents[1] == documents[2]
