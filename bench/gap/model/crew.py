@@ -22,7 +22,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing import connection
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
     from multiprocessing.process import BaseProcess
 
-    from bench.gap.model.world import World
-
 PAYS = 0.15
 """Seconds of work that could have been shared after which workers are started."""
 LOOK = 0.05
@@ -44,6 +42,14 @@ LOOK = 0.05
 Result = TypeVar("Result")
 Task = Callable[..., Result]
 """A function of a module: the world comes first, then what a message brings."""
+
+
+class Place(Protocol):
+    """What is worked on: a world."""
+
+    simulations: int
+    watch: Watch
+    crew: Crew
 
 
 class _Worker(NamedTuple):
@@ -71,18 +77,18 @@ class Crew:
         self._jobs = jobs
         self._spent = 0.0
         # With the world itself, so that no other can have its number.
-        self._teams: dict[int, tuple[World, list[_Worker]]] = {}
+        self._teams: dict[int, tuple[Place, list[_Worker]]] = {}
         self._ending: mmap.mmap | None = None
 
     def map(
-        self, world: World, task: Task[Result], items: Sequence[tuple[Any, ...]]
+        self, world: Place, task: Task[Result], items: Sequence[tuple[Any, ...]]
     ) -> list[Result]:
         """What a task makes of each item, in their order; arguments as those of `each`."""
         results = dict(self.each(world, task, items))
         return [results[number] for number in range(len(items))]
 
     def each(
-        self, world: World, task: Task[Result], items: Sequence[tuple[Any, ...]]
+        self, world: Place, task: Task[Result], items: Sequence[tuple[Any, ...]]
     ) -> Iterator[tuple[int, Result]]:
         """What a task makes of each item, by the item's number, in the order in which they come.
 
@@ -103,7 +109,7 @@ class Crew:
                 self._spent += time.perf_counter() - begun
             yield number, result
 
-    def dismiss(self, world: World) -> None:
+    def dismiss(self, world: Place) -> None:
         """End the workers of a world, whatever they are at."""
         _, team = self._teams.pop(id(world), (world, []))
         for worker in team:
@@ -118,7 +124,7 @@ class Crew:
             self.dismiss(world)
         self._jobs = 1
 
-    def _team(self, world: World) -> list[_Worker]:
+    def _team(self, world: Place) -> list[_Worker]:
         """The workers of a world that are alive."""
         if id(world) not in self._teams:
             # Asked now, as threads come and go.
@@ -126,7 +132,7 @@ class Crew:
             self._teams[id(world)] = world, team
         return self._teams[id(world)][1]
 
-    def _started(self, world: World) -> list[_Worker]:
+    def _started(self, world: Place) -> list[_Worker]:
         if self._ending is None:
             self._ending = mmap.mmap(-1, 1)
         context = multiprocessing.get_context("fork")
@@ -146,7 +152,7 @@ class Crew:
     def _shared(
         self,
         team: list[_Worker],
-        world: World,
+        world: Place,
         task: Task[Result],
         items: Sequence[tuple[Any, ...]],
     ) -> Iterator[tuple[int, Result]]:
@@ -186,7 +192,7 @@ class Crew:
         for number in sorted(errors):
             raise errors[number]
 
-    def _heard(self, pipes: list[Connection], world: World) -> list[Any]:
+    def _heard(self, pipes: list[Connection], world: Place) -> list[Any]:
         """Pipes on which something has come; workers are told meanwhile if the search must end."""
         while True:
             ready = connection.wait(pipes, LOOK)
@@ -261,7 +267,7 @@ def _received(pipe: Connection) -> _Answer | None:
 
 
 def _work(
-    world: World, pipe: Connection, others: list[Connection], ending: mmap.mmap, parent: int
+    world: Place, pipe: Connection, others: list[Connection], ending: mmap.mmap, parent: int
 ) -> None:
     """What a worker does until its pipe ends."""
     # A terminal's Ctrl-C reaches every process of the group; the parent alone answers it.

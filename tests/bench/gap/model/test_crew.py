@@ -144,22 +144,24 @@ def test_a_message_keeps_the_order_of_arrays_in_memory():
 
 
 def test_workers_end_with_a_parent_that_is_killed():
-    code = textwrap.dedent("""
+    code = textwrap.dedent(r"""
         import os, time
         from types import SimpleNamespace
         from bench.gap.model import crew
         from bench.gap.model.watch import Watch
         def task(world, number):
-            print(os.getpid(), flush=True)
+            os.write(1, f"{os.getpid()}\n".encode())
             time.sleep(60)
         crew.PAYS = 0.0
         world = SimpleNamespace(simulations=0, watch=Watch(), crew=None)
         crew.Crew(2).map(world, task, [(1,), (2,)])
     """)
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:
-        workers = [int(parent.stdout.readline()) for _ in range(2)]
-        assert len(alive(workers)) == 2
-        parent.kill()
+        try:
+            workers = [int(parent.stdout.readline()) for _ in range(2)]
+            assert len(alive(workers)) == 2
+        finally:
+            parent.kill()
     for _ in range(200):
         if not alive(workers):
             break
