@@ -86,7 +86,7 @@ _Nothing = ctypes.c_char * 0
 def _address(array: Array) -> int:
     """Where an array begins; numpy's own way takes four times as long, and there are many."""
     if array.flags.writeable:
-        return ctypes.addressof(_Nothing.from_buffer(array))
+        return ctypes.addressof(_Nothing.from_buffer(array.data))
     return int(array.ctypes.data)
 
 
