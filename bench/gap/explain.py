@@ -125,6 +125,7 @@ class _Explainer:
             if part is not None:
                 part.watch = watch
                 part.crew = crew
+                crew.join(part)
         # White to begin with: each likelihood finds the memory of the noise for itself.
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
         self.assessor = Assessor(

@@ -45,10 +45,10 @@ class Meter:
     def __enter__(self):
         meter = self
 
-        def shared(crew, team, world, task, items):
+        def shared(crew, world, task, items):
             spent = Counter()
             wrapped = [(task, *item) for item in items]
-            for number, (result, who, seconds) in meter.usual(crew, team, world, timed, wrapped):
+            for number, (result, who, seconds) in meter.usual(crew, world, timed, wrapped):
                 spent[who] += seconds
                 yield number, result
             meter.rounds += 1

@@ -10,6 +10,7 @@ their pipe), and not by Ctrl-C, which is the parent's to answer.
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import mmap
 import multiprocessing
@@ -76,8 +77,10 @@ class Crew:
     def __init__(self, jobs: int = 1) -> None:
         self._jobs = jobs
         self._spent = 0.0
-        # With the world itself, so that no other can have its number.
-        self._teams: dict[int, tuple[Place, list[_Worker]]] = {}
+        # Worlds that are not done with; and those that the workers know, by their numbers there.
+        self._worlds: list[Place] = []
+        self._known: list[Place] = []
+        self._team: list[_Worker] = []
         self._ending: mmap.mmap | None = None
 
     def map(
@@ -98,9 +101,10 @@ class Crew:
             items: its further arguments.
         """
         several = self._jobs > 1 and len(items) > 1
-        team = self._team(world) if several and self._spent >= PAYS else []
-        if team:
-            yield from self._shared(team, world, task, items)
+        if several and self._spent >= PAYS:
+            self._ready(world)
+        if several and self._team:
+            yield from self._shared(world, task, items)
             return
         for number, item in enumerate(items):
             begun = time.perf_counter()
@@ -109,49 +113,50 @@ class Crew:
                 self._spent += time.perf_counter() - begun
             yield number, result
 
-    def dismiss(self, world: Place) -> None:
-        """End the workers of a world, whatever they are at."""
-        _, team = self._teams.pop(id(world), (world, []))
-        for worker in team:
-            worker.process.kill()
-        for worker in team:
-            worker.process.join()
-            worker.pipe.close()
+    def join(self, world: Place) -> None:
+        """Know of a world that there will be work on, so that workers know it from their start."""
+        self._worlds.append(world)
 
     def close(self) -> None:
-        """End all workers, and do without."""
-        for world, _ in list(self._teams.values()):
-            self.dismiss(world)
+        """End all workers, whatever they are at, and do without."""
+        for worker in list(self._team):
+            worker.process.kill()
+        for worker in list(self._team):
+            self._lose(worker.pipe)
         self._jobs = 1
 
-    def _team(self, world: Place) -> list[_Worker]:
-        """The workers of a world that are alive."""
-        if id(world) not in self._teams:
-            # Asked now, as threads come and go.
-            team = self._started(world) if can_fork() else []
-            self._teams[id(world)] = world, team
-        return self._teams[id(world)][1]
+    def _ready(self, world: Place) -> None:
+        """Have workers that know a world: those that do not are followed by others."""
+        if _among(self._known, world):
+            return
+        for worker in list(self._team):
+            self._lose(worker.pipe)
+        if not _among(self._worlds, world):
+            self.join(world)
+        self._known = list(self._worlds)
+        # Asked now, as threads come and go.
+        if can_fork():
+            self._start()
 
-    def _started(self, world: Place) -> list[_Worker]:
+    def _start(self) -> None:
         if self._ending is None:
             self._ending = mmap.mmap(-1, 1)
         context = multiprocessing.get_context("fork")
-        team: list[_Worker] = []
+        # What there is stays shared memory: a worker that collects garbage would write to it.
+        gc.freeze()
         for _ in range(self._jobs):
             mine, theirs = context.Pipe()
             # Ends of other pipes that a worker held would keep those workers alive.
-            others = [worker.pipe for _, workers in self._teams.values() for worker in workers]
-            others += [worker.pipe for worker in team]
-            told = (world, theirs, [*others, mine], self._ending, os.getpid())
+            others = [mine, *(worker.pipe for worker in self._team)]
+            told = (self._known, theirs, others, self._ending, os.getpid())
             process = context.Process(target=_work, args=told, daemon=True, name="explain")
             process.start()
             theirs.close()
-            team.append(_Worker(process, mine))
-        return team
+            self._team.append(_Worker(process, mine))
+        gc.unfreeze()
 
     def _shared(
         self,
-        team: list[_Worker],
         world: Place,
         task: Task[Result],
         items: Sequence[tuple[Any, ...]],
@@ -159,15 +164,16 @@ class Crew:
         errors: dict[int, Exception] = {}
         waiting = list(range(len(items)))[::-1]
         busy: dict[Connection, int] = {}
-        free = [worker.pipe for worker in team]
+        free = [worker.pipe for worker in self._team]
+        place = next(i for i, known in enumerate(self._known) if known is world)
         while waiting or busy:
             while free and waiting:
                 pipe = free.pop()
                 number = waiting.pop()
-                if _sent(pipe, (task, items[number])):
+                if _sent(pipe, (place, task, items[number])):
                     busy[pipe] = number
                 else:
-                    self._lost(team, pipe)
+                    self._lose(pipe)
                     waiting.append(number)
             # All are gone: what is left is done here.
             if not busy:
@@ -178,7 +184,7 @@ class Crew:
                 answer = _received(pipe)
                 if answer is None:
                     # A worker that died, for want of memory perhaps: its work is done again.
-                    self._lost(team, pipe)
+                    self._lose(pipe)
                     waiting.append(number)
                     continue
                 free.append(pipe)
@@ -201,14 +207,19 @@ class Crew:
             if ready:
                 return ready
 
-    def _lost(self, team: list[_Worker], pipe: Connection) -> None:
+    def _lose(self, pipe: Connection) -> None:
         """Do without a worker."""
-        for worker in list(team):
+        for worker in list(self._team):
             if worker.pipe is pipe:
-                team.remove(worker)
+                self._team.remove(worker)
                 worker.process.kill()
                 worker.process.join()
                 pipe.close()
+
+
+def _among(worlds: Sequence[Place], world: Place) -> bool:
+    """Whether it is one of them, and not only like it."""
+    return any(one is world for one in worlds)
 
 
 def cores() -> int:
@@ -267,7 +278,11 @@ def _received(pipe: Connection) -> _Answer | None:
 
 
 def _work(
-    world: Place, pipe: Connection, others: list[Connection], ending: mmap.mmap, parent: int
+    worlds: Sequence[Place],
+    pipe: Connection,
+    others: list[Connection],
+    ending: mmap.mmap,
+    parent: int,
 ) -> None:
     """What a worker does until its pipe ends."""
     # A terminal's Ctrl-C reaches every process of the group; the parent alone answers it.
@@ -279,13 +294,14 @@ def _work(
         return
     for other in others:
         other.close()
-    world.crew = Crew()
-    deadline = world.watch.deadline
+    for world in worlds:
+        world.crew = Crew()
     while True:
         try:
-            task, item = pickle.loads(pipe.recv_bytes())
+            place, task, item = pickle.loads(pipe.recv_bytes())
         except (EOFError, OSError):
             return
+        world, deadline = worlds[place], worlds[place].watch.deadline
         world.watch = Watch(stop=lambda: ending[0] != 0)
         world.watch.deadline = deadline
         before = world.simulations

@@ -327,8 +327,7 @@ class World:
         return simulator.simulate_lanes(lanes, scenarios, initial)
 
     def close(self) -> None:
-        """Give back what the engine and the crew hold."""
-        self.crew.dismiss(self)
+        """Give back what the engine holds."""
         self.simulator.close()
         self._fine.close()
 
