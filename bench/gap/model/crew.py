@@ -59,12 +59,22 @@ class _Worker(NamedTuple):
 
 
 class _Answer(NamedTuple):
-    """What a worker sends back: a result or what went wrong, and what it takes to account for."""
+    """What a worker sends back: a result or what went wrong and where, and what it takes to account
+    for.
+    """
 
     result: Any
     error: Exception | None
+    trace: str
     simulations: int
     left: bool
+
+
+class _ThereError(Exception):
+    """Where in a worker an error was raised, as its cause."""
+
+    def __str__(self) -> str:
+        return f"in a worker:\n{self.args[0]}"
 
 
 class Crew:
@@ -161,7 +171,7 @@ class Crew:
         task: Task[Result],
         items: Sequence[tuple[Any, ...]],
     ) -> Iterator[tuple[int, Result]]:
-        errors: dict[int, Exception] = {}
+        errors: dict[int, tuple[Exception, str]] = {}
         waiting = list(range(len(items)))[::-1]
         busy: dict[Connection, int] = {}
         free = [worker.pipe for worker in self._team]
@@ -191,12 +201,13 @@ class Crew:
                 world.simulations += answer.simulations
                 world.watch.left_off(answer.left)
                 if answer.error is not None:
-                    errors[number] = answer.error
+                    errors[number] = answer.error, answer.trace
                 else:
                     yield number, answer.result
         # The first in order, whichever came first.
         for number in sorted(errors):
-            raise errors[number]
+            error, trace = errors[number]
+            raise error from _ThereError(trace)
 
     def _heard(self, pipes: list[Connection], world: Place) -> list[Any]:
         """Pipes on which something has come; workers are told meanwhile if the search must end."""
@@ -305,12 +316,11 @@ def _work(
         world.watch = Watch(stop=lambda: ending[0] != 0)
         world.watch.deadline = deadline
         before = world.simulations
-        result, error = None, None
+        result, error, trace = None, None, ""
         try:
             result = task(world, *item)
         except Exception as raised:
-            raised.add_note(traceback.format_exc())
-            error = raised
+            error, trace = raised, traceback.format_exc()
         count = world.simulations - before
-        if not _sent(pipe, _Answer(result, error, count, world.watch.left())):
+        if not _sent(pipe, _Answer(result, error, trace, count, world.watch.left())):
             return

@@ -117,7 +117,7 @@ def test_what_a_worker_that_died_was_at_is_done_again():
 def test_a_fault_is_raised_here():
     with closing(Crew(2)) as crew, pytest.raises(ValueError, match="no 1") as raised:
         crew.map(world(), fails, [(n,) for n in range(3)])
-    assert "in fails" in "".join(raised.value.__notes__)
+    assert "in fails" in str(raised.value.__cause__)
 
 
 def test_workers_leave_off_when_the_search_has_to_end():
