@@ -1,37 +1,23 @@
-"""The compiled engine against the one in numpy, what it traces, and how it is kept.
+"""The compiled engine against the one in numpy, lane by lane.
 
 Its functions are plain Python, so all but the last tests run without a compiler, slowly.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sims.base import Scenario
+from sims.engines.batch import Batch
 from sims.engines.batch.parts import take
-from sims.engines.compiled import advance, evaluate, known, lockstep, machine, pace
-from sims.engines.compiled.graph import LANE, Graph
-from sims.engines.compiled.nodes import UntracedError
+from sims.engines.compiled import advance, evaluate, machine, pace
 from sims.engines.compiled.run import step
-from sims.engines.compiled.traced import Traced
 from sims.pendulum.simulator import Pendulum
-from sims.slider.simulator import Slider
-from sims.system import Coefficient, Force, Friction
 from tests.benchmarks import stepping
 from tests.sims.cases import FORCES, SIMULATORS, drawn, random_case, steps
-
-PLAIN = SimpleNamespace(divide=pace.divide, advance=advance.advance, march=lockstep.march)
-
-
-def lanes_of(simulator, theta, scenarios, monkeypatch):
-    """What the simulator gives its engine."""
-    seen = []
-    engine = simulator.engine
-    whole = engine.integrate
-    monkeypatch.setattr(engine, "integrate", lambda lanes: seen.append(lanes) or whole(lanes))
-    simulator.simulate_lanes(theta, scenarios)
-    return seen[0]
+from tests.sims.plain import PLAIN, lanes_of
 
 
 def two_lanes(system, seed, monkeypatch):
@@ -60,106 +46,6 @@ def test_the_same_numbers_as_in_numpy(system, seed, monkeypatch):
     expected = simulator.engine._moved(lanes)
     for a, b in ((found.x, expected.x), (found.v, expected.v)):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-10)
-
-
-def test_every_effect_of_the_library_compiles(monkeypatch, capsys):
-    from sims import effects
-
-    for cls in SIMULATORS.values():
-        for name, effect in effects.library(cls.system).items():
-            simulator = cls(engine="batch", effects=[name], compiled=False)
-            theta = np.array([[p.nominal for p in simulator.parameters]])
-            theta[:, len(cls.parameters) :] = 0.1
-            lanes = lanes_of(simulator, theta, [Scenario(np.arange(2) / 100)], monkeypatch)
-            acting = [e for e, _ in lanes.effects]
-            assert known.model(lanes, np.array([0]), acting) is not None, (cls.name, effect.name)
-    assert capsys.readouterr().err == ""
-
-
-class Gusts(Force):
-    name, noun, says = "gusts", "gusts", "it gusts"
-    needs = "input"
-    coefficients = (Coefficient("coefficient", ("m/s^2", "N", "N*m"), ((0, 1), (0, 1), (0, 1))),)
-
-    def force(self, c, moment):
-        raise NotImplementedError
-
-
-class Written(Gusts):
-    """With much of what array code may hold."""
-
-    def force(self, c, moment):
-        wave = np.stack([np.tanh(moment.x[:, 0]), np.cos(3.0 * moment.t[:, 0])], axis=1)
-        fast = (np.abs(moment.v) > 0.2) & ~(moment.x < -1.0)
-        result = np.zeros_like(moment.x)
-        result[:, 0] = wave.sum(axis=1) + np.linalg.norm(moment.v, axis=1) ** 1.5
-        return c[0] * np.where(fast, result, np.exp(-(moment.x**2)) / (1.0 + moment.v**2))
-
-
-class Asking(Gusts):
-    def force(self, c, moment):
-        return c[0] * moment.v if moment.v[0, 0] > 0 else 0.0 * moment.v
-
-
-class Forgetful(Gusts):
-    def force(self, c, moment):
-        type(self).asked = getattr(type(self), "asked", 0) + 1
-        return c[0] * moment.v * self.asked
-
-
-class Stateful(Gusts):
-    def __init__(self):
-        self.size = 2.0
-
-    def force(self, c, moment):
-        return c[0] * self.size * np.ones_like(moment.v)
-
-
-class Tabled(Gusts):
-    def force(self, c, moment):
-        return c[0] * np.interp(moment.x, [-1.0, 1.0], [0.0, 1.0])
-
-
-def alone(effect, monkeypatch, c=0.3):
-    simulator = Slider(engine="batch", effects=[effect], compiled=False)
-    t = np.arange(15) / 100
-    theta = np.array([[1.0, c], [1.2, 2 * c], [1.1, 0.0]])
-    runs = [Scenario(t, {"x": 0.1, "v": 0.3}, {"u": np.sin(9 * t)})] * 3
-    return simulator.engine, lanes_of(simulator, theta, runs, monkeypatch)
-
-
-def test_a_plugin_compiles_as_it_stands(monkeypatch):
-    engine, lanes = alone(Written, monkeypatch)
-    found, left = step(lanes, engine._turn, np.inf, PLAIN)
-    assert not left.size
-    np.testing.assert_allclose(found.x, engine._moved(lanes).x, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("effect", "says"),
-    [
-        (Asking, "asks whether a number is true"),
-        (Forgetful, "other numbers"),
-        (Stateful, "state of its own"),
-        (Tabled, "numpy.interp is not traced"),
-    ],
-)
-def test_what_does_not_compile_is_said_once_and_stepped_in_numpy(effect, says, monkeypatch, capsys):
-    effect = type(effect.__name__, (effect,), {})  # which nobody has asked yet
-    engine, lanes = alone(effect, monkeypatch)
-    for _ in range(2):
-        left = step(lanes, engine._turn, np.inf, PLAIN)[1]
-        assert len(left) == 2  # those in which it acts
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 1
-    assert "effect gusts" in told[0]
-    assert says in told[0]
-    monkeypatch.setattr(machine, "machine", lambda: PLAIN)
-    monkeypatch.setattr(engine, "_compiled", True)
-    whole = engine.integrate(lanes)
-    monkeypatch.setattr(engine, "_compiled", False)
-    if effect.__base__ is not Forgetful:
-        np.testing.assert_allclose(whole.x, engine.integrate(lanes).x, rtol=1e-12)
 
 
 def test_a_lane_depends_on_itself_alone(monkeypatch):
@@ -249,17 +135,6 @@ def test_elementary_functions_to_the_last_bits():
     np.testing.assert_array_equal(r[1, :4], [np.nan, np.nan, np.nan, 0.0])
 
 
-def test_equal_expressions_are_one_and_constants_are_computed():
-    graph = Graph()
-    nodes = np.empty((1, 1), dtype=object)
-    nodes[0, 0] = graph.input(LANE)
-    x = Traced(graph, nodes)
-    assert (np.sin(x) + 1.0).nodes[0, 0] is (np.sin(x) + 1.0).nodes[0, 0]
-    assert (np.full((1, 1), 2.0) * np.ones_like(x)).nodes[0, 0].value == 2.0
-    with pytest.raises(UntracedError, match=r"numpy\.sort is not"):
-        np.sort(x)
-
-
 needs_compiler = pytest.mark.skipif(machine.machine() is None, reason="no compiler is installed")
 
 
@@ -274,19 +149,33 @@ def test_machine_code_gives_what_the_functions_give(system, monkeypatch):
     np.testing.assert_array_equal(found.a, expected.a)
 
 
-class Rubbing(Friction):
-    name, says, needs = "rubbing", "it rubs", "guide"
-    coefficients = Gusts.coefficients
+def spoilt(lanes, rng):
+    """The lanes, with one of what they bring beyond all measure here and there."""
 
-    def limit(self, c, moment):
-        return np.maximum(c[0], 0.0) * (1.0 + moment.speed)
+    def bad(values, share):
+        values = np.array(values)
+        here = rng.random(values.shape) < share
+        values[here] = rng.choice([np.nan, np.inf, -np.inf, 1e308, 1e150, 1e-320, 0.0], here.sum())
+        return values
+
+    yield replace(lanes, x=bad(lanes.x, 0.3))
+    yield replace(lanes, v=bad(lanes.v, 0.3))
+    yield replace(lanes, inputs={name: bad(u, 0.1) for name, u in lanes.inputs.items()})
+    yield replace(lanes, effects=tuple((effect, bad(c, 0.3)) for effect, c in lanes.effects))
+    yield replace(lanes, steps=np.where(rng.random(lanes.steps.shape) < 0.4, 0.0, lanes.steps))
+    yield replace(lanes, steps=np.where(rng.random(lanes.steps.shape) < 0.4, 1e-15, lanes.steps))
+    yield replace(lanes, steps=0.0 * lanes.steps)
+    yield replace(lanes, every=10**6)
 
 
-def test_a_plugin_friction_sticks_and_slips(monkeypatch):
-    engine, lanes = alone(Rubbing, monkeypatch, 0.6)
-    found, left = step(lanes, engine._turn, np.inf, PLAIN)
-    assert not left.size
-    np.testing.assert_allclose(found.x, engine._moved(lanes).x, atol=1e-13)
+@needs_compiler
+@pytest.mark.parametrize("system", list(SIMULATORS))
+def test_spoilt_lanes_end_as_in_numpy(system, monkeypatch):
+    lanes = two_lanes(system, 11, monkeypatch)[1]
+    for one in spoilt(lanes, np.random.default_rng(11)):
+        found, expected = (Batch(patience=20.0, compiled=c).integrate(one) for c in (True, False))
+        for a, b in ((found.x, expected.x), (found.v, expected.v)):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-10)
 
 
 @needs_compiler
