@@ -12,6 +12,7 @@ from bench.gap.model.fit import Fitter, Start
 from bench.gap.model.models import Model
 from bench.gap.model.thinning import thinned
 from bench.gap.model.watch import EndedError
+from bench.gap.model.world import World
 
 SINGLES = 6
 """So many of the best models with one effect are fitted to all samples besides."""
@@ -30,19 +31,25 @@ def sought(search: Search) -> Model:
     few = thinned(search.world)
     if few is None:
         return search.run()
-    sketch = Search(
-        few, search.noise, search.frozen, search.drawing("fewer samples"), search.stated
-    )
+    try:
+        return _foreseen(search, few)
+    finally:
+        few.close()
+
+
+def _foreseen(search: Search, few: World) -> Model:
+    """`sought`, in a world of fewer samples first."""
+    # what shows nothing at the first look, whose scores all merits need, takes no search
+    if search.plain(search.base, UNLIKELY):
+        return search.run()
+    rng = search.drawing("fewer samples")
+    sketch = Search(few, search.noise, search.frozen, rng, search.stated)
     sketch.refit([search.base.fit.start()])
     try:
         found = settle(sketch, sketch.run())
     except EndedError:
         _enter(search, sketch.so_far())
         raise
-    finally:
-        few.close()
-    # merits need to know what effects gain by chance before any model of them is entered
-    search.scan(search.base)
     starts = _starts(sketch, found)
     if starts:
         search.refit(starts)

@@ -61,6 +61,15 @@ def test_where_all_samples_show_more_the_search_is_made_on_all(search, monkeypat
     assert search.settled is None
 
 
+def test_what_shows_nothing_is_not_searched_with_fewer_samples(monkeypatch):
+    clean = recording(
+        "slider", runs=2, seconds=1.5, rate=400.0, seed=3, observe=["x"], noise=["x=0.003"]
+    )
+    search, base = searched(clean, SIGMA)
+    monkeypatch.setattr(foresee, "settle", None)
+    assert sought(search) is base
+
+
 def test_a_search_that_has_to_end_tells_what_few_samples_support(search, monkeypatch):
     ended = Watch(stop=lambda: any(len(m.names) > 0 for m in foreseen))
     foreseen = []
