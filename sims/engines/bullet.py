@@ -14,7 +14,7 @@ from typing import cast
 
 from sims import bullet
 from sims.base import InputError
-from sims.engines import bullet_joints, flight, native, together
+from sims.engines import bullet_joints, flight, joint, joints, native, together
 from sims.engines.external import Rollouts, checked_time_step, in_turn, integrate
 from sims.engines.point import State, Vector
 from sims.engines.worlds import (
@@ -120,9 +120,10 @@ class BulletEngine:
         else:
             body = cast(BulletJointModule, module)
             self._world = bullet.PersistentWorld(body.build)
-            alone = bullet_joints.Joint(self._world, body)
+            alone = partial(joint.rollout, bullet_joints.Joint(self._world, body))
             self._many = bullet_joints.Joints(body)
-            self._rollouts = partial(together.rollouts, alone, self._many, self._world.discard)
+            company = joints.Company(self._many)
+            self._rollouts = partial(together.rollouts, alone, company, self._world.discard)
 
     def integrate(self, lanes: Lanes) -> Motion:
         """See `Engine`."""

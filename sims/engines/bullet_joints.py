@@ -13,8 +13,7 @@ import numpy as np
 
 from sims import bullet
 from sims.base import Array
-from sims.engines.external import Places
-from sims.engines.joints import ApartError, Mask
+from sims.engines.external import ApartError, Mask, Places
 from sims.engines.worlds import BulletJointModule
 
 FEWEST: dict[str, int] = {"asked": 8}

@@ -40,6 +40,7 @@ DEFAULT_STEPS = {"point": 1 / 120, "linear": 2.5e-3, "rotary": 2.5e-3}
 """Longest step in seconds where the user sets none, by the system's kind."""
 
 Places = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 Path = tuple[Array, Array, Array]
 """Positions, velocities, accelerations of one lane, (N, D)."""
 
@@ -88,6 +89,10 @@ class Lane:
         known = {name: np.repeat(value, n, axis=0) for name, value in self.constants.items()}
         theta = np.repeat(self.theta, n, axis=0)
         return Moment(self.system, theta, known, t, x, v, inputs)
+
+
+class ApartError(Exception):
+    """Lanes cannot be integrated together."""
 
 
 Rollouts = Callable[[Sequence[Lane]], Iterable[Path]]

@@ -82,7 +82,7 @@ class FlyingBall(Mover, Protocol):
 def rollout(ball: FlyingBall, lane: Lane) -> Path:
     """Integrate one lane."""
     ball.start(lane.numbers)
-    flight = _Flight(ball, lane)
+    flight = Flight(ball, lane)
     kept = set(lane.kept.tolist())
     steps = lane.steps.tolist()
     rows = [flight.state]
@@ -95,8 +95,19 @@ def rollout(ball: FlyingBall, lane: Lane) -> Path:
     return path_of(lane, rows)
 
 
-class _Flight:
-    """One rollout."""
+class Flight:
+    """One rollout.
+
+    Attributes:
+        x: position.
+        v: velocity.
+        a: acceleration.
+        lift: the vertical one if there were no ground.
+        w: the engine's velocity; None when it must be placed anew.
+        step: the engine's, seconds; NaN when it must be set anew.
+        rests: whether it lies on the ground.
+        time: seconds since the start.
+    """
 
     def __init__(self, ball: FlyingBall, lane: Lane) -> None:
         self._ball = ball
@@ -105,23 +116,23 @@ class _Flight:
         self._gravity = gravity(lane)
         self._floor = float(lane.system.floor(lane.constants)[0, 0])
         x, y, z = lane.x.tolist()
-        self._x: Vector = x, y, max(z, self._floor)  # what begins inside the ground begins on it
-        self._v: Vector = lane.v.tolist()
-        self._a = self._gravity
-        self._lift = self._gravity[2]  # vertical acceleration if there were no ground
-        self._w: Vector | None = None  # the engine's velocity; None when it must be placed anew
-        self._step = math.nan
-        self._rests = False
-        self._time = 0.0
+        self.x: Vector = x, y, max(z, self._floor)  # what begins inside the ground begins on it
+        self.v: Vector = lane.v.tolist()
+        self.a = self._gravity
+        self.lift = self._gravity[2]
+        self.w: Vector | None = None
+        self.step = math.nan
+        self.rests = False
+        self.time = 0.0
         self._look()
-        if self._time_to_ground() == 0.0 and self._v[2] == 0.0:
+        if self._time_to_ground() == 0.0 and self.v[2] == 0.0:
             self._rest()
             self._look()
 
     @property
     def state(self) -> tuple[float, ...]:
         """Position, velocity, acceleration."""
-        return (*self._x, *self._v, *self._a)
+        return (*self.x, *self.v, *self.a)
 
     def leg(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
         """So many steps, and so many again, and so on; the state reached each time."""
@@ -131,7 +142,7 @@ class _Flight:
         left = list(counts)
         while left:
             # Steps until the impact: as many whole samples as fit go to the engine in one call.
-            room = math.inf if self._rests else self._time_to_ground() / step
+            room = math.inf if self.rests else self._time_to_ground() / step
             whole = 0
             for count in left:
                 if room < count:
@@ -145,7 +156,7 @@ class _Flight:
             # Then the whole steps before the impact, and the one that it cuts.
             if room >= 1.0:
                 self._glide(step, (int(room),))
-            self._meet(step)
+            self.meet(step)
             left[0] -= int(room) + 1
             if not left[0]:
                 states.append(self.state)
@@ -156,20 +167,20 @@ class _Flight:
         """Steps that ask for the forces; the state they reach."""
         for _ in range(count):
             # What lies on the ground and is pulled upward flies again.
-            if self._rests and self._lift > 0.0:
-                self._rests = False
-                self._w = None
+            if self.rests and self.lift > 0.0:
+                self.rests = False
+                self.w = None
                 self._look()
-            if self._rests or self._time_to_ground() >= step:
+            if self.rests or self._time_to_ground() >= step:
                 self._forced(step)
             else:
-                self._meet(step)
+                self.meet(step)
         return self.state
 
-    def _meet(self, left: float) -> None:
+    def meet(self, left: float) -> None:
         """A step with impacts."""
         while left > _NO_TIME:
-            until = math.inf if self._rests else self._time_to_ground()
+            until = math.inf if self.rests else self._time_to_ground()
             if until > _NO_TIME:
                 part = min(until, left)
                 if self._pull.any:
@@ -184,74 +195,74 @@ class _Flight:
     def _ready(self, step: float) -> Vector:
         """Make the engine step so, placed if it must be; its velocity."""
         # The velocity half a step before is another one for another step.
-        if step != self._step:
+        if step != self.step:
             self._ball.pace(step)
-            self._step = step
-            self._w = None
-        if self._w is None:
+            self.step = step
+            self.w = None
+        if self.w is None:
             # (1) backwards, from the step before.
             half = 0.5 * step
-            x, y, z = self._v
-            ax, ay, az = self._a
-            self._w = x - half * ax, y - half * ay, z - half * az
-            self._ball.place(self._x, self._w)
-        return self._w
+            x, y, z = self.v
+            ax, ay, az = self.a
+            self.w = x - half * ax, y - half * ay, z - half * az
+            self._ball.place(self.x, self.w)
+        return self.w
 
     def _glide(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
         """Steps under gravity alone, or at rest; the states they reach."""
         self._ready(step)
-        ax, ay, az = self._a
+        ax, ay, az = self.a
         x = 0.5 * step * ax
         y = 0.5 * step * ay
         z = 0.5 * step * az
         reached = self._ball.glide(counts)
-        self._x, self._w = reached[-1]
+        self.x, self.w = reached[-1]
         states = []
         for at, w in reached:
             v = w[0] + x, w[1] + y, w[2] + z  # (3)
             states.append((*at, *v, ax, ay, az))
-        self._v = states[-1][3:6]
+        self.v = states[-1][3:6]
         return states
 
     def _forced(self, step: float) -> None:
         """One step, in flight or at rest, under all that acts."""
         half = 0.5 * step
         wx, wy, wz = self._ready(step)
-        x, y, z = self._v
-        ax, ay, az = self._a
+        x, y, z = self.v
+        ax, ay, az = self.a
         gx, gy, gz = self._gravity
         # (4); at rest the engine's contact bears whatever presses the ball on the ground.
-        lift = self._lift - gz if self._rests else (z + half * az - wz) / step - gz
+        lift = self.lift - gz if self.rests else (z + half * az - wz) / step - gz
         along = (x + half * ax - wx) / step - gx
         across = (y + half * ay - wy) / step - gy
-        self._x, self._w = self._ball.advance((along, across, lift))
-        self._time += step
-        wx, wy, wz = self._w
+        self.x, self.w = self._ball.advance((along, across, lift))
+        self.time += step
+        wx, wy, wz = self.w
         # The acceleration at the end is asked for at the velocity that (3) gives with that at the
         # beginning, and (3) is taken with what comes back.
-        self._v = 2.0 * wx - x, 2.0 * wy - y, 0.0 if self._rests else 2.0 * wz - z
+        self.v = 2.0 * wx - x, 2.0 * wy - y, 0.0 if self.rests else 2.0 * wz - z
         self._look()
-        ax, ay, az = self._a
-        self._v = wx + half * ax, wy + half * ay, 0.0 if self._rests else wz + half * az
+        ax, ay, az = self.a
+        self.v = wx + half * ax, wy + half * ay, 0.0 if self.rests else wz + half * az
 
     def _look(self) -> None:
         """Acceleration here and now; at rest the ground takes the vertical one."""
         x, y, z = self._gravity
         if self._pull.any:
-            felt = self._pull.at(self._time, self._x, self._v)
+            felt = self._pull.at(self.time, self.x, self.v)
             x = x + felt[0]
             y = y + felt[1]
             z = z + felt[2]
-        self._lift = z
-        self._a = x, y, 0.0 if self._rests else z
+        self.lift = z
+        self.a = x, y, 0.0 if self.rests else z
 
     def _time_to_ground(self) -> float:
         """Seconds until a flight with the present acceleration meets the ground; 0 on it, inf if
         never.
         """
-        gap = max(self._x[2] - self._floor, 0.0)
-        rate = self._v[2]
-        lift = self._a[2]
+        gap = max(self.x[2] - self._floor, 0.0)
+        rate = self.v[2]
+        lift = self.a[2]
         inside = rate * rate - 2.0 * lift * gap
         # (5): of its two forms the one in which no digits are lost.
         if rate > 0.0 or (rate == 0.0 and lift < 0.0):
@@ -261,20 +272,20 @@ class _Flight:
         return 2.0 * gap / (math.sqrt(inside) - rate)
 
     def _strike(self) -> None:
-        speed = -self._v[2]
-        self._w = None  # whatever contact makes of the velocity, the engine must be told
-        restitution, friction, over = self._contact.law(max(speed, 0.0), -self._a[2])
+        speed = -self.v[2]
+        self.w = None  # whatever contact makes of the velocity, the engine must be told
+        restitution, friction, over = self._contact.law(max(speed, 0.0), -self.a[2])
         if speed > 0.0:
-            self._v = self._ball.strike(self._x, self._v, restitution, friction)
-            self._step = math.nan  # the engine's own step was that of the contact
+            self.v = self._ball.strike(self.x, self.v, restitution, friction)
+            self.step = math.nan  # the engine's own step was that of the contact
         if over:
             self._rest()
         self._look()
 
     def _rest(self) -> None:
-        self._rests = True
+        self.rests = True
         # A little inside, so that the engine's contact acts from the first step on.
-        x, y, z = self._x
-        self._x = x, y, min(z, self._floor - INSIDE)
-        self._v = self._v[0], self._v[1], 0.0
+        x, y, z = self.x
+        self.x = x, y, min(z, self._floor - INSIDE)
+        self.v = self.v[0], self.v[1], 0.0
         self._ball.hold()

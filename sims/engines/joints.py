@@ -11,17 +11,14 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sims.base import Array
-from sims.engines.external import Lane, Path, Places, finite
+from sims.engines.external import Lane, Mask, Path, Places, finite
 from sims.engines.forces import kicks, rates
-from sims.engines.joint import Way, failed, halfway, read_off, turning, whole
+from sims.engines.joint import failed, halfway, read_off, turning, way_of, whole
 from sims.engines.joint_felt import drive_of
 from sims.engines.joints_felt import Asked, Felt, Known
 from sims.engines.timetable import Table, filled
-
-Mask = NDArray[np.bool_]
 
 
 class Joints(Protocol):
@@ -83,36 +80,44 @@ class Joints(Protocol):
         ...
 
 
-class ApartError(Exception):
-    """Lanes that cannot share a world."""
+class Company:
+    """Bodies on joints together; see `sims.engines.together.Company`."""
 
+    def __init__(self, joints: Joints) -> None:
+        self._joints = joints
+        self.fewest = joints.fewest
+        self.most = joints.most
+        self.alike = joints.alike
 
-def rollouts(joints: Joints, lanes: Sequence[Lane], ways: Sequence[Way]) -> list[Path | None]:
-    """Integrate lanes of the same constants and the same kind of way, each of at least one step.
+    def kind(self, lane: Lane) -> str:
+        """See `Joints.fewest`."""
+        way = way_of(lane, self._joints.open_loop)
+        if way.damping is not None:
+            even = bool((lane.steps == lane.steps[0]).all())
+            return "open" if even else "stretches"
+        return "asked" if way.opposing is None else "known"
 
-    Returns:
-        The motion of each; None where it must be integrated by itself.
+    def rollouts(self, lanes: Sequence[Lane]) -> list[Path | None]:
+        """See `sims.engines.together.Company`.
 
-    Raises:
-        ApartError: they must be integrated one by one.
-    """
-    order = sorted(range(len(lanes)), key=lambda i: -lanes[i].steps.size)
-    sorted_lanes = [lanes[i] for i in order]
-    joints.start(sorted_lanes[0].numbers, len(lanes))
-    dampings = [ways[i].damping for i in order]
-    opposing = [ways[i].opposing for i in order]
-    felt: Felt
-    if all(damping is not None for damping in dampings):
-        run: _Run = _Open(joints, sorted_lanes, np.array(dampings, dtype=np.float64))
-    elif all(law is not None for law in opposing):
-        felt = Known(joints.gravity, sorted_lanes)
-        run = _Driven(joints, sorted_lanes, felt)
-    else:
-        felt = Asked(joints.gravity, sorted_lanes)
-        run = _Driven(joints, sorted_lanes, felt)
-    paths = run.paths()
-    again = joints.again(np.array([not finite(path) for path in paths]))
-    return [None if again[place] else paths[place] for place in np.argsort(order)]
+        Raises:
+            ApartError: they must be integrated one by one.
+        """
+        order = sorted(range(len(lanes)), key=lambda i: -lanes[i].steps.size)
+        chosen = [lanes[i] for i in order]
+        self._joints.start(chosen[0].numbers, len(lanes))
+        paths = self._run(chosen).paths()
+        again = self._joints.again(np.array([not finite(path) for path in paths]))
+        return [None if again[place] else paths[place] for place in np.argsort(order)]
+
+    def _run(self, lanes: Sequence[Lane]) -> _Run:
+        ways = [way_of(lane, self._joints.open_loop) for lane in lanes]
+        dampings = [way.damping for way in ways]
+        if None not in dampings:
+            return _Open(self._joints, lanes, np.array(dampings, dtype=np.float64))
+        if None not in [way.opposing for way in ways]:
+            return _Driven(self._joints, lanes, Known(self._joints.gravity, lanes))
+        return _Driven(self._joints, lanes, Asked(self._joints.gravity, lanes))
 
 
 class _Run(Protocol):

@@ -10,12 +10,22 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import cast
+from typing import Protocol, cast
 
 from sims.base import InputError
-from sims.engines import flight, joint, mujoco_batch, native, together
+from sims.engines import (
+    flight,
+    flights,
+    joint,
+    joints,
+    mujoco_balls,
+    mujoco_batch,
+    native,
+    together,
+)
 from sims.engines.external import Lane, Path, Rollouts, checked_time_step, in_turn, integrate
-from sims.engines.mujoco_bodies import CompiledWorld, Joint, MujocoBall, SoftBall, library
+from sims.engines.mujoco_bodies import CompiledWorld, Joint, MujocoBall, library
+from sims.engines.mujoco_soft import SoftBall
 from sims.engines.worlds import MujocoJointModule, MujocoModule, world_module
 from sims.limits import cut
 from sims.system import Engine, Lanes, Motion, System
@@ -47,7 +57,7 @@ def engine(
             way, whose damping is chosen for the restitution; stepped and read at first order
             (`sims.engines.native`).
         stiffness: with `native_contact`: of the contact, 1/s^2 (1e5, that is contacts of 10 ms).
-        threads: over which lanes of a system of one coordinate are spread; results do not depend on
+        threads: over which lanes that are stepped together are spread; results do not depend on
             it. One is right where other processes use the other cores.
 
     Raises:
@@ -74,9 +84,17 @@ def engine(
     return MujocoEngine(system, step, stiffness or _STIFFNESS)
 
 
+class _Closed(Protocol):
+    """What is closed with the engine."""
+
+    def close(self) -> None:
+        """Give back what is kept."""
+        ...
+
+
 class MujocoEngine:
-    """MuJoCo: lanes of one coordinate together where there is `mujoco.batch`, the others one after
-    the other in one world.
+    """MuJoCo: lanes together where there is `mujoco.batch` and they are enough, else one after the
+    other in one world.
     """
 
     name: str = "mujoco"
@@ -91,7 +109,7 @@ class MujocoEngine:
     ) -> None:
         self.largest_step = largest_step
         self._rollouts: Rollouts | None = None
-        self._many: mujoco_batch.Joints | None = None
+        self._many: _Closed | None = None
         asked = MujocoModule if system.bounces else MujocoJointModule
         module, self._reason = world_module(system, "mujoco_world", asked)
         if module is None:
@@ -100,22 +118,28 @@ class MujocoEngine:
         if stiffness is not None:
             self._alone(partial(native.rollout, SoftBall(self._world, stiffness)))
         elif system.bounces:
-            self._alone(partial(flight.rollout, MujocoBall(self._world)))
+            alone = partial(flight.rollout, MujocoBall(self._world))
+            balls = mujoco_balls.Balls(CompiledWorld(cast(MujocoModule, module).model), threads)
+            self._together(alone, balls, flights.Fliers(balls))
         else:
-            self._joints(cast(MujocoJointModule, module), threads)
+            body = cast(MujocoJointModule, module)
+            on_joint = partial(joint.rollout, Joint(self._world, body))
+            bodies = mujoco_batch.Joints(self._world, body, threads)
+            self._together(on_joint, bodies, joints.Company(bodies))
 
     def _alone(self, rollout: Callable[[Lane], Path]) -> None:
         """Integrate lane after lane."""
         self._rollouts = partial(in_turn, rollout, self.close)
 
-    def _joints(self, module: MujocoJointModule, threads: int) -> None:
-        """Integrate bodies on joints."""
-        alone = Joint(self._world, module)
+    def _together(
+        self, alone: Callable[[Lane], Path], many: _Closed, company: together.Company
+    ) -> None:
+        """Integrate lanes together, if this MuJoCo does."""
         if not mujoco_batch.there():
-            self._alone(partial(joint.rollout, alone))
+            self._alone(alone)
             return
-        self._many = mujoco_batch.Joints(self._world, module, threads)
-        self._rollouts = partial(together.rollouts, alone, self._many, self.close)
+        self._many = many
+        self._rollouts = partial(together.rollouts, alone, company, self.close)
 
     def integrate(self, lanes: Lanes) -> Motion:
         """See `Engine`."""

@@ -10,14 +10,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sims.base import Array
-from sims.engines.external import Places
-from sims.engines.joints import ApartError, Mask
+from sims.engines.external import ApartError, Mask, Places
 from sims.engines.mujoco_bodies import CompiledWorld, library
 from sims.engines.worlds import MujocoJointModule
 
@@ -27,7 +27,7 @@ _UNINTERRUPTED = 40_000
 FEWEST = {"open": 1, "stretches": 16, "known": 24, "asked": 5}
 MOST = 256
 """Lanes of a batch: of more, what is held for them leaves the processor's cache."""
-_KEPT = 4
+KEPT = 4
 """Worlds of other constants or numbers of lanes that are kept."""
 
 Bytes = NDArray[np.uint8]
@@ -35,8 +35,10 @@ Bytes = NDArray[np.uint8]
 
 @functools.cache
 def there() -> bool:
-    """Whether this MuJoCo steps batches."""
-    return find_spec("mujoco") is not None and find_spec("mujoco.batch") is not None
+    """Whether this MuJoCo steps batches; it is not imported."""
+    found = find_spec("mujoco")
+    folders = found.submodule_search_locations if found else None
+    return any((Path(folder) / "batch.py").exists() for folder in folders or ())
 
 
 class Joints:
@@ -67,7 +69,7 @@ class Joints:
         self._weigh = self._gravity(constants)
         key = (*constants.items(), count)
         if key not in self._worlds:
-            if len(self._worlds) == _KEPT:
+            if len(self._worlds) == KEPT:
                 self._worlds.clear()
             self._worlds[key] = _World(self._world.fresh(constants)[0], count, self._threads)
         world = self._worlds[key]

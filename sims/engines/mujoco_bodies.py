@@ -38,8 +38,6 @@ _IMPACT = 1e-4
 """Seconds that the step of an impact lasts; MuJoCo takes accelerations above 1e10 for a failure."""
 _IMPEDANCE = 0.9999
 """Share d of the acceleration asked for that contact gives: the largest MuJoCo allows."""
-_MOST_DAMPED = 2.0
-"""Largest damping ratio of a springy contact."""
 
 
 @functools.cache
@@ -141,7 +139,7 @@ class Joint:
         return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity", "open_loop")}
 
 
-class _Mover:
+class Mover:
     """A ball on three slides; see `sims.engines.flight.Mover`."""
 
     def __init__(self, world: CompiledWorld) -> None:
@@ -206,7 +204,7 @@ class _Mover:
         }
 
 
-class MujocoBall(_Mover):
+class MujocoBall(Mover):
     """A ball that MuJoCo's contact sends back in one step; see `sims.engines.flight.FlyingBall`."""
 
     def start(self, constants: dict[str, float]) -> None:
@@ -214,11 +212,40 @@ class MujocoBall(_Mover):
         super().start(constants)
         self._held = False
 
+    @property
+    def model(self) -> Any:
+        """The compiled world as `start` has made it."""
+        return self._model
+
+    def be(self, held: bool, before: Any) -> None:
+        """Go on as another ball of this world, whose step and place follow.
+
+        Args:
+            held: whether contact holds it up.
+            before: its acceleration in the step before, from which MuJoCo's solver begins.
+        """
+        self._held = held
+        self._meets(held)
+        self._hertz = math.nan
+        self._data.qacc_warmstart[:] = before
+
+    @property
+    def became(self) -> tuple[bool, int, Any]:
+        """What makes another ball go on as this one: as for `be`, and what is disabled, before the
+        acceleration.
+        """
+        return self._held, self._model.opt.disableflags, self._data.qacc_warmstart
+
+    def holding(self, step: float) -> tuple[float, float]:
+        """What contact that holds a ball up is to MuJoCo, as ``solref``."""
+        hertz = 1.0 / step
+        return -0.1 * hertz**2, -hertz  # (4)
+
     def pace(self, step: float) -> None:
         """Step in seconds."""
         super().pace(step)
         if self._held:
-            self._contact(0.1 * self._hertz**2, self._hertz)  # (4)
+            self._model.geom_solref[:] = self.holding(step)
 
     def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
         """MuJoCo's contact solver on one short step, gravity made up for, friction put in as an
@@ -244,71 +271,3 @@ class MujocoBall(_Mover):
         # (4) depends on the step: where one is set already, contact is set for it.
         if not math.isnan(self._hertz):
             self.pace(1.0 / self._hertz)
-
-
-class SoftBall(_Mover):
-    """A ball on MuJoCo's springy contact; see `sims.engines.native.NativeBall`.
-
-    Friction is put in as a force, a share of the normal force of the step before.
-    """
-
-    damping = 0.0
-
-    def __init__(self, world: CompiledWorld, stiffness: float) -> None:
-        super().__init__(world)
-        self._stiffness = stiffness
-
-    def start(self, constants: dict[str, float]) -> None:
-        """As every ball's, with contact."""
-        super().start(constants)
-        self._meets(True)
-        self._touched = math.nan, math.nan
-
-    def touch(self, restitution: float, friction: float) -> None:
-        """Damping that gives this restitution if the step is short; friction."""
-        if (restitution, friction) != self._touched:
-            self._touched = restitution, friction
-            # Of a spring of k and a damper of b per unit mass, the damping ratio is b / (2 sqrt k).
-            damping = 2.0 * damping_ratio(restitution) * math.sqrt(self._stiffness)
-            self._contact(self._stiffness, damping)
-
-    def near(self, gap: float) -> bool:
-        """Touching."""
-        return gap <= 0.0
-
-    def advance(self, force: Vector) -> State:
-        """One step with a force at the centre and what friction there is."""
-        friction = self._touched[1]
-        if friction and self._data.nefc:
-            vx, vy, _ = self._w.tolist()
-            slip = math.hypot(vx, vy)
-            normal = float(self._data.efc_force[0])
-            # No more than stops the slip within the step.
-            share = min(friction * normal / self._mass / slip, self._hertz) if slip else 0.0
-            force = force[0] - share * vx, force[1] - share * vy, force[2]
-        return super().advance(force)
-
-
-def damping_ratio(restitution: float) -> float:
-    """The damping ratio of a spring and damper that push but do not pull, for a restitution; at
-    most 2, for 0.06.
-
-    T. Schwager, T. Poeschel, Granular Matter 9, 465 (2007), doi:10.1007/s10035-007-0065-z, equation
-    20.
-    """
-    # Restitution falls with damping; sixty halvings leave nothing but rounding.
-    low = 0.0
-    high = _MOST_DAMPED
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if _rebound(middle) > restitution else (low, middle)
-    return low
-
-
-def _rebound(ratio: float) -> float:
-    """Restitution of a spring and damper of this damping ratio."""
-    if ratio >= 1.0:
-        root = math.sqrt(ratio * ratio - 1.0)
-        return math.exp(-2.0 * ratio * math.acosh(ratio) / root) if root else math.exp(-2.0)
-    root = math.sqrt(1.0 - ratio * ratio)
-    return math.exp(-ratio / root * math.atan2(2.0 * ratio * root, 2.0 * ratio * ratio - 1.0))

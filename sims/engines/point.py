@@ -7,10 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sims.base import Array
 from sims.engines.external import Lane, Path
 from sims.engines.forces import Forces
 from sims.engines.ground import PATIENCE, SHORT, SHORTEST
-from sims.engines.scalar import resistance
+from sims.engines.scalar import resistance, resistances
 
 Vector = Sequence[float]
 """x, y, z."""
@@ -66,6 +67,51 @@ class Pull:
         if limit and speed:
             share += limit / speed
         return fx - share * vx, fy - share * vy, fz - share * vz
+
+
+class Pulls:
+    """`Pull` of many lanes: for each of which effects are asked, or for each of which they are
+    written out.
+    """
+
+    def __init__(self, lanes: Sequence[Lane]) -> None:
+        self._take(lanes)
+
+    def only(self, count: int) -> None:
+        """Go on with the first lanes."""
+        if count < len(self._lanes):
+            self._take(self._lanes[:count])
+
+    def _take(self, lanes: Sequence[Lane]) -> None:
+        self._lanes = lanes
+        known = all(resistance(lane) is not None for lane in lanes)
+        self._opposing = resistances(lanes) if known else None
+        self._ask = None if known else Forces(lanes, 1)
+
+    def at(self, t: Array, x: Array, v: Array) -> Array:
+        """(n, 3) m/s^2, at instants t (n,), positions and velocities (n, 3)."""
+        vx, vy, vz = v.T
+        speed = np.sqrt(vx * vx + vy * vy + vz * vz)
+        limit: Array | None
+        if self._opposing:
+            share = self._opposing.at(speed)[0]
+            limit = self._opposing.limit
+            force = np.zeros(v.shape)
+        else:
+            assert self._ask is not None
+            moment = self._ask.moment
+            moment.t[:, 0] = t
+            moment.x[:] = x
+            moment.v[:] = v
+            force = self._ask.force()
+            share = np.zeros(t.size)
+            limit = self._ask.limits() if self._ask.rubs else None
+        # Dry friction has no direction where there is no motion.
+        if limit is not None:
+            rubs = (limit != 0.0) & (speed != 0.0)
+            share = share + np.where(rubs, limit / np.where(rubs, speed, 1.0), 0.0)
+        result: Array = force - share[:, None] * v
+        return result
 
 
 class Impact:

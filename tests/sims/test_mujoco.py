@@ -9,7 +9,7 @@ import pytest
 
 from sims.ball.simulator import Ball
 from sims.base import Scenario
-from sims.engines.mujoco_bodies import damping_ratio
+from sims.engines.mujoco_soft import damping_ratio
 from sims.pendulum.simulator import Pendulum
 from sims.servo.simulator import Servo
 from sims.slider.simulator import Slider

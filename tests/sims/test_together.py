@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from sims import bullet, effects
+from sims.ball import mujoco_world as mujoco_world_of_balls
 from sims.base import InputError, Scenario
-from sims.engines import bullet_joints, joint, joints, mujoco_batch, together
+from sims.engines import bullet_joints, joints, mujoco_balls, mujoco_batch, together
 from sims.engines.forces import kick, kicks, rate, rates
+from sims.engines.mujoco_bodies import CompiledWorld
 from sims.pendulum import bullet_world, mujoco_world
 from sims.system import Coefficient, Force
 from tests.sims.agreement import OTHERS, SIMULATORS, THETA
@@ -31,7 +33,7 @@ def split(monkeypatch):
     """Sets from how many lanes on they are integrated together."""
 
     def choose(fewest):
-        for engine in (mujoco_batch, bullet_joints):
+        for engine in (mujoco_batch, mujoco_balls, bullet_joints):
             for kind, count in fewest.items():
                 monkeypatch.setitem(engine.FEWEST, kind, count)
 
@@ -136,7 +138,7 @@ def test_a_warning_is_forgotten(split, monkeypatch):
     split(ALWAYS)
     wild = Scenario(np.arange(5) / 100, {"qd": 3e10})
     assert np.isfinite(pendulum.simulate(theta, wild)).all()
-    monkeypatch.setattr(joint, "rollout", lambda *_: pytest.fail("integrated by itself"))
+    monkeypatch.setattr(together, "in_turn", lambda alone, discard, lanes: iter(lanes))  # none left
     assert np.isfinite(pendulum.simulate(theta, Scenario(wild.times))).all()
 
 
@@ -144,20 +146,22 @@ class Picky(Force):
     """A force that can be asked about numbers only, as a table can."""
 
     name, says = "test.picky", "there is a table"
-    coefficients = (Coefficient("size", (None, "N", "N*m"), ((0, 1), (0, 1), (0, 1))),)
+    coefficients = (Coefficient("size", ("m/s^2", "N", "N*m"), ((0, 1), (0, 1), (0, 1))),)
 
     def force(self, c, moment):
         assert np.isfinite(moment.x).all()
         return c[0] * np.sign(moment.x)
 
 
-def test_effects_are_asked_about_numbers_alone(split, fresh_registries):
+@pytest.mark.parametrize(("name", "rate"), [("pendulum", "qd"), ("ball", "vz")])
+def test_effects_are_asked_about_numbers_alone(name, rate, split, fresh_registries):
     effects.register(Picky)
-    pendulum = SIMULATORS["pendulum"](engine="mujoco", fixed={"test.picky": 0.1})
+    forces = {"test.picky": 0.1, "drag.quadratic": 1e-4}
+    simulator = SIMULATORS[name](engine="mujoco", fixed=forces)
     split(ALWAYS)
-    theta = np.full((2, 1), THETA["pendulum"])
-    both = [Scenario(np.arange(20) / 100, {"qd": qd}) for qd in (1.0, 1e300)]
-    found = pendulum.simulate_lanes(theta, both)
+    theta = np.full((2, 1), THETA[name])
+    both = [Scenario(np.arange(20) / 100, {rate: value}) for value in (1.0, 1e300)]
+    found = simulator.simulate_lanes(theta, both)
     assert np.isfinite(found[0]).all()
     assert np.isnan(found[1]).all()
 
@@ -225,8 +229,8 @@ def test_a_world_that_writes_what_lanes_share_is_stepped_one_by_one(split, monke
     split(NEVER)
     expected = simulator.simulate_lanes(theta, scenarios)
     split(ALWAYS)
-    real = joints.rollouts
-    monkeypatch.setattr(joints, "rollouts", lambda *a: tried.append(1) or real(*a))
+    real = joints.Company.rollouts
+    monkeypatch.setattr(joints.Company, "rollouts", lambda *given: tried.append(1) or real(*given))
     np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
     assert tried
 
@@ -267,6 +271,85 @@ def test_all_that_a_world_writes_reaches_its_lane(split, monkeypatch):
     expected = simulator.simulate_lanes(theta, scenarios)
     split(ALWAYS)
     np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
+
+
+# ---------------------------------------------------------------------- balls
+
+FORCES = {
+    "known": {"drag.quadratic": 0.05, "restitution.speed": -0.1, "contact.friction": 0.1},
+    "asked": {"lift.magnus": [0.3, 0.1], "drag.linear": 0.2, "contact.friction": 0.1},
+    # at times it pulls a ball that rests up from the ground
+    "lifting": {"force.periodic": [0.5, 12.0, 1.0], "force.bias": 0.1},
+    "without": {"contact.friction": 0.1},
+}
+
+
+def balls(case, count=8):
+    """Balls that bounce, come to rest, lie on the ground or begin inside it, in runs of their
+    own.
+    """
+    simulator = SIMULATORS["ball"](engine="mujoco", effects=list(FORCES[case]))
+    values = np.concatenate([np.ravel(c) for c in FORCES[case].values()])
+    rng = np.random.default_rng(3)
+    theta = np.zeros((count, len(simulator.parameters)))
+    theta[:, 0] = np.linspace(0.3, 1.0, count)
+    theta[:, 1 : 1 + values.size] = values * rng.uniform(0.7, 1.3, (count, 1))
+    theta[-2:, 2:] = 0.0  # the first effect alone
+    uneven = np.cumsum(np.where(np.arange(50) % 7, 0.02, 0.013))
+    runs = [
+        Scenario(np.arange(60) / 50, {"z": 0.7, "vx": 1.0}),
+        Scenario(np.arange(40) / 45, {"z": 0.4, "vz": 2.0, "vy": -1.0}),
+        Scenario(uneven, {"z": 0.0, "vx": 0.5}),
+        Scenario(np.arange(30) / 50, {"z": 0.0, "vz": -3.0}),  # an impact and a whole step
+    ]
+    return simulator, theta, [runs[i % 4] for i in range(count)]
+
+
+@pytest.mark.parametrize("case", FORCES)
+def test_balls_together_are_balls_one_by_one_to_the_bit(case, split):
+    simulator, theta, scenarios = balls(case)
+    split(NEVER)
+    alone = simulator.simulate_lanes(theta, scenarios)
+    split(ALWAYS)
+    for _ in range(2):  # made anew, and used
+        np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), alone)
+
+
+def test_the_cases_of_balls_are_what_they_say(split):
+    split(ALWAYS)
+    _, _, z, *_ = balls("lifting")[0].simulate_lanes(*balls("lifting")[1:]).T
+    height = z[:, 2]  # of a run that begins on the ground
+    on = height <= height[0] + 1e-6
+    assert on[0]
+    assert not on.all()
+
+
+def test_mujocos_solver_begins_where_the_lane_was():
+    together_ = mujoco_balls.Balls(CompiledWorld(mujoco_world_of_balls.model), 1)
+    ball = together_.start({"mass": 0.1, "radius": 0.5, "gravity": 9.81}, 2)
+    before = together_._now.before
+    before[:] = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+    together_.lend(1)
+    np.testing.assert_array_equal(ball.became[2], before[1])
+    ball._data.qacc_warmstart[:] = 7.0
+    together_.take_back(1)
+    np.testing.assert_array_equal(before, [[1.0, 2.0, 3.0], [7.0, 7.0, 7.0]])
+
+
+def test_a_ball_that_fails_is_nan_silently_and_harms_no_other(split, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    simulator, theta, scenarios = balls("asked")
+    split(ALWAYS)
+    healthy = simulator.simulate_lanes(theta, scenarios)
+    broken = scenarios.copy()
+    broken[1] = Scenario(scenarios[1].times, {"z": 1.0, "vz": 1e300})
+    found = simulator.simulate_lanes(theta, broken)
+    assert np.isnan(found[1]).all()
+    others = [0, *range(2, len(theta))]
+    np.testing.assert_array_equal(found[others], healthy[others])
+    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), healthy)
+    assert capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_arrays_of_kicks_are_kicks():

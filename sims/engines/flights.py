@@ -1,0 +1,247 @@
+"""Many balls at once, under forces that are asked at each step: `sims.engines.flight` with arrays
+in place of numbers.
+
+Between impacts lanes step together. A step with an impact is the lane's own: it is handed to a
+`flight.Flight`, which cuts it, and taken back behind it. What each lane comes to is the same as
+alone, to the bit. Lanes stand in the order of their number of steps, most first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from sims.base import Array
+from sims.engines.external import Lane, Path, Places
+from sims.engines.flight import Flight, FlyingBall
+from sims.engines.point import Pulls, gravity, path_of
+from sims.engines.scalar import resistance
+from sims.engines.timetable import Table
+from sims.system import Force, Friction
+
+
+class Balls(Protocol):
+    """As many balls over level ground as there are lanes, in an engine that steps them together."""
+
+    fewest: Mapping[str, int]
+    """As in `sims.engines.joints.Joints`; the kinds are ``known`` and ``asked``."""
+    most: int
+    """Lanes of which together no more are quicker."""
+
+    def start(self, constants: dict[str, float], count: int) -> FlyingBall:
+        """Make the world ready for this many lanes of the same constants.
+
+        Returns:
+            A ball for a lane by itself, also ready.
+        """
+        ...
+
+    def pace(self, lanes: Places, step: Array) -> None:
+        """Set the step (m,) of some lanes."""
+        ...
+
+    def place(self, lanes: Places, x: Array, w: Array) -> None:
+        """Set position and the engine's velocity (m, 3) of some lanes."""
+        ...
+
+    def state(self, count: int) -> tuple[Array, Array]:
+        """Positions and velocities (n, 3) of the first lanes; they follow what the engine does."""
+        ...
+
+    def advance(self, lanes: Places, force: Array) -> None:
+        """Let these lanes take one step with forces (m, 3), m/s^2, beside gravity."""
+        ...
+
+    def lend(self, lane: int) -> None:
+        """Make the ball by itself this lane's."""
+        ...
+
+    def take_back(self, lane: int) -> None:
+        """Make this lane what the ball by itself has become."""
+        ...
+
+
+class Fliers:
+    """Balls together; see `sims.engines.together.Company`."""
+
+    alike = False
+
+    def __init__(self, balls: Balls) -> None:
+        self._balls = balls
+        self.fewest = balls.fewest
+        self.most = balls.most
+
+    def kind(self, lane: Lane) -> str:
+        """``known`` or ``asked``; ``plain`` where nothing acts in flight."""
+        if not any(isinstance(effect, Force | Friction) for effect, _ in lane.effects):
+            return "plain"
+        return "asked" if resistance(lane) is None else "known"
+
+    def rollouts(self, lanes: Sequence[Lane]) -> list[Path | None]:
+        """See `sims.engines.together.Company`."""
+        order = sorted(range(len(lanes)), key=lambda i: -lanes[i].steps.size)
+        paths = _Flights(self._balls, [lanes[i] for i in order]).paths()
+        return [paths[place] for place in np.argsort(order)]
+
+
+class _Flights:
+    """One integration."""
+
+    def __init__(self, balls: Balls, lanes: Sequence[Lane]) -> None:
+        count = len(lanes)
+        self._balls = balls
+        self._lanes = lanes
+        self._table = Table(lanes)
+        self._pulls = Pulls(lanes)
+        self._gravity = np.array(gravity(lanes[0]))
+        first = lanes[0]
+        self._floor = float(first.system.floor(first.constants)[0, 0])
+        ball = balls.start(first.numbers, count)
+        self._own: list[Flight] = []
+        self._rests = np.zeros(count, dtype=bool)
+        self._paced = np.full(count, np.nan)  # the engine's step
+        self._placed = np.zeros(count, dtype=bool)
+        self._failed = np.zeros(count, dtype=bool)
+        self._t = np.zeros(count)
+        self._v = np.zeros((count, 3))
+        self._a = np.zeros((count, 3))
+        self._lift = np.zeros(count)
+        self._x, self._w = balls.state(count)
+        self._rows = np.full((self._table.kept, count, 9), np.nan)
+        for i, lane in enumerate(lanes):
+            balls.lend(i)
+            self._own.append(Flight(ball, lane))
+            self._back(i)
+        self._start = self._x.copy()
+        self._keep(0)
+
+    def paths(self) -> list[Path]:
+        """The motion of each lane; NaN where it failed."""
+        for begin, end, count in self._table.phases():
+            self._only(count)
+            for k in range(begin, end):
+                self._step(k)
+        return [self._path(i) for i in range(len(self._lanes))]
+
+    def _only(self, count: int) -> None:
+        """Go on with the first lanes."""
+        self._x, self._w = self._balls.state(count)
+        for name in ("_rests", "_paced", "_placed", "_t", "_v", "_a", "_lift"):
+            setattr(self, name, getattr(self, name)[:count])
+        self._pulls.only(count)
+
+    def _step(self, k: int) -> None:
+        """One step; what follows is `Flight._stepwise`, with its equations."""
+        h = self._table.steps[: self._t.size, k]
+        flies = self._rests & (self._lift > 0.0)
+        if flies.any():
+            self._rests = self._rests & ~flies
+            self._placed = self._placed & ~flies
+            self._a[flies, 2] = self._lift[flies]
+        meets = ~self._rests & (self._time_to_ground() < h)
+        some = np.flatnonzero(~meets)
+        left = np.flatnonzero(meets)
+        before = [values[left] for values in (self._v, self._a, self._lift, self._t)]
+        if some.size:
+            self._forced(some, h)
+        # Of those with an impact nothing has come about yet.
+        for values, kept in zip((self._v, self._a, self._lift, self._t), before, strict=True):
+            values[left] = kept
+        for i in left.tolist():
+            self._meet(i, float(h[i]))
+        if self._table.rows[k + 1] >= 0:
+            self._keep(int(self._table.rows[k + 1]))
+
+    def _forced(self, some: Places, h: Array) -> None:
+        """A step of some lanes, in flight or at rest, under all that acts; of the others time and
+        velocity are of no meaning then.
+        """
+        half = 0.5 * h[:, None]
+        ahead = self._v + half * self._a
+        new = some[(self._paced[some] != h[some]) | ~self._placed[some]]
+        if new.size:
+            self._balls.pace(new, h[new])
+            self._paced[new] = h[new]
+            self._placed[new] = True
+            self._balls.place(new, self._x[new], (self._v - half * self._a)[new])
+        force = (ahead - self._w) / h[:, None] - self._gravity  # (4)
+        force[:, 2] = np.where(self._rests, self._lift - self._gravity[2], force[:, 2])
+        self._balls.advance(some, force[some])
+        if not np.isfinite(self._x.sum() + self._w.sum()):
+            self._set_aside()
+        self._t = self._t + h
+        self._v = 2.0 * self._w - self._v
+        self._v[self._rests, 2] = 0.0
+        self._look()
+        self._v = self._w + half * self._a  # (3)
+        self._v[self._rests, 2] = 0.0
+
+    def _look(self) -> None:
+        """Accelerations here and now; at rest the ground takes the vertical one."""
+        self._a = self._gravity + self._pulls.at(self._t, self._x, self._v)
+        self._lift = self._a[:, 2].copy()
+        self._a[self._rests, 2] = 0.0
+
+    def _time_to_ground(self) -> Array:
+        """(n,) as in `Flight`; NaN for what is no number."""
+        gap = np.maximum(self._x[:, 2] - self._floor, 0.0)
+        rate = self._v[:, 2]
+        lift = self._a[:, 2]
+        inside = rate * rate - 2.0 * lift * gap
+        root = np.sqrt(inside)
+        rises = (rate > 0.0) | ((rate == 0.0) & (lift < 0.0))
+        back = np.where(lift < 0.0, (rate + root) / -lift, np.inf)  # (5)
+        never = (inside < 0.0) | ((rate == 0.0) & (lift >= 0.0))
+        down = np.where(never, np.inf, 2.0 * gap / (root - rate))
+        return np.where(rises, back, down)
+
+    def _meet(self, i: int, step: float) -> None:
+        """A step with impacts."""
+        own = self._own[i]
+        self._balls.lend(i)
+        own.x = self._x[i].tolist()
+        own.v = self._v[i].tolist()
+        own.a = self._a[i].tolist()
+        own.lift = float(self._lift[i])
+        own.time = float(self._t[i])
+        own.rests = False
+        own.w = None
+        own.step = np.nan
+        own.meet(step)
+        self._back(i)
+
+    def _back(self, i: int) -> None:
+        """Take a lane back from its own flight."""
+        own = self._own[i]
+        self._balls.take_back(i)
+        self._v[i] = own.v
+        self._a[i] = own.a
+        self._lift[i] = own.lift
+        self._t[i] = own.time
+        self._rests[i] = own.rests
+        self._paced[i] = own.step
+        self._placed[i] = own.w is not None
+        one = np.array([i])
+        if own.w is not None:
+            self._balls.pace(one, self._paced[one])
+        self._balls.place(one, np.array([own.x]), np.array([own.w or own.v]))
+
+    def _set_aside(self) -> None:
+        """Put what has failed back to where it began; what becomes of it is not looked at."""
+        bad = np.flatnonzero(~np.isfinite(self._x.sum(axis=1) + self._w.sum(axis=1)))
+        self._failed[bad] = True
+        self._v[bad] = 0.0
+        self._balls.place(bad, self._start[bad], np.zeros((bad.size, 3)))
+
+    def _keep(self, row: int) -> None:
+        count = self._t.size
+        self._rows[row, :count, :3] = self._x
+        self._rows[row, :count, 3:6] = self._v
+        self._rows[row, :count, 6:] = self._a
+
+    def _path(self, i: int) -> Path:
+        lane = self._lanes[i]
+        rows = self._rows[self._table.rows[lane.kept], i]
+        return path_of(lane, [] if self._failed[i] else [tuple(row) for row in rows.tolist()])
