@@ -4,10 +4,12 @@ import json
 
 import pytest
 
+from bench.api import explain as api
 from bench.gap.explain import explain
 from bench.gap.model import crew, fit, world
 from bench.gap.model.crew import Crew, can_fork
 from bench.gap.model.world import World
+from sims.base import InputError
 from tests.bench.gap.made import recording
 
 
@@ -39,3 +41,9 @@ def test_the_answer_is_the_same_to_the_last_bit_with_one_two_and_eight(monkeypat
         assert set(shared) == ({jobs} if jobs > 1 else set())
         assert jobs == 1 or len(shared) > 10
     assert documents[0] == documents[1] == documents[2]
+
+
+@pytest.mark.parametrize("jobs", [0, -2])
+def test_there_is_at_least_one_process(jobs):
+    with pytest.raises(InputError, match="jobs: expected a whole number of at least 1, found"):
+        api.explain("missing.csv", jobs=jobs)
