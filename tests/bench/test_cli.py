@@ -159,9 +159,12 @@ def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path)
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     deadline = time.monotonic() + 60
-    while not (tmp_path / "out" / "environment.json").exists() and time.monotonic() < deadline:
+    # Once some runs are kept, however long the workers took to start; then all of them have.
+    journals = tmp_path / "out" / "segments"
+    while time.monotonic() < deadline:
+        if sum(path.stat().st_size for path in journals.glob("*.journal")) > 20_000:
+            break
         time.sleep(0.1)
-    time.sleep(4)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: parent and workers
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
