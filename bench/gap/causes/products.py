@@ -173,8 +173,10 @@ class Design:
             near[:, now.shape[1] - former.shape[1] :] += former
             latter = around[:, begin - first + 1 :]
             near[:, : latter.shape[1]] += latter
-        flat = now.reshape(rows, -1)
-        return _Columns(flat, near.reshape(rows, -1), flat[:, place.edge])
+        # Written out, as -1 is ambiguous where there are no rows.
+        size = rows, now.shape[1] * now.shape[2]
+        flat = now.reshape(size)
+        return _Columns(flat, near.reshape(size), flat[:, place.edge])
 
     def _add(self, place: _Place) -> None:
         """The products of one stretch."""
@@ -189,17 +191,20 @@ class Design:
                 members = _Columns(some.now[block], some.near[block], some.edge[block])
                 _gather(parts, members, members, place)
 
-    def crossed(self, residuals: Array) -> tuple[Parts, Parts, Parts]:
-        """Products of residuals (S, R, T, C) with themselves (S,), with the Jacobian run by run
-        (R, q + s, S), and of directions with them (K, S).
+    def crossed(self, *residuals: Array) -> tuple[Parts, Parts, Parts]:
+        """Products of residuals (S, R, T, C), any number of arrays one after another, with
+        themselves (S,), with the Jacobian run by run (R, q + s, S), and of directions with them
+        (K, S).
         """
         size, runs, *_ = self._jacobian.shape
-        samples = len(residuals)
+        samples = sum(len(some) for some in residuals)
         squares = Parts.of(samples)
         shared = Parts.of(runs, size, samples)
         cross = Parts.of(len(self._directions), samples)
         for place in self._places():
-            left = self._columns(residuals, place)
+            # Stretch by stretch: side by side as a whole they would take their memory once more.
+            parts = [self._columns(some, place) for some in residuals]
+            left = _Columns(*(np.concatenate(rows) for rows in zip(*parts, strict=True)))
             own = self._columns(self._jacobian, place)
             some = self._columns(self._directions, place, beside=False)
             _squares(squares, left, place)
@@ -279,12 +284,12 @@ class Products:
 
     Args:
         design: the model's Jacobian and the directions.
-        residuals: (S, R, T, C), zero where nothing was seen.
+        residuals: (S, R, T, C), zero where nothing was seen; any number of arrays.
     """
 
-    def __init__(self, design: Design, residuals: Array) -> None:
+    def __init__(self, design: Design, *residuals: Array) -> None:
         self._design = design
-        self._squares, self._shared, self._cross = design.crossed(residuals)
+        self._squares, self._shared, self._cross = design.crossed(*residuals)
 
     def projected(self, phi: float) -> tuple[Array, list[Array], Array]:
         """Products of eq. (2) after whitening by a correlation.

@@ -120,11 +120,9 @@ class ScoreTest:
             surrogate: (S, R, T, C) residuals that mean nothing.
         """
         # The residual is the first of all: they are scored in the same products.
-        everything = residual[None]
-        if surrogate is not None:
-            everything = np.concatenate([everything, surrogate])
-        table = _Table(self._groups, len(everything), self._count)
-        products = Products(self._design, everything)
+        drawn = np.zeros((0, *residual.shape)) if surrogate is None else surrogate
+        table = _Table(self._groups, 1 + len(drawn), self._count)
+        products = Products(self._design, residual[None], drawn)
         # A grid: the products of one pass over the samples serve every correlation.
         for phi, determinant in self._determinants.items():
             total, grams, cross = products.projected(phi)
