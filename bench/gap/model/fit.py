@@ -260,7 +260,8 @@ class Fitter:
         if not world.apart:
             return [list(going)]
         runs, length, _ = world.observed.shape
-        lanes = sum(1 + problems[i].steps.size for i in going) * runs
+        unknown = int((~world.known.all(axis=0)).sum())
+        lanes = sum(1 + problems[i].free.size + unknown for i in going) * runs
         cost = lanes * length * self.share + ALGEBRA * len(going)
         # compiled lanes are stepped side by side, however long they are
         count = int(np.ceil(min(cost / GROUP, lanes / FEWEST_LANES)))
@@ -336,12 +337,13 @@ class Fitter:
         """What each problem gives at a trial's place, its derivatives and its cost.
 
         One call of the engine has every run of every model, with every unknown moved: it goes
-        through time once for all of them.
+        through time once for all of them. An initial state that every run knows is no unknown.
         """
         runs, size = self.world.guess.shape
+        unknown = np.flatnonzero(~self.world.known.all(axis=0))
         steps = [problem.inward(start.theta) for problem, start in trials]
         moved = [
-            _moved(start, problem.free, step)
+            _moved(start, problem.free, step, unknown)
             for (problem, start), step in zip(trials, steps, strict=True)
         ]
         # lanes model by model, in each unknown by unknown, in each run by run
@@ -353,18 +355,38 @@ class Fitter:
 
         points = []
         first = 0
-        for (_, start), step in zip(trials, steps, strict=True):
+        for (problem, start), step in zip(trials, steps, strict=True):
             # as it is, and with each unknown moved
-            last = first + 1 + step.size
+            last = first + 1 + problem.free.size + unknown.size
             part = simulated[first:last]
             first = last
-            # a lane that was given up is NaN, and tells nothing of how its unknown acts
-            with np.errstate(all="ignore"):
-                quotients = np.moveaxis(part[1:] - part[0], 0, -1) / step
-            jacobian = np.nan_to_num(quotients, nan=0.0, posinf=0.0, neginf=0.0)
+            jacobian = self._derivatives(part, step, unknown)
             cost = self._cost(part[0], start.states, seen)
             points.append(_Point(start, part[0], jacobian, cost))
         return points
+
+    def _derivatives(self, part: Array, steps: Array, unknown: Indices) -> Array:
+        """(R, T, C, q + s) difference quotients; zero by an initial state where it is known, which
+        absorbs nothing.
+
+        Args:
+            part: (1 + q + n, R, T, C) as it is, and with each unknown moved.
+            steps: (q + s,) by what.
+            unknown: (n,) the initial states that are moved.
+        """
+        known = self.world.known
+        q = steps.size - known.shape[1]
+        columns = np.concatenate([np.arange(q), q + unknown])
+        # a lane that was given up is NaN, and tells nothing of how its unknown acts
+        with np.errstate(all="ignore"):
+            quotients = np.moveaxis(part[1:] - part[0], 0, -1) / steps[columns]
+        quotients = np.nan_to_num(quotients, nan=0.0, posinf=0.0, neginf=0.0)
+        if not known.any():
+            return quotients
+        jacobian = np.zeros((*part.shape[1:], steps.size))
+        jacobian[..., columns] = quotients
+        jacobian[..., q:] *= ~known[:, None, None, :]
+        return jacobian
 
     def _take(self, problem: _Problem, point: _Point) -> None:
         """Go on from a point, with differences that suit what it responds to."""
@@ -471,18 +493,18 @@ def _give_up(problems: Sequence[_Problem], reached: float) -> None:
         p.done |= p.point.cost - HOPE * p.promised > best + BEATEN
 
 
-def _moved(start: Start, free: Indices, steps: Array) -> tuple[Array, Array]:
-    """Parameters (1 + q + s, P) and initial states (1 + q + s, R, s): as they are, then each
-    unknown moved by its step, an initial state in all runs at once.
+def _moved(start: Start, free: Indices, steps: Array, unknown: Indices) -> tuple[Array, Array]:
+    """Parameters (1 + q + n, P) and initial states (1 + q + n, R, s): as they are, then each
+    unknown moved by its step, each of n initial states in all runs at once.
     """
-    q, size = free.size, start.states.shape[1]
-    theta = np.tile(start.theta, (1 + q + size, 1))
-    states = np.tile(start.states, (1 + q + size, 1, 1))
+    q, count = free.size, unknown.size
+    theta = np.tile(start.theta, (1 + q + count, 1))
+    states = np.tile(start.states, (1 + q + count, 1, 1))
     for j, place in enumerate(free):
         theta[1 + j, place] += steps[j]
     # no run's initial state touches another run: one lane has the derivatives of all
-    for j in range(size):
-        states[1 + q + j, :, j] += steps[q + j]
+    for j, place in enumerate(unknown):
+        states[1 + q + j, :, place] += steps[q + place]
     return theta, states
 
 

@@ -172,6 +172,20 @@ def test_frozen_parameters_and_known_initial_states_stay():
     assert alone.cost > 1e3 * fitted(world(made)).cost
 
 
+def test_no_derivative_is_simulated_by_what_is_known():
+    made = swings()
+    told = [{"q": 0.7, "qd": 0.0}, {"q": -1.2}, {"q": 2.2}]
+    runs = [replace(run, initial=known) for run, known in zip(made.runs, told, strict=True)]
+    there = world(replace(made, runs=tuple(runs)))
+    fit = fitted(there, iterations=0)
+    assert there.simulations == 3 * (1 + 1 + 1), "as it is, the inertia moved, the rate moved"
+    usual = fitted(world(made), iterations=0, states=there.guess)
+    np.testing.assert_array_equal(fit.jacobian[..., 0], usual.jacobian[..., 0])
+    assert not fit.jacobian[..., 1].any()
+    assert not fit.jacobian[0, ..., 2].any(), "a state that only one run states"
+    assert fit.jacobian[1:, ..., 2].any()
+
+
 def test_what_is_known_beforehand_depends_on_the_channels():
     made = recording(runs=1, seconds=0.5, observe=["q"])
     np.testing.assert_array_equal(prior_of(world(made)), [MEASURED, MEASURED])
