@@ -380,10 +380,10 @@ class Fitter:
         # a lane that was given up is NaN, and tells nothing of how its unknown acts
         with np.errstate(all="ignore"):
             quotients = np.moveaxis(part[1:] - part[0], 0, -1) / steps[columns]
-        quotients = np.nan_to_num(quotients, nan=0.0, posinf=0.0, neginf=0.0)
+        jacobian: Array = np.nan_to_num(quotients, nan=0.0, posinf=0.0, neginf=0.0)
         if not known.any():
-            return quotients
-        jacobian = np.zeros((*part.shape[1:], steps.size))
+            return jacobian
+        quotients, jacobian = jacobian, np.zeros((*part.shape[1:], steps.size))
         jacobian[..., columns] = quotients
         jacobian[..., q:] *= ~known[:, None, None, :]
         return jacobian
