@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
     from multiprocessing.process import BaseProcess
 
-PAYS = 0.15
+PAYS = 0.4
 """Seconds of work that could have been shared after which workers are started."""
 LOOK = 0.05
 """Seconds between two looks at whether the search has to end."""
