@@ -26,6 +26,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.gap.causes.sums import (
+    Columns,
+    Parts,
+    Place,
+    add_squares,
+    gather,
+    lacking,
+    part_of,
+)
 from bench.gap.model.fit import Fit
 from bench.gap.model.noise import Mask
 from bench.gap.model.world import Indices
@@ -41,57 +50,6 @@ CHUNK = 400_000
 """Numbers of one array that are worked on at once: more would not stay in the cache."""
 SHORTEST = 64
 """But so many samples at least, or each stretch would cost more than its products."""
-
-
-class Parts(NamedTuple):
-    """The three sums that eq. (1) puts together, each an array of products."""
-
-    whole: Array
-    mixed: Array
-    ends: Array
-
-    @staticmethod
-    def of(*shape: int) -> Parts:
-        """Nothing yet, to be added to."""
-        return Parts(np.zeros(shape), np.zeros(shape), np.zeros(shape))
-
-    def at(self, phi: float) -> Array:
-        """The products after whitening by a correlation."""
-        square = phi * phi
-        follow = (1.0 + square) * self.whole - phi * self.mixed - square * self.ends
-        result: Array = follow / (1.0 - square)  # (1)
-        return result
-
-
-class _Place(NamedTuple):
-    """A stretch of a run.
-
-    Attributes:
-        run: which.
-        begin, end: its samples.
-        edge: which of them lack a neighbour, all channels in a row.
-        lacking: (m,) how many each of those lacks.
-    """
-
-    run: int
-    begin: int
-    end: int
-    edge: Indices
-    lacking: Array
-
-
-class _Columns(NamedTuple):
-    """Columns over a stretch in sigmas, all channels in a row.
-
-    Attributes:
-        now: (k, n) the samples.
-        near: (k, n) those before and behind each, added.
-        edge: (k, m) those that lack a neighbour.
-    """
-
-    now: Array
-    near: Array
-    edge: Array
 
 
 class _Reduced(NamedTuple):
@@ -137,7 +95,7 @@ class Design:
         self._jacobian = np.moveaxis(at.jacobian, 3, 0)
         self._directions = np.moveaxis(directions, 3, 0)
         self._weights = seen / sigma
-        self._lacking = _lacking(seen)
+        self._lacking = lacking(seen)
         size, runs, *_ = self._jacobian.shape
         count = len(self._directions)
         self._normal = Parts.of(runs, size, size)
@@ -148,18 +106,18 @@ class Design:
         for place in self._places():
             self._add(place)
 
-    def _places(self) -> Iterator[_Place]:
+    def _places(self) -> Iterator[Place]:
         """All runs, in stretches that stay in the cache."""
         count, runs, length, channels = self._directions.shape
         step = max(CHUNK // (max(count, 1) * channels), SHORTEST)
         for run in range(runs):
             for begin in range(0, length, step):
                 end = min(begin + step, length)
-                lacking = self._lacking[run, begin:end].ravel()
-                edge = np.flatnonzero(lacking)
-                yield _Place(run, begin, end, edge, lacking[edge])
+                without = self._lacking[run, begin:end].ravel()
+                edge = np.flatnonzero(without)
+                yield Place(run, begin, end, edge, without[edge])
 
-    def _columns(self, values: Array, place: _Place, beside: bool = True) -> _Columns:
+    def _columns(self, values: Array, place: Place, beside: bool = True) -> Columns:
         """Of values (k, R, T, C); the neighbours only where they are asked for."""
         run, begin, end = place.run, place.begin, place.end
         rows = len(values)
@@ -176,20 +134,20 @@ class Design:
         # Written out, as -1 is ambiguous where there are no rows.
         size = rows, now.shape[1] * now.shape[2]
         flat = now.reshape(size)
-        return _Columns(flat, near.reshape(size), flat[:, place.edge])
+        return Columns(flat, near.reshape(size), flat[:, place.edge])
 
-    def _add(self, place: _Place) -> None:
+    def _add(self, place: Place) -> None:
         """The products of one stretch."""
         own = self._columns(self._jacobian, place)
         some = self._columns(self._directions, place)
-        _gather(_part(self._normal, place.run), own, own, place)
-        _gather(_part(self._mixed, place.run), own, some, place)
-        _squares(self._powers, some, place)
+        gather(part_of(self._normal, place.run), own, own, place)
+        gather(part_of(self._mixed, place.run), own, some, place)
+        add_squares(self._powers, some, place)
         for block, parts in zip(self.blocks, self._grams, strict=True):
             # A column that acts alone has its square already.
             if block.shape[1] > 1:
-                members = _Columns(some.now[block], some.near[block], some.edge[block])
-                _gather(parts, members, members, place)
+                members = Columns(some.now[block], some.near[block], some.edge[block])
+                gather(parts, members, members, place)
 
     def crossed(self, *residuals: Array) -> tuple[Parts, Parts, Parts]:
         """Products of residuals (S, R, T, C), any number of arrays one after another, with
@@ -204,12 +162,12 @@ class Design:
         for place in self._places():
             # Stretch by stretch: side by side as a whole they would take their memory once more.
             parts = [self._columns(some, place) for some in residuals]
-            left = _Columns(*(np.concatenate(rows) for rows in zip(*parts, strict=True)))
+            left = Columns(*(np.concatenate(rows) for rows in zip(*parts, strict=True)))
             own = self._columns(self._jacobian, place)
             some = self._columns(self._directions, place, beside=False)
-            _squares(squares, left, place)
-            _gather(_part(shared, place.run), own, left, place)
-            _gather(cross, some, left, place)
+            add_squares(squares, left, place)
+            gather(part_of(shared, place.run), own, left, place)
+            gather(cross, some, left, place)
         return squares, shared, cross
 
     def left(self, residuals: Array) -> Array:
@@ -306,35 +264,6 @@ class Products:
         others = np.concatenate([known.by_states[:, q:], known.by_own])
         cross = self._cross.at(phi) - others.T @ taken
         return np.maximum(total, 0.0), known.grams, np.where(known.acting[:, None], cross, 0.0)
-
-
-def _lacking(seen: Mask) -> Array:
-    """(R, T, C) how many of its two neighbours each sample lacks that is there."""
-    lacking = np.full(seen.shape, 2.0)
-    lacking[:, 1:] -= seen[:, :-1]
-    lacking[:, :-1] -= seen[:, 1:]
-    # Behind a gap noise starts anew: what it remembers of before is not known.
-    return np.where(seen, lacking, 0.0)
-
-
-def _part(parts: Parts, run: int) -> Parts:
-    """Those of one run, where they are kept."""
-    return Parts(*(values[run] for values in parts))
-
-
-def _gather(parts: Parts, some: _Columns, others: _Columns, place: _Place) -> None:
-    """Add the products of all columns of some with all of others."""
-    parts.whole[...] += some.now @ np.swapaxes(others.now, -1, -2)
-    # Summed over a run it makes no difference on which side the neighbours are.
-    parts.mixed[...] += some.now @ np.swapaxes(others.near, -1, -2)
-    parts.ends[...] += (some.edge * place.lacking) @ np.swapaxes(others.edge, -1, -2)
-
-
-def _squares(parts: Parts, some: _Columns, place: _Place) -> None:
-    """Add the products of columns with themselves."""
-    parts.whole[...] += np.einsum("kn,kn->k", some.now, some.now)
-    parts.mixed[...] += np.einsum("kn,kn->k", some.near, some.now)
-    parts.ends[...] += np.einsum("km,km,m->k", some.edge, some.edge, place.lacking)
 
 
 def _flat(values: Array) -> Array:
