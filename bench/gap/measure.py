@@ -27,9 +27,11 @@ from itertools import pairwise
 import numpy as np
 
 from bench.gap.model.arrow import held, schur_complement
-from bench.gap.model.fit import Fit, Fitter, Start, difference_steps, prior_of
+from bench.gap.model.differences import difference_steps
+from bench.gap.model.fit import Fitter, prior_of
 from bench.gap.model.models import Model, Models, freedom
 from bench.gap.model.noise import Mask, Noise, likelihood, whitened
+from bench.gap.model.problem import Fit, Start
 from bench.gap.model.world import World
 from sims.base import Array
 

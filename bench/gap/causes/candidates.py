@@ -22,8 +22,8 @@ from itertools import product
 import numpy as np
 
 from bench.gap.model.bounds import CYCLES
-from bench.gap.model.fit import Fit, Start
 from bench.gap.model.noise import Mask
+from bench.gap.model.problem import Fit, Start
 from bench.gap.model.world import World
 from sims.base import Array, Parameter
 from sims.simulated import effect_parameters

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from bench.gap.causes.search import DOUBTFUL, FAR, UNLIKELY, Search, of_size
 from bench.gap.causes.settle import rivals, settle, smaller
-from bench.gap.model.fit import Fitter, Start
+from bench.gap.model.fit import Fitter
 from bench.gap.model.models import Model
+from bench.gap.model.problem import Start
 from bench.gap.model.thinning import thinned
 from bench.gap.model.watch import EndedError
 from bench.gap.model.world import World

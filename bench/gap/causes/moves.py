@@ -11,8 +11,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from bench.gap.causes.scored import Scored
-from bench.gap.model.fit import Start
 from bench.gap.model.models import Model
+from bench.gap.model.problem import Start
 
 NOMINATED = 7
 """Candidates of the best scores that are refitted about one model."""

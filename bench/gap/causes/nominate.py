@@ -13,9 +13,9 @@ from bench.gap.causes.gains import Group
 from bench.gap.causes.score_test import Scores
 from bench.gap.model.base_fit import HORIZONS
 from bench.gap.model.bounds import coefficient_bounds
-from bench.gap.model.fit import Start
 from bench.gap.model.models import Model, Names
 from bench.gap.model.noise import Noise
+from bench.gap.model.problem import Start
 from bench.gap.model.world import World
 from sims.base import Array
 

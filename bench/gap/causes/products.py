@@ -35,8 +35,8 @@ from bench.gap.causes.sums import (
     lacking,
     part_of,
 )
-from bench.gap.model.fit import Fit
 from bench.gap.model.noise import Mask
+from bench.gap.model.problem import Fit
 from bench.gap.model.world import Indices
 from sims.base import Array
 

@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 from bench.gap.causes.candidates import Directions
 from bench.gap.causes.gains import Batch, Group, batches, explained, groups
 from bench.gap.causes.products import Design, Products
-from bench.gap.model.fit import Fit
 from bench.gap.model.noise import GRID, Mask, Noise, log_determinant
+from bench.gap.model.problem import Fit
 from sims.base import Array
 
 MANY = 12

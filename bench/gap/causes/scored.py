@@ -15,9 +15,9 @@ import numpy as np
 from bench.gap.causes.candidates import Directions, directions
 from bench.gap.causes.nominate import nominated
 from bench.gap.causes.score_test import Scores, ScoreTest, calibrated, tail
-from bench.gap.model.fit import Fit
 from bench.gap.model.models import Model, Models
 from bench.gap.model.noise import Mask, Noise, forgets
+from bench.gap.model.problem import Fit
 from bench.gap.model.surrogates import surrogates
 from bench.gap.model.world import World
 from sims.base import Array

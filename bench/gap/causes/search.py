@@ -15,9 +15,9 @@ import numpy as np
 
 from bench.gap.causes.moves import NOMINATED, Moves
 from bench.gap.causes.rules import ALPHA
-from bench.gap.model.fit import Start
 from bench.gap.model.models import Model, Models
 from bench.gap.model.multiple_shooting import pieces, whole
+from bench.gap.model.problem import Start
 
 UNLIKELY = 0.1
 """Chance of the linear scores above which no effect is tried by simulation."""

@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.gap.model.fit import Fit, Fitter, Start
+from bench.gap.model.fit import Fitter
 from bench.gap.model.noise import Noise
+from bench.gap.model.problem import Fit, Start
 from bench.gap.model.world import World
 from bench.runs.standalone import evenly
 from sims.base import Array, Parameter

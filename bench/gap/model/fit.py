@@ -4,199 +4,36 @@ for itself.
 Levenberg-Marquardt for many models at once, so that one call of the engine serves all of them. One
 step of one model is in `arrow`. Noise that remembers is whitened first (`noise`), which makes the
 fit one of generalised least squares.
-
-A step that promised a decrease p of the cost F and brought it from F to F' has the gain ratio
-
-    ρ = (F - F') / p                                                                             (1)
-
-and the damping λ follows it by Nielsen's rule (H. B. Nielsen, Damping parameter in Marquardt's
-method, IMM-REP-1999-05), here quicker in both directions: his least factor is 1/3, his growth ν λ.
-
-    λ ← λ max(0.1, 1 - (2ρ - 1)³),   ν ← 2        where F' < F, and the step is taken            (2)
-    λ ← 2ν λ,                        ν ← 2ν       where it is not                                (3)
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from bench.gap.model.arrow import arrow_step
 from bench.gap.model.bounds import coefficient_bounds
+from bench.gap.model.differences import FIRST_STATE_STEP, FIRST_STEP, difference_steps, displaced
 from bench.gap.model.noise import Mask, Noise, whitened
+from bench.gap.model.problem import ENOUGH, LARGEST_DAMPING, SHARE, Fit, Point, Problem, Start
+from bench.gap.model.race import RACED, Leg, give_up, legs
 from bench.gap.model.world import FEWEST_LANES, Indices, World
 from sims.base import Array
-
-RESPONSE = 0.1
-"""Finite differences move a parameter until the observation changes by this share of its noise,
-RMS.
-"""
-FIRST_STEP = 1e-4
-"""The first one, before the response is known, as a share of a parameter's bounds."""
-FIRST_STATE_STEP = 1e-5
-"""The first one of an initial state, SI units."""
-LARGEST_STEP = 1e-2
-"""The largest one, as a share of a parameter's bounds; of an initial state, SI units."""
-SMALLEST_STEP = 1e-5
-"""The smallest one, as a share of the largest: below it rounding is in the quotient."""
 
 UNMEASURED = 3.0
 """1 sigma of what is known beforehand of an initial state that no sample shows, SI units."""
 MEASURED = 100.0
 """The same where samples show it, SI units: so wide that they decide alone."""
 
-RACED = 4
-"""Steps after which a model can be so far behind that it is given up."""
-LEG = 3
-"""Steps after which those who race hear of each other."""
 GROUP = 60_000
 """What a group of models costs in a step, about, in samples that are simulated."""
 ALGEBRA = 8_000
 """What the equations of one model cost in the same unit."""
-BEATEN = 100.0
-"""A model is given up whose sum of squares, less what may be hoped for, is so much above the best
-one's.
-"""
-HOPE = 10.0
-"""What may be hoped for, in multiples of what the next step promises."""
 
-ENOUGH = 0.02
-"""A fit has converged when a step lowers the sum of squares, in units of the noise, by less than
-this and the share below of it.
-"""
-SHARE = 1e-4
-"""The share."""
-
-FIRST_DAMPING = 1e-3
-"""Where the λ of (2) begins."""
-LEAST_DAMPING = 1e-10
-"""The lowest one: from zero, no factor would bring it back."""
-LARGEST_DAMPING = 1e8
-"""Above it no step downhill is to be found, however short."""
-GROWTH = 2.0
-"""Where the ν of (3) begins, and by what it grows."""
-LEAST_FACTOR = 0.1
-"""The least factor of (2)."""
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where a fit begins: the effects that act, parameters (P,), initial states (R, s)."""
-
-    effects: tuple[str, ...]
-    theta: Array
-    states: Array
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A fitted model.
-
-    Attributes:
-        effects: which effects act.
-        theta: (P,) parameters and coefficients.
-        states: (R, s) initial states.
-        free: (q,) which of theta were fitted.
-        simulated: (R, T, C).
-        jacobian: (R, T, C, q + s) its derivatives, initial states last.
-        cost: sum of squares of the whitened residual.
-    """
-
-    effects: tuple[str, ...]
-    theta: Array
-    states: Array
-    free: Indices
-    simulated: Array
-    jacobian: Array
-    cost: float
-
-    def start(self) -> Start:
-        """To go on from here."""
-        return Start(self.effects, self.theta, self.states)
-
-
-@dataclass(frozen=True)
-class _Point:
-    """Where a model stands, and what it gives there; attributes as those of `Fit`."""
-
-    start: Start
-    simulated: Array
-    jacobian: Array
-    cost: float
-
-
-@dataclass
-class _Problem:
-    """One model on its way.
-
-    Attributes:
-        point: the best one so far.
-        free: (q,) which of theta are fitted.
-        low, high: (q,) where they may be.
-        widths: (q,) the ranges of their bounds.
-        steps: (q + s,) of the finite differences.
-        damping: λ.
-        growth: ν.
-        promised: decrease of the cost that the last step promised.
-        done: whether it has converged, or is given up.
-    """
-
-    point: _Point
-    free: Indices
-    low: Array
-    high: Array
-    widths: Array
-    steps: Array
-    damping: float = FIRST_DAMPING
-    growth: float = GROWTH
-    promised: float = np.inf
-    done: bool = False
-
-    def fit(self) -> Fit:
-        at = self.point
-        return Fit(
-            at.start.effects,
-            at.start.theta,
-            at.start.states,
-            self.free,
-            at.simulated,
-            at.jacobian,
-            at.cost,
-        )
-
-    def inward(self, theta: Array) -> Array:
-        """(q + s,) the steps from parameters (P,), with their signs: inward at an upper bound."""
-        steps = self.steps.copy()
-        own = steps[: self.free.size]
-        own[theta[self.free] + own > self.high] *= -1.0
-        return steps
-
-    def taken(self, gained: float, cost: float) -> None:
-        """After a step that brought the cost down to this."""
-        ratio = gained / max(self.promised, 1e-300)  # (1)
-        factor = max(LEAST_FACTOR, 1.0 - (2.0 * ratio - 1.0) ** 3)
-        self.damping = max(self.damping * factor, LEAST_DAMPING)  # (2)
-        self.growth = GROWTH
-        self.done = gained < ENOUGH + SHARE * cost  # converged
-
-    def refused(self) -> None:
-        """After a step that did not, (3)."""
-        self.damping = self.damping * GROWTH * self.growth
-        self.growth = GROWTH * self.growth
-
-
-class _Leg(NamedTuple):
-    """Steps from the first until the last, which is not made any more, of so many in all."""
-
-    first: int
-    last: int
-    all: int
-
-
-_Trial = tuple[_Problem, Start]
+_Trial = tuple[Problem, Start]
 """A model, and where it may go next."""
 
 
@@ -234,7 +71,7 @@ class Fitter:
             reached: what other models have come down to.
         """
         problems = [self._problem(start) for start in starts]
-        for leg in _legs(iterations, race):
+        for leg in legs(iterations, race):
             # who is not done goes on, in groups that know nothing of each other within a leg
             going = [i for i, problem in enumerate(problems) if not problem.done]
             if not going or (leg.first and self.world.watch.leaves(leg.first / iterations)):
@@ -252,7 +89,7 @@ class Fitter:
         """All but the world."""
         return self.noise, self.frozen, self.share, self.parameters
 
-    def _groups(self, problems: Sequence[_Problem], going: Sequence[int]) -> list[list[int]]:
+    def _groups(self, problems: Sequence[Problem], going: Sequence[int]) -> list[list[int]]:
         """Those that go on, in groups of about `GROUP` samples to simulate, of one kind each as far
         as may be; one group where more lanes of a call cost less.
         """
@@ -271,8 +108,8 @@ class Fitter:
         return [part.tolist() for part in parts]
 
     def go(
-        self, problems: Sequence[_Problem], leg: _Leg, race: bool, reached: float
-    ) -> list[_Problem]:
+        self, problems: Sequence[Problem], leg: Leg, race: bool, reached: float
+    ) -> list[Problem]:
         """Some problems after a leg of their way.
 
         Args:
@@ -290,7 +127,7 @@ class Fitter:
         for iteration in range(leg.first, leg.last):
             # in its first steps even the right model may be far behind
             if race and iteration >= RACED:
-                _give_up(problems, reached)
+                give_up(problems, reached)
             trials = list(self._trials(problems, seen))
             # what comes after it sees that this was left off
             if not trials or self.world.watch.leaves(iteration / leg.all):
@@ -300,7 +137,7 @@ class Fitter:
                 self._judge(problem, point)
         return list(problems)
 
-    def _problem(self, start: Start) -> _Problem:
+    def _problem(self, start: Start) -> Problem:
         """What of a model is fitted, and how far it may go."""
         world = self.world
         free: list[int] = []
@@ -324,8 +161,8 @@ class Fitter:
         theta = start.theta.copy()
         theta[free] = np.clip(theta[free], low, high)
         begun = Start(start.effects, theta, start.states.copy())
-        return _Problem(
-            point=_Point(begun, np.empty(0), np.empty(0), np.inf),
+        return Problem(
+            point=Point(begun, np.empty(0), np.empty(0), np.inf),
             free=np.array(free, dtype=np.intp),
             low=low,
             high=high,
@@ -333,7 +170,7 @@ class Fitter:
             steps=np.concatenate([FIRST_STEP * widths, state_steps]),
         )
 
-    def _points(self, trials: Sequence[_Trial], seen: Mask) -> list[_Point]:
+    def _points(self, trials: Sequence[_Trial], seen: Mask) -> list[Point]:
         """What each problem gives at a trial's place, its derivatives and its cost.
 
         One call of the engine has every run of every model, with every unknown moved: it goes
@@ -343,7 +180,7 @@ class Fitter:
         unknown = np.flatnonzero(~self.world.known.all(axis=0))
         steps = [problem.inward(start.theta) for problem, start in trials]
         moved = [
-            _moved(start, problem.free, step, unknown)
+            displaced(start, problem.free, step, unknown)
             for (problem, start), step in zip(trials, steps, strict=True)
         ]
         # lanes model by model, in each unknown by unknown, in each run by run
@@ -362,7 +199,7 @@ class Fitter:
             first = last
             jacobian = self._derivatives(part, step, unknown)
             cost = self._cost(part[0], start.states, seen)
-            points.append(_Point(start, part[0], jacobian, cost))
+            points.append(Point(start, part[0], jacobian, cost))
         return points
 
     def _derivatives(self, part: Array, steps: Array, unknown: Indices) -> Array:
@@ -388,7 +225,7 @@ class Fitter:
         jacobian[..., q:] *= ~known[:, None, None, :]
         return jacobian
 
-    def _take(self, problem: _Problem, point: _Point) -> None:
+    def _take(self, problem: Problem, point: Point) -> None:
         """Go on from a point, with differences that suit what it responds to."""
         problem.point = point
         problem.steps = difference_steps(point.jacobian, self.noise, problem.widths)
@@ -413,7 +250,7 @@ class Fitter:
         drift = self._drift(states)
         return float((w * w).sum() + (drift * drift).sum())
 
-    def _trials(self, problems: Sequence[_Problem], seen: Mask) -> Iterator[_Trial]:
+    def _trials(self, problems: Sequence[Problem], seen: Mask) -> Iterator[_Trial]:
         """Where each problem that is not done goes next; one whose step promises nothing is."""
         for problem in problems:
             if problem.done:
@@ -422,7 +259,7 @@ class Fitter:
             if trial is not None:
                 yield problem, trial
 
-    def _trial(self, problem: _Problem, seen: Mask) -> Start | None:
+    def _trial(self, problem: Problem, seen: Mask) -> Start | None:
         """The next parameters and initial states to try; None, and done, if they promise
         nothing.
         """
@@ -444,7 +281,7 @@ class Fitter:
             prior_of(self.world),
             self.world.known,
             problem.damping,
-            _stuck(problem, residual, jacobian),  # clipped afterwards, they would spoil the rest
+            problem.stuck(residual, jacobian),  # clipped afterwards, they would spoil the rest
         )
         problem.promised = step.promised
         # converged, or no step is short enough
@@ -458,7 +295,7 @@ class Fitter:
         theta[problem.free] = np.clip(moved, problem.low, problem.high)
         return replace(at.start, theta=theta, states=at.start.states + step.own)
 
-    def _judge(self, problem: _Problem, point: _Point) -> None:
+    def _judge(self, problem: Problem, point: Point) -> None:
         """Take a trial's point if it is better, and learn from it how much to damp."""
         gained = problem.point.cost - point.cost
         if point.cost < problem.point.cost:
@@ -468,64 +305,9 @@ class Fitter:
             problem.refused()
 
 
-def _gone(world: World, terms: tuple[Any, ...], *call: Any) -> list[_Problem]:
+def _gone(world: World, terms: tuple[Any, ...], *call: Any) -> list[Problem]:
     """A group after a leg, whoever goes it."""
     return Fitter(world, *terms).go(*call)
-
-
-def _legs(iterations: int, race: bool) -> Iterator[_Leg]:
-    """The way of a fit: in legs where models race, who hear of each other between them."""
-    first = 0
-    while first < iterations or not first:
-        last = iterations
-        if race:
-            last = min(iterations, first + LEG if first else RACED)
-        yield _Leg(first, last, max(iterations, 1))
-        if not iterations:
-            return
-        first = last
-
-
-def _give_up(problems: Sequence[_Problem], reached: float) -> None:
-    """Leave models unfinished that several steps like the last would not bring near the best."""
-    best = min(reached, *(p.point.cost for p in problems))
-    for p in problems:
-        p.done |= p.point.cost - HOPE * p.promised > best + BEATEN
-
-
-def _moved(start: Start, free: Indices, steps: Array, unknown: Indices) -> tuple[Array, Array]:
-    """Parameters (1 + q + n, P) and initial states (1 + q + n, R, s): as they are, then each
-    unknown moved by its step, each of n initial states in all runs at once.
-    """
-    q, count = free.size, unknown.size
-    theta = np.tile(start.theta, (1 + q + count, 1))
-    states = np.tile(start.states, (1 + q + count, 1, 1))
-    for j, place in enumerate(free):
-        theta[1 + j, place] += steps[j]
-    # no run's initial state touches another run: one lane has the derivatives of all
-    for j, place in enumerate(unknown):
-        states[1 + q + j, :, place] += steps[q + place]
-    return theta, states
-
-
-def difference_steps(jacobian: Array, noise: Noise, widths: Array) -> Array:
-    """(q + s,) steps of finite differences that move the runs by `RESPONSE` of the noise.
-
-    Args:
-        jacobian: (R, T, C, q + s) by an earlier difference.
-        noise: of each channel.
-        widths: (q,) the ranges of the parameters' bounds.
-    """
-    squares = np.square(jacobian / noise.sigma[:, None])
-    responses = np.sqrt(np.mean(squares, axis=(0, 1, 2)))
-    states = np.full(len(responses) - len(widths), LARGEST_STEP)
-    largest = np.concatenate([LARGEST_STEP * widths, states])
-    # an unknown without any response is moved as far as may be
-    with np.errstate(divide="ignore"):
-        wanted = RESPONSE / np.where(responses > 0, responses, 1e-300)
-    # below the least step rounding would be the difference, above the largest one curvature
-    steps: Array = np.clip(wanted, SMALLEST_STEP * largest, largest)
-    return steps
 
 
 def prior_of(world: World) -> Array:
@@ -535,15 +317,3 @@ def prior_of(world: World) -> Array:
     pairs = dict(zip(system.rates, system.coordinates, strict=False))
     measured = [name in shown or pairs.get(name) in shown for name in world.states]
     return np.where(measured, MEASURED, UNMEASURED)
-
-
-def _stuck(problem: _Problem, residual: Array, jacobian: Array) -> Mask:
-    """(q,) parameters at a bound that the data push against."""
-    start, free = problem.point.start, problem.free
-    # the gradient of the cost, downhill
-    pushed = np.einsum("rtc,rtcq->q", residual, jacobian[..., : free.size])
-    here = start.theta[free]
-    below = (here <= problem.low) & (pushed < 0)
-    above = (here >= problem.high) & (pushed > 0)
-    stuck: Mask = below | above
-    return stuck

@@ -18,8 +18,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bench.gap.model.base_fit import HORIZONS
-from bench.gap.model.fit import Fit, Fitter, Start, prior_of
+from bench.gap.model.fit import Fitter, prior_of
 from bench.gap.model.noise import Likelihood, Mask, Noise, likelihood
+from bench.gap.model.problem import Fit, Start
 from bench.gap.model.world import World
 from bench.problem.seeds import rng_for
 from sims.base import Array

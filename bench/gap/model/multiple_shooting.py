@@ -20,8 +20,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.gap.model.fit import Fit, Start
 from bench.gap.model.noise import Mask
+from bench.gap.model.problem import Fit, Start
 from bench.gap.model.world import World
 from sims.recording.recording import Run
 

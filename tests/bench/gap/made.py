@@ -7,8 +7,8 @@ import numpy as np
 
 from bench.gap.causes.search import Search
 from bench.gap.model.base_fit import fit_base
-from bench.gap.model.fit import Fit
 from bench.gap.model.noise import Noise
+from bench.gap.model.problem import Fit
 from bench.gap.model.world import World
 from bench.recordings.simulate import make
 from bench.registry import simulators

@@ -6,8 +6,9 @@ import pytest
 
 from bench.gap.causes.search import Search
 from bench.gap.measure import HeldOutRuns, central, covariance, gain, intervals
-from bench.gap.model.fit import Fitter, Start
+from bench.gap.model.fit import Fitter
 from bench.gap.model.noise import Noise, likelihood
+from bench.gap.model.problem import Start
 from sims.pendulum.simulator import Pendulum
 from sims.slider.simulator import Slider
 from tests.bench.gap.made import (

@@ -5,7 +5,8 @@ import pytest
 
 from bench.gap.causes.search import Search
 from bench.gap.model.base_fit import fit_base
-from bench.gap.model.fit import Fitter, Start
+from bench.gap.model.fit import Fitter
+from bench.gap.model.problem import Start
 from bench.gap.propose import TELLING, next_experiment
 from sims.base import Scenario
 from sims.pendulum.simulator import Pendulum

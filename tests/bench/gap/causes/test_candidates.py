@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from bench.gap.causes.candidates import FREQUENCIES, SHAPES, directions, simulate_with
-from bench.gap.model.fit import Fitter, Start
+from bench.gap.model.fit import Fitter
+from bench.gap.model.problem import Start
 from sims.base import Scenario
 from sims.pendulum.simulator import Pendulum
 from tests.bench.gap.made import recording, searched, white, world

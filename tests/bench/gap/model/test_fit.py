@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.gap.model.fit import MEASURED, UNMEASURED, Fitter, Start, prior_of
+from bench.gap.model.fit import MEASURED, UNMEASURED, Fitter, prior_of
+from bench.gap.model.problem import Start
 from sims.ball.simulator import Ball
 from sims.pendulum.simulator import Pendulum
 from tests.bench.gap.made import changed, recorded, recording, white, with_runs, world

@@ -7,8 +7,9 @@ import pytest
 
 from bench.gap.causes import moves, search
 from bench.gap.causes.settle import settle
-from bench.gap.model.fit import Fitter, Start
+from bench.gap.model.fit import Fitter
 from bench.gap.model.multiple_shooting import PIECES, pieces, whole
+from bench.gap.model.problem import Start
 from sims.ball.simulator import Ball
 from sims.pendulum.simulator import Pendulum
 from tests.bench.gap.made import recorded, searched, white, with_runs, world
