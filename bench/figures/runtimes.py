@@ -88,9 +88,9 @@ def amortisation_figure(
     for axis, (kind, by_tuner) in zip(axes, prices.items(), strict=True):
         for tuner, price in by_tuner.items():
             ert = float(price.effort.ert())
-            # Who never gets there has no line: it would be at infinity.
-            if np.isfinite(ert):
-                total = price.fit_simulations + targets * ert
+            total = price.fit_simulations + targets * ert
+            # A logarithmic axis has no place for who never gets there, or is there from the start.
+            if np.isfinite(ert) and total[0] > 0:
                 axis.plot(targets, total, markevery=25, markersize=4.5, **style.of(tuner))
         _mark_even(axis, by_tuner)
         axis.set_xscale("log")
@@ -101,7 +101,7 @@ def amortisation_figure(
     caption = (
         f"To reach an error of {level:.2g} for good: training + targets × expected simulations "
         "(ERT). Rings: a learned tuner passes a search tuner; bars: 95 % bootstrap interval. "
-        "A tuner without a line never got there."
+        "A tuner without a line never got there, or began there."
     )
     finish(figure, axes, style, experiment, caption)
     return figure
@@ -133,8 +133,8 @@ def cost_figure(experiment: Experiment, style: Styles, prices: Prices, level: fl
     figure, axes = canvas(len(prices))
     for axis, (kind, by_tuner) in zip(axes, prices.items(), strict=True):
         for tuner, price in by_tuner.items():
-            if np.isfinite(price.effort.ert()):
-                seconds = price.seconds(COSTS, SHARED)
+            seconds = price.seconds(COSTS, SHARED)
+            if np.isfinite(price.effort.ert()) and seconds[0] > 0:
                 axis.plot(COSTS, seconds, markevery=20, markersize=4.5, **style.of(tuner))
         axis.set_xscale("log")
         axis.set_yscale("log")

@@ -2,6 +2,7 @@
 
 import socket
 import threading
+from contextlib import suppress
 
 import pandas as pd
 import pytest
@@ -22,20 +23,27 @@ pytestmark = pytest.mark.slow
 def server(tmp_path_factory):
     """Somebody outside who would tell, and notes who asked."""
     address, asked = str(tmp_path_factory.mktemp("outside") / "socket"), []
-    servers = [socket.socket(socket.AF_UNIX), socket.socket(socket.AF_INET)]
+    servers, threads = [socket.socket(socket.AF_UNIX), socket.socket(socket.AF_INET)], []
     for one, where in zip(servers, (address, ("127.0.0.1", 0)), strict=True):
         one.bind(where)
         one.listen()
 
         def serve(one=one):
-            while True:
-                link, _ = one.accept()
-                asked.append(link.recv(1024))
-                link.sendall(bytes(16))
-                link.close()
+            # Until it is shut down.
+            with suppress(OSError):
+                while True:
+                    link, _ = one.accept()
+                    asked.append(link.recv(1024))
+                    link.sendall(bytes(16))
+                    link.close()
 
-        threading.Thread(target=serve, daemon=True).start()
-    return {"address": address, "port": servers[1].getsockname()[1]}, asked
+        threads.append(threading.Thread(target=serve, daemon=True))
+        threads[-1].start()
+    yield {"address": address, "port": servers[1].getsockname()[1]}, asked
+    for one, thread in zip(servers, threads, strict=True):
+        one.shutdown(socket.SHUT_RDWR)
+        thread.join()
+        one.close()
 
 
 def entries(folder, server):

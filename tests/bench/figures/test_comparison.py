@@ -101,3 +101,16 @@ def test_tables_can_be_had_without_a_file():
     assert set(made["break_even"]["learned"]) == {"tunenet"}
     assert len(made["who_wins"]) > 0
     assert tables(stored(runs=pd.DataFrame())) == {}
+
+
+def test_who_begins_at_the_target_needs_nothing_and_has_no_place_on_a_logarithmic_axis():
+    whole = stored()
+    first = whole.runs.assign(tuner_seconds=whole.runs["tuner_seconds"] * (whole.runs["k"] > 0))
+    errors = ["param_error", "param_abs_error", "stiff_error", "sloppy_error"]
+    first.loc[first["tuner"] == "random", errors] = 0.01
+    there = stored(runs=first)
+    for name in ("amortisation", "cost"):
+        drawn = figure(there, LABELS, name)
+        lines = {line.get_label() for axis in drawn.axes for line in axis.get_lines()}
+        assert "random" not in lines
+        assert "tunenet" in lines

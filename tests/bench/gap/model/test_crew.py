@@ -17,7 +17,7 @@ from bench.gap.model import crew as crews
 from bench.gap.model.crew import Crew, can_fork, cores, packed
 from bench.gap.model.watch import Watch
 
-pytestmark = pytest.mark.skipif(not can_fork(), reason="workers cannot be forked here")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="workers are forked on Linux alone")
 
 
 def world(**watch):
@@ -27,8 +27,11 @@ def world(**watch):
 
 @pytest.fixture(autouse=True)
 def eager(monkeypatch):
-    """Workers are started at once, however little there is to do."""
+    """Workers are started at once, however little there is to do, and whatever threads other tests
+    have left.
+    """
     monkeypatch.setattr(crews, "PAYS", 0.0)
+    monkeypatch.setattr(crews, "can_fork", lambda: True)
 
 
 def times(there, number):
@@ -93,7 +96,8 @@ def test_little_work_starts_nobody(monkeypatch):
             assert {process for _, process in results} == {os.getpid()}
 
 
-def test_beside_a_thread_nobody_is_forked():
+def test_beside_a_thread_nobody_is_forked(monkeypatch):
+    monkeypatch.setattr(crews, "can_fork", can_fork)
     done = threading.Event()
     thread = threading.Thread(target=done.wait)
     thread.start()
