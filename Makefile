@@ -2,7 +2,7 @@
 # make explain   a small diagnosis: makes a recording with a hidden cause, finds it, writes the report
 # make test      the tests
 # make check     lint, types and import rules
-# make exam      hides causes in hundreds of recordings and has explain find them (about an hour; QUICK=--quick)
+# make exam      hides causes in hundreds of recordings and has explain find them (about 6 minutes; QUICK=--quick)
 # make benchmark measurements printed as ratios
 # make chaos     100 kills at random moments; what is resumed must equal what was never disturbed (about 10 minutes)
 # make malformed ten thousand malformed files, folders and arguments to every command (about 5 minutes; KINDS="films weights")
