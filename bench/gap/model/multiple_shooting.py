@@ -45,22 +45,7 @@ def pieces(world: World) -> World | None:
     runs = [piece for run in world.runs for piece in _cut(run)]
     if len(runs) == len(world.runs):
         return None
-    freed = [p.name for p in world.freed]
-    cut = World(
-        world.kind,
-        world.recording,
-        runs,
-        engine=world.engine,
-        extra=world.extra,
-        free=freed,
-        candidates=world.library,
-    )
-    # what is periodic goes on from piece to piece
-    cut.longest = world.longest
-    cut.travel = world.travel
-    cut.watch = world.watch
-    cut.crew = world.crew
-    return cut
+    return world.over(runs)
 
 
 def _cut(run: Run) -> list[Run]:

@@ -39,21 +39,7 @@ def thinned(world: World) -> World | None:
         _shown(few, run, factor) for few, run, factor in zip(runs, world.runs, factors, strict=True)
     ):
         return None
-    few = World(
-        world.kind,
-        world.recording,
-        runs,
-        engine=world.engine,
-        extra=world.extra,
-        free=[p.name for p in world.freed],
-        candidates=world.library,
-    )
-    few.watch = world.watch
-    few.crew = world.crew
-    # the same grids of shapes, so that what is found here is what would be found there
-    few.longest = world.longest
-    few.travel = world.travel
-    return few
+    return world.over(runs)
 
 
 def _factor(run: Run) -> int:

@@ -269,6 +269,26 @@ class World:
             result[parts[number], last:] = np.nan
         return result
 
+    def over(self, runs: Sequence[Run]) -> World:
+        """A world of other runs, cut or thinned from these: with the same parameters, the same
+        grids of shapes, the same watch and crew.
+        """
+        other = World(
+            self.kind,
+            self.recording,
+            runs,
+            engine=self.engine,
+            extra=self.extra,
+            free=[p.name for p in self.freed],
+            candidates=self.library,
+        )
+        # what is periodic goes on from piece to piece, and what is found in one is found in all
+        other.longest = self.longest
+        other.travel = self.travel
+        other.watch = self.watch
+        other.crew = self.crew
+        return other
+
     def kinds(self, theta: Array) -> Indices:
         """(L,) which lanes of parameters (L, P) can be simulated together: those of one number."""
         active = theta != 0
