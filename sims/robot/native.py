@@ -1,0 +1,198 @@
+"""Effects that MuJoCo has in its model: which fields of a compiled model each of them changes, and
+how, for many lanes at once.
+
+With c the coefficient, and what the model file states before it, at a joint, an actuator or a body:
+
+* (1) added: stated + c, never below zero: dampings, dry friction, stiffness, armature
+* (2) scaled: stated times 1 + c, with 1 + c never below `SMALLEST`
+* (3) moved: the centre of mass by c (3 numbers, m) in the body's frame
+* (4) tilted: gravity plus g x along x and g y along y, g what the file states, as a size
+* (5) limited: the file's range cut to -c ... c; a limit of zero is none
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sims.base import Array
+from sims.robot.model import Robot
+
+SOLREF = (0.002, 1.0)
+"""Of dry friction: time constant in s and damping ratio. MuJoCo's own, 0.02 s, creeps at rest."""
+
+SOLIMP = (0.99, 0.99, 0.001, 0.5, 2.0)
+"""Of dry friction: as hard as at the end of MuJoCo's own range, everywhere."""
+
+SMALLEST = 1e-6
+"""The least share of a mass or a gain that is left, so that none is zero or negative."""
+
+Fields = Mapping[str, Any]
+"""Model fields by name, arrays (L, ...) of the lanes."""
+
+Write = Callable[[Fields, Robot, str, Array], None]
+"""Changes fields in place: of the robot, at the place, by coefficients (K, L)."""
+
+
+@dataclass(frozen=True)
+class Native:
+    """An effect that is written into the model.
+
+    Attributes:
+        fields: that it writes, as ``mujoco.batch.Batch.expand`` names them.
+        write: what it does to them; the fields hold what the file states, or what another effect
+            has made of it.
+        derived: whether constants are derived from the fields, so that ``set_const`` must follow;
+            it does so only in a model of `lanes_model`.
+    """
+
+    fields: tuple[str, ...]
+    write: Write
+    derived: bool = False
+
+
+def lanes_model(robot: Robot) -> Any:
+    """The compiled model whose masses and centres of mass may be changed lane by lane.
+
+    MuJoCo stores less for a body that turns about its centre of mass, and refuses to move that
+    centre afterwards; here it stores all. The motion is the same.
+    """
+    spec = robot.spec.copy()
+    for body in spec.bodies:
+        body.simple = False
+    return spec.compile()
+
+
+def added(stated: Any, c: Any) -> Any:
+    """(1); a number below zero that the file states may stay."""
+    return np.maximum(stated + c, np.minimum(stated, 0.0))
+
+
+def share(c: Any) -> Any:
+    """1 + c of (2)."""
+    return np.maximum(1.0 + c, SMALLEST)
+
+
+def _add_dof(field: str) -> Write:
+    """Adds to a number of a joint's velocity."""
+
+    def write(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+        column = robot.joint(place).velocity
+        fields[field][:, column] = added(fields[field][:, column], c[0])
+
+    return write
+
+
+def _add_quadratic(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+    # The polynomial's first number is that of |v| v.
+    column = fields["dof_dampingpoly"][:, robot.joint(place).velocity]
+    column[:, 0] = added(column[:, 0], c[0])
+
+
+def _add_friction(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+    column = robot.joint(place).velocity
+    loss = fields["dof_frictionloss"]
+    # Friction that the file states is taken as stiff as well, or zero would be a jump.
+    rubs = (c[0] != 0) | (loss[:, column] > 0)
+    loss[:, column] = added(loss[:, column], c[0])
+    fields["dof_solref"][rubs, column] = SOLREF
+    fields["dof_solimp"][rubs, column] = SOLIMP
+
+
+def _add_spring(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+    column = fields["jnt_stiffness"]
+    number = robot.joint(place).id
+    column[:, number] = added(column[:, number], c[0])
+
+
+def _add_cubic(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+    # The polynomial's second number is that of x^3; a spring may soften, so it has no floor.
+    fields["jnt_stiffnesspoly"][:, robot.joint(place).id, 1] += c[0]
+
+
+def _scale_mass(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+    number = robot.body(place).id
+    fields["body_mass"][:, number] *= share(c[0])
+    fields["body_inertia"][:, number] *= share(c[0])[:, None]
+
+
+def _scale_inertia(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+    fields["body_inertia"][:, robot.body(place).id] *= share(c[0])[:, None]
+
+
+def _offset_mass(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+    fields["body_ipos"][:, robot.body(place).id] += c.T  # (3)
+
+
+def _scale_stiffness(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+    number = robot.actuator(place).id
+    gain, bias = fields["actuator_gainprm"][:, number], fields["actuator_biasprm"][:, number]
+    bias[:, 1] *= share(c[0])
+    if _gain_pulls(robot, number, 1):
+        gain[:, 0] *= share(c[0])
+
+
+def _scale_damping(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+    number = robot.actuator(place).id
+    gain, bias = fields["actuator_gainprm"][:, number], fields["actuator_biasprm"][:, number]
+    bias[:, 2] *= share(c[0])
+    if _gain_pulls(robot, number, 2):
+        gain[:, 0] *= share(c[0])
+
+
+def _gain_pulls(robot: Robot, number: int, term: int) -> bool:
+    """Whether an actuator's control is a set point of its position (term 1) or velocity (2)."""
+    import mujoco
+
+    model = robot.compiled
+    gain, bias = model.actuator_gainprm[number], model.actuator_biasprm[number]
+    fixed = int(model.actuator_gaintype[number]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+    # Where it has a stiffness as well, the set point is multiplied by that one.
+    return bool(fixed and gain[0] == -bias[term] and (term == 1 or bias[1] == 0))
+
+
+def _scale_gravity(fields: Fields, robot: Robot, place: str, c: Array) -> None:  # noqa: ARG001
+    gravity = fields["opt.gravity"]
+    # What a tilt has added is no part of what is scaled.
+    gravity += c[0][:, None] * robot.compiled.opt.gravity
+
+
+def _tilt_gravity(fields: Fields, robot: Robot, place: str, c: Array) -> None:  # noqa: ARG001
+    size = float(np.linalg.norm(robot.compiled.opt.gravity))
+    fields["opt.gravity"][:, :2] += size * c.T  # (4)
+
+
+def _limit_force(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+    number = robot.actuator(place).id
+    limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
+    limits = c[0] > 0
+    free = limits & ~limited[:, number].astype(bool)
+    ranges[free, number] = (-np.inf, np.inf)
+    cut = np.stack([-c[0], c[0]], axis=1)[limits]
+    low, high = ranges[limits, number].T
+    ranges[limits, number] = np.clip(cut, low[:, None], high[:, None])  # (5)
+    limited[limits, number] = True
+
+
+_SERVO = ("actuator_gainprm", "actuator_biasprm")
+
+FIELDS: Mapping[str, Native] = {
+    "drag.linear": Native(("dof_damping",), _add_dof("dof_damping")),
+    "drag.quadratic": Native(("dof_dampingpoly",), _add_quadratic),
+    "friction.coulomb": Native(("dof_frictionloss", "dof_solref", "dof_solimp"), _add_friction),
+    "spring.linear": Native(("jnt_stiffness",), _add_spring),
+    "spring.cubic": Native(("jnt_stiffnesspoly",), _add_cubic),
+    "inertia.armature": Native(("dof_armature",), _add_dof("dof_armature"), derived=True),
+    "mass.scale": Native(("body_mass", "body_inertia"), _scale_mass, derived=True),
+    "mass.offset": Native(("body_ipos",), _offset_mass, derived=True),
+    "inertia.scale": Native(("body_inertia",), _scale_inertia, derived=True),
+    "actuator.stiffness": Native(_SERVO, _scale_stiffness),
+    "actuator.damping": Native(_SERVO, _scale_damping),
+    "gravity.scale": Native(("opt.gravity",), _scale_gravity),
+    "gravity.tilt": Native(("opt.gravity",), _tilt_gravity),
+    "actuator.limit": Native(("actuator_forcelimited", "actuator_forcerange"), _limit_force),
+}
+"""Native effects by name, each at a place of its kind; the world's take any place, as ``""``."""

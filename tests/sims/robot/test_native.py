@@ -1,0 +1,110 @@
+"""Effects that are written into model fields: lane by lane, the motion of a file that states it."""
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco.batch import Batch
+
+from sims.robot import native
+from sims.robot.model import Robot
+from tests.sims.robot.arms import ARM, robot
+
+ELBOW = 'damping="0.1" frictionloss="0.05" stiffness="0.5"'
+STIFF = 'solreffriction="0.002 1" solimpfriction="0.99 0.99 0.001 0.5 2"'
+FORE = 'pos="0.15 0 0.01" mass="0.8" diaginertia="0.002 0.008 0.009"'
+WHEEL = '<geom type="cylinder" size="0.05 0.01" mass="0.2"/>'
+MOVED = (
+    '<inertial pos="0.02 0 0.03" mass="0.2" diaginertia="0.000131666666666666 0.00013166666666666'
+)
+MOVED += '6 0.00025"/>' + WHEEL
+STATED = {
+    ("drag.linear", "shoulder", (0.3,)): ('damping="0.2 0.05 0"', 'damping="0.5 0.05 0"'),
+    ("drag.linear", "elbow", (-0.3,)): ('damping="0.1"', 'damping="0"'),
+    ("drag.quadratic", "shoulder", (0.25,)): ("0.2 0.05 0", "0.2 0.3 0"),
+    ("friction.coulomb", "shoulder", (0.3,)): ("armature", f'frictionloss="0.3" {STIFF} armature'),
+    ("friction.coulomb", "elbow", (0.3,)): (
+        'frictionloss="0.05"',
+        f'frictionloss="0.35" {STIFF}',
+    ),
+    ("spring.linear", "elbow", (0.5,)): ('stiffness="0.5"', 'stiffness="1"'),
+    ("spring.cubic", "elbow", (-0.4,)): ('stiffness="0.5"', 'stiffness="0.5 0 -0.4"'),
+    ("inertia.armature", "shoulder", (0.02,)): ('armature="0.01"', 'armature="0.03"'),
+    ("mass.scale", "fore", (0.5,)): (
+        FORE,
+        'pos="0.15 0 0.01" mass="1.2" diaginertia="0.003 0.012 0.0135"',
+    ),
+    ("mass.offset", "fore", (0.02, 0.0, 0.03)): ("0.15 0 0.01", "0.17 0 0.04"),
+    ("mass.offset", "wheel", (0.02, 0.0, 0.03)): (WHEEL, MOVED),
+    ("inertia.scale", "fore", (0.5,)): ("0.002 0.008 0.009", "0.003 0.012 0.0135"),
+    ("actuator.stiffness", "m_shoulder", (-0.25,)): ('kp="60"', 'kp="45"'),
+    ("actuator.damping", "m_shoulder", (-0.5,)): ('kv="3"', 'kv="1.5"'),
+    ("actuator.damping", "m_spin", (1.0,)): ('kv="0.05"', 'kv="0.1"'),
+    ("gravity.scale", "", (-0.1,)): ("-9.81", "-8.829"),
+    ("gravity.tilt", "", (0.1, -0.05)): ("0 0 -9.81", "0.981 -0.4905 -9.81"),
+    ("actuator.limit", "m_elbow", (1.5,)): ("-1 4", "-1 1.5"),
+    ("actuator.limit", "m_spin", (0.02,)): ('kv="0.05"', 'kv="0.05" forcerange="-0.02 0.02"'),
+}
+"""By effect, place and coefficients: what stands in the file, and what says the same."""
+
+CONTROL = (0.7, 1.8, 6.0)
+
+
+def lanes(robot: Robot, effect: str, place: str, c: tuple[float, ...]) -> Any:
+    """(2, nq) positions after 0.4 s: a lane without the effect, one with it."""
+    of = native.FIELDS[effect]
+    batch = Batch(native.lanes_model(robot), 2, 1)
+    fields = {name: batch.expand(name) for name in of.fields}
+    of.write(fields, robot, place, np.array([[0.0, value] for value in c]))
+    if of.derived:
+        batch.set_const()
+    return moved(batch)
+
+
+def moved(batch: Batch) -> Any:
+    """Where it is after 0.4 s of motion."""
+    batch.bind("qpos")[:] = (0.3, -0.5, 0.1)
+    batch.bind("ctrl")[:] = CONTROL
+    batch.step(nstep=400)
+    return batch.bind("qpos").copy()
+
+
+@pytest.mark.parametrize(("effect", "place", "c"), STATED)
+def test_a_lane_moves_as_the_file_that_states_it(
+    effect: str, place: str, c: tuple[float, ...], tmp_path: Path
+) -> None:
+    """A lane with a coefficient moves as a model whose file says so; the lane beside it is still
+    what the file says.
+    """
+    arm = robot(tmp_path)
+    found = lanes(arm, effect, place, c)
+    before, after = STATED[effect, place, c]
+    assert ARM.count(before) == 1
+    stated = moved(Batch(mujoco.MjModel.from_xml_string(ARM.replace(before, after)), 1, 1))
+    plain = moved(Batch(arm.compiled, 1, 1))
+    np.testing.assert_allclose(found[1], stated[0], rtol=0, atol=1e-10)
+    if place != "elbow" or effect != "friction.coulomb":
+        np.testing.assert_allclose(found[0], plain[0], rtol=0, atol=1e-12)
+    assert np.abs(stated[0] - plain[0]).max() > 1e-5
+
+
+def test_stated_friction_is_stiff_in_every_lane(tmp_path: Path) -> None:
+    """Where the file states friction, a coefficient of zero is no jump."""
+    found = lanes(robot(tmp_path), "friction.coulomb", "elbow", (1e-9,))
+    np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-7)
+
+
+def test_every_native_effect_is_compared() -> None:
+    """None is left out of the table above."""
+    assert {effect for effect, _, _ in STATED} == set(native.FIELDS)
+
+
+def test_no_mass_becomes_negative(tmp_path: Path) -> None:
+    """However large the coefficient, something is left."""
+    arm = robot(tmp_path)
+    fields = {name: np.array(getattr(arm.compiled, name))[None] for name in ("body_mass",)}
+    fields["body_inertia"] = np.array(arm.compiled.body_inertia)[None]
+    native.FIELDS["mass.scale"].write(fields, arm, "fore", np.array([[-3.0]]))
+    assert fields["body_mass"][0, arm.body("fore").id] > 0
