@@ -1,0 +1,103 @@
+"""A robot as links and joints: what is drawn where nothing can be rendered."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.figures.style import CHANCE, INK, SOFT
+from bench.figures.view import View
+from sims.base import Array
+from sims.robot.model import Joint, Robot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+TICK = 0.07
+"""Length of an axis of a joint to either side, as a share of the picture."""
+HEAD_ON = 0.25
+"""Share of an axis that is seen below which it points at the reader, and is not drawn."""
+
+
+def draw_links(axis: Axes, robot: Robot, data: Any, view: View) -> None:
+    """Links as lines between the anchors of joints, joints as dots with a tick along each axis."""
+    for begin, end in links(robot, data):
+        line = view.seen(np.stack([begin, end]))
+        axis.plot(*line.T, color=CHANCE, linewidth=5, solid_capstyle="round", zorder=1)
+    for point in _bases(robot, data):
+        x, y = view.seen(point[None])[0]
+        axis.plot(x, y, "s", color=SOFT, markersize=11, zorder=2)
+    for joint in robot.joints:
+        _draw_joint(axis, joint, data, view)
+
+
+def links(robot: Robot, data: Any) -> list[tuple[Array, Array]]:
+    """Ends (3,) of each link: from the joint of the body that carries it to its own, and from the
+    last joint to the end of the last body.
+    """
+    model = robot.compiled
+    found = []
+    carried = set()
+    for body in range(1, model.nbody):
+        if not int(model.body_weldid[body]):
+            continue
+        parent = int(model.body_parentid[body])
+        carried.add(parent)
+        if parent:
+            found.append((_begin(model, data, parent), _begin(model, data, body)))
+    for body in range(1, model.nbody):
+        if int(model.body_weldid[body]) and body not in carried:
+            begin = _begin(model, data, body)
+            found.append((begin, _end(model, data, body, begin)))
+    return found
+
+
+def _begin(model: Any, data: Any, body: int) -> Array:
+    """(3,) the anchor of the body's first joint; its origin where it has none."""
+    first = int(model.body_jntadr[body])
+    return np.array(data.xanchor[first] if first >= 0 else data.xpos[body])
+
+
+def _end(model: Any, data: Any, body: int, begin: Array) -> Array:
+    """(3,) the end of a body that carries no other: of its shapes what is furthest from the joint,
+    else as far behind its centre of mass as that is from the joint.
+    """
+    points = [2 * data.xipos[body] - begin]
+    for g in range(model.ngeom):
+        if int(model.geom_bodyid[g]) != body:
+            continue
+        turn = data.geom_xmat[g].reshape(3, 3)
+        middle = data.geom_xpos[g] + turn @ model.geom_aabb[g, :3]
+        sides = turn * model.geom_aabb[g, 3:]
+        points += [*(middle + sides.T), *(middle - sides.T)]
+    shapes = points[1:] or points
+    return np.array(max(shapes, key=lambda p: round(float(np.linalg.norm(p - begin)), 9)))
+
+
+def _bases(robot: Robot, data: Any) -> list[Array]:
+    """(3,) each: where what moves is fixed to what does not."""
+    model = robot.compiled
+    found = []
+    for body in range(1, model.nbody):
+        parent = int(model.body_parentid[body])
+        if int(model.body_weldid[body]) and not int(model.body_weldid[parent]):
+            found.append(np.array(data.xpos[parent]) if parent else _begin(model, data, body))
+    return found
+
+
+def _draw_joint(axis: Axes, joint: Joint, data: Any, view: View) -> None:
+    anchor = data.xanchor[joint.id]
+    x, y = view.seen(anchor[None])[0]
+    if joint.single:
+        along = view.axes[:2] @ data.xaxis[joint.id]
+        # An axis that points at the reader has no direction to draw.
+        if float(np.linalg.norm(along)) > HEAD_ON:
+            reach = TICK * max(view.width, view.height) * along
+            middle = np.array([x, y])
+            ends = np.stack([middle - reach, middle + reach])
+            axis.plot(*ends.T, color=INK, linewidth=1.3, linestyle=(0, (3, 1.2)), zorder=3)
+    shape = "s" if joint.kind == "slide" else "o"
+    axis.plot(
+        x, y, shape, color=INK, markerfacecolor="white", markersize=7, markeredgewidth=1.4, zorder=4
+    )

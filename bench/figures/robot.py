@@ -1,0 +1,273 @@
+"""A robot drawn at a pose, with the places marked that a verdict names.
+
+Rendered where this machine can, else as links and joints; places are marked the same way in both.
+Labels stand in columns to both sides, each tied to its place by a line, so that none covers
+another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from bench.figures.links import draw_links
+from bench.figures.offscreen import rendered
+from bench.figures.style import BLUE, INK, SOFT, blank
+from bench.figures.view import View, place_of, posed, view
+from sims.base import Array
+from sims.robot.model import Robot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LONGEST = 4.4
+"""Inches of the longer side of the drawing."""
+COLUMN = 2.1
+"""Inches of a column of labels."""
+FOOT = 0.55
+"""Inches below the drawing, for the scale."""
+MOST_NAMED = 12
+"""Joints up to which all are named; of more, those that are marked."""
+LETTERS = 34
+"""Of a line of a label."""
+_LINE = 0.155
+"""Inches from a line of a label to the next."""
+_BETWEEN = 0.09
+"""Inches between labels."""
+_SIZES: Mapping[str, tuple[str, float]] = {
+    "joint": ("o", 17.0),
+    "actuator": ("s", 22.0),
+    "body": ("D", 17.0),
+    "channel": ("^", 25.0),
+}
+"""Shape and size of a mark, in points, by the kind of its place: two at one place are both seen."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A place to mark.
+
+    Attributes:
+        kind: ``joint``, ``actuator``, ``body`` or ``channel``.
+        name: of the place.
+        says: what is there, such as ``Coulomb friction``; may be empty.
+        sure: whether it is this place; drawn dashed where it may be another.
+    """
+
+    kind: str
+    name: str
+    says: str = ""
+    sure: bool = True
+
+
+class _Label(NamedTuple):
+    """A label: its lines, the (2,) metres of its place, and whether that is marked."""
+
+    lines: tuple[str, ...]
+    point: Array
+    marked: bool
+
+    @property
+    def height(self) -> float:
+        """Inches."""
+        return _LINE * len(self.lines) + _BETWEEN
+
+
+def robot_figure(
+    robot: Robot, positions: Mapping[str, float], marks: Sequence[Mark] = ()
+) -> Figure:
+    """The robot at a pose, with places marked.
+
+    Args:
+        robot: what to draw.
+        positions: rad or m by joint; a joint that is not named stands where the file has it.
+        marks: places; one that the robot does not have is left out.
+    """
+    data = posed(robot, dict(positions))
+    seen_from = view(robot, data)
+    labels = _labels(robot, data, seen_from, marks)
+    sides = _sides(labels)
+    columns = [COLUMN if side else 0.3 for side in sides]
+    scale = LONGEST / max(seen_from.width, seen_from.height)
+    needed = max((sum(label.height for label in side) for side in sides), default=0.0)
+    width, height = scale * seen_from.width, scale * seen_from.height
+    tall = max(height, needed)
+    size = (columns[0] + width + columns[1], tall + FOOT + 0.15)
+    figure, axes = blank(1, 1, size, layout=None)
+    axis = axes[0, 0]
+    below = (FOOT + (tall - height) / 2) / size[1]
+    axis.set_position((columns[0] / size[0], below, width / size[0], height / size[1]))
+    axis.set_axis_off()
+    across, up = seen_from.width / 2, seen_from.height / 2
+    axis.set(xlim=(-across, across), ylim=(-up, up))
+    axis.set_autoscale_on(False)
+
+    image = rendered(robot.compiled, data.qpos.copy(), seen_from) if _shaped(robot) else None
+    if image is None:
+        draw_links(axis, robot, data, seen_from)
+    else:
+        axis.imshow(image, extent=(-across, across, -up, up), zorder=0, aspect="auto")
+        dots = seen_from.seen(np.array([data.xanchor[j.id] for j in robot.joints]))
+        axis.plot(*dots.T, "o", color=INK, markersize=3.5, zorder=4)
+    _mark(axis, robot, data, seen_from, marks)
+    for side, ((left, right), begin) in enumerate(
+        zip(((1, 0), (0, 1)), (-0.12, 0.12), strict=True)
+    ):
+        _write(axis, sides[side], left * -across + right * across + begin / scale, scale, tall)
+    _scale(axis, seen_from, scale, tall)
+    return figure
+
+
+def _shaped(robot: Robot) -> bool:
+    """Whether there is anything to render: a file whose meshes are absent has no shapes."""
+    model = robot.compiled
+    return any(int(model.body_weldid[body]) for body in model.geom_bodyid.tolist())
+
+
+def _labels(robot: Robot, data: Any, seen_from: View, marks: Sequence[Mark]) -> list[_Label]:
+    """Labels of marked places, each once, and of the other joints."""
+    said: dict[tuple[str, str], list[str]] = {}
+    for mark in marks:
+        lines = said.setdefault((mark.kind, mark.name), [])
+        lines += [mark.says] if mark.says and mark.says not in lines else []
+    if len(robot.joints) <= MOST_NAMED:
+        for joint in robot.joints:
+            said.setdefault(("joint", joint.name), [])
+    marked = {(mark.kind, mark.name) for mark in marks}
+    labels = []
+    for (kind, name), lines in said.items():
+        place = place_of(robot, data, kind, name)
+        if place is None:
+            continue
+        # A bare name is a joint's.
+        title = name if kind == "joint" else f"{kind} {name}"
+        lines = [_short(line) for line in (title, *lines)]
+        point = seen_from.seen(place[None])[0]
+        labels.append(_Label(tuple(lines), point, (kind, name) in marked))
+    return labels
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= LETTERS else text[: LETTERS - 1] + "…"
+
+
+def _sides(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]]:
+    """Labels for the left and for the right column, from above to below: as many lines on each, by
+    where their places lie.
+    """
+    across = sorted(labels, key=lambda label: (label.point[0], -label.point[1]))
+    heights = np.cumsum([label.height for label in across])
+    # A few labels stand on one side, where the drawing can be larger.
+    half = int(np.searchsorted(heights, heights[-1] / 2)) + 1 if len(across) > 1 else 0
+    left, right = across[:half], across[half:]
+    return _downwards(left), _downwards(right)
+
+
+def _downwards(labels: Sequence[_Label]) -> list[_Label]:
+    return sorted(labels, key=lambda label: -label.point[1])
+
+
+def heights_of(wanted: Sequence[float], sizes: Sequence[float], low: float, high: float) -> Array:
+    """(N,) middles of labels that do not overlap, as near to those wanted as a pass in each
+    direction brings them.
+
+    Args:
+        wanted: (N,) their middles, from above to below.
+        sizes: (N,) their heights.
+        low: where the column ends.
+        high: where it begins; it holds them all.
+    """
+    middles = np.array(wanted, dtype=np.float64)
+    ceiling = high
+    for i, size in enumerate(sizes):
+        middles[i] = min(middles[i], ceiling - size / 2)
+        ceiling = middles[i] - size / 2
+    floor = low
+    for i in reversed(range(len(middles))):
+        middles[i] = max(middles[i], floor + sizes[i] / 2)
+        floor = middles[i] + sizes[i] / 2
+    return middles
+
+
+def _write(axis: Axes, labels: Sequence[_Label], x: float, scale: float, tall: float) -> None:
+    """A column of labels at `x` metres; `scale` is inches a metre, `tall` the column in inches."""
+    sizes = [label.height / scale for label in labels]
+    half = tall / scale / 2
+    middles = heights_of([label.point[1] for label in labels], sizes, -half, half)
+    for label, y in zip(labels, middles.tolist(), strict=True):
+        colour = "black" if label.marked else SOFT
+        axis.annotate(
+            "\n".join(label.lines),
+            (label.point[0], label.point[1]),
+            (x, y),
+            ha="right" if x < 0 else "left",
+            va="center",
+            fontsize=9 if label.marked else 8,
+            weight="bold" if label.marked else "normal",
+            color=colour,
+            annotation_clip=False,
+            parse_math=False,
+            zorder=6,
+            arrowprops={
+                "arrowstyle": "-",
+                "color": colour,
+                "linewidth": 0.9 if label.marked else 0.5,
+                "shrinkA": 2,
+                "shrinkB": 9 if label.marked else 3,
+            },
+        )
+
+
+def _mark(axis: Axes, robot: Robot, data: Any, seen_from: View, marks: Sequence[Mark]) -> None:
+    """Rings about places: whole where it is sure, dashed where it may be another."""
+    sure: dict[tuple[str, str], bool] = {}
+    for mark in marks:
+        key = mark.kind, mark.name
+        sure[key] = sure.get(key, False) or mark.sure
+    for (kind, name), whole in sure.items():
+        place = place_of(robot, data, kind, name)
+        if place is None:
+            continue
+        shape, size = _SIZES.get(kind, _SIZES["joint"])
+        across, up = seen_from.seen(place[None])[0].tolist()
+        # Markers have no dashes of their own: a ring is a scatter of one point.
+        axis.scatter(
+            across,
+            up,
+            s=size**2,
+            marker=shape,
+            facecolors="none",
+            edgecolors=BLUE,
+            linewidths=2.4,
+            linestyles="-" if whole else (0, (1.6, 1.0)),
+            zorder=5,
+            clip_on=False,
+        )
+
+
+def _scale(axis: Axes, seen_from: View, scale: float, tall: float) -> None:
+    """A bar of so many metres, below to the left."""
+    length = round_length(0.3 * seen_from.width)
+    left = -seen_from.width / 2
+    y = -tall / scale / 2 - 0.2 / scale
+    axis.plot(
+        [left, left + length],
+        [y, y],
+        color=INK,
+        linewidth=2.2,
+        solid_capstyle="butt",
+        clip_on=False,
+    )
+    axis.text(
+        left + length / 2, y - 0.06 / scale, f"{length:g} m", ha="center", va="top", fontsize=8
+    )
+
+
+def round_length(most: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above `most` metres."""
+    power = 10.0 ** np.floor(np.log10(most))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most))
