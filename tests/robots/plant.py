@@ -1,0 +1,228 @@
+"""What there really is: a robot by Pinocchio, with whatever is hidden in it.
+
+Equations of motion: M(q) a + n(q, v) = drive - damping v - quadratic |v| v - spring q + bias +
+ripple + friction, with M and n of Pinocchio (J. Carpentier et al., The Pinocchio C++ library, SII
+2019; R. Featherstone, Rigid Body Dynamics Algorithms, 2008). Everything else is written here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tests.robots.machines import Machine
+
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class Binding:
+    """Dry friction in part of a joint's travel: a foreign cause."""
+
+    joint: int
+    force: float
+    centre: float
+    half: float
+
+    def limit(self, q):
+        """It sets in over a tenth of its half width."""
+        inside = (self.half - abs(q[self.joint] - self.centre)) / (0.1 * self.half)
+        return self.force * min(max(inside, 0.0), 1.0)
+
+
+@dataclass(frozen=True)
+class Elastic:
+    """A joint whose motor sits behind a spring: a foreign cause. The encoder is the motor's."""
+
+    joint: int
+    rotor: float
+    stiffness: float
+    damping: float
+
+
+@dataclass
+class Plant:
+    """Forces and inertias of a machine.
+
+    Attributes:
+        model, data: of Pinocchio.
+        damping, quadratic, spring, bias: by joint, (N,).
+        coulomb, extra, speed: dry friction `coulomb + extra exp(-(v / speed)^2)`, (N,).
+        ripples: (joint, sine, cosine, period).
+        binding, elastic: see there; None where there is none.
+    """
+
+    model: object
+    data: object
+    damping: np.ndarray
+    coulomb: np.ndarray
+    quadratic: np.ndarray
+    spring: np.ndarray
+    bias: np.ndarray
+    extra: np.ndarray
+    speed: np.ndarray
+    ripples: list = field(default_factory=list)
+    binding: Binding | None = None
+    elastic: Elastic | None = None
+
+    @property
+    def size(self):
+        return self.damping.size
+
+    @property
+    def rubs(self):
+        """Which joints have dry friction, (N,)."""
+        rubs = (self.coulomb > 0) | (self.extra > 0)
+        if self.binding:
+            rubs[self.binding.joint] = True
+        return rubs
+
+    def limit(self, q, v):
+        """Largest dry friction of every joint, (N,)."""
+        limit = self.coulomb
+        if self.extra.any():
+            limit = limit + self.extra * np.exp(-((v / self.speed) ** 2))
+        if self.binding:
+            limit = limit.copy()
+            limit[self.binding.joint] += self.binding.limit(q)
+        return limit
+
+    def passive(self, q, v):
+        """Forces of joints by position and speed, without dry friction, (N,)."""
+        force = self.bias - self.damping * v
+        if self.spring.any():
+            force -= self.spring * q
+        if self.quadratic.any():
+            force -= self.quadratic * np.abs(v) * v
+        for joint, sine, cosine, period in self.ripples:
+            angle = 2 * np.pi * q[joint] / period
+            force[joint] += sine * np.sin(angle) + cosine * np.cos(angle)
+        return force
+
+    def accelerations(self, q, v, force):
+        """By the articulated-body algorithm, (N,)."""
+        import pinocchio
+
+        return pinocchio.aba(self.model, self.data, q, v, force).copy()
+
+    def inertia(self, q):
+        """M(q), (N, N)."""
+        import pinocchio
+
+        mass = pinocchio.crba(self.model, self.data, q)
+        return np.triu(mass) + np.triu(mass, 1).T
+
+    def needed(self, q, v):
+        """n(q, v): forces at which nothing accelerates, (N,)."""
+        import pinocchio
+
+        return pinocchio.nonLinearEffects(self.model, self.data, q, v).copy()
+
+    def energy(self, q, v):
+        """Kinetic and potential energy, J."""
+        import pinocchio
+
+        kinetic = pinocchio.computeKineticEnergy(self.model, self.data, q, v)
+        return kinetic + pinocchio.computePotentialEnergy(self.model, self.data, q)
+
+
+def plant(machine: Machine, effects=None, foreign=None):
+    """A machine's plant.
+
+    Args:
+        machine: as its file describes it.
+        effects: coefficients by effect@place; what acts on signals is not looked at.
+        foreign: `Binding`, `Elastic` or None.
+    """
+    model = machine.model()
+    count = model.nv
+    damping, coulomb = (np.array(values) for values in zip(*machine.stated(), strict=True))
+    made = Plant(
+        model, None, damping, coulomb, *np.zeros((3, count)), np.zeros(count), np.ones(count)
+    )  # fmt: skip
+    for name, c in (effects or {}).items():
+        effect, _, place = name.partition("@")
+        change = FORCES.get(effect) or INERTIAS.get(effect)
+        if change is None:
+            if effect.startswith("gravity."):
+                _gravity(model, effect, c)
+            continue
+        change(made, machine.index(place), c)
+    made.data = made.model.createData()
+    made.binding = foreign if isinstance(foreign, Binding) else None
+    made.elastic = foreign if isinstance(foreign, Elastic) else None
+    return made
+
+
+def _gravity(model, effect, c):
+    linear = model.gravity.linear.copy()
+    if effect == "gravity.scale":
+        linear *= 1 + c[0]
+    else:
+        linear += GRAVITY * np.array([c[0], c[1] if len(c) > 1 else 0.0, 0.0])
+    model.gravity.linear = linear
+
+
+def _adds(attribute):
+    def change(plant, joint, c):
+        getattr(plant, attribute)[joint] += c[0]
+
+    return change
+
+
+def _stribeck(plant, joint, c):
+    plant.coulomb[joint] += c[0]
+    plant.extra[joint] += c[1]
+    plant.speed[joint] = c[2]
+
+
+def _ripple(plant, joint, c):
+    plant.ripples.append((joint, *c))
+
+
+FORCES = {
+    "friction.coulomb": _adds("coulomb"),
+    "friction.stribeck": _stribeck,
+    "drag.linear": _adds("damping"),
+    "drag.quadratic": _adds("quadratic"),
+    "spring.linear": _adds("spring"),
+    "force.bias": _adds("bias"),
+    "force.ripple": _ripple,
+}
+
+
+def _mass(plant, joint, c):
+    _reshaped(plant.model, joint, mass=1 + c[0], tensor=1 + c[0])
+
+
+def _offset(plant, joint, c):
+    _reshaped(plant.model, joint, shift=np.array(c))
+
+
+def _tensor(plant, joint, c):
+    _reshaped(plant.model, joint, tensor=1 + c[0])
+
+
+def _armature(plant, joint, c):
+    armature = np.array(plant.model.armature)
+    armature[joint] += c[0]
+    plant.model.armature = armature
+
+
+def _reshaped(model, joint, mass=1.0, tensor=1.0, shift=0.0):
+    """The body that a joint moves, with all that is fixed to it."""
+    import pinocchio
+
+    body = model.inertias[joint + 1]
+    model.inertias[joint + 1] = pinocchio.Inertia(
+        body.mass * mass, body.lever + shift, body.inertia * tensor
+    )
+
+
+INERTIAS = {
+    "mass.scale": _mass,
+    "mass.offset": _offset,
+    "inertia.scale": _tensor,
+    "inertia.armature": _armature,
+}

@@ -1,0 +1,169 @@
+"""The worlds against physics, and against MuJoCo."""
+
+import numpy as np
+import pytest
+
+from tests.robots import reference, robots
+from tests.robots.friction import held
+from tests.robots.machines import Drive, Machine
+from tests.robots.plant import Binding, Elastic
+from tests.robots.world import Run, World
+
+pytest.importorskip("pinocchio", reason="pin has no wheel here")
+STAMPS = np.arange(401) / 100
+ROLLER = robots.urdf(
+    "roller",
+    robots.link("disc", 2.0, (0, 0, 0), (0.1, 0.1, 0.4)),
+    robots.joint("axle", "revolute", "base", "disc", (0, 0, 0), "0 0 1", (-100, 100, 50)),
+)
+
+
+def roller(kind="motor"):
+    """A disc of 0.4 kg m^2 about an upright axle: gravity has no say."""
+    return Machine("roller", ROLLER, (Drive("axle", kind, 30.0, 3.0, 50.0),), (0.0,))
+
+
+def driven(machine, amplitude, frequency=3.0, stamps=STAMPS):
+    """Every actuator's command a sine about what holds the pose."""
+    pose = np.array(machine.pose)
+    hold = World(machine).plant.needed(pose, 0 * pose)
+    commands = {}
+    for joint, drive in zip(machine.driven, machine.drives, strict=True):
+        middle = pose[joint] + hold[joint] / drive.kp if drive.kp else hold[joint]
+        commands[drive.name] = middle + amplitude * np.sin(frequency * stamps + joint)
+    return Run(stamps, commands, pose, 0 * pose)
+
+
+def test_a_double_pendulum_without_friction_keeps_its_energy():
+    text = robots.hanging("two", (0.3, 0.25), (1.0, 0.6), ("a", "b"))
+    world = World(Machine("two", text, (), (0.0, 0.0)), step=5e-4)
+    start = Run(STAMPS, {}, np.array([1.2, -0.7]), np.array([0.5, 2.0]))
+    motion = world.move(start, STAMPS)
+    energy = np.array([world.plant.energy(q, v) for q, v in zip(motion.q, motion.v, strict=True)])
+    swing = energy[0] - world.plant.energy(np.zeros(2), np.zeros(2))
+    assert np.ptp(energy) < 1e-6 * swing
+    assert np.ptp(motion.q[:, 1]) > 1.0
+
+
+def test_a_joint_with_dry_friction_stops_where_and_when_theory_says():
+    world = World(roller(), {"friction.coulomb@axle": (0.47,)})
+    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.0]))
+    motion = world.move(start, STAMPS)
+    stop, distance = 2.0 * 0.4 / 0.47, 2.0**2 * 0.4 / (2 * 0.47)
+    moving = stop - 1e-9 > STAMPS
+    assert motion.q[-1, 0] == pytest.approx(distance, abs=1e-12)
+    assert np.all(motion.v[moving, 0] > 0)
+    assert np.all(motion.v[~moving, 0] == 0.0)
+    expected = 2.0 * STAMPS - 0.47 / 0.4 * STAMPS**2 / 2
+    np.testing.assert_allclose(motion.q[moving, 0], expected[moving], atol=1e-12)
+
+
+def test_friction_holds_exactly_below_its_limit_and_breaks_loose_above_it():
+    pull = np.where(STAMPS < 2.0, 0.4999, 0.75)
+    world = World(roller(), {"friction.coulomb@axle": (0.5,)})
+    motion = world.move(Run(STAMPS, {"m_axle": pull}, np.zeros(1), np.zeros(1)), STAMPS)
+    held_still = STAMPS <= 2.0
+    assert np.all(motion.q[held_still, 0] == 0.0)
+    expected = (0.75 - 0.5) / 0.4 * (STAMPS[-1] - 2.0) ** 2 / 2
+    assert motion.q[-1, 0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_servo_breaks_loose_when_its_lagging_command_pulls_enough():
+    """kp (1 - exp(-t / lag)) = friction."""
+    lag, friction, step = 0.5, 12.0, np.ones(STAMPS.size)
+    effects = {"friction.coulomb@axle": (friction,), "input.lag@m_axle": (lag,)}
+    world = World(roller("position"), effects)
+    command = np.where(STAMPS > 0, step, 0.0)
+    motion = world.move(Run(STAMPS, {"m_axle": command}, np.zeros(1), np.zeros(1)), STAMPS)
+    loose = 0.01 - lag * np.log(1 - friction / 30.0)
+    assert np.all(motion.q[loose > STAMPS, 0] == 0.0)
+    assert np.all(motion.q[loose + 0.01 < STAMPS, 0] > 0.0)
+
+
+def test_friction_of_coupled_joints_is_the_solution_of_its_complementarity_problem():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        root = rng.normal(size=(6, 6))
+        coupling, free = root @ root.T + 0.3 * np.eye(6), 3.0 * rng.normal(size=6)
+        limits = rng.uniform(0.0, 2.0, 6)
+        forces, pulls = held(coupling, free, limits)
+        inside = np.abs(forces) < limits
+        np.testing.assert_allclose(pulls[inside], 0.0, atol=1e-10)
+        assert np.all(forces[~inside] * pulls[~inside] <= 1e-12)
+        assert np.all(np.abs(forces) <= limits)
+
+
+def test_joints_that_stick_together_in_an_arm_do_not_creep():
+    machine = robots.machine("arm2-motor", np.random.default_rng(1))
+    effects = {f"friction.coulomb@{name}": (5.0,) for name in machine.joints}
+    motion = World(machine, effects).move(driven(machine, 1.0), STAMPS)
+    assert np.ptp(motion.q, axis=0).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("name", ["arm2-motor", "cartpole-motor", "ur5-servo", "iiwa-servo"])
+def test_a_clean_robot_moves_as_mujoco_says_at_a_tenth_of_its_step(name):
+    machine = robots.machine(name, np.random.default_rng(5))
+    run = driven(machine, 0.2, stamps=np.arange(201) / 100)
+    expected = reference.moved(machine, run, step=2e-4, integrator="RK4")
+    np.testing.assert_allclose(World(machine).move(run, run.times).q, expected, atol=1e-4)
+    assert np.ptp(expected, axis=0).max() > 0.03
+
+
+def test_halving_the_step_changes_nothing_that_a_sensor_sees():
+    machine = robots.machine("panda-servo", np.random.default_rng(2))
+    effects = {"friction.coulomb@panda_joint2": (3.0,), "friction.coulomb@panda_joint4": (1.0,)}
+    run = driven(machine, 0.2, stamps=np.arange(101) / 100)
+    first, second = (World(machine, effects, step=h).move(run, run.times).q for h in (1e-3, 5e-4))
+    np.testing.assert_allclose(first, second, atol=1e-6)
+
+
+def test_what_is_hidden_in_a_body_changes_its_inertia_as_stated():
+    machine = robots.machine("arm2-motor", np.random.default_rng(0))
+    plain, heavy = World(machine), World(machine, {"mass.scale@elbow_link": (0.2,)})
+    light, swollen = plain.plant.model.inertias[2], heavy.plant.model.inertias[2]
+    assert swollen.mass == pytest.approx(1.2 * light.mass)
+    np.testing.assert_allclose(swollen.inertia, 1.2 * light.inertia)
+    np.testing.assert_allclose(swollen.lever, light.lever)
+    shifted = World(machine, {"mass.offset@elbow_link": (0.01, 0.0, -0.02)}).plant.model.inertias[2]
+    np.testing.assert_allclose(shifted.lever, light.lever + np.array([0.01, 0.0, -0.02]))
+    np.testing.assert_allclose(shifted.inertia, light.inertia)
+
+
+def test_an_armature_slows_a_joint_by_what_it_adds():
+    pull = Run(STAMPS, {"m_axle": np.ones(STAMPS.size)}, np.zeros(1), np.zeros(1))
+    motion = World(roller(), {"inertia.armature@axle": (0.1,)}).move(pull, STAMPS)
+    assert motion.q[-1, 0] == pytest.approx(16.0 / (2 * 0.5), rel=1e-12)
+
+
+def test_an_elastic_joint_swings_at_the_frequency_of_two_masses_and_a_spring():
+    """w^2 = k (1/J1 + 1/J2), about the common motion."""
+    soft = Elastic(0, 0.1, 20.0, 0.0)
+    kick = np.where(STAMPS < 0.02, 10.0, 0.0)
+    world = World(roller(), foreign=soft)
+    motion = world.move(Run(STAMPS, {"m_axle": kick}, np.zeros(1), np.zeros(1)), STAMPS)
+    late = STAMPS > 0.5
+    line = np.polyfit(STAMPS[late], motion.q[late, 0], 1)
+    swing = motion.q[late, 0] - np.polyval(line, STAMPS[late])
+    turns = STAMPS[late][1:][np.diff(np.sign(swing)) != 0]
+    expected = np.sqrt(20.0 * (1 / 0.1 + 1 / 0.4))
+    assert np.pi / np.mean(np.diff(turns)) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_binding_range_rubs_only_where_it_is():
+    world = World(roller(), foreign=Binding(0, 0.5, 3.0, 0.5))
+    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.0]))
+    v = world.move(start, STAMPS).v[:, 0]
+    assert v[STAMPS < 1.2].tolist() == [2.0] * int(np.sum(STAMPS < 1.2))
+    # Friction sets in and goes over a tenth of the half width, which counts half.
+    assert v[-1] ** 2 == pytest.approx(4.0 - 2 * 0.5 * 0.95 / 0.4, rel=1e-4)
+
+
+def test_commands_arrive_late_and_dull_as_stated():
+    command = np.where(STAMPS >= 1.0, 1.0, 0.0)
+    run = Run(STAMPS, {"m_axle": command}, np.zeros(1), np.zeros(1))
+    late = World(roller(), {"input.delay@m_axle": (0.105,)}).move(run, STAMPS)
+    assert late.q[-1, 0] == pytest.approx((3.0 - 0.105) ** 2 / (2 * 0.4), rel=1e-9)
+    dull = World(roller(), {"input.gain@m_axle": (0.5,), "input.deadband@m_axle": (0.3,)})
+    moved = dull.move(run, STAMPS)
+    assert moved.q[-1, 0] == pytest.approx(1.2 * 9.0 / (2 * 0.4), rel=1e-9)
+    np.testing.assert_allclose(moved.force[STAMPS >= 1.0, 0], 1.2)
