@@ -16,6 +16,7 @@ from sims.base import InputError, unknown
 
 Format = Literal["mjcf", "urdf"]
 Kind = Literal["hinge", "slide", "ball", "free"]
+Drive = Literal["motor", "position", "velocity", "pid", "other"]
 KINDS: tuple[Kind, ...] = ("free", "ball", "slide", "hinge")
 """In the order of MuJoCo's mjtJoint."""
 
@@ -66,18 +67,22 @@ class Actuator:
         name: of the model; ``actuator3`` where it has none.
         id: its number.
         joint: the joint that it drives; None where it drives something else.
-        kind: ``motor`` (its control is a force, by its gear), ``position``, ``velocity``, or
-            ``other``.
-        range: of its control; None where it is not limited.
+        kind: ``motor`` (its control is a force, by its gear), ``position``, ``velocity``, ``pid``,
+            or ``other``.
+        range: of its (first) control; None where it is not limited.
         force: lowest and highest force; None where it is not limited.
+        control: address of its first control.
+        controls: how many it has: a pid may have, in this order, a position, a velocity, a force.
     """
 
     name: str
     id: int
     joint: str | None
-    kind: Literal["motor", "position", "velocity", "other"]
+    kind: Drive
     range: tuple[float, float] | None
     force: tuple[float, float] | None
+    control: int = -1
+    controls: int = 1
 
 
 @dataclass(frozen=True)
@@ -112,6 +117,7 @@ class Robot:
         notes: what was mended or left out, one line each.
         aliases: by link that is fused into another, the body that MuJoCo compiles.
         digest: of all that was read, in hexadecimal digits.
+        rated: actuators whose second control is the rate of their first, to be put in with it.
     """
 
     path: Path
@@ -120,6 +126,7 @@ class Robot:
     notes: tuple[str, ...] = ()
     aliases: Mapping[str, str] | None = None
     digest: str = ""
+    rated: tuple[str, ...] = ()
 
     @cached_property
     def compiled(self) -> Any:
@@ -156,7 +163,9 @@ class Robot:
     @cached_property
     def actuators(self) -> tuple[Actuator, ...]:
         """All actuators."""
-        return tuple(self._actuator(i) for i in range(self.compiled.nu))
+        model = self.compiled
+        # Before MuJoCo 4 each actuator had one control.
+        return tuple(self._actuator(i) for i in range(getattr(model, "nactuator", model.nu)))
 
     def _actuator(self, i: int) -> Actuator:
         import mujoco
@@ -166,13 +175,19 @@ class Robot:
         drives = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
         if int(model.actuator_trntype[i]) in drives:
             joint = self.joints[int(model.actuator_trnid[i, 0])].name
+        control, controls = i, 1
+        if hasattr(model, "actuator_ctrladr"):
+            control, controls = int(model.actuator_ctrladr[i]), int(model.actuator_ctrlnum[i])
+        limited = controls > 0 and bool(model.actuator_ctrllimited[control])
         return Actuator(
             name=model.actuator(i).name or f"actuator{i}",
             id=i,
             joint=joint,
             kind=_kind(model, i),
-            range=_limit(model.actuator_ctrlrange[i], bool(model.actuator_ctrllimited[i])),
+            range=_limit(model.actuator_ctrlrange[control], True) if limited else None,
             force=_limit(model.actuator_forcerange[i], bool(model.actuator_forcelimited[i])),
+            control=control,
+            controls=controls,
         )
 
     @cached_property
@@ -184,8 +199,8 @@ class Robot:
             fused.setdefault(name, []).append(alias)
         moving = []
         for i in range(1, model.nbody):
-            # Bodies welded to the world are part of it.
-            if int(model.body_weldid[i]) != i:
+            # Bodies welded to the world are part of it; those welded to others move with them.
+            if int(model.body_weldid[i]) == 0:
                 continue
             name = model.body(i).name or f"body{i}"
             aliases = tuple(fused.get(name, ()))
@@ -253,7 +268,7 @@ def _limit(values: Any, limited: bool) -> tuple[float, float] | None:
     return (float(values[0]), float(values[1])) if limited else None
 
 
-def _kind(model: Any, i: int) -> Literal["motor", "position", "velocity", "other"]:
+def _kind(model: Any, i: int) -> Drive:
     """What an actuator's control means, by its gain and its bias (MuJoCo's shortcuts)."""
     import mujoco
 
@@ -261,6 +276,9 @@ def _kind(model: Any, i: int) -> Literal["motor", "position", "velocity", "other
     fixed = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
     affine = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
     direct = int(model.actuator_dyntype[i]) == int(mujoco.mjtDyn.mjDYN_NONE)
+    pid = getattr(mujoco.mjtGain, "mjGAIN_PID", None)  # since MuJoCo 4
+    if pid is not None and int(model.actuator_gaintype[i]) == int(pid):
+        return "pid"
     if not fixed or not direct:
         return "other"
     if not affine or not np.any(bias[:3]):

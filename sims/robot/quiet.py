@@ -1,0 +1,34 @@
+"""MuJoCo, kept quiet: its warnings are collected, its errors become one line, and neither its
+printing nor its log file happens.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def quiet() -> Iterator[list[str]]:
+    """Collects the warnings that MuJoCo gives within the block, each as one line.
+
+    Without a handler MuJoCo prints warnings and appends them to ``MUJOCO_LOG.TXT`` in the folder
+    where the program runs.
+    """
+    import mujoco
+
+    warnings: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: warnings.append(one_line(text)))
+    try:
+        yield warnings
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def one_line(message: object) -> str:
+    """What MuJoCo says, in one line: ``what; Element 'joint', line 6``."""
+    lines = [line.strip().rstrip(".") for line in str(message).splitlines()]
+    said = "; ".join(line for line in lines if line)
+    return re.sub(r"^(XML |Schema )?(Error|Warning): ", "", said)

@@ -1,0 +1,133 @@
+"""Model files read: an MJCF or a URDF becomes a `Robot`, mended where that is safe and noted."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+from sims.base import InputError
+from sims.limits import cut
+from sims.robot import added, mends, mjcf, urdf
+from sims.robot.model import Format, Robot
+from sims.robot.quiet import one_line, quiet
+from sims.robot.xmlfile import Files, include, tree, written
+
+FORMATS: Mapping[str, Format] = {"mujoco": "mjcf", "robot": "urdf"}
+"""By the root element."""
+
+
+def read(
+    path: str | Path,
+    *,
+    actuators: Mapping[str, Any] | None = None,
+    engine: Mapping[str, Any] | None = None,
+) -> Robot:
+    """The robot of a model file; nothing is printed and nothing is written.
+
+    Args:
+        path: of an MJCF or a URDF, told apart by what is in it.
+        actuators: by name, tables as in a recording's ``[actuators.NAME]``; they are added.
+        engine: ``timestep`` (s) and ``integrator``, in place of what the file states.
+
+    Returns:
+        The robot, with a note for all that was mended or left out.
+
+    Raises:
+        InputError: it cannot be read, or MuJoCo refuses what it says; one line with file and cause.
+    """
+    path = Path(path)
+    files = Files(path)
+    try:
+        root = tree(files, path)
+        kind = FORMATS.get(root.tag)
+        if kind is None:
+            raise InputError(f"{path}: expected <mujoco> or <robot>, found <{cut(root.tag)}>")
+        include(files, root)
+        with quiet() as warnings:
+            return _robot(files, root, kind, actuators or {}, engine or {}, warnings)
+    except RecursionError:
+        raise InputError(f"{path}: elements too deep within each other") from None
+
+
+def _robot(
+    files: Files,
+    root: Element,
+    kind: Format,
+    actuators: Mapping[str, Any],
+    engine: Mapping[str, Any],
+    warnings: list[str],
+) -> Robot:
+    if kind == "urdf":
+        notes = urdf.mended(files, root)
+        spec = _parsed(files, root)
+    else:
+        absent = mjcf.found(files, root)
+        spec = _parsed(files, root)
+        notes = absent.leave_out(spec)
+    rated = added.add_actuators(spec, actuators, str(files.path))
+    added.set_engine(spec, engine, str(files.path))
+    parents = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
+    try:
+        model = mends.compiled(spec, notes)
+    except ValueError as error:
+        raise InputError(f"{files.path}: {one_line(error)}") from None
+    if model.njnt == 0:
+        raise InputError(f"{files.path}: it has no joint that moves: nothing to explain")
+    aliases = _fused(parents, {model.body(i).name for i in range(model.nbody)})
+    notes += _said_of(aliases)
+    notes += [f"MuJoCo: {warning}" for warning in dict.fromkeys(warnings)]
+    settings = json.dumps([actuators, engine], sort_keys=True, default=str)
+    files.add(settings.encode())
+    return Robot(
+        path=files.path,
+        format=kind,
+        spec=spec,
+        notes=tuple(notes),
+        aliases=aliases,
+        digest=files.hashed.hexdigest(),
+        rated=rated,
+    )
+
+
+def _parsed(files: Files, root: Element) -> Any:
+    """The mujoco.MjSpec of the mended file."""
+    import mujoco
+
+    text, elements = written(root)
+    try:
+        spec = mujoco.MjSpec.from_string(text)
+    except ValueError as error:
+        said = one_line(error)
+        line = re.search(r"[;,] line (\d+)", said)
+        element = None
+        if line and int(line[1]) <= len(elements):
+            element = elements[int(line[1]) - 1]
+        raise files.fault(element, re.sub(r", line \d+", "", said)) from None
+    spec.modelfiledir = str(files.path.parent.resolve())
+    return spec
+
+
+def _fused(parents: Mapping[str, str], compiled: set[str]) -> dict[str, str]:
+    """By body that MuJoCo fused into another, which that is."""
+    aliases = {}
+    for name in parents:
+        into = name
+        while into not in compiled:
+            into = parents[into]
+        if into != name:
+            aliases[name] = into
+    return aliases
+
+
+def _said_of(aliases: Mapping[str, str]) -> list[str]:
+    groups: dict[str, list[str]] = {}
+    for alias, name in aliases.items():
+        groups.setdefault(name, []).append(cut(alias))
+    said = [f"{', '.join(names)} of {cut(into)}" for into, names in groups.items()]
+    return (
+        [f"links on fixed joints are part of what carries them: {'; '.join(said)}"] if said else []
+    )

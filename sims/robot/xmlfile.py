@@ -1,0 +1,187 @@
+"""Model files as trees of elements: read by a parser that opens nothing by itself, with what they
+include, and written again so that a line of what is written leads back to the user's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, tostring
+from xml.parsers import expat
+
+from sims.base import InputError
+
+LARGEST = 50 * 2**20
+"""Bytes of a model file with all that it includes."""
+MESH = 500 * 2**20
+"""Bytes of a mesh or a picture."""
+DEEPEST = 400
+"""Elements within elements."""
+
+
+@dataclass
+class Files:
+    """What has been read for one model.
+
+    Attributes:
+        path: the model file; what it includes lies relative to its folder.
+        places: by element, file and line where it stands.
+        included: files that have been included, and the model file.
+        size: bytes that have been read of them.
+        hashed: of all that has been read.
+    """
+
+    path: Path
+    places: dict[Element, str] = field(default_factory=dict)
+    included: list[Path] = field(default_factory=list)
+    size: int = 0
+    hashed: Any = field(default_factory=hashlib.sha256)
+
+    def fault(self, element: Element | None, message: str) -> InputError:
+        """The error for an element of the file."""
+        place = self.places.get(element) if element is not None else None
+        return InputError(f"{place or self.path}: {message}")
+
+    def content(self, path: Path, most: int) -> bytes:
+        """What is in a file; its bytes enter the digest.
+
+        Raises:
+            InputError: it cannot be read, or is too large.
+        """
+        if not path.is_file():
+            raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+        try:
+            size = path.stat().st_size
+            if size > most:
+                raise InputError(f"{path}: {size} bytes; a file of a model has at most {most}")
+            data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        self.add(data)
+        return data
+
+    def add(self, data: bytes) -> None:
+        """Let this enter the digest."""
+        self.hashed.update(f"{len(data)}:".encode())
+        self.hashed.update(data)
+
+
+def tree(files: Files, path: Path) -> Element:
+    """The root element of a file.
+
+    Raises:
+        InputError: the file cannot be read, is too large or is no XML, or declares what an XML
+            parser would fetch or repeat (a document type, an entity).
+    """
+    data = files.content(path, LARGEST)
+    files.included.append(path.resolve())
+    files.size += len(data)
+    if files.size > LARGEST:
+        raise InputError(f"{files.path}: with what it includes it has more than {LARGEST} bytes")
+    # What MuJoCo's parser lets pass: blank lines before the declaration, zeros after the end.
+    text = data.rstrip(b"\0").lstrip(b" \t\r\n")
+    above = data[: data.find(text[:1])].count(b"\n") if text else 0
+    parser = expat.ParserCreate()
+    grown = _Growing(files, path, parser, above)
+    try:
+        parser.Parse(text, True)
+    except InputError:
+        raise
+    except expat.ExpatError as error:
+        what = expat.ErrorString(error.code)
+        line = error.lineno + above
+        raise InputError(f"{path}:{line}: not well-formed XML: {what}") from None
+    except (ValueError, LookupError) as error:  # an encoding that does not exist
+        raise InputError(f"{path}: not XML: {error}") from None
+    return grown.root
+
+
+class _Growing:
+    """The tree while the parser goes through the file."""
+
+    def __init__(self, files: Files, path: Path, parser: Any, above: int) -> None:
+        self.files, self.path, self.parser, self.above = files, path, parser, above
+        self.open: list[Element] = []
+        self.top: Element | None = None
+        parser.StartElementHandler = self.begin
+        parser.EndElementHandler = self.end
+        parser.StartDoctypeDeclHandler = self.refuse
+        parser.EntityDeclHandler = self.refuse
+
+    @property
+    def root(self) -> Element:
+        assert self.top is not None, "a well-formed file has a root"
+        return self.top
+
+    @property
+    def here(self) -> str:
+        """File and line."""
+        return f"{self.path}:{self.parser.CurrentLineNumber + self.above}"
+
+    def begin(self, name: str, attributes: dict[str, str]) -> None:
+        element = Element(name, attributes)
+        self.files.places[element] = self.here
+        if self.open:
+            self.open[-1].append(element)
+        else:
+            self.top = element
+        self.open.append(element)
+        if len(self.open) > DEEPEST:
+            raise self.files.fault(element, f"elements more than {DEEPEST} deep")
+
+    def end(self, _: str) -> None:
+        self.open.pop()
+
+    def refuse(self, *_: Any) -> None:
+        raise InputError(f"{self.here}: document types and entities are not read; remove them")
+
+
+def include(files: Files, root: Element) -> None:
+    """Put what a file includes in the place of its ``include`` elements, as MuJoCo does: names are
+    relative to the model file's folder, and no file is included twice.
+    """
+    for parent in list(root.iter()):
+        if any(child.tag == "include" for child in parent):
+            parent[:] = _with_included(files, parent)
+
+
+def _with_included(files: Files, parent: Element) -> list[Element]:
+    children: list[Element] = []
+    for child in parent:
+        if child.tag != "include":
+            children.append(child)
+            continue
+        name = child.get("file")
+        if not name:
+            raise files.fault(child, "an include states no file")
+        path = files.path.parent / name.replace("\\", "/")
+        if not path.is_file():
+            raise files.fault(child, f"the included file {name} is absent ({path})")
+        if path.resolve() in files.included:
+            raise files.fault(child, f"{name} is included already: MuJoCo takes each file once")
+        inner = tree(files, path)
+        include(files, inner)
+        children += list(inner)
+    return children
+
+
+def written(root: Element) -> tuple[str, list[Element]]:
+    """The tree as text, one element begun in each line, and which one each line begins."""
+    elements = list(root.iter())
+    for element in elements:
+        element.text = "\n" if len(element) else None
+        element.tail = None
+    for element in elements:
+        for child in element[:-1]:
+            child.tail = "\n"
+    return tostring(root, encoding="unicode"), elements
+
+
+def children(element: Element, *path: str) -> list[Element]:
+    """All elements that a path of tags leads to; a tag may stand repeatedly."""
+    found = [element]
+    for tag in path:
+        found = [child for parent in found for child in parent if child.tag == tag]
+    return found

@@ -1,0 +1,14 @@
+import pytest
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Puts a text into a file and gives its path."""
+
+    def written(text, name="robot.xml"):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        return path
+
+    return written
