@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -40,6 +40,30 @@ simulators: Registry[Simulator] = Registry(
 
 REGISTRIES: tuple[Registry[Any], ...] = (tuners, simulators, effects)
 """Of each kind of part, in the order in which a plugin's class is tried."""
+
+
+def robot(
+    path: str | Path,
+    actuators: Mapping[str, Any] | None = None,
+    engine: Mapping[str, Any] | None = None,
+    free: Sequence[str] = (),
+) -> type[Simulator]:
+    """The simulator of a robot's model file.
+
+    Args:
+        path: MJCF or URDF.
+        actuators: that the file lacks, as a recording states them.
+        engine: time step and integrator other than the file's.
+        free: numbers of the file to tune, as ``damping@*``.
+
+    Raises:
+        InputError: the file cannot be used, or something asked for does not exist in it.
+    """
+    # Loaded here alone: most commands have nothing to do with robots.
+    from sims.robot.reading import read
+    from sims.robot.simulator import robot_simulator
+
+    return robot_simulator(read(Path(path), actuators=actuators, engine=engine), free)
 
 
 def load_plugins(paths: Iterable[str | Path]) -> None:

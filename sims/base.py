@@ -259,6 +259,7 @@ class Simulator(ABC):
         inputs: input signals a scenario may give, as channels.
         states: initial state names with their defaults (SI).
         requires: importable packages without which this simulator is skipped.
+        has_model: whether it comes from a robot's model file.
     """
 
     name: ClassVar[str]
@@ -269,6 +270,7 @@ class Simulator(ABC):
     inputs: tuple[Channel, ...] = ()
     states: Mapping[str, float] = {}
     requires: ClassVar[tuple[str, ...]] = ()
+    has_model: ClassVar[bool] = False
 
     def __init__(
         self, constants: Mapping[str, float] | None = None, observe: Sequence[str] | None = None

@@ -115,6 +115,7 @@ class OwnSimulator(Simulated):
     """
 
     system = OwnSystem
+    own_engine = True
     time_step: ClassVar[float] = 1 / 240
     kind: ClassVar[Kind] = "linear"
     coordinates: ClassVar[tuple[str, ...]] = ()

@@ -52,6 +52,8 @@ class Simulated(Simulator):
 
     system: ClassVar[type[System]]
     default_engine: ClassVar[str] = "batch"
+    own_engine: ClassVar[bool] = False
+    """Whether it steps itself, so that there is no engine to choose."""
 
     def __init__(
         self,
@@ -105,7 +107,10 @@ class Simulated(Simulator):
         return engine_named(name or self.default_engine, self.system, settings)
 
     def _effect(self, named: str | type[Effect]) -> Effect:
-        effect = library.get(named) if isinstance(named, str) else named
+        effect = library.find(named, self.system) if isinstance(named, str) else named
+        # An effect of a place is one that the system itself has made.
+        if effect.of:
+            return effect()
         if reason := effect.misses(self.system):
             raise InputError(
                 f"system {self.system.name} cannot have effect {effect.name}: {reason}"
@@ -221,7 +226,7 @@ class Simulated(Simulator):
             # A gain or bias is that of one channel.
             reading = tuple((e, c) for e, c in sensors if _filters(e) or name == valued)
             if reading:
-                values = _sensed(reading, values, steps, times)
+                values = sensed(reading, values, steps, times)
             observations[:, :, place] = _chosen(values, rows)
         observations += 0.0  # no zero is negative: whatever made it, it is the same zero
         return observations
@@ -232,7 +237,7 @@ def _filters(effect: Effect) -> bool:
     return isinstance(effect, Sensor) and effect.filters
 
 
-def _sensed(sensors: Acting, values: Array, steps: Array, times: Array) -> Array:
+def sensed(sensors: Acting, values: Array, steps: Array, times: Array) -> Array:
     """(L, R) what sensors in a row make of a channel's values (L, R).
 
     Each reads what the one before gives, also at the start, in which the next begins.

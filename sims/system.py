@@ -32,6 +32,8 @@ Kind = Literal["point", "linear", "rotary"]
 """How a system counts force: `point` per unit mass (m/s^2), `linear` in N, `rotary` in N*m."""
 KINDS: tuple[Kind, ...] = ("point", "linear", "rotary")
 """All kinds, in the order of a coefficient's units and ranges."""
+PlaceKind = Literal["joint", "actuator", "body", "channel", "world"]
+"""Kinds of places in a robot."""
 STANDARD_GRAVITY = 9.80665
 """m/s^2 (3rd General Conference on Weights and Measures, 1901)."""
 
@@ -146,6 +148,7 @@ class System(ABC):
         primary: index of the coordinate that biases and springs act on.
         uniform: whether its own force is the same everywhere and always, so that it moves along
             parabolas.
+        has_model: whether it comes from a model file, whose numbers may be wrong.
         usual_recording: what its simulated recordings show where the user does not say.
     """
 
@@ -163,12 +166,27 @@ class System(ABC):
     primary: ClassVar[int] = 0
     bounces: ClassVar[bool] = False
     uniform: ClassVar[bool] = False
+    has_model: ClassVar[bool] = False
     usual_recording: ClassVar[UsualRecording] = UsualRecording()
 
     @classmethod
     def reading(cls, observed: Sequence[str]) -> str:
         """The channel among those `observed` whose value sensor effects act on."""
         return next((name for name in cls.sensed if name in observed), observed[0])
+
+    @classmethod
+    def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
+        """The registered effect where this system can have it: itself in a system of one place, a
+        class for each place and family in a robot; empty where it cannot.
+        """
+        return (effect,) if effect.fits(cls) else ()
+
+    @classmethod
+    def effect(cls, name: str) -> type[Effect] | None:  # noqa: ARG003
+        """The effect of a name that only this system knows, as those of its places; None for what
+        is registered.
+        """
+        return None
 
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:  # noqa: ARG003
@@ -243,12 +261,14 @@ class Coefficient:
         plausible: the range one would expect, in the same order.
         of: whose unit it has where `units` are only the usual ones: ``input`` the first input's,
             ``reading`` that of the channel it acts on, ``reading/s`` the same per second.
+        least: what a fit may not go below, where that is not a matter of plausibility.
     """
 
     name: str
     units: tuple[str | None, str | None, str | None]
     plausible: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
     of: Literal["", "input", "reading", "reading/s"] = ""
+    least: float | None = None
 
     def unit(self, kind: Kind) -> str | None:
         """The unit on systems of this kind; None where the effect does not exist there."""
@@ -286,9 +306,16 @@ class Effect(ABC):
             first lacks the effect.
         needs: what the system must have: ``input``; ``ground`` to strike; ``guide``, which a body
             that flies freely lacks; ``gravity``; ``push``, a say in what horizontal acceleration
-            does to it; ``space`` of three dimensions; or empty.
+            does to it; ``space`` of three dimensions; ``model``, a file that states its numbers;
+            or empty.
         contains: simpler effects that it turns into where some of its coefficients are zero.
         hook: which of the engine's hooks it uses; set by the hook classes.
+        at: of what kind its places in a robot are.
+        place: of a robot: the joint, actuator, body or channel where it acts; ``*`` of a family;
+            empty for an effect of the world and in systems of one place.
+        coordinate: which coordinate it acts on; None for the system's primary one.
+        signal: the input or channel that it acts on; empty for the first, or for all.
+        of: name of the effect that it is at a place.
     """
 
     name: ClassVar[str]
@@ -299,6 +326,15 @@ class Effect(ABC):
     needs: ClassVar[str] = ""
     contains: ClassVar[tuple[str, ...]] = ()
     hook: ClassVar[str]
+    at: ClassVar[PlaceKind]
+    place: ClassVar[str] = ""
+    coordinate: ClassVar[int | None] = None
+    signal: ClassVar[str] = ""
+    of: ClassVar[str] = ""
+
+    def parts(self, c: Array) -> Acting:
+        """The effect as the sum of effects at one place each, with their coefficients (K, L, 1)."""
+        return ((self, c),)
 
     @classmethod
     def fits(cls, system: System | type[System]) -> bool:
@@ -321,6 +357,9 @@ class Effect(ABC):
             "gravity": "" if heavy else "it states no gravity",
             "push": "" if says_push else "it does not say what horizontal acceleration does",
             "space": "" if in_space else "it does not move in three dimensions",
+            "model": ""
+            if declared.has_model
+            else "it has no model file whose numbers may be wrong",
         }[cls.needs]
         undefined = "" if cls.on(system) else f"it is not defined for a {system.kind} system"
         return lacks or undefined or system.refuses(cls)
@@ -336,6 +375,7 @@ class Force(Effect):
     """A generalised force, added to the others."""
 
     hook = "force"
+    at: ClassVar[PlaceKind] = "joint"
 
     @abstractmethod
     def force(self, c: Array, moment: Moment) -> Array:
@@ -350,16 +390,27 @@ class Friction(Effect):
     """
 
     hook = "force"
+    at: ClassVar[PlaceKind] = "joint"
 
     @abstractmethod
     def limit(self, c: Array, moment: Moment) -> Array:
         """(L, 1) largest force, >= 0."""
 
 
+class Value(Effect):
+    """A number that a robot's model file states, and that may be wrong; the engine writes it into
+    the model.
+    """
+
+    hook = "value"
+    needs = "model"
+
+
 class Contact(Effect):
     """A change to what happens at an impact with the ground."""
 
     hook = "contact"
+    at: ClassVar[PlaceKind] = "world"
 
     def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:  # noqa: ARG002
         """(L, 1) restitution from what it would be, and the impact speed (L, 1) >= 0 in m/s."""
@@ -396,6 +447,7 @@ class Input(Effect):
     """
 
     hook = "input"
+    at: ClassVar[PlaceKind] = "actuator"
     needs = "input"
 
     def times(self, c: Array, t: Array) -> Array:  # noqa: ARG002
@@ -411,6 +463,7 @@ class Sensor(Effect):
     """The observation as recorded."""
 
     hook = "sensor"
+    at: ClassVar[PlaceKind] = "channel"
     filters: ClassVar[bool] = False
     """Whether `read` must see every step of the integration rather than the samples alone."""
 

@@ -20,6 +20,7 @@ def explain(
     recording: str | Path | Recording | SimulatedRecording,
     *,
     system: str | None = None,
+    model: str | Path | None = None,
     engine: str = "batch",
     free: Sequence[str] = (),
     tuner: str | None = None,
@@ -36,8 +37,10 @@ def explain(
     Args:
         recording: the path of ``NAME.csv``, or a recording that was read or simulated.
         system: take it for this system, whatever the description says.
+        model: take it for this robot, whatever the description says: an MJCF or URDF.
         engine: pybullet, mujoco or batch; a simulator that steps itself has its own.
-        free: constants to estimate with the parameters.
+        free: constants to estimate with the parameters; of a robot numbers of its file, as
+            ``damping@*`` or ``mass@forearm``.
         tuner: a registered tuner that finds where the fit of the base parameters begins.
         seed: of the surrogates and the bootstrap.
         force: explain what needs more than this machine has, or has stamps that cannot be seconds.
@@ -61,7 +64,7 @@ def explain(
         raise InputError(f"jobs: expected a whole number of at least 1, found {jobs!r}")
     watch = Watch(budget, stop, progress)
     given = system, engine, seed, free, tuner, say, force
-    return explaining.explain(recording, *given, watch, jobs or cores())
+    return explaining.explain(recording, *given, watch, jobs or cores(), model)
 
 
 def score(

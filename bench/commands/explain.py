@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from bench.commands.interrupts import INTERRUPTED, Interrupts
-from bench.commands.options import add_force, add_plugin, names, place, positive, seconds
+from bench.commands.options import add_force, add_model, add_plugin, names, place, positive, seconds
 
 
 def add_explain(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +21,7 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
     )
+    add_model(parser)
     parser.add_argument(
         "--engine",
         metavar="NAME",
@@ -37,7 +38,11 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
         "--seed", type=int, metavar="K", default=0, help="of all that is drawn (default: 0)"
     )
     parser.add_argument(
-        "--free", metavar="A,B,...", default="", help="constants to estimate with the parameters"
+        "--free",
+        metavar="A,B,...",
+        default="",
+        help="constants to estimate with the parameters; "
+        "of a robot numbers of its model file, as damping@* or mass@forearm",
     )
     parser.add_argument(
         "--tuner",
@@ -99,6 +104,7 @@ def _explain(options: argparse.Namespace) -> int:
         explanation = explain(
             options.recording,
             system=options.system,
+            model=options.model,
             engine=options.engine,
             free=names(options.free),
             tuner=options.tuner,

@@ -20,6 +20,16 @@ def add_plugin(parser: argparse.ArgumentParser, more: str) -> None:
     )
 
 
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """The option ``--model FILE``."""
+    parser.add_argument(
+        "--model",
+        type=place,
+        metavar="FILE",
+        help="take it for this robot, whatever the .toml says: an MJCF or URDF",
+    )
+
+
 def add_force(parser: argparse.ArgumentParser) -> None:
     """The option ``--force``."""
     parser.add_argument(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.commands.options import add_force, add_plugin, names, place, positive
+from bench.commands.options import add_force, add_model, add_plugin, names, place, positive
 
 
 def add_simulate(simulate: argparse.ArgumentParser) -> None:
@@ -67,6 +67,7 @@ def add_inspect(inspect: argparse.ArgumentParser) -> None:
     inspect.add_argument(
         "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
     )
+    add_model(inspect)
     inspect.add_argument(
         "--out", metavar="DIR", type=place, help="folder for the figure (default: results/inspect)"
     )
@@ -119,7 +120,7 @@ def _inspect(options: argparse.Namespace) -> int:
     from bench.registry import load_plugins
 
     load_plugins(options.plugin)
-    recording, kind = load(options.recording, options.system)
+    recording, kind = load(options.recording, options.system, options.model)
     for line in summary(recording, kind):
         print(line)
     for odd in oddities(recording, kind):

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,11 +29,9 @@ from bench.problem.seeds import rng_for
 from bench.recordings.inspection import load
 from bench.recordings.size import check_recording
 from bench.recordings.stamps import refuse_odd
-from sims import effects as library
 from sims import extended as extend
 from sims.base import Array, InputError
 from sims.extended import Extended
-from sims.own import OwnSimulator
 from sims.recording.recording import Recording
 from sims.simulated import Simulated
 
@@ -56,6 +55,7 @@ def explain(
     force: bool = False,
     watch: Watch | None = None,
     jobs: int = 1,
+    model: str | Path | None = None,
 ) -> Explanation:
     """Explain a recording.
 
@@ -70,21 +70,30 @@ def explain(
         force: whether the user insists on a recording that is refused otherwise.
         watch: says when the search has to end, and is told how far it is.
         jobs: processes that work at once; the answer does not depend on it.
+        model: take it for this robot, whatever the description says: a model file.
 
     Raises:
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
             or the search was ended before anything could be simulated.
     """
     with closing(Crew(jobs)) as crew:
-        given = seed, tuple(free), tuner, say, force
-        return _Explainer(recording, system, engine, *given, watch or Watch(), crew).run()
+        subject = _Subject(recording, system, model)
+        given = engine, seed, tuple(free), tuner, say, force
+        return _Explainer(subject, *given, watch or Watch(), crew).run()
+
+
+class _Subject(NamedTuple):
+    """What is explained: a recording, and what it is taken for if not for what it says."""
+
+    source: str | Path | Recording
+    system: str | None
+    model: str | Path | None
 
 
 class _Explainer:
     def __init__(
         self,
-        source: str | Path | Recording,
-        system: str | None,
+        subject: _Subject,
         engine: str,
         seed: int,
         free: tuple[str, ...],
@@ -98,7 +107,7 @@ class _Explainer:
         self.seed = seed
         self.tuner = tuner
         self.say = say
-        self.recording, kind = load(source, system)
+        self.recording, kind = load(*subject, free)
         self.path = self.recording.path
         if not issubclass(kind, Simulated):
             raise self._takes_no_effects()
@@ -106,7 +115,9 @@ class _Explainer:
         extend.refuse_extended(kind)
         self.kind: type[Simulated] = kind
         # A simulator that steps itself has no engine to choose.
-        self.engine = None if issubclass(kind, OwnSimulator) else engine
+        self.engine = None if kind.own_engine else engine
+        # What is free of a robot is a number of its file, and a parameter of its simulator.
+        free = () if kind.has_model else free
         # Before the worlds, which plan every step of every run.
         for odd in refuse_odd(self.recording, kind, force):
             say(f"{self.path}: {odd}")
@@ -212,7 +223,7 @@ class _Explainer:
         for effect, slot in world.slots.items():
             if effect not in finding.model.names:
                 continue
-            coefficients = library.get(effect).on(world.simulator.system)
+            coefficients = world.effects[effect].on(world.simulator.system)
             places = range(*slot.indices(len(world.parameters)))
             added[effect] = {
                 coefficient.name: numbers[place]

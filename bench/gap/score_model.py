@@ -20,7 +20,6 @@ from bench.recordings.stamps import refuse_odd
 from bench.registry import simulators
 from sims.base import Array, InputError, unknown
 from sims.extended import Extended, opened
-from sims.own import OwnSimulator
 from sims.recording.recording import read_recording, system_of
 
 
@@ -56,7 +55,7 @@ def scored(
             f"{recording}: no run is marked held_out, and only such runs were to count"
         )
     _check_channels(recording, extended, list(runs[0].channels))
-    engine = None if issubclass(kind, OwnSimulator) else extended.engine
+    engine = None if kind.own_engine else extended.engine
     refuse_huge(data)
     refuse_odd(data, kind, force)
     check_recording(data, kind(engine=engine), force)

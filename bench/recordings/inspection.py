@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from bench.recordings.noise import NoiseEstimate, estimated, gaps
-from bench.registry import simulators
+from bench.registry import robot, simulators
 from sims.base import Array, Channel, InputError, Simulator
 from sims.limits import LARGEST
+from sims.recording.description import model_of
 from sims.recording.recording import Recording, Run, divided, read_recording, system_of
 
 _MOST_RUNS = 40
@@ -37,26 +38,52 @@ _SIGNAL_HEAD = ("signal", "kind", "unit", "min", "max", "missing", "noise: state
 
 
 def load(
-    source: str | Path | Recording, system: str | None = None
+    source: str | Path | Recording,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
 ) -> tuple[Recording, type[Simulator]]:
-    """A recording, and the simulator of the system it is of (or of `system`).
+    """A recording, and the simulator of the system it is of (or of `system`, or of `model`).
 
     Args:
         source: the table's path, or a recording that is in memory already.
         system: take it for this system, whatever it says of itself.
+        model: take it for this robot: a model file.
+        free: numbers of a robot's model file that are tuned.
 
     Raises:
         InputError: it cannot be read, or there is no such system.
     """
     path = source.path if isinstance(source, Recording) else Path(source)
-    name = system or (source.system if isinstance(source, Recording) else system_of(path))
-    try:
-        kind = simulators.get(name)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    kind = kind_of(source, path, system, model, free)
     recording = divided(source) if isinstance(source, Recording) else read_recording(path, kind)
     refuse_huge(recording)
     return recording, kind
+
+
+def kind_of(
+    source: str | Path | Recording,
+    path: Path,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+) -> type[Simulator]:
+    """The simulator of the system or robot that a recording is of; arguments as those of `load`."""
+    if system is not None and model is not None:
+        raise InputError("expected a system or a model file, found both; leave one out")
+    if isinstance(source, Recording):
+        if model is not None:
+            return robot(model, free=free)
+        of_file = source.model
+    else:
+        of_file = None if system is not None else model_of(path, model)
+    if of_file is not None and system is None:
+        return robot(of_file.path, of_file.actuators, of_file.engine, free)
+    name = system or (source.system if isinstance(source, Recording) else system_of(path))
+    try:
+        return simulators.get(name)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def refuse_huge(recording: Recording) -> None:

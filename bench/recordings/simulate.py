@@ -20,7 +20,6 @@ from bench.registry import simulators
 from sims import effects as library
 from sims.base import Array, InputError, Scenario, Simulator
 from sims.limits import BRIEFEST, FASTEST, LARGEST, cut, is_number
-from sims.own import OwnSimulator
 from sims.recording.recording import Recording, Run
 from sims.recording.write import refuse_existing, write_recording
 from sims.simulated import Simulated
@@ -145,7 +144,7 @@ class _Maker:
         self.theta = _theta(wish.parameters, kind)
         self.effects = {name: _coefficients(name, c, kind) for name, c in wish.effects.items()}
         self.engine = wish.engine
-        if not self.engine and issubclass(kind, Simulated) and not issubclass(kind, OwnSimulator):
+        if not self.engine and issubclass(kind, Simulated) and not kind.own_engine:
             self.engine = "batch"
         self.simulator = self._simulator()
         self.noise = _noise(wish.noise, [c.name for c in self.simulator.channels])
@@ -282,7 +281,9 @@ def _theta(given: Mapping[str, float] | Sequence[float], kind: type[Simulator]) 
 def _coefficients(name: str, given: Coefficients, kind: type[Simulator]) -> list[float]:
     """An effect's coefficients in order; those that are not named are zero."""
     if isinstance(given, Mapping):
-        of_system = library.get(name).on(kind.system) if issubclass(kind, Simulated) else ()
+        of_system = (
+            library.find(name, kind.system).on(kind.system) if issubclass(kind, Simulated) else ()
+        )
         names = [c.name for c in of_system]
         known(f"coefficient of effect {name}", given, names)
         return [_number(f"effect {name}:", c, given.get(c, 0.0)) for c in names]

@@ -24,7 +24,6 @@ import numpy as np
 
 from bench.sizes import INSIST
 from sims.base import Array, InputError, Simulator
-from sims.own import OwnSimulator
 from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 from sims.system import Moment, System
@@ -101,7 +100,7 @@ def _gap(run: Run) -> Oddity | None:
 def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Oddity | None:
     """Whether the run moves far more slowly than its system would."""
     # What steps itself tells nobody its forces.
-    if not issubclass(kind, Simulated) or issubclass(kind, OwnSimulator):
+    if not issubclass(kind, Simulated) or kind.own_engine:
         return None
     system = kind.system()
     interval = float(np.median(np.diff(run.times)))

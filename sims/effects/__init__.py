@@ -21,6 +21,15 @@ def library(system: type[System]) -> dict[str, type[Effect]]:
             effect = registry.get(name)
         except SkippedError:  # whoever lists effects says why; explain does without
             continue
-        if effect.fits(system):
-            usable[name] = effect
+        for placed in system.placed(effect):
+            usable[placed.name] = placed
     return usable
+
+
+def find(name: str, system: type[System]) -> type[Effect]:
+    """The effect of a name on a system: one of its places, or a registered one.
+
+    Raises:
+        InputError: there is none.
+    """
+    return system.effect(name) or registry.get(name)

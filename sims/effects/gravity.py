@@ -22,7 +22,7 @@ class Scale(Force):
     noun = "a correction of gravity"
     says = "gravity acts more strongly or weakly than its stated value"
     source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
-    needs = "gravity"
+    needs, at = "gravity", "world"
     coefficients = (Coefficient("coefficient", _PURE, _FIFTH),)
 
     def force(self, c: Array, moment: Moment) -> Array:
@@ -37,7 +37,7 @@ class Tilt(Force):
     noun = "a tilt of gravity"
     says = "the ground is not level: gravity also pulls sideways"
     source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
-    needs = "push"
+    needs, at = "push", "world"
     coefficients = (
         Coefficient("x", _PURE, _FIFTH),
         Coefficient("y", ("1", None, None), ((-0.2, 0.2), (0, 0), (0, 0))),

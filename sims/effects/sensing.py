@@ -119,6 +119,7 @@ class Skew(Sensor):
     noun = "a clock skew"
     says = "the recorder's clock runs slow or fast"
     source = "V. Paxson et al., Framework for IP Performance Metrics, RFC 2330 (1998), section 10.1"
+    at = "world"
     coefficients = (Coefficient("coefficient", _PURE, _SLOW),)
 
     def times(self, c: Array, t: Array) -> Array:

@@ -17,7 +17,18 @@ from sims.user_toml import checked, fault, finite, known, read_toml, table, text
 Declared: TypeAlias = type[Simulator] | type[System]
 """What a recording is checked against: channels, inputs, constants and states of a system."""
 
-_KEYS = ("system", "title", "channels", "inputs", "constants", "runs", "extra")
+_KEYS = (
+    "system",
+    "model",
+    "actuators",
+    "engine",
+    "title",
+    "channels",
+    "inputs",
+    "constants",
+    "runs",
+    "extra",
+)
 """What may stand in the file."""
 
 _NEVER = 1e12
@@ -65,6 +76,44 @@ class Description:
     extra: Mapping[str, str]
 
 
+@dataclass(frozen=True)
+class ModelFile:
+    """The robot that a recording is of.
+
+    Attributes:
+        path: of its model file.
+        actuators: that the file lacks, by name.
+        engine: time step and integrator other than the file's.
+    """
+
+    path: Path
+    actuators: Mapping[str, Any]
+    engine: Mapping[str, Any]
+
+
+def model_of(path: str | Path, model: str | Path | None = None) -> ModelFile | None:
+    """The model file that a recording's description states; None where it states a system.
+
+    Args:
+        path: the recording's table, `NAME.csv`.
+        model: a model file in place of the one that the description states.
+
+    Raises:
+        InputError: the description is missing or malformed, or states both.
+    """
+    description = description_of(Path(path))
+    meta = read_toml(description)
+    if model is None and "model" not in meta:
+        return None
+    if model is None:
+        if "system" in meta:
+            raise InputError(f"{description}: expected system or model, found both; leave one out")
+        model = description.parent / text(description, "model", meta["model"])
+    actuators = table(description, "actuators", meta.get("actuators", {}))
+    engine = table(description, "engine", meta.get("engine", {}))
+    return ModelFile(Path(model), actuators, engine)
+
+
 def system_of(path: str | Path) -> str:
     """The name of the system that a recording's description states.
 
@@ -107,8 +156,10 @@ def read_description(path: Path, declared: Declared) -> Description:
     # Whether the table has these runs is known only when it has been read (`check_names`).
     marks = table(path, "runs", meta.get("runs", {}))
     runs = {name: _run(path, name, own, declared) for name, own in marks.items()}
+    # A robot has no name of a system: its model file stands for it.
+    robotic = declared.has_model
     return Description(
-        system=_system(path, meta),
+        system=declared.name if robotic else _system(path, meta),
         title=title,
         channels={name: column.scale for name, column in channels.items()},
         inputs={name: column.scale for name, column in inputs.items()},
@@ -144,9 +195,24 @@ def _columns(
 ) -> dict[str, _Column]:
     """The columns of one kind, channel or input, each with its scale."""
     units = {signal.name: signal.unit for signal in declared}
-    given = table(path, f"{kind}s", meta.get(f"{kind}s", {}))
+    given = _dotted(table(path, f"{kind}s", meta.get(f"{kind}s", {})), units)
     known(f"{kind} in {path}", given, units)
     return {name: _column(path, kind, name, own, units[name]) for name, own in given.items()}
+
+
+def _dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Entries whose names have dots, which TOML takes for tables in tables unless they are quoted:
+    ``[channels.q.elbow]`` is ``q.elbow``.
+    """
+    result: dict[str, Any] = {}
+    for name, value in given.items():
+        inside = isinstance(value, dict) and name not in names
+        if inside and any(known.startswith(f"{name}.") for known in names):
+            within = {f"{name}.{key}": entry for key, entry in value.items()}
+            result.update(_dotted(within, names))
+        else:
+            result[name] = value
+    return result
 
 
 def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
@@ -227,7 +293,7 @@ def _constants(path: Path, where: str, value: Any, declared: Declared) -> dict[s
 
 
 def _numbers(path: Path, where: str, value: Any, allowed: Collection[str]) -> dict[str, float]:
-    given = table(path, where, value)
+    given = _dotted(table(path, where, value), allowed)
     _known(path, where, given, allowed)
     return {name: finite(path, f"{where}.{name}", number) for name, number in given.items()}
 

@@ -18,9 +18,11 @@ from sims.base import Array, InputError, frozen
 from sims.recording.description import (
     Declared,
     Description,
+    ModelFile,
     RunMarks,
     check_names,
     description_of,
+    model_of,
     read_description,
     system_of,
 )
@@ -68,7 +70,7 @@ class Recording:
     its runs.
 
     `extra` has the units of the columns that belong to no channel or input, such as pixels of a
-    tracked film.
+    tracked film; `model` the model file where it is of a robot.
     """
 
     path: Path
@@ -78,6 +80,7 @@ class Recording:
     noise: Mapping[str, float]
     runs: tuple[Run, ...]
     extra: Mapping[str, str] = field(default_factory=dict)
+    model: ModelFile | None = None
 
     def __repr__(self) -> str:
         first = self.runs[0] if self.runs else None
@@ -115,7 +118,14 @@ def read_recording(path: str | Path, declared: Declared, whole: bool = False) ->
     runs = [_run(table, part, about) for part in parts]
     kept = tuple(runs) if whole else _split(description, runs)
     return Recording(
-        table, about.system, about.title, about.constants, about.noise, kept, about.extra
+        table,
+        about.system,
+        about.title,
+        about.constants,
+        about.noise,
+        kept,
+        about.extra,
+        model_of(table),
     )
 
 

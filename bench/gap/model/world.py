@@ -111,7 +111,10 @@ class World:
         self.runs = tuple(runs)
         self.extra = tuple(extra)
         usable = library.library(kind.system)
-        self.library = list(usable) if candidates is None else list(candidates)
+        recorded = {*self.runs[0].channels, *(c.name for c in kind.inputs)}
+        # an effect on a channel that nobody recorded shows nowhere
+        shown = [name for name, effect in usable.items() if _shows(effect, recorded)]
+        self.library = shown if candidates is None else list(candidates)
         self.simulator, self._fine = self._simulators()
 
         # theta in its three parts: own parameters, freed constants, coefficients
@@ -350,6 +353,12 @@ class World:
         """Give back what the engine holds."""
         self.simulator.close()
         self._fine.close()
+
+
+def _shows(effect: type[Effect], recorded: set[str]) -> bool:
+    """Whether the signals that an effect acts on are there; all of them, if it is a family."""
+    members = getattr(effect, "members", ()) or (effect,)
+    return all(not member.signal or member.signal in recorded for member in members)
 
 
 def _simulated(world: World, *call: Any) -> Array:

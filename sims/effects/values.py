@@ -1,0 +1,110 @@
+"""Numbers that a robot's model file states, and that may be wrong.
+
+They act on what the file states, as a share c of it or as a difference, so that a coefficient of
+zero is the file's own number:
+
+* (1) mass: m (1 + c) and the inertia tensor with it, the centre of mass where it was
+* (2) centre of mass: moved by (x, y, z) in the body's frame, mass and inertia about it kept
+* (3) inertia: the tensor alone times (1 + c)
+* (4) armature: the inertia of the rotor, as the joint feels it, plus c
+* (5) stiffness: the servo's kp (1 + c)
+* (6) damping: the servo's kv (1 + c)
+* (7) limit: the actuator's force cut off at c either way; a limit of zero is the file's own
+
+A mass stays positive and an inertia tensor one that a body can have, by what c may be: a tensor
+times a positive number keeps the triangle inequality of its moments.
+"""
+
+from __future__ import annotations
+
+from sims.system import Coefficient, Value
+
+_PURE = ("1", "1", "1")
+"""A pure number, on every kind of system."""
+_HALF = ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
+"""Plausible shares: half as much more or less."""
+_LENGTH = ("m", "m", "m")
+_TENTH = ((-0.1, 0.1), (-0.1, 0.1), (-0.1, 0.1))
+"""Plausible offsets of a centre of mass, metres."""
+_IDENTIFICATION = "W. Khalil, E. Dombre, Modeling, Identification and Control of Robots (2002)"
+_LEAST = -0.99
+"""The least share that leaves something of a number that must be positive."""
+
+
+class Mass(Value):
+    """The mass and, with it, the inertia of a body times 1 + c."""
+
+    name = "mass.scale"
+    noun = "a wrong mass"
+    says = "the body is heavier or lighter than the model file says"
+    source = _IDENTIFICATION + ", chapter 12"
+    at = "body"
+    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)
+
+
+class Offset(Value):
+    """The centre of mass of a body moved by x, y and z in its own frame."""
+
+    name = "mass.offset"
+    noun = "a misplaced centre of mass"
+    says = "the body's centre of mass is elsewhere than the model file says"
+    source = _IDENTIFICATION + ", chapter 12"
+    at = "body"
+    coefficients = tuple(Coefficient(axis, _LENGTH, _TENTH) for axis in "xyz")
+
+
+class Inertia(Value):
+    """The inertia tensor of a body times 1 + c."""
+
+    name = "inertia.scale"
+    noun = "a wrong inertia"
+    says = "the body turns more or less readily than the model file says"
+    source = _IDENTIFICATION + ", chapter 12"
+    at = "body"
+    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)
+
+
+class Armature(Value):
+    """The inertia of the rotor that the joint feels, plus c."""
+
+    name = "inertia.armature"
+    noun = "a wrong armature"
+    says = "the rotor's inertia, as the joint feels it, is not what the model file says"
+    source = _IDENTIFICATION + ", section 9.4"
+    at = "joint"
+    coefficients = (
+        Coefficient("coefficient", (None, "kg", "kg*m^2"), ((0, 0), (0, 5), (0, 0.05))),
+    )
+
+
+class Stiffness(Value):
+    """The servo's proportional gain times 1 + c."""
+
+    name = "actuator.stiffness"
+    noun = "a wrong servo stiffness"
+    says = "the servo pulls towards its command more strongly or weakly than the model file says"
+    source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), chapter 10"
+    at = "actuator"
+    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)
+
+
+class Damping(Value):
+    """The servo's gain on velocity times 1 + c."""
+
+    name = "actuator.damping"
+    noun = "a wrong servo damping"
+    says = "the servo damps its motion more strongly or weakly than the model file says"
+    source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), chapter 10"
+    at = "actuator"
+    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)
+
+
+class Limit(Value):
+    """The actuator's force cut off at c either way; zero is the file's own limit."""
+
+    name = "actuator.limit"
+    noun = "a limit of the actuator's force"
+    says = "the actuator gives no more than a certain force"
+    source = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
+    at = "actuator"
+    coefficients = (Coefficient("coefficient", ("N", "N", "N*m"), ((0, 50), (0, 50), (0, 5))),)

@@ -1,0 +1,95 @@
+"""Forces of effects on a robot: those that are known beforehand, and those that are asked for in
+every step, of all lanes at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sims.base import Array
+from sims.robot.lanes import Addresses
+from sims.robot.moment import RobotMoment
+from sims.robot.system import RobotSystem
+from sims.system import Acting, Force, Friction
+
+OVER_TIME = frozenset({"force.bias", "force.periodic"})
+"""Effects whose force hangs on nothing but time."""
+
+
+def moment_of(
+    system: RobotSystem, t: Array, x: Array, v: Array, inputs: Mapping[str, Array], carried: Array
+) -> RobotMoment:
+    """The instant of lanes; t (L, 1), all others (L, D)."""
+    theta = np.zeros((len(x), 0))
+    return RobotMoment(
+        system, theta, {}, t, x, v, inputs, carried, system.alone, dict(system.drives)
+    )
+
+
+def over_time(system: RobotSystem, acting: Acting, t: Array, size: int, lanes: int) -> Array:
+    """(L, S, D) forces that hang on time alone, at the beginnings t (S,) of steps and half a step
+    later.
+    """
+    result = np.zeros((lanes, t.size, size))
+    half = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
+    nothing = np.zeros((t.size, size))
+    # The force in the middle of a step gives the momentum that the force over it does.
+    moment = moment_of(system, (t + half)[:, None], nothing, nothing, {}, nothing)
+    for effect, c in acting:
+        if effect.of not in OVER_TIME or not isinstance(effect, Force):
+            continue
+        for lane in np.flatnonzero((c != 0).any(axis=0)[:, 0]):
+            own = np.repeat(c[:, lane : lane + 1], t.size, axis=1)
+            result[lane] += effect.force(own, moment)
+    return result
+
+
+class Forces:
+    """Forces of effects that hang on where the robot is.
+
+    Attributes:
+        rubs: whether there is dry friction among them.
+
+    Args:
+        system: the robot's.
+        acting: effects at one place each.
+        count: how many lanes.
+        addresses: of the joints.
+    """
+
+    def __init__(
+        self, system: RobotSystem, acting: Acting, count: int, addresses: Addresses
+    ) -> None:
+        self._system = system
+        self._count = count
+        self.addresses = addresses
+        asked = [(e, c) for e, c in acting if e.hook == "force" and e.of not in OVER_TIME]
+        self._forces = [(e, c) for e, c in asked if isinstance(e, Force) and not _native(e.of)]
+        self._frictions = [
+            (e, c) for e, c in asked if isinstance(e, Friction) and not _native(e.of)
+        ]
+        self.rubs = bool(self._frictions)
+
+    def at(
+        self, t: float, x: Array, v: Array, inputs: Mapping[str, Array], carried: Array
+    ) -> tuple[Array, Array]:
+        """Forces and limits of dry friction (L, D) each, at an instant."""
+        now = np.full((len(x), 1), t)
+        moment = moment_of(self._system, now, x, v, inputs, carried)
+        force = np.zeros_like(x)
+        for effect, c in self._forces:
+            force += effect.force(c, moment)
+        limit = np.zeros_like(x)
+        for dry, c in self._frictions:
+            joint = dry.coordinate
+            assert joint is not None
+            limit[:, joint] += dry.limit(c, moment)[:, 0]
+        return force, limit
+
+
+def _native(name: str) -> bool:
+    from sims.robot.native import FIELDS
+
+    return name in FIELDS

@@ -1,0 +1,241 @@
+"""Many lanes of one robot in MuJoCo: `mujoco.batch.Batch`, with the model fields that effects
+write.
+
+A lane's fields begin as the file states them; what acts in the lane is written into them. Fields
+from which MuJoCo derives others (masses) go into a batch of their own, so that lanes without such a
+change keep the very constants of the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.base import Array
+from sims.robot.model import Robot
+from sims.robot.native import FIELDS, SOLIMP, SOLREF, lanes_model
+from sims.system import Acting
+
+LANES = 64
+"""Of a batch: of more, what is held for them leaves the processor's cache."""
+INTERRUPTED = 40_000
+"""Steps of all lanes together in one call: a fraction of a second, after which Ctrl-C is heard."""
+
+Places = NDArray[np.intp]
+
+
+class Addresses:
+    """Where the joints of one coordinate stand in MuJoCo's vectors.
+
+    Attributes:
+        positions: (D,) in qpos.
+        velocities: (D,) in qvel.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        joints = [joint for joint in robot.joints if joint.single]
+        self.positions: Places = np.array([j.position for j in joints], dtype=np.intp)
+        self.velocities: Places = np.array([j.velocity for j in joints], dtype=np.intp)
+
+
+class Asked(Protocol):
+    """Effects that are asked for their forces in every step, as `sims.robot.forces.Forces`."""
+
+    rubs: bool
+    addresses: Addresses
+
+    def at(
+        self, t: float, x: Array, v: Array, inputs: Mapping[str, Array], carried: Array
+    ) -> tuple[Array, Array]:
+        """Forces and limits of dry friction."""
+        ...
+
+
+class Bench:
+    """Up to `LANES` simulations of a robot side by side.
+
+    Attributes:
+        fields: model fields of the lanes, (LANES, ...) by name, as they are.
+        batch: the mujoco.batch.Batch.
+
+    Args:
+        robot: whose.
+        derived: whether masses or armatures change, from which MuJoCo derives constants.
+        settings: of the options: timestep (seconds), integrator (its number).
+        count: how many lanes there are.
+    """
+
+    def __init__(
+        self, robot: Robot, derived: bool, settings: Mapping[str, float], count: int = LANES
+    ) -> None:
+        import mujoco
+        from mujoco import batch
+
+        self.robot = robot
+        self.derived = derived
+        self.count = count
+        model = lanes_model(robot) if derived else robot.spec.copy().compile()
+        for name, value in settings.items():
+            setattr(model.opt, name, value)
+        # A lane that fails must be NaN: MuJoCo would reset it, and it would pass for done.
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self.batch: Any = batch.Batch(model, count, 1)
+        names = {
+            field
+            for native in FIELDS.values()
+            if derived or not native.derived
+            for field in native.fields
+        }
+        self.fields: dict[str, Any] = {name: self.batch.expand(name) for name in sorted(names)}
+        self._stated = {name: values[:1].copy() for name, values in self.fields.items()}
+        self._changed: set[str] = set()
+
+    @property
+    def model(self) -> Any:
+        """The mujoco.MjModel that lanes share but for their fields."""
+        return self.batch.model
+
+    def load(self, acting: Acting) -> None:
+        """Write the native effects, with coefficients (K, LANES, 1), into the lanes' fields."""
+        for name in self._changed:
+            self.fields[name][...] = self._stated[name]
+        was_derived = any(self._derives(name) for name in self._changed)
+        self._changed.clear()
+        derives = was_derived
+        for effect, c in acting:
+            native = FIELDS[effect.of or effect.name]
+            if not c.any():
+                continue
+            native.write(self.fields, self.robot, effect.place, c[:, :, 0])
+            self._changed.update(native.fields)
+            derives = derives or native.derived
+        if derives:
+            self.batch.set_const()
+
+    @staticmethod
+    def _derives(field: str) -> bool:
+        return any(field in native.fields and native.derived for native in FIELDS.values())
+
+    def begin(self, positions: Array, velocities: Array, places: Addresses) -> None:
+        """Put the lanes at their initial states: (n, D) each, of the joints at these addresses."""
+        self.batch.reset(stage=0)
+        qpos, qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        n = len(positions)
+        qpos[:n, places.positions] = positions
+        qvel[:n, places.velocities] = velocities
+
+    def settle(self, controls: Array) -> None:
+        """Let filters of actuators begin at their first controls (n, nu): they were on before."""
+        import mujoco
+
+        model = self.model
+        if not model.na:
+            return
+        dynamics = mujoco.mjtDyn
+        filters = (int(dynamics.mjDYN_FILTER), int(dynamics.mjDYN_FILTEREXACT))
+        act = self.batch.bind("act")
+        for i in range(model.nu):
+            if int(model.actuator_dyntype[i]) in filters:
+                act[: len(controls), int(model.actuator_actadr[i])] = controls[:, i]
+
+    def run(self, controls: Array, forces: Array, record: Sequence[str]) -> dict[str, Array]:
+        """Step n lanes S times.
+
+        Args:
+            controls: (n, S, nu).
+            forces: (n, S, nv) generalised forces.
+            record: fields of MuJoCo's data.
+
+        Returns:
+            What is recorded, (n, S, ...) by name.
+        """
+        import mujoco
+
+        state = mujoco.mjtState
+        spec = int(state.mjSTATE_CTRL)
+        given = controls
+        if forces.any():
+            spec |= int(state.mjSTATE_QFRC_APPLIED)
+            given = np.concatenate([controls, forces], axis=2)
+        n, steps, _ = controls.shape
+        result = self._begun(n, steps, record)
+        for part in self._parts(n, steps):
+            done = self.batch.rollout(
+                part.stop - part.start, given[:, part], spec, tuple(record), self._ids(n)
+            )
+            for name, values in done.items():
+                result[name][:, part] = values
+        self._fails(n)
+        return result
+
+    def ask(
+        self,
+        controls: Array,
+        forces: Array,
+        felt: Mapping[str, Array],
+        asking: Asked,
+        step: float,
+        record: Sequence[str],
+    ) -> dict[str, Array]:
+        """The same where effects are asked for their forces in every step.
+
+        Args:
+            controls: as in `run`.
+            forces: likewise.
+            record: likewise.
+            felt: inputs as they are felt, (n, S) by name.
+            asking: the effects.
+            step: seconds.
+        """
+        n, steps, _ = controls.shape
+        dofs = asking.addresses.velocities
+        bind = self.batch.bind
+        qpos, qvel, ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
+        applied, drive, bias = bind("qfrc_applied"), bind("qfrc_actuator"), bind("qfrc_bias")
+        loss = self.fields["dof_frictionloss"]
+        own = loss[:n, dofs].copy()
+        if asking.rubs:
+            self.fields["dof_solref"][:n, dofs] = SOLREF
+            self.fields["dof_solimp"][:n, dofs] = SOLIMP
+            self._changed.update(FIELDS["friction.coulomb"].fields)
+        result = self._begun(n, steps, record)
+        ids = self._ids(n)
+        ctrl[:n] = controls[:, 0]
+        self.batch.forward(ids)
+        for k in range(steps):
+            x = qpos[:n, asking.addresses.positions]
+            v = qvel[:n, dofs]
+            inputs = {name: u[:, k, None] for name, u in felt.items()}
+            carried = (drive[:n] + bias[:n])[:, dofs]
+            force, limit = asking.at(k * step, x, v, inputs, carried)
+            ctrl[:n] = controls[:, k]
+            applied[:n] = forces[:, k]
+            applied[:n, dofs] += force
+            if asking.rubs:
+                loss[:n, dofs] = own + np.maximum(limit, 0.0)
+            self.batch.step(ids)
+            for name, values in result.items():
+                values[:, k] = bind(name)[:n]
+        self._fails(n)
+        return result
+
+    def _begun(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
+        """Arrays that will hold what is recorded."""
+        return {name: np.empty((n, steps, *self.batch.bind(name).shape[1:])) for name in record}
+
+    def _ids(self, n: int) -> Places | None:
+        return None if n == self.count else np.arange(n)
+
+    def _fails(self, n: int) -> None:
+        """What warns stands still from then on: it has failed."""
+        self.failed = (self.batch.warning[:n, :, 1] > 0).any(axis=1)
+
+    @staticmethod
+    def _parts(lanes: int, steps: int) -> Iterator[slice]:
+        """Steps in stretches of a fraction of a second, after which Ctrl-C is heard."""
+        largest = max(INTERRUPTED // max(lanes, 1), 1)
+        for begin in range(0, steps, largest):
+            yield slice(begin, min(begin + largest, steps))

@@ -1,0 +1,318 @@
+"""Effects at the places of a robot: each registered effect becomes a class for every joint,
+actuator, body or channel where it can act, named ``effect@place``, and one for all of them
+together, the family ``effect@*``.
+
+An effect knows nothing of robots. At a joint it sees that joint alone, as a system of one
+coordinate; at an actuator or a channel it gets that signal. A family is the sum of its members.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from sims.base import Array
+from sims.robot.model import Robot
+from sims.robot.moment import RobotMoment
+from sims.system import Acting, Coefficient, Effect, Force, Friction, Input, Moment, Sensor, Value
+
+FAMILY = "*"
+"""The place of a family."""
+SHARED = frozenset({"input.delay", "input.lag", "sensor.delay", "sensor.lag"})
+"""Families of one coefficient for all places: what is late is late everywhere."""
+ALONE = frozenset({"force.periodic", "force.ripple", "friction.stribeck"})
+"""Effects without a family: what shapes them differs from place to place."""
+LEAD = 0.05
+"""Seconds by which an input may be early, where stamps lag behind."""
+TYPICAL = {"hinge": 0.5, "slide": 5.0}
+"""A force for which the plausible ranges of the library are meant: N m on a hinge, N on a slide."""
+WORDS = {
+    "armature": "inertia.armature",
+    "damping": "drag.linear",
+    "frictionloss": "friction.coulomb",
+    "gear": "input.gain",
+    "gravity": "gravity.scale",
+    "inertia": "inertia.scale",
+    "ipos": "mass.offset",
+    "kp": "actuator.stiffness",
+    "kv": "actuator.damping",
+    "mass": "mass.scale",
+    "stiffness": "spring.linear",
+}
+"""MuJoCo's words for what a file states, and the effects that change it."""
+
+
+class Spot(NamedTuple):
+    """A place at which an effect may act.
+
+    Attributes:
+        name: of the joint, actuator, body or channel.
+        kind: of the coordinate whose units count: hinge or slide.
+        coordinate: its number; None where it has none.
+        signal: the input or channel; empty for a joint or body.
+        unit: of the signal.
+        size: a typical force along the coordinate, N or N m.
+        inertia: about it, kg or kg m^2.
+        stated: what the file states, by name of the effect that changes it.
+        words: how a sentence calls it.
+    """
+
+    name: str
+    kind: str
+    coordinate: int | None
+    signal: str
+    unit: str
+    size: float
+    inertia: float
+    stated: Mapping[str, float]
+    words: str
+
+
+def at_world(effect: type[Effect]) -> type[Effect]:
+    """The effect as one of the world's, with the units that it has on any kind of system."""
+    coefficients = [_everywhere(c) for c in effect.coefficients]
+    return _made(effect, effect.name, "", coefficients, {})
+
+
+def at_place(effect: type[Effect], spot: Spot) -> type[Effect]:
+    """The effect at one place."""
+    coefficients = [_of_spot(effect, c, spot) for c in effect.coefficients]
+    changed: dict[str, Any] = {"coordinate": spot.coordinate, "signal": spot.signal}
+    changed["says"] = f"{effect.says} (at {spot.words})"
+    if issubclass(effect, Force):
+        changed["force"] = _force_of(effect)
+    elif issubclass(effect, Friction):
+        changed["limit"] = _limit_of(effect)
+    return _made(effect, f"{effect.name}@{spot.name}", spot.name, coefficients, changed)
+
+
+def _force_of(effect: type[Force]) -> Callable[[Force, Array, Moment], Array]:
+    def force(self: Force, c: Array, moment: Moment) -> Array:
+        """(L, D) along its joint."""
+        joint = cast(int, self.coordinate)
+        alone = cast(RobotMoment, moment).of_joint(joint)
+        result = np.zeros_like(moment.x)
+        result[:, joint] = effect.force(self, c, alone)[:, 0]
+        return result
+
+    return force
+
+
+def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, Moment], Array]:
+    def limit(self: Friction, c: Array, moment: Moment) -> Array:
+        """(L, 1) of its joint."""
+        alone = cast(RobotMoment, moment).of_joint(cast(int, self.coordinate))
+        return effect.limit(self, c, alone)
+
+    return limit
+
+
+def family(effect: type[Effect], members: Sequence[type[Effect]]) -> type[Effect]:
+    """The effect at all of its places at once, a coefficient for each, or one for all."""
+    shared = effect.name in SHARED
+    first = members[0].coefficients
+    coefficients: list[Coefficient] = list(first) if shared else []
+    if not shared:
+        for member in members:
+            for c in member.coefficients:
+                coefficients.append(replace(c, name=f"{c.name}@{member.place}"))
+    count = len(first)
+    instances = tuple(member() for member in members)
+
+    def parts(_: Effect, c: Array) -> Acting:
+        """Each member with its own part of the coefficients."""
+        if shared:
+            return tuple((one, c) for one in instances)
+        return tuple((one, c[i * count : (i + 1) * count]) for i, one in enumerate(instances))
+
+    contains = {member.name for member in members}
+    for member in members:
+        contains.update(member.contains)
+    contains.update(f"{name}@{FAMILY}" for name in effect.contains)
+    changed = {
+        "parts": parts,
+        "members": instances,
+        "places": tuple(member.place for member in members),
+        "contains": tuple(sorted(contains)),
+        "says": f"{effect.says} (at every place of its kind)",
+    }
+    return _made(effect, f"{effect.name}@{FAMILY}", FAMILY, coefficients, changed)
+
+
+def _made(
+    effect: type[Effect],
+    name: str,
+    place: str,
+    coefficients: Sequence[Coefficient],
+    changed: Mapping[str, Any],
+) -> type[Effect]:
+    contains = tuple(f"{other}@{place}" for other in effect.contains) if place else ()
+    body = {
+        "name": name,
+        "of": effect.name,
+        "place": place,
+        "coefficients": tuple(coefficients),
+        "contains": contains,
+        "needs": "",
+        "__module__": __name__,
+        "__doc__": effect.__doc__,
+        **changed,
+    }
+    return type(f"{effect.__name__}At", (effect,), body)
+
+
+def _everywhere(c: Coefficient) -> Coefficient:
+    """With one unit and range for every kind of system: the first that it has."""
+    i = next(k for k, unit in enumerate(c.units) if unit is not None)
+    return replace(c, units=(c.units[i],) * 3, plausible=(c.plausible[i],) * 3)
+
+
+def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
+    """A coefficient with the unit and the plausible range that it has at a place."""
+    i = 2 if spot.kind == "hinge" else 1
+    unit, (low, high) = c.units[i], c.plausible[i]
+    least = c.least
+    if c.of == "input":
+        unit = spot.unit
+    elif c.of.startswith("reading"):
+        unit = c.of.replace("reading", spot.unit)
+    # What the library calls plausible is meant for small joints: a force here may be larger.
+    if unit is None:
+        unit = "1"
+    if unit.startswith("N"):
+        share = spot.size / TYPICAL[spot.kind]
+        low, high = share * low, share * high
+    if effect.name == "inertia.armature":
+        high = 3.0 * spot.inertia
+    if effect.name == "input.delay":
+        low = -LEAD
+    stated = spot.stated.get(effect.name) if effect.at == "joint" else None
+    if stated is not None:
+        # The difference may take away what the file states, and no more.
+        high = max(high, 2.0 * stated)
+        low = least = -stated
+    return Coefficient(c.name, (unit,) * 3, ((low, high),) * 3, least=least)
+
+
+def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[Spot]]:
+    """The places of a robot by kind: joint, actuator, body, channel.
+
+    Args:
+        robot: whose.
+        channels: names and units of those that it can show.
+    """
+    from sims.robot.scales import scales
+
+    sizes = scales(robot)
+    found: dict[str, list[Spot]] = {"joint": [], "actuator": [], "body": [], "channel": []}
+    numbers: dict[str, int] = {}
+    for number, joint in enumerate(j for j in robot.joints if j.single):
+        numbers[joint.name] = number
+        found["joint"].append(
+            Spot(
+                joint.name,
+                joint.kind,
+                number,
+                "",
+                joint.unit,
+                sizes.force[number],
+                sizes.inertia[number],
+                _stated(robot, joint.velocity, joint.id),
+                f"joint {joint.name}",
+            )
+        )
+    for actuator in robot.actuators:
+        on = next((s for s in found["joint"] if s.name == actuator.joint), None)
+        if on is None:
+            continue
+        unit = _control_unit(actuator.kind, on)
+        found["actuator"].append(
+            on._replace(
+                name=actuator.name,
+                signal=f"u.{actuator.name}",
+                unit=unit,
+                stated=_gains(robot, actuator.id),
+                words=f"actuator {actuator.name}",
+            )
+        )
+    for body in robot.bodies:
+        nothing: Mapping[str, float] = {}
+        words = f"body {body.name}"
+        found["body"].append(Spot(body.name, "hinge", None, "", "kg", 1.0, 1.0, nothing, words))
+    for name, unit in channels:
+        _, _, of = name.partition(".")
+        coordinate = numbers.get(of) if name.startswith(("q.", "qd.", "tau.")) else None
+        on = found["joint"][coordinate] if coordinate is not None else None
+        kind, size = (on.kind, on.size) if on else ("hinge", 1.0)
+        words = f"channel {name}"
+        found["channel"].append(Spot(name, kind, coordinate, name, unit, size, 1.0, {}, words))
+    return found
+
+
+def _control_unit(kind: str, on: Spot) -> str:
+    """The unit of an actuator's control."""
+    length = "rad" if on.kind == "hinge" else "m"
+    force = "N*m" if on.kind == "hinge" else "N"
+    return {"position": length, "velocity": f"{length}/s", "motor": force}.get(kind, "1")
+
+
+def _gains(robot: Robot, actuator: int) -> dict[str, float]:
+    """What a servo's file states of its gains; zero where it is no servo."""
+    bias = robot.compiled.actuator_biasprm[actuator]
+    return {"actuator.stiffness": float(bias[1]), "actuator.damping": float(bias[2])}
+
+
+def _stated(robot: Robot, dof: int, joint: int) -> dict[str, float]:
+    model = robot.compiled
+    return {
+        "drag.linear": float(model.dof_damping[dof]),
+        "friction.coulomb": float(model.dof_frictionloss[dof]),
+        "inertia.armature": float(model.dof_armature[dof]),
+        "spring.linear": float(model.jnt_stiffness[joint]),
+        "drag.quadratic": float(np.ravel(model.dof_dampingpoly[dof])[0]),
+    }
+
+
+def classes(
+    effect: type[Effect], found: Mapping[str, Sequence[Spot]], native: Collection[str]
+) -> Iterator[type[Effect]]:
+    """An effect at all places of a robot where it can act, then its family.
+
+    Args:
+        effect: registered.
+        found: the robot's places.
+        native: effects that the engine writes into the model.
+    """
+    if effect.at == "world":
+        if effect.name in native or (issubclass(effect, Sensor) and not effect.filters):
+            yield at_world(effect)
+        return
+    if effect.name not in native and not _for_one(effect):
+        return
+    members = [at_place(effect, s) for s in found[effect.at] if _acts_at(effect, s, found)]
+    yield from members
+    # Encoders are of one make; what else is recorded has units of its own.
+    alike = [m for m in members if effect.at != "channel" or m.place.startswith("q.")]
+    if len(alike) > 1 and effect.name not in ALONE:
+        yield family(effect, alike)
+
+
+def _for_one(effect: type[Effect]) -> bool:
+    """Whether it can act at one of several places without the engine's help."""
+    if issubclass(effect, Input | Sensor):
+        return True
+    # A force that asks for more than its own joint has no meaning at one of several.
+    alone = effect.needs in ("", "guide", "input")
+    return alone and issubclass(effect, Force | Friction)
+
+
+def _acts_at(effect: type[Effect], spot: Spot, found: Mapping[str, Sequence[Spot]]) -> bool:
+    """Whether a place has what the effect changes."""
+    if effect.at == "joint" and effect.needs == "input":
+        return any(actuator.coordinate == spot.coordinate for actuator in found["actuator"])
+    if issubclass(effect, Value) and effect.at == "actuator":
+        return spot.stated.get(effect.name, 1.0) != 0.0
+    return True

@@ -1,0 +1,86 @@
+"""What a log shows of a channel whose values are known after every step.
+
+Between two steps of length h, with values a, b and slopes a', b' at their ends, a position at the
+share s of the step is
+
+    y = (1 + 2s)(1 - s)^2 a + s(1 - s)^2 h a' + s^2 (3 - 2s) b - s^2 (1 - s) h b'               (1)
+
+the cubic through both (C. de Boor, A Practical Guide to Splines, 1978, chapter 4); a reading whose
+slope is not known is linear.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.base import Array
+from sims.plan import acts
+from sims.simulated import sensed
+from sims.system import Acting, Sensor, Signal
+
+EXACT = 1e-6
+"""Share of a step by which an instant may miss its end and be taken for it."""
+
+
+def sampled(
+    values: Array, slopes: Array | None, step: float, times: Array, sensors: Acting
+) -> Array:
+    """Readings (L, T) at the instants `times` (T,) since the start.
+
+    Args:
+        values: (L, S + 1) at the ends of steps, the beginning first.
+        slopes: their rates; None where they are not known.
+        step: seconds.
+        times: recorded stamps, seconds since the start.
+        sensors: effects on this channel in the order in which a signal passes them.
+    """
+    lanes, count = values.shape
+    ends = step * np.arange(count)
+    instants = np.broadcast_to(times, (lanes, times.size))
+    for effect, c in sensors:
+        assert isinstance(effect, Sensor)
+        if type(effect).times is not Sensor.times:
+            instants = np.where(acts(c), effect.times(c, instants), instants)
+    filters = tuple((e, c) for e, c in sensors if isinstance(e, Sensor) and e.filters)
+    if filters:
+        grid = np.broadcast_to(ends, values.shape)
+        steps = np.diff(grid, axis=1, prepend=0.0)
+        values, slopes = sensed(filters, values, steps, grid), None
+    result = _at(values, slopes, step, np.clip(instants, 0.0, ends[-1]))
+    stamps = np.broadcast_to(times, (lanes, times.size))
+    for effect, c in sensors:
+        assert isinstance(effect, Sensor)
+        if effect.filters or type(effect).read is Sensor.read:
+            continue
+        on = np.flatnonzero(acts(c))
+        signal = Signal(result[on], np.zeros_like(result[on]), result[on, :1], stamps[on])
+        result[on] = effect.read(c[:, on], signal)
+    return result
+
+
+def _at(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
+    """Values (L, T) at instants (L, T)."""
+    place = instants / step
+    nearest = np.rint(place)
+    if (np.abs(place - nearest) < EXACT).all():
+        chosen: Array = np.take_along_axis(values, nearest.astype(np.intp), axis=1)
+        return chosen
+    last = values.shape[1] - 2
+    below = np.clip(np.floor(place + EXACT), 0, max(last, 0)).astype(np.intp)
+    s = place - below
+    a = np.take_along_axis(values, below, axis=1)
+    b = np.take_along_axis(values, below + 1, axis=1)
+    if slopes is None:
+        linear: Array = a + s * (b - a)
+        return linear
+    begin = step * np.take_along_axis(slopes, below, axis=1)
+    end = step * np.take_along_axis(slopes, below + 1, axis=1)
+    r = 1.0 - s
+    # (1)
+    cubic: Array = (
+        (1.0 + 2.0 * s) * r * r * a
+        + s * r * r * begin
+        + s * s * (3.0 - 2.0 * s) * b
+        - s * s * r * end
+    )
+    return cubic

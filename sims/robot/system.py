@@ -1,0 +1,210 @@
+"""The system of a robot: its coordinates, inputs and channels, and the effects at its places."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+from sims import effects as library
+from sims.base import Array, Channel, InputError, Parameter, unknown
+from sims.registry import SkippedError
+from sims.robot import places
+from sims.robot.model import Robot
+from sims.robot.moment import OneJoint, Slide
+from sims.robot.native import FIELDS
+from sims.system import Effect, Kind, Moment, System
+
+
+class RobotSystem(System):
+    """The declaration behind a robot's simulator, made from its model file.
+
+    Attributes:
+        robot: whose.
+        spots: its places by kind.
+        alone: (D,) each joint as a system of its own.
+        drives: by coordinate, the inputs of its actuators.
+    """
+
+    name = "robot"
+    says = "a robot of a model file"
+    kind: ClassVar[Kind] = "rotary"
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    channels: ClassVar[tuple[Channel, ...]] = ()
+    coordinates: ClassVar[tuple[str, ...]] = ()
+    rates: ClassVar[tuple[str, ...]] = ()
+    states: ClassVar[Mapping[str, float]] = MappingProxyType({})
+    sensed: ClassVar[tuple[str, ...]] = ()
+    has_model = True
+    robot: ClassVar[Robot]
+    spots: ClassVar[Mapping[str, Sequence[places.Spot]]]
+    alone: ClassVar[tuple[System, ...]]
+    drives: ClassVar[Mapping[int, tuple[str, ...]]]
+    freed: ClassVar[frozenset[str]] = frozenset()
+    freed_effects: ClassVar[tuple[type[Effect], ...]] = ()
+    _placed: ClassVar[dict[str, tuple[type[Effect], ...]]]
+
+    @classmethod
+    def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
+        """The effect at every place, without those that the user has declared free."""
+        if effect.name not in cls._placed:
+            cls._placed[effect.name] = tuple(places.classes(effect, cls.spots, FIELDS))
+        return [one for one in cls._placed[effect.name] if not cls._is_free(one)]
+
+    @classmethod
+    def _is_free(cls, effect: type[Effect]) -> bool:
+        """Whether a coefficient of it is a parameter: it can be no cause beside."""
+        members = getattr(effect, "members", ())
+        return effect.name in cls.freed or any(m.name in cls.freed for m in members)
+
+    @classmethod
+    def effect(cls, name: str) -> type[Effect] | None:
+        """The effect of a name such as ``friction.coulomb@elbow``.
+
+        Raises:
+            InputError: there is no such effect, or it has no such place; the message lists those
+                that there are.
+        """
+        base, _, place = name.partition("@")
+        try:
+            registered = library.get(base)
+        except SkippedError:
+            raise
+        cls.placed(registered)
+        known = {one.name: one for one in cls._placed[base]}
+        if name in known:
+            return known[name]
+        if not known:
+            raise InputError(f"robot {cls.name} cannot have effect {base}")
+        if not place:
+            raise InputError(
+                f"effect {base} of robot {cls.name} needs a place; there are: "
+                + ", ".join(sorted(known))
+            )
+        if registered.at == "body" and place in (cls.robot.aliases or {}):
+            return cls.effect(f"{base}@{cls.robot.body(place).name}")
+        there = [one.place for one in known.values() if one.place]
+        raise unknown(f"place of effect {base} in robot {cls.name}", place, there or ["none"])
+
+    @classmethod
+    def freeable(cls, word: str) -> list[type[Effect]]:
+        """The effects whose coefficients a name of ``--free`` stands for, as ``damping@elbow`` in
+        MuJoCo's words or ``drag.linear@elbow``; ``@*`` is every place.
+        """
+        base, _, place = word.partition("@")
+        name = places.WORDS.get(base, base)
+        found = cls.effect(f"{name}@{place}" if place else name)
+        assert found is not None
+        members = getattr(found, "members", ())
+        return [type(member) for member in members] or [found]
+
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+        """The engine alone knows it: a matrix that changes with the pose."""
+        raise NotImplementedError
+
+    def weight(self, moment: Moment) -> Array:
+        """The engine alone knows it."""
+        raise NotImplementedError
+
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
+        """The engine reads the channels itself."""
+        raise NotImplementedError
+
+
+def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
+    """The system of a robot.
+
+    Args:
+        robot: that was read.
+        free: numbers to tune, as ``damping@*`` or ``mass.scale@forearm``.
+
+    Raises:
+        InputError: it has no joint of one coordinate, or a name in `free` does not exist.
+    """
+    joints = [joint for joint in robot.joints if joint.single]
+    if not joints:
+        raise InputError(f"{robot.path}: expected a hinge or slide joint, found none that moves")
+    channels = _channels(robot)
+    inputs = [Channel(f"u.{a.name}", _unit(robot, a.name)) for a in robot.actuators]
+    inputs += [Channel(f"force.{j.name}", j.force_unit) for j in joints]
+    model = robot.compiled
+    states = {f"q.{j.name}": float(model.qpos0[j.position]) for j in joints}
+    states |= {f"qd.{j.name}": 0.0 for j in joints}
+    drives: dict[int, tuple[str, ...]] = {}
+    for number, joint in enumerate(joints):
+        drives[number] = tuple(f"u.{a.name}" for a in robot.actuators if a.joint == joint.name)
+    declared: dict[str, Any] = {
+        "name": robot.name,
+        "says": f"the robot of {robot.path.name}",
+        "parameters": (),
+        "constants": (),
+        "inputs": tuple(inputs),
+        "channels": channels,
+        "coordinates": tuple(f"q.{j.name}" for j in joints),
+        "rates": tuple(f"qd.{j.name}" for j in joints),
+        "states": MappingProxyType(states),
+        "sensed": tuple(c.name for c in channels),
+        "robot": robot,
+        "spots": places.spots(robot, [(c.name, c.unit) for c in channels]),
+        "alone": tuple(OneJoint() if j.kind == "hinge" else Slide() for j in joints),
+        "drives": drives,
+        "_placed": {},
+    }
+    system: type[RobotSystem] = type("RobotSystemOfFile", (RobotSystem,), declared)
+    if not free:
+        return system
+    effects = freed_effects(system, free)
+    declared["freed"] = frozenset(effect.name for effect in effects)
+    declared["parameters"] = tuple(p for effect in effects for p in _parameters(effect))
+    declared["freed_effects"] = tuple(effects)
+    return type("RobotSystemOfFile", (RobotSystem,), {**declared, "_placed": {}})
+
+
+def freed_effects(system: type[RobotSystem], free: Sequence[str]) -> list[type[Effect]]:
+    """The effects at one place each that the names of ``--free`` stand for, each once."""
+    by_name = {one.name: one for word in free for one in system.freeable(word)}
+    return list(by_name.values())
+
+
+WIDER = 4.0
+"""Bounds of a freed number reach so many times as far as its plausible range."""
+
+
+def _parameters(effect: type[Effect]) -> list[Parameter]:
+    """Its coefficients as parameters, nominally what the file states."""
+    result = []
+    for c in effect.coefficients:
+        low, high = c.plausible[0]
+        least = WIDER * low if c.least is None else max(WIDER * low, c.least)
+        name = effect.name if len(effect.coefficients) == 1 else f"{effect.name}.{c.name}"
+        unit = c.units[0] or "1"
+        bounds = (least, WIDER * high)
+        result.append(Parameter(name, unit, 0.0, bounds, (low, high), says=effect.says))
+    return result
+
+
+def _unit(robot: Robot, actuator: str) -> str:
+    """Of an actuator's control."""
+    a = robot.actuator(actuator)
+    if a.joint is None:
+        return "1"
+    joint = robot.joint(a.joint)
+    units = {"position": joint.unit, "velocity": f"{joint.unit}/s", "motor": joint.force_unit}
+    return units.get(a.kind, "1")
+
+
+def _channels(robot: Robot) -> tuple[Channel, ...]:
+    """Position, velocity and drive of each joint, and the sensors of the model."""
+    joints = [joint for joint in robot.joints if joint.single]
+    channels = [Channel(f"q.{j.name}", j.unit, says=f"position of joint {j.name}") for j in joints]
+    channels += [
+        Channel(f"qd.{j.name}", f"{j.unit}/s", says=f"velocity of joint {j.name}") for j in joints
+    ]
+    channels += [
+        Channel(f"tau.{j.name}", j.force_unit, says=f"what actuators exert on joint {j.name}")
+        for j in joints
+    ]
+    channels += [Channel(f"s.{s.name}", s.unit, says=f"sensor {s.name}") for s in robot.sensors]
+    return tuple(channels)
