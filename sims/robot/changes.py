@@ -1,0 +1,206 @@
+"""What causes make of a robot's model: the numbers that change, stated in an MjSpec.
+
+This is the one place that says what a cause means for a model file; native effects mean here what
+they mean for the lanes of a simulation (`sims.robot.native`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sims.extended import Number
+from sims.robot.causes import Cause, one_by_one
+from sims.robot.commands import COMMANDS, order
+from sims.robot.model import Robot
+from sims.robot.native import FIELDS
+from sims.robot.stated import (
+    ATTRIBUTES,
+    CHOICES,
+    COUNTS,
+    FLAGS,
+    Element,
+    Fields,
+    Statement,
+    differing,
+    fields,
+    lacking,
+)
+
+ROUNDS = 4
+"""How often what moves along with a change is stated as it was."""
+
+CLOSE = 1e-13
+"""Relative difference of two compiled numbers that is rounding."""
+
+KEPT = "as it was: it would move along with another change"
+
+_NOTES = {
+    "friction.coulomb": "friction.coulomb: dry friction is stiff in the file (solreffriction, "
+    "solimpfriction), or it would creep",
+}
+"""What is to be known of effects that a file holds."""
+
+
+@dataclass(frozen=True)
+class Applied:
+    """A robot's model with causes in it.
+
+    Attributes:
+        spec: the mujoco.MjSpec.
+        model: that, compiled.
+        wanted: what the compiled model is to say of every element.
+        comments: by element, the causes that change it.
+        held: the causes that are in it.
+        said: what it cannot hold, and how what it holds differs, one line each.
+    """
+
+    spec: Any
+    model: Any
+    wanted: Fields
+    comments: Mapping[Element, Sequence[str]]
+    held: tuple[Cause, ...]
+    said: tuple[str, ...]
+
+
+def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: str = "") -> Applied:
+    """The robot's model with causes in it.
+
+    Args:
+        robot: what was read; it stays as it is.
+        causes: coefficients by ``effect@place``, ``effect@*`` or ``effect``.
+        recording: to which they were fitted; comments name it.
+
+    Raises:
+        InputError: a place that the robot does not have.
+        RuntimeError: the model does not take a change; a fault of the program.
+    """
+    wanted = fields(robot.compiled)
+    comments: dict[Element, list[str]] = {}
+    held, said = [], []
+    for cause in sorted(one_by_one(robot, causes), key=order):
+        before = {name: values.copy() for name, values in wanted.items()}
+        answer = _write(wanted, robot, cause)
+        if answer and not answer.startswith("+"):
+            said.append(f"{cause.told(recording)}: not in the file: {answer}")
+            continue
+        held.append(cause)
+        note = f"{cause.effect}: {answer[1:]}" if answer else _NOTES.get(cause.effect)
+        if note and note not in said:
+            said.append(note)
+        for statement in differing(robot.compiled, before, wanted, 0.0):
+            comments.setdefault(statement.element, []).append(cause.told(recording))
+    spec, model = _compiled(robot, wanted)
+    return Applied(spec, model, wanted, comments, tuple(held), tuple(said))
+
+
+def _write(wanted: Fields, robot: Robot, cause: Cause) -> str | None:
+    """Let a cause change the fields."""
+    if cause.effect in FIELDS:
+        FIELDS[cause.effect].write(wanted, robot, cause.place, cause.coefficients[:, None])
+        return None
+    if cause.effect in COMMANDS:
+        return COMMANDS[cause.effect](wanted, robot, cause)
+    if cause.effect.startswith(("sensor.", "clock.")):
+        return "what a sensor shows is no part of the model"
+    return "MuJoCo has no such element"
+
+
+def _compiled(robot: Robot, wanted: Fields) -> tuple[Any, Any]:
+    """A spec that compiles to what is wanted, and the compiled model."""
+    spec, model = robot.spec.copy(), robot.compiled
+    by_id = Elements(spec, robot)
+    tolerance = 0.0
+    for _ in range(ROUNDS):
+        statements = lacking(model, wanted, tolerance)
+        if not statements:
+            return spec, model
+        for statement in statements:
+            state(by_id.of(statement.element), statement)
+        if any(statement.element.kind == "body" for statement in statements):
+            _keep_masses(spec, wanted)
+        model, tolerance = spec.compile(), CLOSE
+    left = lacking(model, wanted, tolerance)
+    if left:
+        raise RuntimeError(f"{robot.path}: the model does not take {left[0]}")
+    return spec, model
+
+
+def _keep_masses(spec: Any, wanted: Fields) -> None:
+    """Let the compiler take inertials as they are stated."""
+    import mujoco
+
+    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    if spec.compiler.settotalmass > 0:
+        spec.compiler.settotalmass = float(wanted["body_mass"].sum())
+
+
+class Elements:
+    """The elements of a spec by their numbers in the compiled model."""
+
+    def __init__(self, spec: Any, robot: Robot) -> None:
+        self.spec = spec
+        # Numbers are known once it has been compiled.
+        spec.compile()
+        self.joints = {joint.id: joint for joint in spec.joints}
+        self.bodies = {body.id: body for body in spec.bodies}
+        self.actuators = {actuator.id: actuator for actuator in spec.actuators}
+        self.robot = robot
+
+    def of(self, element: Element) -> Any:
+        """The spec's element."""
+        if element.kind == "option":
+            return self.spec.option
+        return {"joint": self.joints, "body": self.bodies, "actuator": self.actuators}[
+            element.kind
+        ][element.id]
+
+
+def state(element: Any, statement: Statement) -> None:
+    """Set in an element of a spec what a statement says."""
+    import mujoco
+
+    kind = statement.element.kind
+    known = {attribute.name: attribute.spec for attribute in ATTRIBUTES[kind]}
+    for name, values in statement.values.items():
+        if name in CHOICES:
+            value: Any = getattr(mujoco, CHOICES[name])(int(values[0]))
+        elif name in FLAGS:
+            limited = mujoco.mjtLimited
+            value = limited.mjLIMITED_TRUE if values[0] else limited.mjLIMITED_FALSE
+        elif name in COUNTS:
+            value = int(values[0])
+        else:
+            value = _numbers(element, name, known[name], values)
+        setattr(element, known[name], value)
+    if kind == "body":
+        _explicit(element)
+    if kind == "joint" and {"damping", "stiffness"} & set(statement.values):
+        element.springdamper = (0.0, 0.0)
+
+
+def _numbers(element: Any, name: str, attribute: str, values: Sequence[float]) -> Any:
+    """Values as the spec takes them: one number, or an array of the length that it has."""
+    import mujoco
+
+    if name == "springref" and element.type == mujoco.mjtJoint.mjJNT_HINGE:
+        return float(np.rad2deg(values[0])) if element.compiler.degree else values[0]
+    now = np.asarray(getattr(element, attribute))
+    if now.ndim == 0:
+        return values[0]
+    padded = np.zeros(now.shape)
+    padded[: len(values)] = values[: len(padded)]
+    return padded
+
+
+def _explicit(body: Any) -> None:
+    """Let the inertial that was set be the one that counts."""
+    import mujoco
+
+    body.explicitinertial = True
+    body.fullinertia = np.full(6, np.nan)
+    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT

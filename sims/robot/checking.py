@@ -1,0 +1,150 @@
+"""Files that were written for a robot, loaded again: the numbers of their models and their motion
+are those that were meant.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims.base import Array
+from sims.robot.causes import one_by_one
+from sims.robot.changes import apply
+from sims.robot.mends import MOMENT
+from sims.robot.model import Robot
+from sims.robot.precise import unlike
+from sims.robot.quiet import quiet
+from sims.robot.writing import SAME, Causes, Written
+
+NEAR = 1e-9
+"""rad and m by which two motions may differ."""
+
+SECONDS = 1.0
+"""Of motion that is compared."""
+
+MOST = 2000
+"""Steps of it, at most."""
+
+_OF_URDF = ("body_mass", "body_ipos", "dof_damping", "dof_frictionloss")
+"""Fields that a URDF states, beside tensors of inertia."""
+
+
+def check(robot: Robot, causes: Causes, done: Written, folder: Path) -> None:
+    """Load each file again and compare it.
+
+    Args:
+        robot: what was read.
+        causes: what was written.
+        done: the files.
+        folder: where they will be; a file that is there for a moment.
+
+    Raises:
+        RuntimeError: a number or the motion differs; names the field. A fault of the program.
+        OSError: nothing can be written there.
+    """
+    import mujoco
+
+    if done.xml is not None:
+        with beside(folder, ".xml", done.xml) as path, quiet():
+            model = mujoco.MjModel.from_xml_path(str(path))
+        _compare(model, done.applied.model, "extended.xml")
+    if done.urdf is not None:
+        with beside(folder, ".urdf", done.urdf) as path:
+            _check_urdf(robot, causes, path)
+
+
+@contextmanager
+def beside(folder: Path, suffix: str, text: str) -> Iterator[Path]:
+    """A file in a folder, for as long as it is needed."""
+    handle, name = tempfile.mkstemp(suffix, ".check-", folder)
+    path = Path(name)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
+            file.write(text)
+        yield path
+    finally:
+        path.unlink()
+
+
+def _check_urdf(robot: Robot, causes: Causes, path: Path) -> None:
+    """Compare what the URDF says with the causes that it holds."""
+    from sims.robot.reading import read
+    from sims.robot.urdf_out import UrdfWriter
+
+    plain, writer = read(robot.path), UrdfWriter(robot, "")
+    held = {c.name: c.numbers for c in one_by_one(robot, causes) if writer.write(c) is None}
+    wanted, found = apply(plain, held).model, read(path).compiled
+    for name in _OF_URDF:
+        one, other = getattr(found, name), getattr(wanted, name)
+        if one.shape != other.shape or not np.allclose(one, other, rtol=SAME, atol=SAME):
+            raise RuntimeError(f"extended.urdf is not as it was meant: {name}")
+    # Where two moments are alike their axes are anybody's: the whole tensor counts.
+    one, other = _tensors(found), _tensors(wanted)
+    if not np.allclose(one, other, rtol=SAME, atol=max(NEAR * np.abs(other).max(), MOMENT)):
+        raise RuntimeError("extended.urdf is not as it was meant: body_inertia")
+    for model in (wanted, found):
+        # URDF says nothing of how stiff friction is, and what touches may be a mesh elsewhere.
+        _without_contacts(model)
+        for name in ("dof_solref", "dof_solimp", "body_inertia", "body_iquat"):
+            getattr(model, name)[:] = getattr(found, name)
+    _compare_motion(found, wanted, "extended.urdf")
+
+
+def _tensors(model: Any) -> Array:
+    """(N, 3, 3) of the bodies, about their centres, in their axes."""
+    import mujoco
+
+    turns = np.zeros((model.nbody, 9))
+    for turn, quat in zip(turns, model.body_iquat, strict=True):
+        mujoco.mju_quat2Mat(turn, quat)
+    axes = turns.reshape(-1, 3, 3)
+    result: Array = np.einsum("nij,nj,nkj->nik", axes, model.body_inertia, axes)
+    return result
+
+
+def _without_contacts(model: Any) -> None:
+    import mujoco
+
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+
+
+def _compare(found: Any, wanted: Any, name: str) -> None:
+    differs = unlike(found, wanted, SAME)
+    if differs:
+        raise RuntimeError(f"{name} is not as it was meant: {differs}")
+    _compare_motion(found, wanted, name)
+
+
+def _compare_motion(found: Any, wanted: Any, name: str) -> None:
+    one, other = moved(found), moved(wanted)
+    if not np.allclose(one, other, rtol=NEAR, atol=NEAR, equal_nan=True):
+        error = float(np.nanmax(np.abs(one - other)))
+        raise RuntimeError(f"{name} does not move as it was meant: qpos differs by {error:.2g}")
+
+
+def moved(model: Any) -> Array:
+    """(S, nq) motion of a model from a pose beside its own, with controls that are not zero."""
+    import mujoco
+    from mujoco import rollout
+
+    data = mujoco.MjData(model)
+    # No two coordinates alike, so that a swap would show.
+    mujoco.mj_integratePos(model, data.qpos, 0.1 + 0.05 * np.sin(np.arange(model.nv)), 1.0)
+    low, high = model.actuator_ctrlrange.T
+    middle, half = (low + high) / 2.0, (high - low) / 2.0
+    limited = model.actuator_ctrllimited.astype(bool)
+    signs = 0.5 * np.cos(np.arange(model.nu))
+    control = np.where(limited, middle + half * signs, signs)
+    steps = min(int(SECONDS / model.opt.timestep), MOST)
+    state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    controls = np.tile(control, (1, steps, 1))
+    made, _ = rollout.rollout(model, data, state, controls)
+    result: Array = made[0, :, 1 : 1 + model.nq]
+    return result

@@ -1,0 +1,219 @@
+"""XML as text that a person wrote: elements with the places where they stand, so that attributes
+and comments change and every other character stays.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.parsers import expat
+from xml.sax.saxutils import escape
+
+_ATTRIBUTE = re.compile(rb"(\s+)([\w:.-]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
+
+
+class UnfitError(Exception):
+    """A text that cannot be changed this way; says why, as a clause."""
+
+
+@dataclass(eq=False)
+class Tag:
+    """An element, and what is to change in it.
+
+    Attributes:
+        name: of the element.
+        attributes: as they were read.
+        begin: of its start tag, bytes.
+        inside: where its start tag ends.
+        end: where its end tag begins; as `inside` where it has none.
+        children: in the order of the text.
+        new: new values by attribute.
+        removed: attributes that go.
+        renamed: its new name.
+        before: comments that are to stand before it.
+        within: elements, with their comments, that are to be its first.
+        text: of another file, to stand in its place.
+    """
+
+    name: str
+    attributes: dict[str, str]
+    begin: int
+    inside: int = 0
+    end: int = 0
+    children: list[Tag] = field(default_factory=list)
+    new: dict[str, str] = field(default_factory=dict)
+    removed: set[str] = field(default_factory=set)
+    renamed: str = ""
+    before: list[str] = field(default_factory=list)
+    within: list[tuple[list[str], str]] = field(default_factory=list)
+    text: bytes | None = None
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything in it or below it changes."""
+        own = self.new or self.removed or self.renamed or self.before or self.within
+        return bool(own) or any(child.changed for child in self.children)
+
+    def says(self, name: str) -> str | None:
+        """The value of an attribute."""
+        if name in self.new:
+            return self.new[name]
+        return None if name in self.removed else self.attributes.get(name)
+
+    def walk(self) -> Iterator[Tag]:
+        """It and all below it, in the order of the text."""
+        yield self
+        for child in self.children:
+            yield from child.walk()
+
+
+class Markup:
+    """A text of XML.
+
+    Raises:
+        UnfitError: it is no XML in UTF-8, or declares entities.
+    """
+
+    def __init__(self, text: bytes, path: Path) -> None:
+        self.text, self.path = text, path
+        self._open: list[Tag] = []
+        self._top: Tag | None = None
+        self._parser = expat.ParserCreate("utf-8")
+        self._parser.StartElementHandler = self._begin
+        self._parser.EndElementHandler = self._end
+        self._parser.StartDoctypeDeclHandler = self._refuse
+        try:
+            self._parser.Parse(text, True)
+        except expat.ExpatError as error:
+            raise UnfitError(f"{path.name} is no XML in UTF-8 ({error})") from None
+        # The newlines that the file has.
+        self._newline = b"\r\n" if b"\r\n" in text else b"\n"
+
+    @property
+    def root(self) -> Tag:
+        """The outermost element."""
+        assert self._top is not None, "well-formed XML has one"
+        return self._top
+
+    def _refuse(self, *what: object) -> None:  # noqa: ARG002
+        raise UnfitError(f"{self.path.name} has a document type")
+
+    def _begin(self, name: str, attributes: dict[str, str]) -> None:
+        tag = Tag(name, attributes, self._parser.CurrentByteIndex)
+        tag.inside = tag.end = self._end_of(tag.begin)
+        if self._open:
+            self._open[-1].children.append(tag)
+        else:
+            self._top = tag
+        self._open.append(tag)
+
+    def _end(self, name: str) -> None:  # noqa: ARG002
+        tag = self._open.pop()
+        if not self._closed(tag):
+            tag.end = self._parser.CurrentByteIndex
+
+    def _closed(self, tag: Tag) -> bool:
+        """Whether its start tag is its end as well."""
+        return self.text[tag.inside - 2 : tag.inside] == b"/>"
+
+    def _end_of(self, begin: int) -> int:
+        """Where a start tag ends: at the first > outside of quotes."""
+        quote = b""
+        for i in range(begin, len(self.text)):
+            one = self.text[i : i + 1]
+            if quote:
+                quote = b"" if one == quote else quote
+            elif one in (b'"', b"'"):
+                quote = one
+            elif one == b">":
+                return i + 1
+        raise UnfitError(f"{self.path.name} ends within a tag")
+
+    def inner(self) -> bytes:
+        """What stands in the outermost element, with all changes."""
+        return self._written(self.root.inside, self.root.end, self.root.children)
+
+    def whole(self) -> bytes:
+        """The text with all changes."""
+        return self._written(0, len(self.text), [self.root])
+
+    def _written(self, begin: int, end: int, tags: list[Tag]) -> bytes:
+        parts, at = [], begin
+        for tag in tags:
+            if tag.changed or tag.text is not None:
+                parts += [self.text[at : tag.begin], self._tag(tag)]
+                at = self._after(tag)
+        return b"".join([*parts, self.text[at:end]])
+
+    def _after(self, tag: Tag) -> int:
+        return tag.inside if self._closed(tag) else self._end_of(tag.end)
+
+    def _tag(self, tag: Tag) -> bytes:
+        """An element with its changes."""
+        indent = self._indent(tag.begin)
+        comments = [_comment(text) + self._newline + indent for text in tag.before]
+        if tag.text is not None:
+            return b"".join([*comments, tag.text])
+        if self._closed(tag) and tag.within:
+            raise UnfitError(f"{tag.name} has nothing in it")
+        closing = self.text[tag.end : self._after(tag)] if not self._closed(tag) else b""
+        if tag.renamed:
+            closing = closing.replace(tag.name.encode(), tag.renamed.encode(), 1)
+        inside = self._written(tag.inside, tag.end, tag.children)
+        return b"".join([*comments, self._start(tag), self._first(tag, indent), inside, closing])
+
+    def _first(self, tag: Tag, indent: bytes) -> bytes:
+        """Elements that are new, before all others."""
+        below = self._indent(tag.children[0].begin) if tag.children else indent + b"  "
+        parts = []
+        for comments, element in tag.within:
+            for line in [*map(_comment, comments), *([element.encode()] if element else [])]:
+                parts += [self._newline + below, line]
+        return b"".join(parts)
+
+    def _start(self, tag: Tag) -> bytes:
+        """The start tag with its changes; what stays keeps its spaces and quotes."""
+        text = self.text[tag.begin : tag.inside]
+        at = 1 + len(tag.name.encode())
+        parts = [b"<", (tag.renamed or tag.name).encode()]
+        written = set()
+        while found := _ATTRIBUTE.match(text, at):
+            name = found[2].decode()
+            if name in tag.new:
+                parts.append(found[1] + _attribute(name, tag.new[name]))
+                written.add(name)
+            elif name not in tag.removed:
+                parts.append(found[0])
+            at = found.end()
+        parts += [
+            b" " + _attribute(name, value) for name, value in tag.new.items() if name not in written
+        ]
+        return b"".join([*parts, text[at:]])
+
+    def _indent(self, begin: int) -> bytes:
+        """The spaces before an element on its line; none where something else stands there."""
+        line = self.text[self.text.rfind(b"\n", 0, begin) + 1 : begin]
+        return line if not line.strip() else b""
+
+
+def _attribute(name: str, value: str) -> bytes:
+    return f'{name}="{escape(value, {chr(34): "&quot;"})}"'.encode()
+
+
+def _comment(text: str) -> bytes:
+    # Two hyphens end a comment too early, and so would one at its end.
+    safe = re.sub(r"-(?=-)", "- ", text)
+    return f"<!-- {safe} -->".encode()
+
+
+def number(value: float) -> str:
+    """The shortest text that reads as the same number."""
+    text = repr(float(value))
+    return text[:-2] if text.endswith(".0") else text
+
+
+def numbers(values: tuple[float, ...]) -> str:
+    """Numbers as MJCF and URDF write them."""
+    return " ".join(number(value) for value in values)

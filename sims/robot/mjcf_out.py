@@ -1,0 +1,198 @@
+"""Statements written into an MJCF: attributes of its elements, each with a comment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sims.robot.document import Document
+from sims.robot.markup import Tag, number, numbers
+from sims.robot.stated import (
+    CHOICES,
+    COUNTS,
+    FLAGS,
+    Element,
+    Fields,
+    Statement,
+    Values,
+    fields,
+    whole,
+    word,
+)
+
+_ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
+"""What says in another way what ``quat`` and ``diaginertia`` say."""
+
+_OWN = ("kp", "kv", "ki", "dampratio", "timeconst", "inheritrange")
+"""Attributes of MuJoCo's shortcuts, which ``general`` has not."""
+
+_INPUTS = {"position": "pos", "velocity": "vel"}
+"""What the control of a shortcut is, where MuJoCo knows (since 4.0)."""
+
+_SERVO = {"gainprm", "biasprm"}
+
+_LISTS = {"damping", "stiffness", "dynprm", "gainprm", "biasprm"}
+
+
+class Writer:
+    """Writes statements into a document.
+
+    Args:
+        document: the MJCF.
+        model: what it compiles to.
+        wanted: what it is to compile to.
+        degrees: whether it states angles in degrees.
+    """
+
+    def __init__(self, document: Document, model: Any, wanted: Fields) -> None:
+        self.document, self.model, self.wanted = document, model, wanted
+        self.tags = document.numbered(model)
+        self.degrees = True
+        for compiler in document.under("compiler"):
+            self.degrees = compiler.attributes.get("angle", "degree") == "degree"
+
+    def write(self, statement: Statement, comments: Sequence[str]) -> None:
+        """State something of an element."""
+        element = statement.element
+        if element.kind == "option":
+            self._option(statement, comments)
+        elif element.kind == "body":
+            if statement.values:
+                self._keep_masses()
+            self._inertial(self.tags[element], statement, comments)
+        else:
+            tag = self.tags[element]
+            _say(tag, comments)
+            values = self._joint(tag, statement)
+            if element.kind == "actuator":
+                values = self._actuator(tag, statement)
+            tag.new |= values
+
+    def _option(self, statement: Statement, comments: Sequence[str]) -> None:
+        options, values = self.document.under("option"), _texts(statement.values)
+        if options:
+            _say(options[-1], comments)
+            options[-1].new |= values
+            return
+        if not values:
+            return
+        said = " ".join(f'{name}="{value}"' for name, value in values.items())
+        self.document.root.within.append((list(comments), f"<option {said}/>"))
+
+    def _keep_masses(self) -> None:
+        """Let the compiler take inertials as they are stated."""
+        for compiler in self.document.under("compiler"):
+            if compiler.says("inertiafromgeom") == "true":
+                compiler.new["inertiafromgeom"] = "auto"
+            if float(compiler.says("settotalmass") or -1) > 0:
+                compiler.new["settotalmass"] = number(float(self.wanted["body_mass"].sum()))
+
+    def _inertial(self, body: Tag, statement: Statement, comments: Sequence[str]) -> None:
+        values = _texts(statement.values)
+        for child in self.document.children(body):
+            if child.name == "inertial":
+                _say(child, comments)
+                if not values:
+                    return
+                before = self._before(statement.element)
+                changed = {
+                    name for name, stated in statement.values.items() if stated != before[name]
+                }
+                if statement.insisted:
+                    changed = set(values)
+                if "diaginertia" in changed:
+                    changed |= {"quat"}
+                    child.removed |= set(_ORIENTATIONS)
+                child.new |= {name: values[name] for name in values if name in changed}
+                return
+        if not values:
+            _say(body, comments)
+            return
+        said = " ".join(f'{name}="{value}"' for name, value in values.items())
+        body.within.append((list(comments), f"<inertial {said}/>"))
+
+    def _before(self, element: Element) -> Mapping[str, Values]:
+        return whole(self.model, element, fields(self.model))
+
+    def _joint(self, tag: Tag, statement: Statement) -> dict[str, str]:
+        values = _texts(statement.values)
+        hinge = tag.says("type") in (None, "hinge")
+        if "springref" in statement.values and hinge and self.degrees:
+            values["springref"] = numbers((float(np.rad2deg(statement.values["springref"][0])),))
+        if {"damping", "stiffness"} & set(values) and tag.says("springdamper"):
+            values["springdamper"] = "0 0"
+        return values
+
+    def _actuator(self, tag: Tag, statement: Statement) -> dict[str, str]:
+        """Of an actuator: what its shortcut has words for, or all that ``general`` says."""
+        changed = statement.values
+        before = {} if statement.insisted else self._before(statement.element)
+        own = _shortcut(
+            tag.name, whole(self.model, statement.element, self.wanted), changed, before
+        )
+        if own is not None:
+            if "kv" in own:
+                tag.removed.add("dampratio")
+            return _texts({k: v for k, v in changed.items() if k not in _SERVO}) | own
+        if tag.name != "general":
+            tag.renamed = "general"
+            tag.removed |= set(_OWN)
+            stated = whole(self.model, statement.element, self.wanted)
+            changed = {k: v for k, v in stated.items() if k in changed or _needed(k, v)}
+            if tag.name in _INPUTS and hasattr(self.model, "actuator_ctrlspec"):
+                tag.new["input"] = _INPUTS[tag.name]
+        return _texts(changed)
+
+
+def _needed(name: str, values: tuple[float, ...]) -> bool:
+    """Whether a ``general`` must state it in place of a shortcut that implies it."""
+    if name in ("dyntype", "gaintype", "biastype", "gainprm", "biasprm"):
+        return True
+    return name in ("dynprm", "ctrllimited", "ctrlrange") and any(values)
+
+
+def _shortcut(
+    name: str,
+    stated: Mapping[str, Values],
+    changed: Mapping[str, Values],
+    before: Mapping[str, Values],
+) -> dict[str, str] | None:
+    """The gains of a shortcut, in its own words; None where it has none for them."""
+    if set(changed) & {"dyntype", "dynprm", "gaintype", "biastype"}:
+        return None
+    if not set(changed) & _SERVO:
+        return {}
+    gain = stated["gainprm"][0]
+    offset, stiffness, damping = stated["biasprm"][:3]
+    if name == "position" and offset == 0 and stiffness == -gain:
+        gains = {} if before and gain == before["gainprm"][0] else {"kp": number(gain)}
+        if not before or damping != before["biasprm"][2]:
+            gains["kv"] = number(-damping)
+        return gains
+    if name == "velocity" and offset == stiffness == 0 and damping == -gain:
+        return {"kv": number(gain)}
+    return None
+
+
+def _say(tag: Tag, comments: Sequence[str]) -> None:
+    tag.before += [text for text in comments if text not in tag.before]
+
+
+def _texts(values: Mapping[str, Values]) -> dict[str, str]:
+    return {name: _text(name, stated) for name, stated in values.items()}
+
+
+def _text(name: str, values: tuple[float, ...]) -> str:
+    if name in CHOICES or name == "interp":
+        return word(name, values[0])
+    if name in FLAGS:
+        return "true" if values[0] else "false"
+    if name in COUNTS:
+        return str(int(values[0]))
+    if name in _LISTS:
+        # Numbers that a list does not state are zero.
+        last = max((i for i, value in enumerate(values) if value), default=0)
+        return numbers(values[: last + 1])
+    return numbers(values)

@@ -1,0 +1,91 @@
+"""A model as MuJoCo writes it, with all digits, and models compared number by number."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+DIGITS = 17
+"""With which every number is read as what it was."""
+
+_TEXTS = ("name", "path", "text", "names_map", "signature", "tex_data")
+"""Parts of the names of fields that say nothing of motion."""
+
+
+def saved(spec: Any, folder: Path) -> str:
+    """The spec as MJCF, in the notation in which it was stated, its files found from anywhere.
+
+    Args:
+        spec: a mujoco.MjSpec; it stays as it is.
+        folder: to which its files are relative.
+
+    Raises:
+        RuntimeError: this MuJoCo cannot be told how many digits to write.
+    """
+    spec = spec.copy()
+    spec.meshdir = str(folder / spec.meshdir)
+    spec.texturedir = str(folder / spec.texturedir)
+    spec.compiler.savecompiled = False
+    spec.compiler.savecanonical = False
+    library = _library()
+    try:
+        digits = library._mjPRIVATE__get_xml_precision()
+        library._mjPRIVATE__set_xml_precision(DIGITS)
+    except AttributeError:
+        raise RuntimeError("this MuJoCo writes models with six digits only") from None
+    try:
+        return str(spec.to_xml())
+    finally:
+        library._mjPRIVATE__set_xml_precision(digits)
+
+
+@cache
+def _library() -> Any:
+    """MuJoCo's library, which is loaded already; its Python module has no word for the digits."""
+    import mujoco
+
+    folder = Path(mujoco.__file__).parent
+    names = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")
+    (path, *_) = [found for name in names for found in sorted(folder.glob(name))]
+    return ctypes.CDLL(str(path))
+
+
+def unlike(one: Any, other: Any, tolerance: float) -> str | None:
+    """The first field in which two compiled models differ, with both; None where none does.
+
+    Args:
+        one: a mujoco.MjModel.
+        other: another.
+        tolerance: difference that is rounding, relative to the largest of a field.
+    """
+    for prefix, this, that in (("", one, other), ("opt.", one.opt, other.opt)):
+        for name in sorted(dir(this)):
+            if name.startswith("_") or any(part in name for part in _TEXTS):
+                continue
+            mine, others = getattr(this, name), getattr(that, name)
+            if isinstance(mine, np.ndarray | int | float) and _differ(mine, others, tolerance):
+                return f"{prefix}{name}: {_shown(mine, others)}"
+    return None
+
+
+def _differ(one: Any, other: Any, tolerance: float) -> bool:
+    one, other = np.asarray(one), np.asarray(other)
+    if one.shape != other.shape:
+        return True
+    if one.dtype.kind != "f":
+        return bool((one != other).any())
+    scale = max(float(np.abs(one).max(initial=0.0)), float(np.abs(other).max(initial=0.0)))
+    near = np.abs(one - other) <= tolerance * scale
+    return not bool((near | (one == other)).all())
+
+
+def _shown(one: Any, other: Any) -> str:
+    one, other = np.asarray(one), np.asarray(other)
+    if one.shape != other.shape:
+        return f"{one.shape} and {other.shape}"
+    at = np.argmax(np.abs(one.astype(float) - other.astype(float)))
+    return f"{one.flat[at]!r} and {other.flat[at]!r}"

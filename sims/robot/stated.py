@@ -1,0 +1,226 @@
+"""What MJCF says of a joint, a body, an actuator and the options, and where a compiled model keeps
+it: so that a number of the compiled model can be stated in a file, or set in a spec.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+Kind = Literal["joint", "body", "actuator", "option", "compiler"]
+
+Fields = dict[str, Any]
+"""Fields of a compiled model by name, arrays (1, ...): one lane."""
+
+Values = tuple[float, ...]
+
+
+class Element(NamedTuple):
+    """An element of a model file: its kind and its number in the compiled model."""
+
+    kind: Kind
+    id: int
+
+
+@dataclass
+class Statement:
+    """What a file is to say of one element.
+
+    Attributes:
+        element: which.
+        values: by MJCF's attribute, in MuJoCo's units (angles in rad).
+        insisted: whether what stands beside it has to be stated as well: it was not enough before.
+    """
+
+    element: Element
+    values: dict[str, Values] = field(default_factory=dict)
+    insisted: bool = False
+
+
+class Attribute(NamedTuple):
+    """An attribute of MJCF.
+
+    Attributes:
+        name: in the file.
+        spec: in an MjSpec.
+        read: its values, from the fields and an element's addresses.
+    """
+
+    name: str
+    spec: str
+    read: Callable[[Fields, Any], Any]
+
+
+def _of(name: str, address: str = "id") -> Callable[[Fields, Any], Any]:
+    return lambda fields, where: fields[name][0, getattr(where, address)]
+
+
+class Where(NamedTuple):
+    """Where a compiled model keeps what it knows of an element."""
+
+    id: int
+    velocity: int = 0
+    position: int = 0
+    control: int = 0
+
+
+def _polynomial(
+    first: str, others: str, address: str = "id"
+) -> Callable[[Fields, Any], list[float]]:
+    def read(fields: Fields, where: Any) -> list[float]:
+        at = getattr(where, address)
+        return [fields[first][0, at], *fields[others][0, at]]
+
+    return read
+
+
+ATTRIBUTES: Mapping[Kind, tuple[Attribute, ...]] = {
+    "joint": (
+        Attribute("damping", "damping", _polynomial("dof_damping", "dof_dampingpoly", "velocity")),
+        Attribute("frictionloss", "frictionloss", _of("dof_frictionloss", "velocity")),
+        Attribute("solreffriction", "solref_friction", _of("dof_solref", "velocity")),
+        Attribute("solimpfriction", "solimp_friction", _of("dof_solimp", "velocity")),
+        Attribute("stiffness", "stiffness", _polynomial("jnt_stiffness", "jnt_stiffnesspoly")),
+        Attribute("springref", "springref", _of("qpos_spring", "position")),
+        Attribute("armature", "armature", _of("dof_armature", "velocity")),
+    ),
+    "body": (
+        Attribute("pos", "ipos", _of("body_ipos")),
+        Attribute("quat", "iquat", _of("body_iquat")),
+        Attribute("mass", "mass", _of("body_mass")),
+        Attribute("diaginertia", "inertia", _of("body_inertia")),
+    ),
+    "actuator": (
+        Attribute("dyntype", "dyntype", _of("actuator_dyntype")),
+        Attribute("dynprm", "dynprm", _of("actuator_dynprm")),
+        Attribute("gaintype", "gaintype", _of("actuator_gaintype")),
+        Attribute("gainprm", "gainprm", _of("actuator_gainprm")),
+        Attribute("biastype", "biastype", _of("actuator_biastype")),
+        Attribute("biasprm", "biasprm", _of("actuator_biasprm")),
+        Attribute("ctrllimited", "ctrllimited", _of("actuator_ctrllimited", "control")),
+        Attribute("ctrlrange", "ctrlrange", _of("actuator_ctrlrange", "control")),
+        Attribute("forcelimited", "forcelimited", _of("actuator_forcelimited")),
+        Attribute("forcerange", "forcerange", _of("actuator_forcerange")),
+        Attribute("delay", "delay", _of("actuator_delay")),
+        Attribute("nsample", "nsample", lambda f, where: f["actuator_history"][0, where.id, 0]),
+        Attribute("interp", "interp", lambda f, where: f["actuator_history"][0, where.id, 1]),
+    ),
+    "option": (
+        Attribute("timestep", "timestep", lambda f, _: f["opt.timestep"][0]),
+        Attribute("integrator", "integrator", lambda f, _: f["opt.integrator"][0]),
+        Attribute("gravity", "gravity", lambda f, _: f["opt.gravity"][0]),
+    ),
+    "compiler": (),
+}
+"""By kind of element. An inertial is of its body."""
+
+_NAMES = (
+    *("dof_damping", "dof_dampingpoly", "dof_frictionloss", "dof_solref", "dof_solimp"),
+    *("jnt_stiffness", "jnt_stiffnesspoly", "qpos_spring", "dof_armature"),
+    *("body_ipos", "body_iquat", "body_mass", "body_inertia"),
+    *("actuator_dyntype", "actuator_dynprm", "actuator_gaintype", "actuator_gainprm"),
+    *("actuator_biastype", "actuator_biasprm", "actuator_ctrllimited", "actuator_ctrlrange"),
+    *("actuator_forcelimited", "actuator_forcerange", "actuator_delay", "actuator_history"),
+)
+
+FLAGS = frozenset({"ctrllimited", "forcelimited"})
+COUNTS = frozenset({"nsample", "interp"})
+CHOICES: Mapping[str, str] = {
+    "dyntype": "mjtDyn",
+    "gaintype": "mjtGain",
+    "biastype": "mjtBias",
+    "integrator": "mjtIntegrator",
+}
+"""Attributes that are words, and MuJoCo's enumerations of them."""
+
+
+def fields(model: Any) -> Fields:
+    """A copy of what a compiled model says of all elements."""
+    found = {name: np.array(getattr(model, name))[None] for name in _NAMES}
+    for name in ("timestep", "integrator", "gravity"):
+        found[f"opt.{name}"] = np.array(getattr(model.opt, name))[None]
+    return found
+
+
+def where(model: Any, element: Element) -> Where:
+    """Where a compiled model keeps what it knows of an element."""
+    i = element.id
+    if element.kind == "joint":
+        return Where(i, int(model.jnt_dofadr[i]), int(model.jnt_qposadr[i]))
+    if element.kind == "actuator":
+        return Where(i, control=int(model.actuator_ctrladr[i]))
+    return Where(i)
+
+
+def elements(model: Any) -> list[Element]:
+    """All of which something can be stated: joints with one coordinate, bodies, actuators with one
+    control, the options.
+    """
+    import mujoco
+
+    one = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    found = [Element("joint", i) for i in range(model.njnt) if int(model.jnt_type[i]) in one]
+    found += [Element("body", i) for i in range(1, model.nbody)]
+    single = [i for i in range(len(model.actuator_ctrlnum)) if int(model.actuator_ctrlnum[i]) == 1]
+    found += [Element("actuator", i) for i in single]
+    return [*found, Element("option", 0)]
+
+
+def lacking(model: Any, wanted: Fields, tolerance: float) -> list[Statement]:
+    """What has to be stated of a compiled model so that it says what is wanted.
+
+    Args:
+        model: what a file says.
+        wanted: what it should say.
+        tolerance: relative difference that is none.
+    """
+    return differing(model, fields(model), wanted, tolerance)
+
+
+def differing(model: Any, found: Fields, wanted: Fields, tolerance: float) -> list[Statement]:
+    """What has to be stated where `found` is what is; otherwise as `lacking`."""
+    statements = []
+    for element in elements(model):
+        at = where(model, element)
+        values = {}
+        for attribute in ATTRIBUTES[element.kind]:
+            is_now, should = attribute.read(found, at), attribute.read(wanted, at)
+            if not _same(is_now, should, tolerance):
+                values[attribute.name] = tuple(float(v) for v in np.atleast_1d(should))
+        if element.kind == "body" and values:
+            # An inertial is stated whole, or not at all.
+            values = whole(model, element, wanted)
+        if values:
+            statements.append(Statement(element, values))
+    return statements
+
+
+def whole(model: Any, element: Element, wanted: Fields) -> dict[str, Values]:
+    """All attributes of an element."""
+    at = where(model, element)
+    return {
+        attribute.name: tuple(float(v) for v in np.atleast_1d(attribute.read(wanted, at)))
+        for attribute in ATTRIBUTES[element.kind]
+    }
+
+
+def _same(one: Any, other: Any, tolerance: float) -> bool:
+    one, other = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
+    if one.shape != other.shape:
+        return False
+    scale = np.maximum(np.abs(one), np.abs(other)).max(initial=0.0)
+    return bool((np.abs(one - other) <= tolerance * scale).all())
+
+
+def word(name: str, value: float) -> str:
+    """The word of MJCF for a number of an enumeration."""
+    import mujoco
+
+    if name == "interp":
+        return ("zoh", "linear", "cubic")[int(value)]
+    choice = getattr(mujoco, CHOICES[name])(int(value))
+    text = str(choice.name).partition("_")[2].lower()
+    return {"rk4": "RK4", "euler": "Euler"}.get(text, text)

@@ -1,0 +1,188 @@
+"""Causes written into a URDF: what its elements can say, each with a comment.
+
+URDF has a linear damping and a dry friction of a joint, and the inertial of a link. A body that
+MuJoCo made of several links on fixed joints is changed in each of them:
+
+* (1) mass and tensor times 1 + c of each link: the body's mass, tensor and centre follow
+* (2) each centre of mass moved by R' c, R the link's axes in the body's: the body's moves by c
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from sims.base import Array
+from sims.robot.causes import Cause
+from sims.robot.markup import Markup, Tag, number, numbers
+from sims.robot.model import Robot
+from sims.robot.native import added, share
+
+_TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+class UrdfWriter:
+    """Writes causes into a text of URDF.
+
+    Args:
+        robot: what was read.
+        recording: to which the causes were fitted.
+
+    Raises:
+        UnfitError: the file is no XML in UTF-8.
+    """
+
+    def __init__(self, robot: Robot, recording: str) -> None:
+        self.robot, self.recording = robot, recording
+        self.markup = Markup(robot.path.read_bytes(), robot.path)
+        top = self.markup.root.children
+        self.links = {tag.says("name"): tag for tag in top if tag.name == "link"}
+        self.joints = {tag.says("name"): tag for tag in top if tag.name == "joint"}
+
+    def write(self, cause: Cause) -> str | None:
+        """Write a cause; why it cannot be, where it cannot."""
+        known: Mapping[str, Callable[[Cause], str | None]] = {
+            "drag.linear": lambda cause: self._dynamics(cause, "damping"),
+            "friction.coulomb": lambda cause: self._dynamics(cause, "friction"),
+            "mass.scale": self._mass,
+            "inertia.scale": self._tensor,
+            "mass.offset": self._offset,
+        }
+        if cause.effect not in known:
+            return "URDF has no word for it"
+        return known[cause.effect](cause)
+
+    def text(self, said: list[str]) -> str:
+        """The file with all changes.
+
+        Args:
+            said: lines that stand at its top.
+        """
+        fitted = f", with what was found in {self.recording}" if self.recording else ""
+        heading = [f"{self.robot.path.name}{fitted}; written by simgap", *said]
+        self.markup.root.within.insert(0, (heading, ""))
+        return self.markup.whole().decode()
+
+    def _dynamics(self, cause: Cause, attribute: str) -> str | None:
+        joint = self.joints.get(cause.place)
+        if joint is None:
+            return "the file has no joint of this name"
+        stated = _child(joint, "dynamics")
+        before = float((stated.says(attribute) if stated else None) or 0.0)
+        value = number(float(added(before, cause.coefficients[0])))
+        self._say(stated or joint, cause)
+        if stated:
+            stated.new[attribute] = value
+        else:
+            self._insert(joint, "dynamics", attribute, value)
+        return None
+
+    def _insert(self, joint: Tag, name: str, attribute: str, value: str) -> None:
+        """A child of a joint that is not there yet, or more of one that is new."""
+        begin = f"<{name} "
+        for i, (comments, element) in enumerate(joint.within):
+            if element.startswith(begin):
+                joint.within[i] = (
+                    comments,
+                    f'{begin}{attribute}="{value}" {element[len(begin) :]}',
+                )
+                return
+        joint.within.append(([], f'{begin}{attribute}="{value}"/>'))
+
+    def _say(self, tag: Tag, cause: Cause) -> None:
+        tag.before.append(cause.told(self.recording))
+
+    def _inertials(self, cause: Cause) -> list[tuple[str, Tag]] | None:
+        """The links of a body with their inertials; None where one has none."""
+        body = self.robot.body(cause.place)
+        found = []
+        for name in (body.name, *body.aliases):
+            link = self.links.get(name)
+            inertial = _child(link, "inertial") if link else None
+            if inertial is not None:
+                found.append((name, inertial))
+            elif link is None or _child(link, "collision") or name == body.name:
+                return None
+        return found
+
+    def _mass(self, cause: Cause) -> str | None:
+        inertials = self._inertials(cause)
+        if inertials is None:
+            return "a link of the body states no inertial"
+        factor = float(share(cause.coefficients[0]))
+        for _, inertial in inertials:
+            self._say(inertial, cause)
+            _scale(inertial, "mass", ("value",), factor)  # (1)
+            _scale(inertial, "inertia", _TENSOR, factor)
+        return None
+
+    def _tensor(self, cause: Cause) -> str | None:
+        inertials = self._inertials(cause)
+        if inertials is None or len(inertials) > 1:
+            return "the body is not one link with an inertial"
+        ((_, inertial),) = inertials
+        self._say(inertial, cause)
+        _scale(inertial, "inertia", _TENSOR, float(share(cause.coefficients[0])))
+        return None
+
+    def _offset(self, cause: Cause) -> str | None:
+        inertials = self._inertials(cause)
+        if inertials is None:
+            return "a link of the body states no inertial"
+        body = self.robot.body(cause.place).name
+        for name, inertial in inertials:
+            self._say(inertial, cause)
+            moved = self._axes(name, body).T @ cause.coefficients  # (2)
+            origin = _child(inertial, "origin")
+            if origin is None:
+                inertial.within.append(([], f'<origin xyz="{numbers(tuple(moved))}" rpy="0 0 0"/>'))
+                continue
+            before = _vector(origin.says("xyz"))
+            origin.new["xyz"] = numbers(tuple(float(v) for v in before + moved))
+        return None
+
+    def _axes(self, link: str, body: str) -> Array:
+        """(3, 3) a link's axes in those of the body into which it is fused."""
+        axes = np.eye(3)
+        while link != body:
+            (joint,) = [tag for tag in self.joints.values() if _names(tag, "child") == link]
+            origin = _child(joint, "origin")
+            axes = _turn(_vector(origin.says("rpy") if origin else None)) @ axes
+            link = _names(joint, "parent")
+        return axes
+
+
+def _child(tag: Tag, name: str) -> Tag | None:
+    return next((child for child in tag.children if child.name == name), None)
+
+
+def _names(joint: Tag, end: str) -> str:
+    """The link at an end of a joint."""
+    found = _child(joint, end)
+    return (found.says("link") or "") if found else ""
+
+
+def _scale(inertial: Tag, name: str, attributes: tuple[str, ...], factor: float) -> None:
+    child = _child(inertial, name)
+    for attribute in attributes:
+        value = child.says(attribute) if child else None
+        if child and value is not None:
+            child.new[attribute] = number(float(value) * factor)
+
+
+def _vector(text: str | None) -> Array:
+    """(3,) numbers; zeros where there are none."""
+    return np.array([float(word) for word in text.split()]) if text else np.zeros(3)
+
+
+def _turn(rpy: Array) -> Array:
+    """(3, 3) axes turned about fixed x, y and z, one after the other, as URDF says."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )

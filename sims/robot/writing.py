@@ -1,0 +1,161 @@
+"""The result of explain, back in the robot's own file.
+
+An MJCF stays the file that its author wrote: attributes change, each with a comment beside it that
+says why. Where that is impossible (elements that stand for several, a URDF) MuJoCo writes the
+model, with the same comments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from sims.extended import Number
+from sims.robot.causes import one_by_one
+from sims.robot.changes import CLOSE, KEPT, ROUNDS, Applied, apply
+from sims.robot.document import Document
+from sims.robot.markup import UnfitError
+from sims.robot.mjcf_out import Writer
+from sims.robot.model import Robot
+from sims.robot.precise import saved, unlike
+from sims.robot.stated import Statement, lacking
+from sims.robot.urdf_out import UrdfWriter
+
+Causes = Mapping[str, Mapping[str, Number]]
+"""Coefficients by ``effect@place``, ``effect@*`` or ``effect``."""
+
+SAME = 1e-12
+"""Relative difference of two numbers of a compiled model that is rounding."""
+
+
+@dataclass(frozen=True)
+class Written:
+    """A robot's file with causes in it.
+
+    Attributes:
+        xml: an MJCF that MuJoCo loads.
+        urdf: a URDF, where the robot came from one.
+        said: what the files do not hold, and what is to be known of what they hold; a line each.
+        applied: the model that `xml` states.
+    """
+
+    xml: str | None
+    urdf: str | None
+    said: tuple[str, ...]
+    applied: Applied = field(compare=False, repr=False)
+
+
+def written(robot: Robot, causes: Causes, recording: str = "") -> Written:
+    """The robot's own file with causes in it.
+
+    Args:
+        robot: what was read.
+        causes: coefficients by ``effect@place``, ``effect@*`` or ``effect``.
+        recording: its title; comments name it.
+
+    Raises:
+        InputError: a place that the robot does not have.
+    """
+    applied = apply(robot, causes, recording)
+    said = list(applied.said)
+    try:
+        if robot.format != "mjcf":
+            raise UnfitError("it is a URDF")
+        text = Edit(robot, applied, recording, robot.path.read_bytes()).stated()
+    except UnfitError as unfit:
+        if robot.format == "mjcf":
+            said.append(f"the MJCF is as MuJoCo writes it, not as {robot.path.name}: {unfit}")
+        saving = saved(applied.spec, robot.path.resolve().parent)
+        text = Edit(robot, applied, recording, saving.encode()).stated()
+    urdf = _urdf(robot, causes, recording, said) if robot.format == "urdf" else None
+    return Written(text, urdf, tuple(said), applied)
+
+
+def _urdf(robot: Robot, causes: Causes, recording: str, said: list[str]) -> str | None:
+    """The URDF with what it can say; adds what it cannot."""
+    try:
+        writer = UrdfWriter(robot, recording)
+    except UnfitError as unfit:
+        said.append(f"no URDF is written: {unfit}")
+        return None
+    lines = []
+    for cause in one_by_one(robot, causes):
+        answer = writer.write(cause)
+        if answer:
+            lines.append(f"{cause.told(recording)}: not in the URDF: {answer}")
+    said += lines
+    return writer.text(lines)
+
+
+class Edit:
+    """Writes what is wanted into a text of MJCF.
+
+    Args:
+        robot: of which it is.
+        applied: what it is to compile to.
+        recording: its title.
+        text: of the file.
+    """
+
+    def __init__(self, robot: Robot, applied: Applied, recording: str, text: bytes) -> None:
+        self.robot, self.applied, self.recording, self.text = robot, applied, recording, text
+        self.folder = robot.path.resolve().parent
+        self.original = compiled(self._document().written())
+
+    def _document(self) -> Document:
+        """The text, which finds its files from anywhere."""
+        document = Document(self.text, self.robot.path)
+        document.rooted(self.folder)
+        return document
+
+    def stated(self) -> str:
+        """The text with what is wanted.
+
+        Raises:
+            UnfitError: whatever is stated, it does not compile to that.
+        """
+        # What carries a comment is a statement, though its numbers may be in the text already.
+        statements = {element: Statement(element) for element in self.applied.comments}
+        model = self.original
+        for _ in range(ROUNDS):
+            for statement in lacking(model, self.applied.wanted, CLOSE):
+                held = statements.setdefault(statement.element, Statement(statement.element))
+                # What was stated and still lacks needs all that goes with it.
+                held.insisted = bool(held.values) or model is not self.original
+                held.values |= statement.values
+            text = self._written(list(statements.values()))
+            model = compiled(text)
+            if not lacking(model, self.applied.wanted, CLOSE):
+                break
+        differs = unlike(model, self.applied.model, SAME)
+        if differs:
+            raise UnfitError(f"its attributes do not say all ({differs})")
+        return text
+
+    def _written(self, statements: Sequence[Statement]) -> str:
+        document = self._document()
+        writer = Writer(document, self.original, self.applied.wanted)
+        for statement in statements:
+            writer.write(statement, self.applied.comments.get(statement.element, [KEPT]))
+        document.root.within.insert(0, (self._heading(), ""))
+        return document.written()
+
+    def _heading(self) -> list[str]:
+        """What the file is, and what it does not hold."""
+        fitted = f", with what was found in {self.recording}" if self.recording else ""
+        return [f"{self.robot.path.name}{fitted}; written by simgap", *self.applied.said]
+
+
+def compiled(text: str) -> Any:
+    """The model of an MJCF.
+
+    Raises:
+        UnfitError: MuJoCo refuses it.
+    """
+    import mujoco
+
+    try:
+        return mujoco.MjSpec.from_string(text).compile()
+    except ValueError as error:
+        raise UnfitError(f"MuJoCo refuses it: {' '.join(str(error).split())}") from None

@@ -1,0 +1,262 @@
+"""A robot's own file with causes in it: it stays the author's, and moves as it was meant."""
+
+import difflib
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from sims.robot.checking import check, moved
+from sims.robot.reading import read
+from sims.robot.writing import Causes, written
+from tests.sims.robot.arms import ARM, robot
+from tests.sims.robot.test_changes import MOVING, number, one
+
+CAUSES: Causes = {
+    "friction.coulomb@*": {
+        "coefficient@elbow": number(0.3, "N*m"),
+        "coefficient@shoulder": number(0.1, "N*m"),
+    },
+    "mass.scale@upper": one(0.1),
+    "mass.offset@fore": {"x": number(0.01, "m"), "z": number(-0.02, "m")},
+    "input.gain@m_elbow": one(0.1),
+    "actuator.stiffness@m_shoulder": one(0.1),
+    "actuator.damping@m_spin": one(-0.2),
+    "gravity.tilt": {"x": number(0.01), "y": number(0.02)},
+    "backlash@m_elbow": one(0.1),
+}
+
+
+def test_an_mjcf_stays_its_authors(tmp_path: Path) -> None:
+    """Only lines that say something else have changed; each has its comment before it."""
+    arm = robot(tmp_path)
+    done = written(arm, CAUSES, "log.csv")
+    assert done.xml is not None
+    before, after = ARM.splitlines(), done.xml.splitlines()
+    changes = [line for line in difflib.ndiff(before, after) if line[0] in "-+"]
+    gone = [line[2:].strip() for line in changes if line[0] == "-"]
+    comments = [line[2:].strip() for line in changes if line.startswith("+ ") and "<!--" in line]
+    assert len(gone) == 8
+    assert "<!-- the elbow is the one that wears -->" in done.xml
+    told = "friction.coulomb@elbow: 0.3 N*m (95 %: 0.27 to 0.33), fitted to log.csv"
+    place = next(i for i, line in enumerate(after) if told in line)
+    assert 'name="elbow"' in after[place + 1]
+    assert 'frictionloss="0.35"' in after[place + 1]
+    assert "solreffriction" in after[place + 2]
+    assert sum("fitted to log.csv" in line for line in comments) == 9
+    assert 'kp="66"' in done.xml
+    assert any("backlash@m_elbow" in line for line in done.said)
+    check(arm, CAUSES, done, tmp_path)
+
+
+def test_nothing_found_leaves_the_file(tmp_path: Path) -> None:
+    """Without a cause the file is itself, with a line that says where it is from."""
+    arm = robot(tmp_path)
+    text = written(arm, {}, "log.csv").xml
+    assert text is not None
+    lines = [line for line in text.splitlines() if "<!-- arm.xml" not in line]
+    assert lines == ARM.splitlines()
+
+
+def test_what_one_writes_a_rollout_moves(tmp_path: Path) -> None:
+    """The file on disk moves as the causes do, not as the file before."""
+    arm = robot(tmp_path)
+    done = written(arm, CAUSES)
+    assert done.xml is not None
+    path = tmp_path / "elsewhere" / "extended.xml"
+    path.parent.mkdir()
+    path.write_text(done.xml)
+    motion = moved(mujoco.MjModel.from_xml_path(str(path)))
+    np.testing.assert_allclose(motion, moved(done.applied.model), rtol=0, atol=1e-9)
+    assert np.abs(motion - moved(arm.compiled)).max() > 1e-2
+
+
+PARTS = {
+    "main.xml": """<?xml version="1.0" encoding="utf-8"?>
+<!-- a robot, with windows -->
+<mujoco model="parts">
+  <compiler angle="radian" meshdir="meshes"/>
+  <include file="defaults.xml"/>
+  <asset><mesh name="t" file="t.obj"/></asset>
+  <worldbody>
+    <frame pos="0 0 1">
+      <body name="a" childclass="arm">
+        <joint/>
+        <geom type="mesh" mesh="t"/>
+        <include file="fore.xml"/>
+      </body>
+    </frame>
+  </worldbody>
+  <actuator>
+    <position class="arm" joint="e"/>
+    <general joint='e' gainprm="2" biastype="affine" biasprm="1 0 -.1"/>
+  </actuator>
+</mujoco>
+""",
+    "defaults.xml": """<mujocoinclude><default><default class="arm">
+  <joint axis="0 1 0" damping="0.3 0.1" armature="0.02" range="-2 2"/>
+  <position kp="40" dampratio="0.7" ctrlrange="-1 1"/></default></default></mujocoinclude>
+""",
+    "fore.xml": """<mujocoinclude>
+  <body name="b" pos=".3 0 0"><joint name="e"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0"/></body>
+</mujocoinclude>
+""",
+    "meshes/t.obj": "v 0 0 0\nv .3 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n",
+}
+
+
+def test_files_of_a_file_are_found_from_anywhere(tmp_path: Path) -> None:
+    """What is included stays so where nothing changes in it; meshes are found; lines end as they
+    did; classes and elements without names are no hindrance.
+    """
+    home, away = tmp_path / "home", tmp_path / "away"
+    for name, text in PARTS.items():
+        path = home / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(text.replace("\n", "\r\n").encode())
+    away.mkdir()
+    arm = read(home / "main.xml")
+    causes: Causes = {
+        "drag.quadratic@e": one(0.05),
+        "inertia.armature@joint0": one(0.01),
+        "mass.scale@a": one(0.2),
+        "input.bias@actuator0": one(0.02),
+    }
+    done = written(arm, causes, "log.csv")
+    check(arm, causes, done, away)
+    assert done.xml is not None
+    assert not done.said
+    assert 'file="defaults.xml"' not in done.xml
+    assert str(home / "defaults.xml") in done.xml
+    assert 'class="arm">' not in done.xml.replace('childclass="arm">', "")
+    assert "from here: fore.xml" in done.xml
+    assert 'damping="0.3 0.15' in done.xml
+    assert done.xml.count("\r\n") == done.xml.count("\n")
+
+
+REPEATED = """
+<mujoco><worldbody><replicate count="2" offset="0 .2 0"><body name="a">
+  <joint name="j" axis="0 1 0" damping="0.1"/><geom size=".05" pos=".3 0 0"/></body></replicate>
+</worldbody></mujoco>
+"""
+
+
+def test_where_elements_are_repeated_mujoco_writes(tmp_path: Path) -> None:
+    """One of several that one element stands for changes alone, with its comment."""
+    arm = robot(tmp_path, REPEATED)
+    causes = {"drag.linear@j1": one(0.123456789012345)}
+    done = written(arm, causes, "log.csv")
+    check(arm, causes, done, tmp_path)
+    assert done.xml is not None
+    (line,) = done.said
+    assert "<replicate>" in line
+    before, _, _ = done.xml.partition('name="j1"')
+    assert "drag.linear@j1" in before.splitlines()[-2]
+
+
+def test_what_moves_along_is_stated(tmp_path: Path) -> None:
+    """A damping ratio becomes the damping that it was, with a comment that says so."""
+    arm = robot(tmp_path, MOVING)
+    done = written(arm, {"mass.scale@b": one(0.2)})
+    check(arm, {"mass.scale@b": one(0.2)}, done, tmp_path)
+    assert done.xml is not None
+    assert not done.said
+    assert "dampratio" not in done.xml
+    assert 'springdamper="0 0"' in done.xml
+    # The inertial that the compiler ignored, the spring and the servo.
+    assert done.xml.count("as it was") == 3
+
+
+def test_another_motion_is_a_fault_of_the_program(tmp_path: Path) -> None:
+    """A file that does not say what was meant is not written; the field is named."""
+    arm = robot(tmp_path)
+    done = written(arm, CAUSES)
+    assert done.xml is not None
+    wrong = replace(done, xml=done.xml.replace('frictionloss="0.35"', 'frictionloss="0.35001"'))
+    with pytest.raises(RuntimeError, match="dof_frictionloss"):
+        check(arm, CAUSES, wrong, tmp_path)
+    assert not list(tmp_path.glob(".check*"))
+
+
+def test_two_hyphens_end_no_comment(tmp_path: Path) -> None:
+    """A recording may be called as it likes."""
+    arm = robot(tmp_path)
+    done = written(arm, {"drag.linear@elbow": one(0.1)}, "a--b-->-")
+    check(arm, {"drag.linear@elbow": one(0.1)}, done, tmp_path)
+
+
+URDF = """<robot name="arm">
+  <link name="base"/>
+  <link name="fore">
+    <inertial><origin xyz="0.1 0 0" rpy="0.3 0 0"/><mass value="1.2"/>
+      <inertia ixx="0.01" ixy="0.001" ixz="0" iyy="0.02" iyz="0" izz="0.02"/></inertial>
+  </link>
+  <link name="tool">
+    <inertial><mass value="0.3"/>
+      <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/></inertial>
+  </link>
+  <!-- the elbow -->
+  <joint name="elbow" type="continuous">
+    <parent link="base"/><child link="fore"/><origin xyz="0 0 1"/><axis xyz="0 1 0"/>
+    <dynamics damping="0.2"/>
+  </joint>
+  <joint name="weld" type="fixed">
+    <parent link="fore"/><child link="tool"/><origin xyz="0.2 0 0" rpy="0 0.5 1.0"/>
+  </joint>
+</robot>
+"""
+
+
+def test_a_urdf_says_what_it_can(tmp_path: Path) -> None:
+    """Links on fixed joints move with their body; the rest is said, and stands in the MJCF."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF)
+    arm = read(path)
+    causes: Causes = {
+        "drag.linear@elbow": one(0.1),
+        "friction.coulomb@elbow": one(0.05),
+        "mass.scale@fore": one(0.2),
+        "mass.offset@fore": {"x": number(0.01, "m"), "y": number(0.02, "m")},
+        "inertia.armature@elbow": one(0.01),
+        "inertia.scale@fore": one(0.1),
+    }
+    done = written(arm, causes, "log.csv")
+    check(arm, causes, done, tmp_path)
+    assert done.urdf is not None
+    assert '<dynamics damping="0.30000000000000004" friction="0.05"/>' in done.urdf
+    assert "<!-- the elbow -->" in done.urdf
+    unsaid = {line.partition(":")[0] for line in done.said if "not in the URDF" in line}
+    assert unsaid == {"inertia.armature@elbow", "inertia.scale@fore"}
+    assert done.xml is not None
+    assert "inertia.armature@elbow" in done.xml
+    wrong = replace(done, urdf=done.urdf.replace('friction="0.05"', 'friction="0.06"'))
+    with pytest.raises(RuntimeError, match="dof_frictionloss"):
+        check(arm, causes, wrong, tmp_path)
+
+
+def test_a_delay_is_that_of_the_simulator(tmp_path: Path) -> None:
+    """A control that is delayed by a part of a step is the mean over the step, in both."""
+    from sims.base import Scenario
+    from sims.robot.simulator import robot_simulator
+
+    arm = robot(tmp_path)
+    times = np.linspace(0.0, 0.5, 501)
+    command = np.where(times > 0.05, np.sin(9.0 * times), 0.0)
+    simulator = robot_simulator(arm)(effects=["input.delay@m_elbow"])
+    scenario = Scenario(times=times, inputs={"u.m_elbow": command})
+    (shown,) = simulator.simulate_lanes(np.array([[0.0123]]), [scenario])
+    done = written(arm, {"input.delay@m_elbow": {"coefficient": number(0.0123, "s")}})
+    assert done.xml is not None
+    model = mujoco.MjModel.from_xml_string(done.xml)
+    data = mujoco.MjData(model)
+    elbow = []
+    for u in command[:-1]:
+        elbow.append(data.qpos[1])
+        data.ctrl[1] = u
+        mujoco.mj_step(model, data)
+    place = [channel.name for channel in simulator.channels].index("q.elbow")
+    np.testing.assert_allclose(shown[:-1, place], elbow, rtol=0, atol=1e-9)
+    assert np.ptp(elbow) > 0.1
