@@ -21,6 +21,8 @@ from sims.system import Acting
 
 LANES = 64
 """Of a batch: of more, what is held for them leaves the processor's cache."""
+SIZES = (1, 8, LANES)
+"""Lanes that a batch is made for."""
 INTERRUPTED = 40_000
 """Steps of all lanes together in one call: a fraction of a second, after which Ctrl-C is heard."""
 

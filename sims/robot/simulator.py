@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sims.base import Array, InputError, Scenario, unknown
 from sims.plan import Plan, Runs, felt_inputs, make_runs
 from sims.robot.forces import OVER_TIME, Forces, over_time
-from sims.robot.lanes import LANES, Addresses, Bench, Places
+from sims.robot.lanes import LANES, SIZES, Addresses, Bench, Places
 from sims.robot.model import Robot
 from sims.robot.native import FIELDS
 from sims.robot.sampling import sampled
@@ -90,7 +90,7 @@ class RobotSimulator(Simulated):
         self._freed: list[Effect] = [effect() for effect in freed]
         self._robotic = self.system()
         self._addresses = Addresses(self.robot)
-        self._benches: dict[bool, Bench] = {}
+        self._benches: dict[tuple[bool, int], Bench] = {}
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
         if name not in (None, "mujoco"):
@@ -206,8 +206,8 @@ class RobotSimulator(Simulated):
 
     def _stepped(self, work: Work, steps: int, derived: bool, asked: bool) -> Made:
         controls, forces, felt = self.controls(work, steps)
-        bench = self._bench(derived)
         n = len(work.x)
+        bench = self._bench(derived, n)
         bench.load(_filled(_natives(work.acting), n, bench.count))
         bench.begin(work.x, work.v, self._addresses)
         bench.settle(controls[:, 0])
@@ -227,12 +227,15 @@ class RobotSimulator(Simulated):
         x[bench.failed] = np.nan
         return Made(x, v, done.get("qfrc_actuator"), done.get("sensordata"), bench.failed)
 
-    def _bench(self, derived: bool) -> Bench:
-        if derived not in self._benches:
+    def _bench(self, derived: bool, lanes: int) -> Bench:
+        # A tuner asks for one lane at a time: it shall not pay for all the others.
+        count = next(size for size in SIZES if size >= lanes)
+        if (derived, count) not in self._benches:
             engine = self.engine
             assert isinstance(engine, RobotEngine)
-            self._benches[derived] = Bench(self.robot, derived, engine.numerics.settings())
-        return self._benches[derived]
+            settings = engine.numerics.settings()
+            self._benches[derived, count] = Bench(self.robot, derived, settings, count)
+        return self._benches[derived, count]
 
     def _shown(self, made: Made, work: Work, times: Array, steps: int) -> Array:
         """What the sensors record: (n, T, C)."""
