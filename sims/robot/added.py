@@ -42,7 +42,7 @@ GAINS: Mapping[str, tuple[str, ...]] = {
 """By kind of actuator, its gains; the first must be given."""
 INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 """In the order of MuJoCo's mjtIntegrator."""
-LONGEST = 1.0
+SHORTEST, LONGEST = 1e-9, 1.0
 """s of a step."""
 
 
@@ -171,8 +171,8 @@ def set_engine(spec: Any, table: Mapping[str, Any], source: str) -> None:
     given = user_toml.entries(source, "engine", table, user_toml.hints_of(EngineTable))
     if "timestep" in given:
         step = user_toml.finite(source, "engine.timestep", given["timestep"])
-        if not 0 < step <= LONGEST:
-            raise user_toml.fault(source, "engine.timestep", f"s in (0, {LONGEST:g}]", step)
+        if not SHORTEST <= step <= LONGEST:
+            raise user_toml.fault(source, "engine.timestep", f"{SHORTEST:g} to {LONGEST:g} s", step)
         spec.option.timestep = step
     if "integrator" in given:
         name = given["integrator"]

@@ -16,7 +16,7 @@ import numpy as np
 from sims.base import Array
 from sims.robot.causes import one_by_one
 from sims.robot.changes import apply
-from sims.robot.mends import MOMENT
+from sims.robot.inertia import LEAST
 from sims.robot.model import Robot
 from sims.robot.precise import unlike
 from sims.robot.quiet import quiet
@@ -86,7 +86,7 @@ def _check_urdf(robot: Robot, causes: Causes, path: Path) -> None:
             raise RuntimeError(f"extended.urdf is not as it was meant: {name}")
     # Where two moments are alike their axes are anybody's: the whole tensor counts.
     one, other = _tensors(found), _tensors(wanted)
-    if not np.allclose(one, other, rtol=SAME, atol=max(NEAR * np.abs(other).max(), MOMENT)):
+    if not np.allclose(one, other, rtol=SAME, atol=max(NEAR * np.abs(other).max(), LEAST)):
         raise RuntimeError("extended.urdf is not as it was meant: body_inertia")
     for model in (wanted, found):
         # URDF says nothing of how stiff friction is, and what touches may be a mesh elsewhere.

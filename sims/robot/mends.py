@@ -1,97 +1,123 @@
-"""What MuJoCo's compiler refuses and can be mended: moments of inertia, and massless bodies."""
+"""What MuJoCo's compiler refuses and can be mended: moments of inertia, massless bodies, meshes."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from sims.base import InputError
-from sims.limits import cut
+from sims.base import Array, InputError
+from sims.robot import inertia
 from sims.robot.quiet import one_line
+from sims.robot.shapes import Left, without_mesh
+from sims.robot.words import listed, told
 
 MASS = 1e-6
 """kg of a body that states none and moves."""
-MOMENT = 1e-9
-"""kg m^2 of its principal moments."""
-ROUNDING = 1e-9
-"""Part of a moment by which sums are kept on the right side."""
+ABOUT_A_MESH = re.compile(r"mesh|vert|face|stl|obj|hull|volume", re.IGNORECASE)
 
 
-def compiled(spec: Any, notes: list[str]) -> Any:
-    """The compiled model; what is mended on the way is changed in the spec and noted.
+@dataclass
+class Mends:
+    """What was mended while a spec was compiled.
 
-    Raises:
-        ValueError: MuJoCo refuses the model, in its own words.
+    Attributes:
+        left: the shapes that were left out.
+        balanced: bodies with their principal moments before and after.
+        massless: bodies that were given a mass, by whether something hangs on them.
+        slight: bodies that were given moments of inertia.
     """
-    for _ in range(len(spec.bodies) + 2):
-        try:
-            return spec.compile()
-        except ValueError as error:
-            if not _mended(spec, one_line(error), notes):
+
+    left: Left
+    balanced: list[str] = field(default_factory=list)
+    massless: dict[bool, list[str]] = field(default_factory=dict)
+    slight: list[str] = field(default_factory=list)
+
+    def compiled(self, spec: Any) -> Any:
+        """The compiled model; what is mended on the way is changed in the spec.
+
+        Raises:
+            InputError: MuJoCo refuses the model, in its own words.
+        """
+        for _ in range(2 * (len(spec.bodies) + len(spec.meshes)) + 2):
+            try:
+                return spec.compile()
+            except InputError:
                 raise
-    raise InputError("too many bodies have neither mass nor inertia")
+            except Exception as error:
+                said = one_line(error)
+                if not self._mended(spec, said):
+                    break
+        raise InputError(f"{self.left.source}: {said}")
+
+    def _mended(self, spec: Any, said: str) -> bool:
+        found = re.search(r"Element name '(.*?)', id", said)
+        name = found[1] if found else ""
+        if "balanceinertia" in said:
+            return self._balance(spec)
+        if "mass and inertia of moving bodies" in said:
+            return self._weigh(spec, name)
+        what = re.sub(r"; Element.*|Error: ", "", said)
+        return bool(ABOUT_A_MESH.search(what)) and without_mesh(
+            spec, name, f"is refused by MuJoCo ({what})", self.left
+        )
+
+    def _balance(self, spec: Any) -> bool:
+        before = len(self.balanced)
+        for body in spec.bodies:
+            moments, axes = _moments(body)
+            if inertia.lack(moments) > 0:
+                after = inertia.nearest(moments)
+                _state(body, after, axes)
+                self.balanced.append(f"{body.name} {inertia.shown(moments, after)}")
+        return len(self.balanced) > before
+
+    def _weigh(self, spec: Any, name: str) -> bool:
+        for body in [body for body in spec.bodies if body.name == name]:
+            mass, (moments, axes) = float(np.nan_to_num(body.mass)), _moments(body)
+            light, thin = mass < MASS, min(moments) < inertia.LEAST * (1 - inertia.ROUNDING)
+            body.mass = max(mass, MASS)
+            _state(body, np.maximum(moments, inertia.LEAST), axes)
+            body.explicitinertial = True
+            if light:
+                carries = any(b.parent is not None and b.parent.name == name for b in spec.bodies)
+                self.massless.setdefault(carries, []).append(name)
+            elif thin:
+                self.slight.append(name)
+            return light or thin
+        return False
+
+    @property
+    def notes(self) -> list[str]:
+        """One line for each kind of mend."""
+        notes = self.left.notes
+        if self.balanced:
+            notes.append(
+                "no body has principal moments A + B < C; the nearest are taken (kg m^2): "
+                f"{told(self.balanced)}"
+            )
+        given = f"given {MASS:g} kg and moments of {inertia.LEAST:g} kg m^2"
+        for carries, names in self.massless.items():
+            hangs = "" if carries else ", and nothing hangs on them, so their joints mean little"
+            notes.append(f"move without a mass{hangs}; {given}: {listed(names)}")
+        if self.slight:
+            least = f"{inertia.LEAST:g} kg m^2"
+            notes.append(f"move without moments of inertia; given {least}: {listed(self.slight)}")
+        return notes
 
 
-def _mended(spec: Any, said: str, notes: list[str]) -> bool:
-    if "balanceinertia" in said:
-        unbalanced = [body for body in spec.bodies if _lack(_moments(body)[0]) > 0]
-        notes += [_balance(body) for body in unbalanced]
-        return bool(unbalanced)
-    named = re.search(r"Element name '([^']*)'", said)
-    if "mass and inertia of moving bodies" in said and named:
-        return _given_mass(spec, named[1], notes)
-    return False
-
-
-def _lack(moments: Any) -> float:
-    """By how much the largest principal moment exceeds what the two others allow."""
-    return float(2 * np.max(moments) - np.sum(moments))
-
-
-def _balance(body: Any) -> str:
-    """Take the nearest moments that a body can have: A + B = C."""
-    moments, axes = _moments(body)
-    third = (_lack(moments) + ROUNDING * np.max(moments)) / 3
-    nearest = np.where(moments == np.max(moments), moments - third, moments + third)
-    _state(body, nearest, axes)
-    before, after = (", ".join(f"{m:.4g}" for m in sorted(row)) for row in (moments, nearest))
-    return (
-        f"{cut(body.name)}: no body has the principal moments {before} kg m^2 (A + B < C); the "
-        f"nearest are taken, {after}"
-    )
-
-
-def _moments(body: Any) -> tuple[Any, Any]:
+def _moments(body: Any) -> tuple[Array, Array | None]:
     """Principal moments as stated, kg m^2, and their axes; None where they are the body's own."""
     full = np.asarray(body.fullinertia, dtype=float)
     if np.isfinite(full).all() and full.any():
-        xx, yy, zz, xy, xz, yz = full
-        moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        return moments, axes
+        return inertia.principal(list(full))
     return np.nan_to_num(np.asarray(body.inertia, dtype=float)), None
 
 
-def _state(body: Any, moments: Any, axes: Any) -> None:
+def _state(body: Any, moments: Array, axes: Array | None) -> None:
     if axes is None:
         body.inertia = moments
-        return
-    tensor = axes @ np.diag(moments) @ axes.T
-    body.fullinertia = [*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2]]
-
-
-def _given_mass(spec: Any, name: str, notes: list[str]) -> bool:
-    body = next((body for body in spec.bodies if body.name == name), None)
-    if body is None:
-        return False
-    mass, (moments, axes) = float(np.nan_to_num(body.mass)), _moments(body)
-    if mass >= MASS and min(moments) >= MOMENT:
-        return False
-    body.mass = max(mass, MASS)
-    _state(body, np.maximum(moments, MOMENT), axes)
-    body.explicitinertial = True
-    what = f"a mass of {MASS:g} kg and moments" if mass < MASS else "moments"
-    carries = "" if list(body.bodies) else "; nothing hangs on its joint"
-    notes.append(f"{cut(name)}: moves without inertia; given {what} of {MOMENT:g} kg m^2{carries}")
-    return True
+    else:
+        body.fullinertia = inertia.tensor(moments, axes)

@@ -5,6 +5,7 @@ printing nor its log file happens.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -18,11 +19,15 @@ def quiet() -> Iterator[list[str]]:
     """
     import mujoco
 
-    warnings: list[str] = []
+    said: list[str] = []
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda text: warnings.append(one_line(text)))
+    mujoco.set_mju_user_warning(lambda text: said.append(one_line(text)))
     try:
-        yield warnings
+        with warnings.catch_warnings():
+            # Its compiler warns by way of Python.
+            warnings.simplefilter("always")
+            warnings.showwarning = lambda message, *_: said.append(one_line(message))
+            yield said
     finally:
         mujoco.set_mju_user_warning(before)
 
@@ -31,4 +36,4 @@ def one_line(message: object) -> str:
     """What MuJoCo says, in one line: ``what; Element 'joint', line 6``."""
     lines = [line.strip().rstrip(".") for line in str(message).splitlines()]
     said = "; ".join(line for line in lines if line)
-    return re.sub(r"^(XML |Schema )?(Error|Warning): ", "", said)
+    return re.sub(r"^((XML )?(Error|Warning): )+", "", said)

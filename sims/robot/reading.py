@@ -11,9 +11,12 @@ from xml.etree.ElementTree import Element
 
 from sims.base import InputError
 from sims.limits import cut
-from sims.robot import added, mends, mjcf, urdf
+from sims.robot import added, contacts, mjcf, names, urdf
+from sims.robot.mends import Mends
 from sims.robot.model import Format, Robot
 from sims.robot.quiet import one_line, quiet
+from sims.robot.shapes import Left
+from sims.robot.words import listed
 from sims.robot.xmlfile import Files, include, tree, written
 
 FORMATS: Mapping[str, Format] = {"mujoco": "mjcf", "robot": "urdf"}
@@ -61,36 +64,48 @@ def _robot(
     engine: Mapping[str, Any],
     warnings: list[str],
 ) -> Robot:
+    source, notes = str(files.path), names.renamed(root)
+    mends = Mends(Left(source))
     if kind == "urdf":
-        notes = urdf.mended(files, root)
+        notes += urdf.mended(files, root)
         spec = _parsed(files, root)
     else:
         absent = mjcf.found(files, root)
         spec = _parsed(files, root)
-        notes = absent.leave_out(spec)
-    rated = added.add_actuators(spec, actuators, str(files.path))
-    added.set_engine(spec, engine, str(files.path))
-    parents = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
-    try:
-        model = mends.compiled(spec, notes)
-    except ValueError as error:
-        raise InputError(f"{files.path}: {one_line(error)}") from None
-    if model.njnt == 0:
-        raise InputError(f"{files.path}: it has no joint that moves: nothing to explain")
-    aliases = _fused(parents, {model.body(i).name for i in range(model.nbody)})
-    notes += _said_of(aliases)
-    notes += [f"MuJoCo: {warning}" for warning in dict.fromkeys(warnings)]
+        absent.leave_out(spec, mends.left)
+    rated = added.add_actuators(spec, actuators, source)
+    added.set_engine(spec, engine, source)
+    notes += names.given(spec)
+    above = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
+    model = mends.compiled(spec)
+    _check(files, model)
+    further = contacts.without(spec, model) if kind == "urdf" else []
+    if further:
+        model = mends.compiled(spec)
+    aliases = _fused(above, {model.body(i).name for i in range(model.nbody)})
+    said = [f"MuJoCo says: {warning}" for warning in dict.fromkeys(warnings)]
     settings = json.dumps([actuators, engine], sort_keys=True, default=str)
     files.add(settings.encode())
-    return Robot(
+    robot = Robot(
         path=files.path,
         format=kind,
         spec=spec,
-        notes=tuple(notes),
+        notes=(*notes, *mends.notes, *further, *_said_of(aliases), *said),
         aliases=aliases,
         digest=files.hashed.hexdigest(),
         rated=rated,
     )
+    robot.__dict__["compiled"] = model  # which it would compile anew
+    return robot
+
+
+def _check(files: Files, model: Any) -> None:
+    if model.njnt == 0:
+        raise InputError(f"{files.path}: it has no joint that moves")
+    step = float(model.opt.timestep)
+    if not added.SHORTEST <= step <= added.LONGEST:
+        span = f"{added.SHORTEST:g} to {added.LONGEST:g} s"
+        raise InputError(f"{files.path}: option timestep: expected {span}, found {step:g}")
 
 
 def _parsed(files: Files, root: Element) -> Any:
@@ -100,7 +115,7 @@ def _parsed(files: Files, root: Element) -> Any:
     text, elements = written(root)
     try:
         spec = mujoco.MjSpec.from_string(text)
-    except ValueError as error:
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
         said = one_line(error)
         line = re.search(r"[;,] line (\d+)", said)
         element = None
@@ -126,8 +141,7 @@ def _fused(parents: Mapping[str, str], compiled: set[str]) -> dict[str, str]:
 def _said_of(aliases: Mapping[str, str]) -> list[str]:
     groups: dict[str, list[str]] = {}
     for alias, name in aliases.items():
-        groups.setdefault(name, []).append(cut(alias))
-    said = [f"{', '.join(names)} of {cut(into)}" for into, names in groups.items()]
-    return (
-        [f"links on fixed joints are part of what carries them: {'; '.join(said)}"] if said else []
-    )
+        groups.setdefault(name, []).append(alias)
+    said = [f"{listed(names)} of {into}" for into, names in groups.items()]
+    whole = listed(said, between="; ")
+    return [f"links on fixed joints are part of what carries them: {whole}"] if said else []

@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from xml.etree.ElementTree import Element, SubElement
 
-import numpy as np
-
-from sims.base import InputError
+from sims.base import InputError, unknown
 from sims.limits import cut
-from sims.robot.meshes import Meshes
+from sims.robot.links import inertials, mass, number, shapes
 from sims.robot.words import listed
 from sims.robot.xmlfile import Files, children
 
-READ = ("link", "joint", "mujoco", "material")
-"""What is read of a robot; materials colour what is seen and move nothing."""
-MOVING = ("revolute", "continuous", "prismatic", "floating", "planar", "spherical")
-POINT = 1e-9
-"""kg m^2: what a link's moments are that states a mass and none: it is a point."""
-ENTRIES = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
-"""Of a tensor of inertia, with row and column."""
+READ = ("link", "joint", "mujoco")
+"""What is read of a robot."""
+SEEN = ("material", "visual")
+"""What is only seen."""
 SINGLE = ("revolute", "continuous", "prismatic")
+MOVING = (*SINGLE, "floating", "planar", "spherical")
+KINDS = ("fixed", *MOVING)
 
 
 def mended(files: Files, root: Element) -> list[str]:
     """Mend a URDF in its place.
 
     Returns:
-        One line for each thing that was mended or left out.
+        One line for each kind of thing that was mended or left out.
 
     Raises:
         InputError: it is no tree of links, or nothing in it moves.
@@ -36,18 +33,18 @@ def mended(files: Files, root: Element) -> list[str]:
     _no_macros(files, root)
     links, joints = _links(files, root), children(root, "joint")
     notes = [*_unread(root), *_named(files, joints)]
-    _joined(files, links, joints)
+    above = _joined(files, links, joints)
     if not any(joint.get("type") in MOVING for joint in joints):
         raise InputError(f"{files.path}: none of its {len(joints)} joints moves")
-    carried = {_end(files, joint, "child") for joint in joints}
-    roots = [name for name in links if name not in carried]
-    compiler = _compiler(root)
+    held = {name for name in links if _held(above, name)}
+    heavy = [name for name in links if name not in above and mass(links[name]) > 0]
+    if heavy:
+        notes.append(f"held to the world, as MuJoCo does with a URDF's root: {listed(heavy)}")
     notes += _once([*links.values(), *joints])
-    notes += _held(links, roots)
-    notes += _inertials(files, links, roots)
-    notes += _shapes(files, links, compiler)
+    notes += inertials(files, links, held)
+    notes += shapes(files, links, _compiler(root), held)
     notes += _limits(joints)
-    notes += _mimics(files, joints)
+    notes += _mimics(joints)
     return notes
 
 
@@ -61,8 +58,8 @@ def _no_macros(files: Files, root: Element) -> None:
 
 def _unread(root: Element) -> list[str]:
     """Take away what MuJoCo does not read."""
-    tags = sorted({child.tag for child in root if child.tag not in READ})
-    root[:] = [child for child in root if child.tag in READ and child.tag != "material"]
+    tags = sorted({child.tag for child in root if child.tag not in (*READ, *SEEN)})
+    root[:] = [child for child in root if child.tag in READ]
     unread = listed([f"<{tag}>" for tag in tags])
     return [f"not read, since MuJoCo knows no such thing: {unread}"] if tags else []
 
@@ -93,7 +90,7 @@ def _named(files: Files, joints: Sequence[Element]) -> list[str]:
             continue
         joint.set("name", own)
         was = f"another joint {cut(name)}" if name else "a joint without a name"
-        notes.append(f"joint {cut(own)}: so called here; it is {was}")
+        notes.append(f"called {cut(own)} here: {was}")
     return notes
 
 
@@ -107,28 +104,38 @@ def _end(files: Files, joint: Element, tag: str) -> str:
     return name
 
 
-def _joined(files: Files, links: dict[str, Element], joints: Sequence[Element]) -> None:
-    """Refuse what is no tree."""
-    parents: dict[str, str] = {}
+def _joined(
+    files: Files, links: Mapping[str, Element], joints: Sequence[Element]
+) -> dict[str, tuple[str, Element]]:
+    """By link, the one that carries it and the joint between them; what is no tree is refused."""
+    above: dict[str, tuple[str, Element]] = {}
     for joint in joints:
-        label = cut(joint.get("name") or "")
-        for tag in ("parent", "child"):
-            name = _end(files, joint, tag)
+        label, kind = cut(joint.get("name") or ""), joint.get("type") or ""
+        if kind not in KINDS:
+            raise files.fault(joint, f"joint {label}: {unknown('type', kind, KINDS)}")
+        parent, child = _end(files, joint, "parent"), _end(files, joint, "child")
+        for name in (parent, child):
             if name not in links:
                 raise files.fault(joint, f"joint {label}: there is no link '{cut(name)}'")
-        child = _end(files, joint, "child")
-        if child in parents:
-            raise files.fault(
-                joint,
-                f"link {cut(child)} hangs on two joints; a loop needs an MJCF",
-            )
-        parents[child] = _end(files, joint, "parent")
+        if child in above:
+            raise files.fault(joint, f"link {cut(child)} hangs on two joints; a loop needs an MJCF")
+        above[child] = (parent, joint)
     for name in links:
-        above, steps = name, 0
-        while above in parents:
-            above, steps = parents[above], steps + 1
+        upwards, steps = name, 0
+        while upwards in above:
+            upwards, steps = above[upwards][0], steps + 1
             if steps > len(links):
                 raise files.fault(links[name], f"link {cut(name)} hangs on itself")
+    return above
+
+
+def _held(above: Mapping[str, tuple[str, Element]], name: str) -> bool:
+    """Whether a link is fused to the world."""
+    while name in above:
+        name, joint = above[name]
+        if joint.get("type") != "fixed":
+            return False
+    return True
 
 
 def _compiler(root: Element) -> Element:
@@ -141,127 +148,15 @@ def _compiler(root: Element) -> Element:
 
 def _once(parts: Sequence[Element]) -> list[str]:
     """Keep the first of what stands twice in a link or a joint."""
-    notes = []
+    twice = []
     for part in parts:
-        name, seen = cut(part.get("name") or ""), set[str]()
+        seen: set[str] = set()
         for child in list(part):
             if child.tag in seen and child.tag not in ("visual", "collision"):
                 part.remove(child)
-                notes.append(f"{part.tag} {name}: the second <{cut(child.tag)}> is not read")
+                twice.append(f"<{child.tag}> of {part.tag} {part.get('name')}")
             seen.add(child.tag)
-    return notes
-
-
-def _held(links: dict[str, Element], roots: Sequence[str]) -> list[str]:
-    """Say what is fused to the world though it has a mass."""
-    heavy = [name for name in roots if _mass(links[name]) > 0]
-    return [f"{cut(name)}: held to the world, as MuJoCo does with a URDF's root" for name in heavy]
-
-
-def _mass(link: Element) -> float:
-    for element in children(link, "inertial", "mass"):
-        return _number(element.get("value"))
-    return 0.0
-
-
-def _number(text: str | None) -> float:
-    """The number; 0 where there is none, NaN where it is not one."""
-    try:
-        return float(text) if text else 0.0
-    except ValueError:
-        return math.nan
-
-
-def _inertials(files: Files, links: dict[str, Element], roots: Sequence[str]) -> list[str]:
-    notes, points, inferred = [], [], []
-    for name, link in links.items():
-        inertials = children(link, "inertial")
-        if not inertials:
-            shapes = children(link, "collision")
-            inferred += [name] if shapes and name not in roots else []
-            continue
-        inertial = inertials[0]
-        mass = _mass(link)
-        if not mass >= 0:
-            raise files.fault(inertial, f"link {cut(name)}: its mass is {mass:g} kg")
-        if not children(inertial, "mass"):
-            SubElement(inertial, "mass", value="0")
-        for tensor in children(inertial, "inertia") or [SubElement(inertial, "inertia")]:
-            entries = [
-                _number(tensor.get(key)) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-            ]
-            if not all(map(math.isfinite, entries)):
-                raise files.fault(tensor, f"link {cut(name)}: its inertia is not made of numbers")
-            points += [name] if not any(entries) and mass > 0 and name not in roots else []
-            notes += _positive(name, tensor, entries)
-    if points:
-        notes.append(
-            f"{listed(points)}: mass without moments of inertia; points of {POINT:g} kg m^2"
-        )
-    if inferred:
-        notes.append(
-            f"{listed(inferred)}: no mass stated; it follows from the collision shapes at "
-            "1000 kg/m^3, as MuJoCo does"
-        )
-    return notes
-
-
-def _positive(name: str, tensor: Element, entries: Sequence[float]) -> list[str]:
-    """Raise principal moments that are not positive."""
-    xx, yy, zz, xy, xz, yz = entries
-    moments, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-    if moments[0] >= POINT * 1e-3:
-        return []
-    largest = max(float(moments[-1]), 0.0)
-    least = max(POINT, 1e-6 * largest)
-    full = axes @ np.diag(np.maximum(moments, least)) @ axes.T
-    keys = {
-        "ixx": (0, 0),
-        "iyy": (1, 1),
-        "izz": (2, 2),
-        "ixy": (0, 1),
-        "ixz": (0, 2),
-        "iyz": (1, 2),
-    }
-    for key, at in keys.items():
-        tensor.set(key, repr(float(full[at])))
-    if not any(entries):
-        return []
-    shown = ", ".join(f"{moment:.3g}" for moment in moments)
-    return [f"{cut(name)}: principal moments {shown} kg m^2 are raised to at least {least:.3g}"]
-
-
-def _shapes(files: Files, links: dict[str, Element], compiler: Element) -> list[str]:
-    """Leave out what is only seen, and shapes whose mesh is absent or of another format."""
-    meshes = Meshes(files, compiler.get("meshdir") or compiler.get("assetdir") or "")
-    inferring = compiler.get("inertiafromgeom") == "true"
-    for key in ("meshdir", "assetdir", "texturedir", "strippath", "discardvisual"):
-        compiler.attrib.pop(key, None)
-    for name, link in links.items():
-        stated = bool(children(link, "inertial")) and not inferring
-        for shape in [*children(link, "visual"), *children(link, "collision")]:
-            if shape.tag == "visual" or not _kept(files, name, shape, meshes, stated):
-                link.remove(shape)
-    return meshes.notes
-
-
-def _kept(files: Files, name: str, shape: Element, meshes: Meshes, stated: bool) -> bool:
-    """Whether a collision shape can be read; its mesh is called by where it lies."""
-    for mesh in children(shape, "geometry", "mesh"):
-        file = mesh.get("filename") or ""
-        found, why = meshes.find(file)
-        if found is not None:
-            mesh.set("filename", found)
-            return True
-        if not stated:
-            raise files.fault(
-                mesh,
-                f"mesh {cut(file)} {why}, and the mass of link {cut(name)} would follow from it; "
-                "put it there, or state the link's <inertial>",
-            )
-        meshes.leave_out(file, why, name)
-        return False
-    return True
+    return [f"stated twice, the first is read: {listed(twice)}"] if twice else []
 
 
 def _limits(joints: Sequence[Element]) -> list[str]:
@@ -272,44 +167,41 @@ def _limits(joints: Sequence[Element]) -> list[str]:
             if kind not in SINGLE:
                 joint.remove(limit)
                 continue
-            effort = _number(limit.get("effort"))
+            effort = number(limit.get("effort"))
             if "effort" in limit.attrib and not (0 < effort < math.inf):
                 unstated.append(name)
                 del limit.attrib["effort"]
             elif effort > 0:
-                clamped.append(f"{cut(name)} {effort:g}")
-            lower, upper = _number(limit.get("lower")), _number(limit.get("upper"))
-            if kind == "continuous" or lower >= upper:
+                clamped.append(f"{name} {effort:g}")
+            if kind == "continuous" or number(limit.get("lower")) >= number(limit.get("upper")):
+                empty += [name] if kind != "continuous" else []
                 limit.attrib.pop("lower", None)
                 limit.attrib.pop("upper", None)
-                empty += [name] if kind != "continuous" else []
     notes = []
     if clamped:
-        notes.append(f"effort limits clamp what actuators exert (N m, N): {', '.join(clamped)}")
+        notes.append(f"effort limits clamp what actuators exert (N m or N): {listed(clamped)}")
     if unstated:
-        notes.append(f"{listed(unstated)}: an effort limit that is not positive is read as none")
+        notes.append(f"an effort limit that is not positive is read as none: {listed(unstated)}")
     if empty:
-        notes.append(f"{listed(empty)}: a lower limit that is not below the upper is read as none")
+        notes.append(f"a lower limit not below the upper is read as none: {listed(empty)}")
     return notes
 
 
-def _mimics(files: Files, joints: Sequence[Element]) -> list[str]:
+def _mimics(joints: Sequence[Element]) -> list[str]:
     kinds = {joint.get("name"): joint.get("type") for joint in joints}
-    notes = []
+    tied, loose = [], []
     for joint in joints:
         for mimic in children(joint, "mimic"):
             name, other = joint.get("name") or "", mimic.get("joint") or ""
-            if other not in kinds:
-                raise files.fault(mimic, f"joint {cut(name)} mimics '{cut(other)}': no such joint")
-            if joint.get("type") in SINGLE and kinds[other] in SINGLE:
+            if joint.get("type") in SINGLE and kinds.get(other) in SINGLE and name != other:
                 factor, shift = mimic.get("multiplier") or "1", mimic.get("offset") or "0"
-                notes.append(
-                    f"{cut(name)}: mimics {cut(other)} ({cut(factor)} q + {cut(shift)}) by an "
-                    "equality constraint, which is soft as MuJoCo's are"
-                )
+                tied.append(f"{name} = {factor} {other} + {shift}")
             else:
                 joint.remove(mimic)
-                notes.append(
-                    f"{cut(name)}: its mimic of {cut(other)} is not read; one does not turn"
-                )
+                loose.append(f"{name} ({other})")
+    notes = []
+    if tied:
+        notes.append(f"mimic joints follow by MuJoCo's soft equality: {listed(tied)}")
+    if loose:
+        notes.append(f"mimics of joints that do not move, or are not there: {listed(loose)}")
     return notes

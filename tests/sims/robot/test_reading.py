@@ -81,8 +81,8 @@ def test_a_urdf_is_read_with_its_fixed_links_in_what_carries_them(write):
 
 def test_notes_of_a_urdf(write):
     assert read(write(SWING)).notes == (
-        "base: held to the world, as MuJoCo does with a URDF's root",
-        "effort limits clamp what actuators exert (N m, N): pivot 12",
+        "held to the world, as MuJoCo does with a URDF's root: base",
+        "effort limits clamp what actuators exert (N m or N): pivot 12",
         "links on fixed joints are part of what carries them: base of world; plate, bob of rod",
     )
 
