@@ -8,6 +8,7 @@ ripple + friction, with M and n of Pinocchio (J. Carpentier et al., The Pinocchi
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -66,9 +67,28 @@ class Plant:
     binding: Binding | None = None
     elastic: Elastic | None = None
 
+    @cached_property
+    def aba(self):
+        import pinocchio
+
+        return pinocchio.aba
+
     @property
     def size(self):
         return self.damping.size
+
+    # Asked in every stage of every step, so answered once.
+    @cached_property
+    def springs(self):
+        return bool(self.spring.any())
+
+    @cached_property
+    def drags(self):
+        return bool(self.quadratic.any())
+
+    @cached_property
+    def stribeck(self):
+        return bool(self.extra.any())
 
     @property
     def rubs(self):
@@ -81,7 +101,7 @@ class Plant:
     def limit(self, q, v):
         """Largest dry friction of every joint, (N,)."""
         limit = self.coulomb
-        if self.extra.any():
+        if self.stribeck:
             limit = limit + self.extra * np.exp(-((v / self.speed) ** 2))
         if self.binding:
             limit = limit.copy()
@@ -91,9 +111,9 @@ class Plant:
     def passive(self, q, v):
         """Forces of joints by position and speed, without dry friction, (N,)."""
         force = self.bias - self.damping * v
-        if self.spring.any():
+        if self.springs:
             force -= self.spring * q
-        if self.quadratic.any():
+        if self.drags:
             force -= self.quadratic * np.abs(v) * v
         for joint, sine, cosine, period in self.ripples:
             angle = 2 * np.pi * q[joint] / period
@@ -102,9 +122,7 @@ class Plant:
 
     def accelerations(self, q, v, force):
         """By the articulated-body algorithm, (N,)."""
-        import pinocchio
-
-        return pinocchio.aba(self.model, self.data, q, v, force).copy()
+        return self.aba(self.model, self.data, q, v, force)
 
     def inertia(self, q):
         """M(q), (N, N)."""
@@ -118,6 +136,12 @@ class Plant:
         import pinocchio
 
         return pinocchio.nonLinearEffects(self.model, self.data, q, v).copy()
+
+    def torque(self, q, v, a):
+        """What moves it so, (N,)."""
+        import pinocchio
+
+        return pinocchio.rnea(self.model, self.data, q, v, a).copy()
 
     def energy(self, q, v):
         """Kinetic and potential energy, J."""

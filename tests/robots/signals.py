@@ -83,4 +83,5 @@ class Drives:
 
     def forces(self, u, q, v):
         """For commands u by joint."""
-        return np.clip(self.gain * u - self.kp * q - self.kv * v, -self.limit, self.limit)
+        wanted = self.gain * u - self.kp * q - self.kv * v
+        return np.minimum(np.maximum(wanted, -self.limit), self.limit)  # np.clip takes three times

@@ -63,6 +63,7 @@ class World:
         self.plant = plant(machine, self.effects, foreign)
         self.drives = Drives.of(machine, self.effects)
         self.rubs = self.plant.rubs
+        self.dry = bool(self.rubs.any())
 
     def move(self, run, instants):
         """The motion at instants that increase, (K,)."""
@@ -92,6 +93,7 @@ class _Course:
         self.lags = np.zeros(self.count)
         for joint, drive in zip(self.joints, world.machine.drives, strict=True):
             self.lags[joint] = self.signals[drive.name].lag
+        self.dull = bool(self.lags.any())
         self.way, self.stuck = np.zeros(self.count), np.zeros(self.count, dtype=bool)
 
     def _settled_force(self, run):
@@ -132,11 +134,11 @@ class _Course:
         """A new piece: what is commanded may have changed."""
         self.lagged = self._commands(begin)
         self.target, self.begin = self._arrived(begin), begin
-        if self.world.rubs.any():
+        if self.world.dry:
             self._decide(begin)
 
     def _commands(self, t):
-        if not self.lags.any():
+        if not self.dull:
             return self.target
         left = np.exp(-(t - self.begin) / np.maximum(self.lags, 1e-12))
         return self.target + (self.lagged - self.target) * np.where(self.lags > 0, left, 0.0)
@@ -148,7 +150,7 @@ class _Course:
 
     def _step(self, now, end):
         """From now to end, through whatever comes to rest or breaks loose between them."""
-        if not self.world.rubs.any():
+        if not self.world.dry:
             self.state = self._moved(now, end - now)
             return
         whole = end - now
@@ -283,11 +285,11 @@ class _Course:
     def _rate(self, t, state):
         n = self.count
         q, v = state[:n], state[n : 2 * n]
-        if self.stuck.any():
+        if self.world.dry and self.stuck.any():
             a = self._holding(t, state)[1]
         else:
             force = self._force(t, state)
-            if self.way.any():
+            if self.world.dry:
                 force = force - self.way * self.plant.limit(q, v)
             a = self.plant.accelerations(q, v, force)
         if not self.elastic:

@@ -1,0 +1,139 @@
+"""What can be hidden, where, and how strongly: coefficients as a function of a strength, 1 being
+the far end of plausible.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+JOINT = (
+    "friction.coulomb", "friction.stribeck", "drag.linear", "drag.quadratic", "spring.linear",
+    "inertia.armature", "force.bias", "force.ripple",
+)  # fmt: skip
+BODY = ("mass.scale", "mass.offset", "inertia.scale")
+BOTH = ("input.gain", "input.bias", "input.delay", "input.lag")
+MOTOR = ("input.deadband", "input.saturation")
+SERVO = ("actuator.stiffness", "actuator.damping")
+CHANNEL = ("sensor.bias", "sensor.gain", "sensor.delay")
+WORLD = ("gravity.tilt", "gravity.scale", "clock.skew")
+FOREIGN = ("elastic", "binding", "slip")
+FAMILIES = ("friction.coulomb", "drag.linear")
+SIMPLER = {"friction.stribeck": "friction.coulomb"}
+SIGNED = (
+    "force.bias", "mass.scale", "inertia.scale", "input.gain", "input.bias", "sensor.bias",
+    "sensor.gain", "clock.skew", "gravity.scale", "actuator.stiffness", "actuator.damping",
+)  # fmt: skip
+FAR = {  # of effects that need no scale of the motion
+    "mass.scale": 0.5, "inertia.scale": 0.9, "input.gain": 0.4, "input.delay": 0.1,
+    "input.lag": 0.2, "sensor.bias": 0.2, "sensor.gain": 0.3, "sensor.delay": 0.1,
+    "clock.skew": 0.06, "gravity.scale": 0.3, "actuator.stiffness": 0.5, "actuator.damping": 0.8,
+    "gravity.tilt": 0.2, "mass.offset": 0.1,
+}  # fmt: skip
+
+
+def effects(drive):
+    """What can be hidden in a machine that is driven so: motor or servo."""
+    inputs = BOTH + (MOTOR if drive == "motor" else SERVO)
+    return JOINT + BODY + inputs + CHANNEL + WORLD
+
+
+def places(machine, effect):
+    """Where an effect can be."""
+    if effect in JOINT:
+        return list(machine.joints)
+    if effect in BODY:
+        return list(machine.bodies)
+    if effect in CHANNEL:
+        return [f"q.{joint}" for joint in machine.joints]
+    return [""] if effect in WORLD else [drive.name for drive in machine.drives]
+
+
+def named(effect, place):
+    """effect@place, or the effect alone where it is the world's."""
+    return f"{effect}@{place}" if place else effect
+
+
+def shape(effect, place, setting, rng):
+    """Coefficients by strength."""
+    sign = float(rng.choice([-1.0, 1.0])) if effect in SIGNED else 1.0
+    if effect in SHAPES:
+        return SHAPES[effect](place, setting, rng)
+    far = FAR[effect] if effect in FAR else SCALES[effect](place, setting)
+    return lambda s: (sign * far * float(s),)
+
+
+def _at(setting, place):
+    """Typical numbers of the joint of a place, by name."""
+    index = setting.machine.index(place)
+    return {name: float(values[index]) for name, values in setting.typical.items()}
+
+
+def _command(setting, place):
+    return np.concatenate([run.commands[place] for run in setting.fitted])
+
+
+def _per_force(bottom):
+    def far(place, setting):
+        typical = _at(setting, place)
+        return 2.0 * typical["force"] / bottom(typical)
+
+    return far
+
+
+SCALES = {
+    "friction.coulomb": _per_force(lambda typical: 2.0),
+    "drag.linear": _per_force(lambda typical: typical["speed"]),
+    "drag.quadratic": _per_force(lambda typical: typical["speed"] ** 2),
+    "spring.linear": _per_force(lambda typical: typical["position"] + 0.05),
+    "force.bias": _per_force(lambda typical: 1.0),
+    "inertia.armature": lambda place, setting: 2.0 * _at(setting, place)["inertia"],
+    "input.bias": lambda place, setting: float(np.ptp(_command(setting, place))) / 2,
+    "input.deadband": lambda place, setting: float(np.abs(_command(setting, place)).max()) / 2,
+}
+
+
+def _stribeck(place, setting, rng):
+    typical, extra = _at(setting, place), float(rng.uniform(2.0, 6.0))
+    speed = typical["speed"] * float(rng.uniform(0.15, 0.5))
+    return lambda s: (0.3 * typical["force"] * s, 0.3 * extra * typical["force"] * s, speed)
+
+
+def _ripple(place, setting, rng):
+    typical, angle = _at(setting, place), rng.uniform(0, 2 * np.pi)
+    period = float(np.clip(typical["travel"] / rng.uniform(1.5, 4.0), 0.08, 1.0))
+    sine, cosine = float(np.sin(angle)), float(np.cos(angle))
+    return lambda s: (2 * typical["force"] * sine * s, 2 * typical["force"] * cosine * s, period)
+
+
+def _tilt(place, setting, rng):
+    angle = rng.uniform(0, 2 * np.pi)
+    x, y = FAR["gravity.tilt"] * float(np.cos(angle)), FAR["gravity.tilt"] * float(np.sin(angle))
+    return lambda s: (x * s, y * s)
+
+
+def _offset(place, setting, rng):
+    way = rng.normal(size=3)
+    way *= FAR["mass.offset"] / np.linalg.norm(way)
+    return lambda s: tuple((way * s).tolist())
+
+
+def _saturation(place, setting, rng):
+    """A limit below the command's peak: at strength 0 at the peak, at 1 at nothing."""
+    peak = float(np.abs(_command(setting, place)).max())
+    return lambda s: (peak * (1 - s),)
+
+
+SHAPES = {
+    "friction.stribeck": _stribeck,
+    "force.ripple": _ripple,
+    "gravity.tilt": _tilt,
+    "mass.offset": _offset,
+    "input.saturation": _saturation,
+}
+
+
+def family(effect, setting, rng):
+    """Coefficients by effect@place of every joint, of different sizes, by strength."""
+    shares = {joint: float(rng.uniform(0.5, 1.5)) for joint in setting.machine.joints}
+    far = {joint: SCALES[effect](joint, setting) for joint in shares}
+    return lambda s: {f"{effect}@{joint}": (shares[joint] * far[joint] * s,) for joint in shares}

@@ -1,0 +1,103 @@
+"""Questions about robots: drawn alike every time, as large as they say, told to nobody."""
+
+import csv
+
+import numpy as np
+import pytest
+import tomllib
+
+pytest.importorskip("pinocchio", reason="pin has no wheel here")
+
+from tests.robots import causes, foreign, items, questions, recording, sizing
+from tests.robots.sensing import Noise
+
+
+@pytest.fixture(scope="module")
+def item():
+    return items.draw("single", "arm2-servo", "friction.coulomb", 0)
+
+
+def test_an_item_follows_from_its_name(item):
+    assert items.Item.of(item.json()) == item
+    first = items.draw("clean", "arm2-servo", "any", 0)
+    was = items.setting_of(first.name)
+    items.setting_of.cache_clear()
+    again = items.setting_of(first.name)
+    assert items.draw("clean", "arm2-servo", "any", 0) == first
+    assert again.machine == was.machine != items.setting_of(item.name).machine
+    for run, other in zip(again.runs, was.runs, strict=True):
+        assert {name: u.tolist() for name, u in run.commands.items()} == {
+            name: u.tolist() for name, u in other.commands.items()
+        }
+
+
+def test_a_hidden_cause_is_as_large_as_it_says(item):
+    assert 2.9 < item.size < 10.3
+    gauge = items.gauge_of(item.name)
+    assert gauge.gap(item.effects) == pytest.approx(item.size, rel=1e-6)
+    assert gauge.gap({}) == 0.0
+
+
+def test_initial_states_absorb_what_they_can(item):
+    gauge, setting = items.gauge_of(item.name), items.setting_of(item.name)
+    base = [seen.copy() for seen in gauge.base]
+    for seen, basis in zip(base, gauge.free, strict=True):
+        seen += (7.0 * basis[:, 0]).reshape(seen.shape)
+    assert sizing.rms(np.concatenate(gauge.beyond_states(base))) < 1e-9
+    assert all(basis.shape[1] == 2 * len(setting.machine.joints) for basis in gauge.free)
+
+
+def test_the_files_say_what_is_known_and_not_what_is_hidden(item, tmp_path):
+    path = recording.realise(item, tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "recording.csv", "recording.toml", "robot.urdf",
+    ]  # fmt: skip
+    stated = tomllib.loads(path.with_suffix(".toml").read_text())
+    assert stated["model"] == "robot.urdf"
+    assert stated["engine"] == {"timestep": item.step, "integrator": "RK4"}
+    assert {name: a["kind"] for name, a in stated["actuators"].items()} == {
+        "m_shoulder": "position", "m_elbow": "position",
+    }  # fmt: skip
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 6 * 401
+    assert {row["run"] for row in rows if row["run"] in stated["runs"]} == {"4", "5"}
+    text = path.with_suffix(".toml").read_text() + path.read_text()
+    assert "friction" not in text + (tmp_path / "robot.urdf").read_text().replace(
+        'friction="0"', ""
+    )
+
+
+@pytest.mark.parametrize("kind", ["white", "ar1", "quantised"])
+def test_noise_is_as_strong_as_it_says(kind):
+    noise = Noise({"q.a": 1e-3, "qd.a": 5e-3}, kind, 0.6, 0.4)
+    smooth = np.column_stack([np.linspace(0, 3, 20_000), np.linspace(0, -7, 20_000)])
+    rest = noise.added(smooth, np.random.default_rng(0)) - smooth
+    np.testing.assert_allclose(rest.std(axis=0), [1e-3, 5e-3], rtol=0.04)
+
+
+def test_every_place_of_every_effect_can_be_drawn(item):
+    setting = items.setting_of(item.name)
+    rng = np.random.default_rng(0)
+    for effect in causes.effects("servo"):
+        for place in causes.places(setting.machine, effect):
+            c = causes.shape(effect, place, setting, rng)(0.1)
+            assert np.isfinite(c).all()
+            assert any(c)
+    names = {q.name for q in questions.sheet()}
+    assert len(names) == len(questions.sheet())
+    assert {q.kind for q in questions.sheet()} == set(items.KINDS)
+    assert sum(q.kind == "clean" for q in questions.sheet()) >= 200
+
+
+def test_a_slipping_encoder_jumps_and_stays(item):
+    setting = items.setting_of(item.name)
+    of = foreign.drawn("slip", 1, setting, np.random.default_rng(0))
+    slips = foreign.slips_of(of(0.5), 0)
+    assert 1 <= len(slips) <= 2
+    gauge = items.gauge_of(item.name)
+    jump = gauge.seen(of(0.5))[0][:, 1] - gauge.base[0][:, 1]
+    before = setting.runs[0].times < min(instant for _, instant, _ in slips)
+    assert np.all(jump[before] == 0.0)
+    total = sum(size for _, _, size in slips) / setting.sigma[1]
+    assert jump[-1] == pytest.approx(total)
