@@ -73,6 +73,10 @@ def found(files: Files, root: Element) -> Absent:
     meshes = settings.get("meshdir", everywhere)
     pictures = settings.get("texturedir", everywhere)
     strip = settings.get("strippath") == "true"
+    for element in root.iter("flexcomp"):
+        file = element.get("file")
+        if file and _read(files, meshes, file, strip):
+            element.set("file", str((files.path.parent / meshes / file).resolve()))
     for asset in children(root, "asset"):
         for element in list(asset):
             if element.tag == "model":
@@ -114,6 +118,8 @@ def _model(files: Files, element: Element) -> None:
     if path.resolve() in files.included:
         raise files.fault(element, f"{cut(name)} holds itself")
     _measured(files, tree(files, path), 1.0)
+    # It is opened before the spec knows its folder.
+    element.set("file", str(path.resolve()))
 
 
 def _named(element: Element) -> Iterator[str]:

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sims.base import InputError, unknown
+from sims.robot.quiet import quiet
 
 Format = Literal["mjcf", "urdf"]
 Kind = Literal["hinge", "slide", "ball", "free"]
@@ -131,7 +132,8 @@ class Robot:
     @cached_property
     def compiled(self) -> Any:
         """The mujoco.MjModel; nobody writes into it."""
-        return self.spec.compile()
+        with quiet():
+            return self.spec.compile()
 
     @property
     def name(self) -> str:

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from sims.base import InputError
-from sims.limits import cut
+from sims.limits import LARGEST, cut
 from sims.robot import added, contacts, mjcf, names, urdf
 from sims.robot.mends import Mends
 from sims.robot.model import Format, Robot
@@ -21,6 +23,11 @@ from sims.robot.xmlfile import Files, include, tree, written
 
 FORMATS: Mapping[str, Format] = {"mujoco": "mjcf", "robot": "urdf"}
 """By the root element."""
+NUMBERS = (
+    "body_mass", "body_inertia", "body_pos", "body_ipos", "jnt_pos", "jnt_axis",
+    "jnt_stiffness", "dof_damping", "dof_armature", "dof_frictionloss",
+)  # fmt: skip
+"""Fields of the compiled model that may hold whatever the file says."""
 
 
 def read(
@@ -106,6 +113,17 @@ def _check(files: Files, model: Any) -> None:
     if not added.SHORTEST <= step <= added.LONGEST:
         span = f"{added.SHORTEST:g} to {added.LONGEST:g} s"
         raise InputError(f"{files.path}: option timestep: expected {span}, found {step:g}")
+    for field in NUMBERS:
+        values = np.asarray(getattr(model, field), dtype=float)
+        faults = np.argwhere(~(np.abs(values) <= LARGEST))
+        if len(faults):
+            (row, *_), (kind, what) = faults[0], field.split("_", 1)
+            joint = model.dof_jntid[row] if kind == "dof" else row
+            name = (model.body(row) if kind == "body" else model.joint(joint)).name
+            raise InputError(
+                f"{files.path}: {what} of {cut(name)}: expected numbers within ±{LARGEST:g}, "
+                f"found {values[tuple(faults[0])]:g}"
+            )
 
 
 def _parsed(files: Files, root: Element) -> Any:

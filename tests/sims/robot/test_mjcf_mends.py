@@ -139,3 +139,34 @@ def test_free_and_ball_joints_are_read(write):
         ("root", "free", 0),
         ("hip", "ball", 6),
     ]
+
+
+def test_a_mesh_that_mujoco_refuses(write):
+    path = write(mjcf('<mesh name="m" file="bad.obj"/><mesh name="n" file="bad.stl"/>'))
+    write(
+        "v 0 0 0\nv 1 0 0\nv nan 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n",
+        "parts/bad.obj",
+    )
+    write("", "parts/bad.stl")
+    robot = read(path)
+    assert robot.compiled.nmesh == 0
+    (note,) = robot.notes
+    assert note.startswith("shapes left out, and their contacts, since their file is refused by ")
+    assert note.endswith("is not finite): m")
+
+
+def test_attached_models_are_read_from_the_models_folder(write, monkeypatch):
+    hand = '<mujoco><worldbody><body name="hand">{}<geom size="1" mass="3"/></body>'
+    hand = f"{hand}</worldbody></mujoco>"
+    write(hand.format('<joint name="wrist"/>'), "hands/hand.xml")
+    path = write(
+        '<mujoco><asset><model name="m" file="hands/hand.xml"/></asset><worldbody><body name="arm">'
+        '<joint name="elbow"/><geom size="1"/><attach model="m" body="hand" prefix="left/"/></body>'
+        "</worldbody></mujoco>"
+    )
+    monkeypatch.chdir("/")
+    robot = read(path)
+    assert [joint.name for joint in robot.joints] == ["elbow", "left/wrist"]
+    assert robot.body("left/hand").mass == 3
+    write(hand.format(""), "hands/hand.xml")
+    assert read(path).digest != robot.digest

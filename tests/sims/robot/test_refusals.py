@@ -61,6 +61,12 @@ CASES = {
     ),
     mjcf('<size nuser_body="1000000"/>'): ':2: nuser_body="1000000" is too much',
     mjcf('<size memory="900G"/>'): ": engine error: Could not allocate memory",
+    mjcf(
+        body=BODY.replace("<geom", '<inertial pos="0 0 0" mass="inf" diaginertia="1 1 1"/><geom')
+    ): (": mass of b: expected numbers within ±1e+15, found inf"),
+    mjcf(body=BODY.replace("<joint", '<joint damping="1e300"')): (
+        ": damping of j: expected numbers within ±1e+15, found 1e+300"
+    ),
     # URDF
     robot(link("a")): ": none of its 0 joints moves",
     robot(link("a"), link("b"), joint("j", "a", "b", "fixed")): ": none of its 1 joints moves",
