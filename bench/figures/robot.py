@@ -78,7 +78,7 @@ class _Label(NamedTuple):
 
 
 def robot_figure(
-    robot: Robot, positions: Mapping[str, float], marks: Sequence[Mark] = ()
+    robot: Robot, positions: Mapping[str, float], marks: Sequence[Mark] = (), least: float = 0.0
 ) -> Figure:
     """The robot at a pose, with places marked.
 
@@ -86,6 +86,7 @@ def robot_figure(
         robot: what to draw.
         positions: rad or m by joint; a joint that is not named stands where the file has it.
         marks: places; one that the robot does not have is left out.
+        least: inches that the figure is wide at least.
     """
     data = posed(robot, dict(positions))
     seen_from = view(robot, data)
@@ -93,9 +94,11 @@ def robot_figure(
     sides = _sides(labels)
     columns = [COLUMN if side else 0.3 for side in sides]
     scale = LONGEST / max(seen_from.width, seen_from.height)
-    needed = max((sum(label.height for label in side) for side in sides), default=0.0)
+    needed = max(_height(side) for side in sides)
     width, height = scale * seen_from.width, scale * seen_from.height
     tall = max(height, needed)
+    spare = max(0.0, least - sum(columns) - width) / 2
+    columns = [column + spare for column in columns]
     size = (columns[0] + width + columns[1], tall + FOOT + 0.15)
     figure, axes = blank(1, 1, size, layout=None)
     axis = axes[0, 0]
@@ -156,15 +159,21 @@ def _short(text: str) -> str:
 
 
 def _sides(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]]:
-    """Labels for the left and for the right column, from above to below: as many lines on each, by
-    where their places lie.
+    """Labels for the left and for the right column, from above to below: on the side on which their
+    places lie, as long as there is room.
     """
     across = sorted(labels, key=lambda label: (label.point[0], -label.point[1]))
-    heights = np.cumsum([label.height for label in across])
-    # A few labels stand on one side, where the drawing can be larger.
-    half = int(np.searchsorted(heights, heights[-1] / 2)) + 1 if len(across) > 1 else 0
-    left, right = across[:half], across[half:]
-    return _downwards(left), _downwards(right)
+    count = sum(label.point[0] < 0 for label in across)
+    # A column is no longer than the drawing, unless both are.
+    while count and _height(across[:count]) > max(LONGEST, _height(across[count:])):
+        count -= 1
+    while count < len(across) and _height(across[count:]) > max(LONGEST, _height(across[:count])):
+        count += 1
+    return _downwards(across[:count]), _downwards(across[count:])
+
+
+def _height(labels: Sequence[_Label]) -> float:
+    return sum(label.height for label in labels)
 
 
 def _downwards(labels: Sequence[_Label]) -> list[_Label]:

@@ -55,7 +55,9 @@ class Explanation:
 
     @property
     def figures(self) -> tuple[str, ...]:
-        """Names of the figures that there are: ``overview``, ``where``, ``candidates`` at most."""
+        """Names of the figures that there are: ``overview``, ``where``, ``candidates`` at most, and
+        ``robot`` where it is one.
+        """
         return pictures.names(self.story)
 
     def figure(self, name: str) -> Figure:

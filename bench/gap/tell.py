@@ -13,6 +13,7 @@ from bench.gap.causes.rules import CHANCE
 from bench.gap.causes.search import Search
 from bench.gap.model.base_fit import Base
 from bench.gap.report import show
+from bench.gap.report.places import of_set
 from bench.gap.report.story import Place, Shown, Side, Story, Tuned
 from bench.gap.verdict import Verdict
 from sims.base import Array
@@ -58,6 +59,7 @@ class Teller:
             tuple(self._remains()),
             tuple(self._why()),
             self.finding.vague,
+            show.robot_of(world),
         )
 
     def _held_out(self, sigma: Array) -> tuple[Side | None, list[Place]]:
@@ -128,9 +130,11 @@ class Teller:
             yield self._structure()
         for cause in finding.causes:
             if cause.alternatives:
-                others = ", ".join(cause.alternatives)
+                names = [cause.effect, *cause.alternatives]
+                placed = any("@" in name for name in names)
+                all_of_them = of_set(names, "and") if placed else _named(names)
                 yield (
-                    f"{cause.effect} and {others} make the same difference in these runs, "
+                    f"{all_of_them} make the same difference in these runs, "
                     "once parameters and initial states are fitted with each: "
                     "their likelihoods differ by odds of less than 33 to 1"
                 )
@@ -144,6 +148,11 @@ class Teller:
                 "that the sensor's noise does not have"
             )
         return "what is left over exceeds the stated noise of the sensors"
+
+
+def _named(effects: list[str]) -> str:
+    """Registered names in a row."""
+    return f"{effects[0]} and {', '.join(effects[1:])}"
 
 
 def _triple(number: Number) -> tuple[float, float, float]:

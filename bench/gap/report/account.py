@@ -5,17 +5,28 @@ figures say too.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from math import isclose, isfinite
 from textwrap import wrap
 
 import numpy as np
 
 from bench.gap.model.watch import QUESTIONS
-from bench.gap.report.story import Place, Side, Story, Tuned
+from bench.gap.report.places import (
+    coefficient,
+    has_places,
+    is_wrong,
+    lacks,
+    listed,
+    of_set,
+    sized,
+    too_much,
+    without_place,
+)
+from bench.gap.report.story import Place, Shown, Side, Story, Tuned
 from bench.gap.report.words import (
     clean,
     estimate,
-    estimated,
     joined,
     noun,
     number,
@@ -40,6 +51,8 @@ MOST_PHI = 0.98
 """Correlation of neighbouring samples that is believed at most: at 1 no sample would count."""
 FAR = 10.0
 """Shares of its value by which a parameter moves that are no longer said in percent."""
+MOST_CHANNELS = 6
+"""Channels that a sentence names."""
 PERFECT = "with a perfect model the sensor's noise would leave"
 MOVED = 0.05
 """Share by which a parameter moves that is called out where its interval is not known."""
@@ -89,7 +102,7 @@ def details(story: Story) -> Iterator[str]:
 
 def _says(cause: Cause) -> str:
     """What an effect does, to stand within a sentence."""
-    return clean(cause.says).rstrip(".")
+    return without_place(clean(cause.says).rstrip("."))
 
 
 def headline(story: Story) -> str:
@@ -107,24 +120,37 @@ def headline(story: Story) -> str:
         none = f"none of the {len(story.verdict.candidates)} known causes explains it"
         return f"Something is missing from the simulation, and {none}."
     if verdict == "ambiguous":
-        return f"The simulation lacks {_sets(causes)}: these data cannot tell which."
+        return f"The simulation {lacks(causes)}: these data cannot tell which."
     if verdict == "partial":
         more = "something else that no known cause explains"
-        return f"The simulation lacks {_sets(causes)}, and {more}."
-    names = joined([noun(cause.effect) for cause in causes])
-    # With several causes the sentence would not end: what they do follows it.
-    says = f": {_says(causes[0])}" if len(causes) == 1 else ""
-    return f"The simulation lacks {names}{says}."
+        if len(causes) == 1 and (said := sized(causes[0])):
+            return sentence(f"{said}, and the simulation lacks {more}")
+        return f"The simulation {lacks(causes)}, and {_also(causes)}{more}."
+    if len(causes) > 1:
+        # With several causes the sentence would not end: what they do follows it.
+        return f"The simulation {lacks([replace(c, alternatives=()) for c in causes])}."
+    (cause,) = causes
+    if said := sized(cause):
+        return sentence(said)
+    if too_much(cause):
+        return f"The simulation has too much {noun(cause.effect)}."
+    return f"The simulation {lacks([replace(cause, alternatives=())])}: {_says(cause)}."
+
+
+def _also(causes: Sequence[Cause]) -> str:
+    """The verb of what is lacking besides, where the causes before it are wrong numbers."""
+    names = [name for cause in causes for name in (cause.effect, *cause.alternatives)]
+    return "lacks " if any(is_wrong(name) for name in names) else ""
 
 
 def _headline_of_cut(verdict: Verdict) -> str:
     """The same of a search that was ended early: what it has, and no more."""
     if verdict.verdict == "partial":
-        return f"The simulation lacks {_sets(verdict.causes)}; what else, was not asked to the end."
+        return f"The simulation {lacks(verdict.causes)}; what else, was not asked to the end."
     nothing = "The search was ended before it could say what the simulation lacks"
     if not verdict.causes:
         return f"{nothing}."
-    return f"{nothing}; the best that it had come upon: {_sets(verdict.causes)}."
+    return f"{nothing}; the best that it had come upon: {listed(verdict.causes)}."
 
 
 def cut(story: Story) -> str:
@@ -136,20 +162,6 @@ def cut(story: Story) -> str:
     open_ones = joined([QUESTIONS[name] for name in found.not_asked if name in QUESTIONS])
     during = f"; looked at last: {clean(found.during, 80)}" if found.during else ""
     return f"The search was ended by {by}{during}. Not asked to the end: {open_ones}."
-
-
-def _sets(causes: Sequence[Cause]) -> str:
-    """The causes, those that have alternatives last: ``wind, and linear drag or Coulomb
-    friction``.
-    """
-    # Causes that are certain share one list; each open one is a list with "or" of its own.
-    sure = [noun(cause.effect) for cause in causes if not cause.alternatives]
-    parts = [joined(sure)] if sure else []
-    for cause in causes:
-        if cause.alternatives:
-            members = [noun(name) for name in (cause.effect, *cause.alternatives)]
-            parts.append(joined(members, "or"))
-    return ", and ".join(parts)
 
 
 def unfixed(story: Story) -> list[str]:
@@ -222,9 +234,14 @@ def _closer(story: Story) -> str:
         return f"The best of them, {names}, {'closes' if len(causes) == 1 else 'close'} only"
     if len(causes) > 1:
         return "Together they close"
+    if is_wrong(causes[0].effect) and not causes[0].alternatives:
+        return "To correct it closes"
     if story.verdict.verdict == "partial":
         return sentence(f"{noun(causes[0].effect)} closes").rstrip(".")
-    return "Either closes" if story.verdict.verdict == "ambiguous" else "It closes"
+    if story.verdict.verdict != "ambiguous":
+        return "It closes"
+    several = len(causes[0].alternatives) > 1 and has_places(story)
+    return "Each closes" if several else "Either closes"
 
 
 def _fitted_gain(story: Story) -> str:
@@ -273,15 +290,30 @@ def looked_for(story: Story) -> str:
 
 
 def hiding(story: Story) -> str:
-    """How large a gap the noise could hide, channel by channel."""
+    """How large a gap the noise could hide, channel by channel; of many, in the worst of each
+    kind.
+    """
+    sizes = zip(story.channels, hidden(story).tolist(), strict=True)
+    # A channel that was hardly recorded says nothing about what it hides.
+    known = [(channel, size) for channel, size in sizes if isfinite(size)]
     parts = []
-    for channel, size in zip(story.channels, hidden(story).tolist(), strict=True):
-        # A channel that was hardly recorded says nothing about what it hides.
-        if isfinite(size):
-            amount = with_unit(number(size, 2), channel.unit)
-            share = f"{number(size / channel.sigma, 2)} of its noise"
-            parts.append(f"{amount} in {clean(channel.name, 30)} ({share})")
+    for channel, size in _worst_of_each(known):
+        amount = with_unit(number(size, 2), channel.unit)
+        share = f"{number(size / channel.sigma, 2)} of its noise"
+        parts.append(f"{amount} in {clean(channel.name, 30)} ({share})")
     return f"A gap of up to {joined(parts)} RMS could still hide in the noise." if parts else ""
+
+
+def _worst_of_each(sizes: Sequence[tuple[Shown, float]]) -> list[tuple[Shown, float]]:
+    """Of many channels the one of each kind that hides most, in units of its noise."""
+    if len(sizes) <= MOST_CHANNELS:
+        return list(sizes)
+    worst: dict[str, tuple[Shown, float]] = {}
+    for channel, size in sizes:
+        kind = channel.name.partition(".")[0]
+        if kind not in worst or size / channel.sigma > worst[kind][1] / worst[kind][0].sigma:
+            worst[kind] = channel, size
+    return list(worst.values())
 
 
 def hidden(story: Story) -> Array:
@@ -343,11 +375,11 @@ def coefficients(cause: Cause) -> str:
     well.
     """
     parts = []
-    for name, coefficient in cause.coefficients.items():
-        parts.append(f"{clean(name, 60)} {estimated(coefficient)}")
+    for name, fitted in cause.coefficients.items():
+        parts.append(coefficient(name, fitted))
     others = ""
     if cause.alternatives:
-        names = joined([noun(name) for name in cause.alternatives], "or")
+        names = of_set(cause.alternatives)
         others = f"; {names} instead would do as well"
     return f"{joined(parts)}; {probability(cause.p_value)}{others}."
 

@@ -73,6 +73,11 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], marks: Sequence[s
     )
 
 
+def folded(head: str, content: str) -> str:
+    """What is shown once its head is clicked on."""
+    return f"<details>\n<summary>{head}</summary>\n{content}\n</details>"
+
+
 def figure(png: bytes, alternative: str, caption: str) -> str:
     """A picture within the page itself, with its caption.
 

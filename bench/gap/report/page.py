@@ -13,8 +13,11 @@ from pathlib import Path
 
 from bench.gap.report.account import closes, effort, following, headline, heldout_unit, interval
 from bench.gap.report.elements import bar, code, figure, paragraph, safe, strong
+from bench.gap.report.joints import by_joint
+from bench.gap.report.places import marks
 from bench.gap.report.sections import (
     candidates,
+    changes,
     numbers,
     reading,
     remains,
@@ -41,6 +44,11 @@ _CUT = {
 }
 """The same where the search was ended early."""
 _CAPTIONS = {
+    "robot": (
+        "The robot as the run below begins. Blue marks are places that the verdict names: whole "
+        "where it is sure, dashed where it is one of several; circles are joints, squares "
+        "actuators, diamonds bodies, triangles sensors."
+    ),
     "overview": (
         "Above: measured and simulated; below: the residual, what is measured less what is "
         "simulated. In the grey band 95 % of the sensor's noise would lie."
@@ -56,6 +64,12 @@ _CAPTIONS = {
     ),
 }
 """Under the figures."""
+_JOINTS = (
+    "A row for each joint; blue ones are those that the verdict names. Left: measured and "
+    "simulated. Right: what is measured less what is simulated, in units of the sensor's noise σ "
+    "and on one scale for all; in the grey band 95 % of the noise would lie."
+)
+"""Under the figure of a robot's run."""
 _FEW = 5
 """Places and candidates that are read aloud in place of a figure."""
 
@@ -72,11 +86,13 @@ def page(story: Story, drawn: Mapping[str, bytes], for_print: bool = True) -> st
     parts = [
         *_head(story),
         *_opening(story),
+        pictures.get("robot", ""),
         pictures.get("overview", ""),
         *why(story),
         *where(story, pictures.get("where", "")),
         *candidates(story, pictures.get("candidates", "")),
         *numbers(story),
+        *changes(story),
         *remains(story),
         *reading(),
         f"</main>\n{_footer(story)}\n</body>\n</html>\n",
@@ -140,7 +156,7 @@ def _gain(story: Story) -> Iterator[str]:
 
 
 def _picture(story: Story, name: str, png: bytes, for_print: bool) -> str:
-    caption = _CAPTIONS.get(name, "")
+    caption = _JOINTS if name == "overview" and by_joint(story) else _CAPTIONS.get(name, "")
     if for_print:
         caption += f" <span>For print: {safe(name)}.pdf</span>"
     return figure(png, safe(_alternative(story, name), 700), caption)
@@ -148,6 +164,9 @@ def _picture(story: Story, name: str, png: bytes, for_print: bool) -> str:
 
 def _alternative(story: Story, name: str) -> str:
     """What a figure shows, for those who do not see it."""
+    if name == "robot":
+        named = [f"{m.kind} {clean(m.name, 30)} ({clean(m.says, 60)})" for m in marks(story)]
+        return f"The robot; marked: {joined(named) or 'nothing'}."
     if name == "overview":
         names = joined([clean(c.name, 30) for c in story.channels])
         what = f"Measured and simulated {names} of the run that fits worst, with the residual."
@@ -164,7 +183,9 @@ def _alternative(story: Story, name: str) -> str:
 
 
 def _footer(story: Story) -> str:
-    units = safe(joined([pretty(c.unit) or "1" for c in story.channels]), 100)
+    all_units = [pretty(c.unit) or "1" for c in story.channels]
+    # Of a robot's many channels each unit is said once.
+    units = safe(joined(list(dict.fromkeys(all_units)) if by_joint(story) else all_units), 100)
     recording = f"Recording: {code(safe(story.path, 300))} (channels in {units})."
     made = f"{safe(effort(story))} Made by simgap explain."
     return f'<footer class="soft">\n{paragraph(f"{recording} {made}")}\n</footer>'

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.figures.style import BAND, BLUE, CHANCE, INK, JOIN, SKY, VERMILION, ZERO
+from bench.gap.report.places import has_places
+from bench.gap.report.ranking import entries, short_name, standing
 from bench.gap.report.story import Place, Profile, Story
 from bench.gap.report.words import clean, labelled, name_of, number, probability
 from bench.gap.verdict import Candidate
@@ -19,10 +21,13 @@ if TYPE_CHECKING:
 
 MOST_RUNS = 8
 """Runs that are shown, the worst."""
-MOST_PLACES = 6
+MOST_PLACES = 10
 """Channels that are shown, and phases, the worst of each."""
 MOST_PROFILES = 4
-MOST_CANDIDATES = 12
+MOST_LETTERS = 26
+"""Of the name of a variable or of a channel."""
+SHORT = 9
+"""Letters of a channel's name that stand in one line with what is said of it."""
 BEFORE: Mapping[str, Any] = {"color": VERMILION, "linestyle": (0, (5, 2)), "linewidth": 1.3}
 """Curves of the tuned base model: dashed, to be told apart in grey."""
 AFTER: Mapping[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5}
@@ -202,18 +207,12 @@ def profile_panel(axis: Axes, profile: Profile, unit: str, extended: bool) -> No
         looks.append((profile.after, {**AFTER, **FILLED, "markersize": 3.5, "linewidth": 1.2}))
     for values, look in looks:
         axis.errorbar(centres, values[there], yerr=bars, elinewidth=1.0, **look)
-    axis.set_xlabel(label(profile.variable, profile.unit, 16))
-    axis.set_ylabel(label(f"residual of {clean(profile.channel, 9)}", clean(unit, 9)))
+    axis.set_xlabel(label(profile.variable, profile.unit, MOST_LETTERS))
+    # The name of a robot's channel is long: it has a line of its own.
+    name = clean(profile.channel, MOST_LETTERS)
+    of = " of " if len(name) <= SHORT else " of\n"
+    axis.set_ylabel(f"residual{of}{label(name, clean(unit, SHORT))}")
     axis.locator_params(nbins=5)
-
-
-def ranked(story: Story) -> list[Candidate]:
-    """The candidates to show, the highest score first; what is found is among them."""
-    ordered = sorted(story.verdict.candidates, key=lambda c: c.score, reverse=True)
-    # What is found stays, however low it scores beside what it made needless.
-    others = [c for c in ordered if standing(story, c.effect) == "not needed"]
-    beyond = others[max(0, MOST_CANDIDATES - len(ordered) + len(others)) :]
-    return [c for c in ordered if c not in beyond]
 
 
 def scores_panel(axis: Axes, story: Story, shown: Sequence[Candidate]) -> None:
@@ -221,22 +220,30 @@ def scores_panel(axis: Axes, story: Story, shown: Sequence[Candidate]) -> None:
     rows = np.arange(len(shown))
     # A fit that has failed to gain has no evidence, not evidence against.
     sizes = [max(c.score, 0.0) for c in shown]
+    elsewhere = {entry.best.effect: entry.elsewhere for entry in entries(story)}
     for row, size, c in zip(rows, sizes, shown, strict=True):
         look = _LOOKS[standing(story, c.effect)]
         axis.barh(row, size, height=0.62, edgecolor="white", **look)
+        others = [max(other.score, 0.0) for other in elsewhere.get(c.effect, ())]
+        axis.plot(others, [row] * len(others), "|", color=INK, markersize=8, markeredgewidth=1.0)
         axis.annotate(
             f"{number(c.score)}  ({probability(c.p_value)})",
-            (size, row),
+            (max([size, *others]), row),
             (4, 0),
             textcoords="offset points",
             va="center",
             fontsize=8,
         )
-    names = [label(name_of(c.effect), most=34) for c in shown]
+    placed = has_places(story)
+    names = [
+        clean(short_name(c.effect), 44) if placed else label(name_of(c.effect), most=34)
+        for c in shown
+    ]
     axis.set_yticks(rows, names)
     axis.set_ylim(len(shown) - 0.4, -0.6)
     # The number behind the longest bar needs room; without any evidence there is an axis still.
-    longest = max(*sizes, 1e-9)
+    every = [c.score for entry in entries(story) for c in entry.elsewhere if entry.best in shown]
+    longest = max(*sizes, *every, 1e-9)
     axis.set_xlim(0, 1.35 * longest)
     axis.set_xlabel(
         "score: evidence that the simulation lacks it\n(twice the gain in log likelihood)"
@@ -255,19 +262,16 @@ def gains_panel(axis: Axes, story: Story, shown: Sequence[Candidate]) -> None:
     axis.tick_params(left=False)
 
 
-def standing(story: Story, effect: str) -> str:
-    """Whether an effect is found, one of a set that cannot be told apart, or neither."""
-    for cause in story.verdict.causes:
-        if effect in (cause.effect, *cause.alternatives):
-            return "found, but cannot be told apart" if cause.alternatives else "found"
-    return "not needed"
-
-
 def standings(story: Story) -> tuple[list[Any], list[str]]:
     """Handles and labels of the candidates' legend."""
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     there = {standing(story, c.effect) for c in story.verdict.candidates}
     # Bars of one look need no legend where nothing is found.
     names = [name for name in _LOOKS if name in there] if there != {"not needed"} else []
-    return [Patch(edgecolor="white", **_LOOKS[name]) for name in names], names
+    handles: list[Any] = [Patch(edgecolor="white", **_LOOKS[name]) for name in names]
+    if any(entry.elsewhere for entry in entries(story)):
+        handles.append(Line2D([], [], color=INK, marker="|", linestyle="", markersize=8))
+        names = [*names, "the same at other places"]
+    return handles, names

@@ -10,15 +10,14 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.figures import style
+from bench.figures.robot import robot_figure
 from bench.figures.style import BAND, ZERO, blank
-from bench.gap.report.account import sides
+from bench.gap.report.joints import by_joint, joints_figure
 from bench.gap.report.panels import (
     AFTER,
     BEFORE,
@@ -29,13 +28,15 @@ from bench.gap.report.panels import (
     label,
     places_panel,
     profile_panel,
-    ranked,
     scores_panel,
     standings,
     telling,
 )
-from bench.gap.report.story import Side, Story
-from sims.base import Array, unknown
+from bench.gap.report.places import has_places, marks
+from bench.gap.report.ranking import entries, ranked
+from bench.gap.report.shots import Shot, kept, worst
+from bench.gap.report.story import Story
+from sims.base import InputError, unknown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,10 +44,6 @@ if TYPE_CHECKING:
 
 DPI = 130
 """Dots an inch: the page shows figures at about this width."""
-MOST_POINTS = 3000
-"""Samples of a run that are drawn; of a longer one the extremes of each part are."""
-MOST_CHANNELS = 3
-"""Channels of the run that are shown, the worst."""
 _WIDTHS = {1: 8.6, 2: 10.0, 3: 12.5}
 """Inches by the number of channels."""
 _HEADING = 0.22
@@ -66,6 +63,7 @@ _STYLE: dict[Any, Any] = {
 def names(story: Story) -> tuple[str, ...]:
     """The figures that a story has: without places or candidates there is nothing to draw."""
     there = {
+        "robot": story.robot is not None,
         "overview": True,
         "where": bool(chosen_places(story.places)),
         "candidates": bool(ranked(story)),
@@ -115,33 +113,29 @@ def _styled() -> Iterator[None]:
         yield
 
 
-class Shot(NamedTuple):
-    """The run that is shown: its side, its row, whether it is held out, and its channels, the worst
-    first.
-    """
+def pose(story: Story, shot: Shot) -> dict[str, float]:
+    """Positions of joints at the beginning of a run, where they were recorded."""
+    positions = {}
+    for c, channel in enumerate(story.channels):
+        kind, _, joint = channel.name.partition(".")
+        seen = shot.side.observed[shot.row, :, c]
+        seen = seen[np.isfinite(seen)]
+        if kind == "q" and seen.size:
+            positions[joint] = float(seen[0])
+    return positions
 
-    side: Side
-    row: int
-    held_out: bool
-    channels: list[int]
 
-
-def worst(story: Story) -> Shot:
-    """The run with the largest gap in units of the noise, a held-out one if there is any."""
-    side = sides(story)[-1]
-    sigma = np.array([c.sigma for c in story.channels])
-    squares = ((side.observed - side.before) / sigma) ** 2
-    with warnings.catch_warnings():
-        # A run or channel without a sample has no mean, and is not the worst.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        row = int(np.argmax(np.nan_to_num(np.nanmean(squares, axis=(1, 2)))))
-        by_channel = np.nan_to_num(np.nanmean(squares[row], axis=0))
-    channels = np.argsort(-by_channel, kind="stable")[:MOST_CHANNELS]
-    return Shot(side, row, side is story.held_out, sorted(int(c) for c in channels))
+def _robot(story: Story) -> Figure:
+    """The robot as it stood at the beginning of the run that is shown."""
+    if story.robot is None:
+        raise InputError(f"{story.path}: no robot was recorded")
+    return robot_figure(story.robot, pose(story, worst(story)), marks(story), _WIDTHS[1])
 
 
 def _overview(story: Story) -> Figure:
     shot = worst(story)
+    if by_joint(story):
+        return joints_figure(story, shot)
     count = len(shot.channels)
     size = (_WIDTHS[count], 5.2)
     figure, axes = blank(2, count, size, layout=None, sharex=True, height_ratios=(3, 2))
@@ -195,21 +189,6 @@ def _signal(above: Axes, below: Axes, story: Story, shot: Shot, c: int) -> None:
         axis.locator_params(nbins=6)
     # Noise fills no panel: its band must be seen as narrow.
     _at_least(below, 3 * channel.sigma)
-
-
-def kept(values: Array) -> NDArray[np.intp]:
-    """Places of at most about `MOST_POINTS` samples that look the same: the least and largest of
-    each stretch.
-    """
-    if values.size <= MOST_POINTS:
-        return np.arange(values.size)
-    edges = np.linspace(0, values.size, MOST_POINTS // 2 + 1).astype(int)
-    # A missing sample is neither the least nor the largest.
-    low, high = np.nan_to_num(values, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
-    chosen = []
-    for begin, end in pairwise(edges):
-        chosen += [begin + np.argmin(low[begin:end]), begin + np.argmax(high[begin:end])]
-    return np.unique(chosen)
 
 
 def _at_least(axis: Axes, size: float) -> None:
@@ -288,22 +267,26 @@ def _where(story: Story) -> Figure:
 
 def _candidates(story: Story) -> Figure:
     """Left the scores, right the gains on held-out runs."""
-    shown, total = ranked(story), len(story.verdict.candidates)
-    width, height = 9.4, 1.75 + 0.28 * len(shown)
+    shown, total = ranked(story), len(entries(story))
+    # With its place a name is longer.
+    names = 3.2 if has_places(story) else 2.35
+    width, height = 7.05 + names, 1.75 + 0.28 * len(shown)
     figure, axes = blank(1, 2, (width, height), layout=None, sharey=True, width_ratios=(3, 2))
     scores_panel(axes[0, 0], story, shown)
     gains_panel(axes[0, 1], story, shown)
     # Whoever misses a candidate must see that not all are shown.
     some = f", the best {len(shown)} of {total}" if len(shown) < total else ""
+    some += ", each where it explains most" if has_places(story) else ""
     y = 1 - _HEADING / height
     figure.text(0.015, y, f"Candidate causes{some}", fontsize=11, va="center")
     figure.legend(*standings(story), loc="upper right", ncols=3, fontsize=8.5)
     bottom, top = 0.68 / height, 1 - 0.45 / height
-    figure.subplots_adjust(left=0.25, right=0.985, bottom=bottom, top=top, wspace=0.06)
+    figure.subplots_adjust(left=names / width, right=0.985, bottom=bottom, top=top, wspace=0.06)
     return figure
 
 
 _MAKERS: Mapping[str, Callable[[Story], Figure]] = {
+    "robot": _robot,
     "overview": _overview,
     "where": _where,
     "candidates": _candidates,

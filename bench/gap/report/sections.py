@@ -10,23 +10,30 @@ from math import isfinite
 import numpy as np
 
 from bench.gap.report.account import absorbed, experiment, rms, shift
-from bench.gap.report.elements import code, heading, listed, paragraph, safe, strong, table
-from bench.gap.report.panels import standing
+from bench.gap.report.elements import code, folded, heading, listed, paragraph, safe, strong, table
+from bench.gap.report.places import has_places, of_set, without_place
+from bench.gap.report.ranking import entries, standing
 from bench.gap.report.story import Place, Side, Story, Tuned
 from bench.gap.report.words import (
+    FAMILY,
     estimate,
     estimated,
     joined,
     name_of,
     noun,
     number,
+    parted,
     probability,
     sentence,
     with_unit,
 )
-from bench.gap.verdict import Cause
+from bench.gap.verdict import Candidate, Cause
 from sims.base import Array
 
+MOST_CANDIDATES = 25
+"""Effects at places in the table of candidates; all of them stand in the fold below it."""
+MOST_ELSEWHERE = 4
+"""Other places of an effect that are named in its row."""
 MOST_ROWS = 40
 """Rows of a table of places; of more, the worst are shown."""
 _LEFT = {
@@ -35,6 +42,7 @@ _LEFT = {
     "unidentifiable": "What the simulation lacks is open",
 }
 """What the residual is called where the verdict leaves something open."""
+_ALIKE = "change these runs so much alike that either explains them equally well."
 _READING = {
     "RMSE, RMS": "root mean square: the typical size of the error.",
     "noise floor": (
@@ -137,7 +145,35 @@ def candidates(story: Story, picture: str) -> Iterator[str]:
     if proposed := experiment(story):
         yield paragraph(f"{strong('Next experiment:')} {safe(proposed, 1000)}")
     yield picture
-    yield _ranking(story) if story.verdict.candidates else paragraph("No candidate was tried.")
+    if not story.verdict.candidates:
+        yield paragraph("No candidate was tried.")
+    elif has_places(story):
+        yield _by_effect(story)
+        count = len(story.verdict.candidates)
+        yield folded(f"All {count} candidates, place by place", _ranking(story))
+    else:
+        yield _ranking(story)
+
+
+def _by_effect(story: Story) -> str:
+    """A row for each effect where it explains most, and what it scores elsewhere."""
+    heads = ["candidate", "name", "-score", "-p", "-gain on held-out runs", "standing", "elsewhere"]
+    rows = []
+    marks = []
+    there = entries(story)
+    for entry in there[:MOST_CANDIDATES]:
+        row, mark = _candidate(story, entry.best)
+        others = [f"{_elsewhere(c)} {number(c.score, 2)}" for c in entry.elsewhere]
+        more = f" and {len(others) - MOST_ELSEWHERE} more" * (len(others) > MOST_ELSEWHERE)
+        rows.append([*row, safe(", ".join(others[:MOST_ELSEWHERE]) + more)])
+        marks.append(mark)
+    return table(heads, rows, marks)
+
+
+def _elsewhere(c: Candidate) -> str:
+    """The place of a candidate, in a list of places."""
+    _, place = parted(c.effect)
+    return "all" if place == FAMILY else place
 
 
 def _ranking(story: Story) -> str:
@@ -145,37 +181,45 @@ def _ranking(story: Story) -> str:
     rows = []
     marks = []
     for c in story.verdict.candidates:
-        rank = standing(story, c.effect)
-        marks.append("" if rank == "not needed" else "found")
-        row = [safe(name_of(c.effect)), code(safe(c.effect, 80)), number(c.score)]
-        # The column's head says p already.
-        row.append(probability(c.p_value).removeprefix("p = ").removeprefix("p "))
-        row.append(number(c.heldout_gain))
-        # Where nothing is found, nothing made the others needless.
-        row.append(rank if story.verdict.causes else "not convincing")
+        row, mark = _candidate(story, c)
         rows.append(row)
+        marks.append(mark)
     return table(heads, rows, marks)
+
+
+def _candidate(story: Story, c: Candidate) -> tuple[list[str], str]:
+    """A candidate's row, and its mark."""
+    rank = standing(story, c.effect)
+    row = [safe(name_of(c.effect)), code(safe(c.effect, 80)), number(c.score)]
+    # The column's head says p already.
+    row.append(probability(c.p_value).removeprefix("p = ").removeprefix("p "))
+    row.append(number(c.heldout_gain))
+    # Where nothing is found, nothing made the others needless.
+    row.append(rank if story.verdict.causes else "not convincing")
+    return row, "" if rank == "not needed" else "found"
 
 
 def _set(story: Story, cause: Cause) -> str:
     """The members of a set with their scores and gains: they are too close for these data."""
     by_effect = {c.effect: c for c in story.verdict.candidates}
     members = []
+    if any("@" in name for name in (cause.effect, *cause.alternatives)):
+        alike = _ALIKE.replace("either", "each")
+        return f"{of_set([cause.effect, *cause.alternatives], 'and')} {alike}"
     for name in (cause.effect, *cause.alternatives):
         evidence = ""
         if (c := by_effect.get(name)) is not None:
             gain = number(c.heldout_gain)
             evidence = f" (score {number(c.score)}, held-out gain {gain})"
         members.append(noun(name) + evidence)
-    alike = "change these runs so much alike that either explains them equally well."
-    return f"{joined(members)} {alike}"
+    return f"{joined(members)} {_ALIKE}"
 
 
 def numbers(story: Story) -> Iterator[str]:
     """What was found in numbers, and how the parameters move."""
     rows = []
     for cause in story.verdict.causes:
-        what = [safe(noun(cause.effect)), safe(cause.says)]
+        what = [safe(noun(cause.effect)), safe(without_place(cause.says))]
         chance = probability(cause.p_value)
         for name, coefficient in cause.coefficients.items():
             rows.append([*what, safe(name, 60), safe(estimated(coefficient)), chance])
@@ -240,6 +284,26 @@ def _intervals(p: Tuned) -> str:
         shapes.append(f'<circle class="{kind}" {centre} stroke-width="2"/>')
     label = f"intervals of {safe(p.name, 60)} before and after"
     return f'<svg viewBox="0 0 200 30" role="img" aria-label="{label}">{"".join(shapes)}</svg>'
+
+
+def changes(story: Story) -> Iterator[str]:
+    """The lines of the robot's model file to change, before and after."""
+    if not story.changes and not story.unwritten:
+        return
+    yield heading("What to change in the model file")
+    lines = []
+    for change in story.changes:
+        lines.append(f'<span class="soft">{safe(change.element, 120)}</span>')
+        # One blank line between elements, and none within.
+        lines += [f'<del class="line">− {safe(change.before, 2000)}</del>'] * bool(change.before)
+        lines += [f'<ins class="line">+ {safe(change.after, 2000)}</ins>'] * bool(change.after)
+        lines += [f'<span class="soft">  {safe(change.comment, 600)}</span>'] * bool(change.comment)
+        lines.append("")
+    if lines:
+        yield f'<pre class="scroll">{chr(10).join(lines[:-1])}</pre>'
+    if story.unwritten:
+        yield paragraph("What the file cannot say stands in extended.toml alone:")
+        yield listed(safe(sentence(text)) for text in story.unwritten)
 
 
 def remains(story: Story) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from bench.gap.model.noise import Mask
 from bench.gap.model.world import World
 from bench.gap.report.story import Place, Profile, Side
 from sims.base import Array
+from sims.robot.model import Robot
 
 BINS = 12
 """Of a profile."""
@@ -159,12 +160,16 @@ def _saturated(world: World) -> Mask:
 
 def profiles(world: World, before: Array, after: Array, sigma: Array) -> list[Profile]:
     """The residual of the channel that the sensor effects act on, against time, position, speed and
-    the inputs.
+    the inputs; of a robot that of the channel with the largest gap, against its own joint's.
     """
     name = world.simulator.system.reading(world.channels)
+    followed_by = _variables(world, after)
+    if robot_of(world) is not None:
+        name = _loudest(world, before, sigma)
+        followed_by = _variables_of_joint(world, after, name)
     c = world.channels.index(name)
     shown = []
-    for variable, unit, values in _variables(world, after):
+    for variable, unit, values in followed_by:
         good = np.isfinite(world.observed[:, :, c]) & np.isfinite(values)
         followed = values[good]
         edges = _edges(followed)
@@ -187,6 +192,22 @@ def profiles(world: World, before: Array, after: Array, sigma: Array) -> list[Pr
     return shown
 
 
+def robot_of(world: World) -> Robot | None:
+    """The robot of a recording; None where it is of another system."""
+    robot: Robot | None = getattr(world.kind.system, "robot", None)
+    return robot
+
+
+def _loudest(world: World, before: Array, sigma: Array) -> str:
+    """The channel with the largest residual in units of its noise."""
+    squares = np.square((world.observed - before) / sigma)
+    sizes = []
+    for c in range(len(world.channels)):
+        there = squares[:, :, c][np.isfinite(squares[:, :, c])]
+        sizes.append(float(there.mean()) if there.size else 0.0)
+    return world.channels[int(np.argmax(sizes))]
+
+
 def _edges(values: Array) -> Array | None:
     """(BINS + 1,) edges over most of the values; None where they do not differ."""
     if not values.size or np.ptp(values) == 0:
@@ -198,11 +219,7 @@ def _edges(values: Array) -> Array | None:
 
 def _variables(world: World, simulated: Array) -> Iterator[tuple[str, str, Array]]:
     """Name, unit and (R, T) values of what a residual may follow."""
-    shape = simulated.shape[:2]
-    times = np.full(shape, np.nan)
-    # From the beginning of each run: clocks of runs may stand anywhere.
-    for r, track in enumerate(world.tracks):
-        times[r, : len(track.observed)] = track.scenario.times - track.scenario.times[0]
+    times = _times(world)
     yield "time", "s", times
     system = world.simulator.system
     units = {channel.name: channel.unit for channel in world.kind.channels}
@@ -215,11 +232,53 @@ def _variables(world: World, simulated: Array) -> Iterator[tuple[str, str, Array
     if speed is not None:
         unit = f"{units.get(primary, 'm')}/s"
         yield "speed", unit, np.where(np.isfinite(times), speed, np.nan)
+    yield from _inputs(world, [channel.name for channel in world.kind.inputs])
+
+
+def _times(world: World) -> Array:
+    """(R, T) seconds from the beginning of each run: clocks of runs may stand anywhere."""
+    times = np.full(world.observed.shape[:2], np.nan)
+    for r, track in enumerate(world.tracks):
+        times[r, : len(track.observed)] = track.scenario.times - track.scenario.times[0]
+    return times
+
+
+def _inputs(world: World, names: Collection[str]) -> Iterator[tuple[str, str, Array]]:
+    """Name, unit and (R, T) values of the inputs of these names that were recorded."""
     for channel in world.kind.inputs:
-        values = np.full(shape, np.nan)
+        values = np.full(world.observed.shape[:2], np.nan)
         for r, track in enumerate(world.tracks):
             signal = track.scenario.inputs.get(channel.name)
-            if signal is not None:
+            if signal is not None and channel.name in names:
                 values[r, : len(track.observed)] = signal
         if np.isfinite(values).any():
             yield channel.name, channel.unit, values
+
+
+def _variables_of_joint(
+    world: World, simulated: Array, channel: str
+) -> Iterator[tuple[str, str, Array]]:
+    """As `_variables`, of the joint of a channel: its velocity has a sign, as friction has."""
+    times = _times(world)
+    yield "time", "s", times
+    robot = robot_of(world)
+    joints = robot.joints if robot is not None else ()
+    joint = next((j for j in joints if j.name == channel.partition(".")[2]), None)
+    if robot is None or joint is None:
+        return
+    position, rate = f"q.{joint.name}", f"qd.{joint.name}"
+    unit = joint.unit
+    if position in world.channels:
+        values = simulated[:, :, world.channels.index(position)]
+        yield f"position of {joint.name}", unit, values
+        slopes = np.full_like(values, np.nan)
+        for r, track in enumerate(world.tracks):
+            size = len(track.observed)
+            if size > 1:
+                slopes[r, :size] = np.gradient(values[r, :size], track.scenario.times)
+        yield f"velocity of {joint.name}", f"{unit}/s", slopes
+    elif rate in world.channels:
+        values = simulated[:, :, world.channels.index(rate)]
+        yield f"velocity of {joint.name}", f"{unit}/s", values
+    drives = [f"u.{a.name}" for a in robot.actuators if a.joint == joint.name]
+    yield from _inputs(world, [*drives, f"force.{joint.name}"])

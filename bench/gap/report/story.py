@@ -7,6 +7,7 @@ from pathlib import Path
 
 from bench.gap.verdict import Verdict
 from sims.base import Array
+from sims.robot.model import Robot
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,23 @@ class Tuned:
 
 
 @dataclass(frozen=True)
+class Change:
+    """A line of a robot's model file that the extended one has otherwise.
+
+    Attributes:
+        element: whose line, as ``joint elbow``.
+        before: the line as it is; empty where there is none.
+        after: the line as it should be; empty where it goes.
+        comment: which cause, interval and recording ask for it.
+    """
+
+    element: str
+    before: str
+    after: str
+    comment: str = ""
+
+
+@dataclass(frozen=True)
 class Story:
     """Everything that is told.
 
@@ -116,6 +134,9 @@ class Story:
             each; may be empty.
         why: sentences that say why the verdict is what it is, the most important first.
         vague: names of base parameters that the data do not fix.
+        robot: whose recording it is, to be drawn; None for systems that are no robots.
+        changes: of its model file.
+        unwritten: causes that the model file cannot hold, a sentence each.
     """
 
     title: str
@@ -130,3 +151,6 @@ class Story:
     remains: tuple[str, ...]
     why: tuple[str, ...]
     vague: tuple[str, ...] = ()
+    robot: Robot | None = None
+    changes: tuple[Change, ...] = ()
+    unwritten: tuple[str, ...] = ()

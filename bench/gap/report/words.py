@@ -19,6 +19,15 @@ _LARGE = 1e5
 _FEW = log10(3.55)
 """Mantissa of an interval below which it is written with two digits (Particle Data Group's rule).
 """
+FAMILY = "*"
+"""The place of a family: all of one kind."""
+_AT = {
+    "joint": ("at", "joints"),
+    "actuator": ("at", "actuators"),
+    "body": ("of", "bodies"),
+    "channel": ("in", "channels"),
+}
+"""How a sentence leads to a place of each kind, and how it calls several."""
 _LEAST = 1e-12
 """Probabilities below this are all the same."""
 
@@ -46,16 +55,48 @@ def noun(effect: str) -> str:
 
 
 def _noun(name: str) -> str:
-    """The effect's own noun; for one without, its name and the first clause of what it says."""
+    """The effect's own noun, with its place; for one without, its name and the first clause of what
+    it says.
+    """
+    base, place = parted(name)
     try:
-        effect = effects.get(name)
+        effect = effects.get(base)
     except InputError:
         # a verdict may name an effect of a plugin that is not loaded here
         return clean(name, 60)
     if effect.noun:
-        return clean(effect.noun, 60)
+        return clean(effect.noun, 60) + (at(kind_of(name), [place]) if place else "")
     clause = re.split(r"[,:;]", effect.says, maxsplit=1)[0]
     return clean(f"{name} ({clause})", 60)
+
+
+def parted(effect: str) -> tuple[str, str]:
+    """An effect's registered name and its place, ``*`` of a family; empty where it has none."""
+    base, _, place = effect.partition("@")
+    return base, place
+
+
+def kind_of(effect: str) -> str:
+    """Of what kind an effect's places are: ``joint``, ``actuator``, ``body``, ``channel``; empty
+    where that is not known.
+    """
+    try:
+        kind: str = getattr(effects.get(parted(effect)[0]), "at", "")
+    except InputError:
+        return ""
+    return kind if kind in _AT else ""
+
+
+def at(kind: str, places: Sequence[str], last: str = "or") -> str:
+    """`` at joint elbow``, `` at every joint``, `` at any of the joints a, b or c``."""
+    before, several = _AT.get(kind, ("at", "places"))
+    names = [clean(place, 40) for place in places]
+    if names == [FAMILY]:
+        return f" {before} every {kind}" if kind else " everywhere"
+    if len(names) < 3:
+        return f" {before} {kind} {joined(names, last)}".replace("  ", " ")
+    each = "any" if last == "or" else "each"
+    return f" {before} {each} of the {several} {joined(names, last)}"
 
 
 def name_of(effect: str) -> str:

@@ -7,15 +7,10 @@ import numpy as np
 import pytest
 
 from bench.gap.report.page import page
-from bench.gap.report.panels import (
-    MOST_CANDIDATES,
-    chosen_places,
-    profile_panel,
-    ranked,
-    standing,
-    telling,
-)
-from bench.gap.report.pictures import kept, printed, worst
+from bench.gap.report.panels import chosen_places, profile_panel, telling
+from bench.gap.report.pictures import printed
+from bench.gap.report.ranking import MOST_CANDIDATES, ranked, standing
+from bench.gap.report.shots import kept, worst
 from bench.gap.report.story import Place
 from tests.bench.gap.stories import evil, story
 

@@ -1,0 +1,238 @@
+"""Causes at the places of a robot as people say them: what is lacking, what is wrong, and sets of
+places that the data cannot tell apart.
+
+Names without a place read as they always did.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from bench.figures.robot import Mark
+from bench.gap.report.story import Story
+from bench.gap.report.words import (
+    FAMILY,
+    at,
+    clean,
+    estimated,
+    joined,
+    kind_of,
+    noun,
+    number,
+    parted,
+    percent,
+    with_unit,
+)
+from bench.gap.verdict import Cause
+from sims.extended import Number
+
+MOST_NAMED = 6
+"""Members of a set that a sentence names; of more it says how many."""
+ADDED = frozenset({"drag.linear", "drag.quadratic", "friction.coulomb", "spring.linear"})
+"""Effects whose coefficient is a difference from what the file states."""
+_WRONG = re.compile(r"^an? (wrong|misplaced) ")
+"""Nouns of what a simulation has wrong, and does not lack."""
+_MORE = {True: "larger", False: "smaller"}
+
+
+def is_wrong(effect: str) -> bool:
+    """Whether it is a number that is wrong, and nothing that is lacking."""
+    return bool(_WRONG.match(noun(effect))) or effect.startswith("numerics.")
+
+
+def of_set(names: Sequence[str], last: str = "or") -> str:
+    """Effects as people list them: ``Coulomb friction at any of the joints a, b or c``, ``linear
+    drag or Coulomb friction at joint elbow``.
+
+    Args:
+        names: of effects.
+        last: ``or`` where one of them is meant, ``and`` for all.
+    """
+    if not any("@" in name for name in names):
+        return joined([noun(name) for name in names], last)
+    parts = _grouped(names, last)
+    if len(parts) > MOST_NAMED:
+        parts = [*parts[: MOST_NAMED - 1], f"one of {len(parts) - MOST_NAMED + 1} others"]
+    # Lists within a list are set apart by a comma before the last word too.
+    nested = len(parts) > 1 and any(f" {last} " in part for part in parts)
+    return f", {last} ".join(parts) if nested else joined(parts, last)
+
+
+def _grouped(names: Sequence[str], last: str) -> list[str]:
+    """One text for an effect at several places, else for several effects at one."""
+    by_effect: dict[str, list[str]] = {}
+    for name in names:
+        base, place = parted(name)
+        by_effect.setdefault(base if place not in ("", FAMILY) else name, []).append(name)
+    by_place: dict[str, list[str]] = {}
+    for group in by_effect.values():
+        _, place = parted(group[0])
+        alone = len(group) == 1 and place not in ("", FAMILY)
+        key = f"{kind_of(group[0])} {place}" if alone else group[0]
+        by_place.setdefault(key, []).extend(group)
+    return [_together(group, last) for group in by_place.values()]
+
+
+def _together(group: Sequence[str], last: str) -> str:
+    """A group of one effect, or of one place."""
+    if len(group) == 1:
+        return noun(group[0])
+    bases = list(dict.fromkeys(parted(name)[0] for name in group))
+    places = list(dict.fromkeys(parted(name)[1] for name in group))
+    nouns = [noun(base) for base in bases]
+    return joined(nouns, last) + at(kind_of(group[0]), places, last)
+
+
+def lacks(causes: Sequence[Cause]) -> str:
+    """What a simulation lacks and what it has wrong, to stand behind it: ``lacks wind, and linear
+    drag or Coulomb friction``; causes that have alternatives come last.
+    """
+    lacking: list[str] = []
+    wrong: list[str] = []
+    either: list[str] = []
+    certain = [cause.effect for cause in causes if not cause.alternatives]
+    # Causes that are certain share one list; each open one is a list with "or" of its own.
+    for part, into in ((False, lacking), (True, wrong)):
+        if names := [name for name in certain if is_wrong(name) == part]:
+            into.append(joined([noun(name) for name in names]))
+    for cause in causes:
+        if not cause.alternatives:
+            continue
+        names = [cause.effect, *cause.alternatives]
+        bad = [name for name in names if is_wrong(name)]
+        good = [name for name in names if name not in bad]
+        if bad and good:
+            either.append(f"either lacks {of_set(good)} or has {of_set(bad)}")
+        else:
+            (wrong if bad else lacking).append(of_set(names))
+    parts = [f"lacks {', and '.join(lacking)}"] if lacking else []
+    parts += [f"has {', and '.join(wrong)}"] if wrong else []
+    return ", and ".join([*parts, *either])
+
+
+def listed(causes: Sequence[Cause]) -> str:
+    """The causes, those that have alternatives last: ``wind, and linear drag or Coulomb
+    friction``.
+    """
+    sure = [noun(cause.effect) for cause in causes if not cause.alternatives]
+    parts = [joined(sure)] if sure else []
+    parts += [of_set([c.effect, *c.alternatives]) for c in causes if c.alternatives]
+    return ", and ".join(parts)
+
+
+def sized(cause: Cause) -> str:
+    """A number of the model file and how wrong it is, as a clause: ``the mass of body forearm is
+    12 % larger than the model file says``; empty for what is no such number.
+    """
+    base, place = parted(cause.effect)
+    say = _SIZED.get(base)
+    values = list(cause.coefficients.values())
+    if say is None or not place or place == FAMILY or not values:
+        return ""
+    return say(at(kind_of(cause.effect), [place]).strip(), values)
+
+
+def too_much(cause: Cause) -> bool:
+    """Whether the file states more of a friction, a damping or a spring than there is."""
+    values = [n.value for n in cause.coefficients.values()]
+    base, place = parted(cause.effect)
+    return bool(place) and base in ADDED and bool(values) and max(values) < 0
+
+
+def _share(what: str) -> Callable[[str, Sequence[Number]], str]:
+    def say(where: str, values: Sequence[Number]) -> str:
+        c = values[0].value
+        where = re.sub("^(at|in) ", "of ", where)
+        return f"the {what} {where} is {percent(abs(c))} {_MORE[c > 0]} than the model file says"
+
+    return say
+
+
+def _difference(what: str) -> Callable[[str, Sequence[Number]], str]:
+    def say(where: str, values: Sequence[Number]) -> str:
+        size = with_unit(number(abs(values[0].value), 2), values[0].unit)
+        where = re.sub("^(at|in) ", "of ", where)
+        return f"the {what} {where} is {size} {_MORE[values[0].value > 0]} than the model file says"
+
+    return say
+
+
+def _moved(where: str, values: Sequence[Number]) -> str:
+    far = with_unit(number(float(np.linalg.norm([n.value for n in values])), 2), values[0].unit)
+    return f"the centre of mass {where} is {far} from where the model file has it"
+
+
+_SIZED: Mapping[str, Callable[[str, Sequence[Number]], str]] = {
+    "mass.scale": _share("mass"),
+    "inertia.scale": _share("inertia"),
+    "actuator.stiffness": _share("stiffness"),
+    "actuator.damping": _share("damping"),
+    "inertia.armature": _difference("armature"),
+    "mass.offset": _moved,
+}
+"""How wrong a number of the file is, by effect."""
+
+
+def coefficient(name: str, fitted: Number) -> str:
+    """A coefficient with its interval; one of a family with its place."""
+    own, place = parted(name)
+    if not place:
+        return f"{clean(name, 60)} {estimated(fitted)}"
+    # Of a family of effects with one coefficient each, the place says which.
+    front = "" if own == "coefficient" else f"{clean(own, 30)} "
+    return f"{front}{estimated(fitted)} at {clean(place, 40)}"
+
+
+def without_place(says: str) -> str:
+    """What an effect does, without the place in brackets that its noun names already."""
+    return re.sub(r" \(at [^()]*\)$", "", says)
+
+
+def has_places(story: Story) -> bool:
+    """Whether anything of the story stands at a place."""
+    return any("@" in candidate.effect for candidate in story.verdict.candidates)
+
+
+def marks(story: Story) -> list[Mark]:
+    """The places that the verdict names, to be marked on the robot."""
+    found = []
+    for cause in story.verdict.causes:
+        alone = not cause.alternatives
+        for name in (cause.effect, *cause.alternatives):
+            said = noun(parted(name)[0])
+            for place in _places(story, name, cause):
+                size = _size(cause, name, place) if name == cause.effect else ""
+                found.append(Mark(kind_of(name), place, f"{said}{size}", alone))
+    return found
+
+
+def _places(story: Story, effect: str, cause: Cause) -> list[str]:
+    """The places of an effect: those of a family's coefficients, else all of its kind."""
+    _, place = parted(effect)
+    if place != FAMILY:
+        return [place] if place else []
+    own = [parted(name)[1] for name in cause.coefficients if effect == cause.effect]
+    robot = story.robot
+    if any(own) or robot is None:
+        return list(dict.fromkeys(name for name in own if name))
+    tables = {
+        "joint": [joint.name for joint in robot.joints],
+        "actuator": [actuator.name for actuator in robot.actuators],
+        "body": [body.name for body in robot.bodies],
+    }
+    return tables.get(kind_of(effect), [])
+
+
+def _size(cause: Cause, effect: str, place: str) -> str:
+    """The number of a cause with one coefficient, for a label."""
+    there = [n for name, n in cause.coefficients.items() if parted(name)[1] in ("", place)]
+    if len(there) != 1:
+        return ""
+    fitted = there[0]
+    if parted(effect)[0] in _SIZED and fitted.unit == "1":
+        sign = "+" if fitted.value > 0 else ""
+        return f": {sign}{percent(fitted.value)}"
+    return f": {with_unit(number(fitted.value, 2), fitted.unit)}"

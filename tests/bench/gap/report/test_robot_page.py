@@ -1,0 +1,154 @@
+"""The page and the figures of a robot."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.figures import robot as drawing
+from bench.gap.report.joints import rows_of
+from bench.gap.report.page import page
+from bench.gap.report.pictures import figure, names, pose
+from bench.gap.report.shots import worst
+from tests.bench.figures.robots import ARM6
+from tests.bench.gap.report.test_page import PIXEL, Reader
+from tests.bench.gap.robot_stories import CHANGE, EVERYWHERE, WRISTS, robot_story
+from tests.bench.gap.stories import EVIL, story
+
+ALL = ("robot", "overview", "where", "candidates")
+FIGURES = dict.fromkeys(ALL, PIXEL)
+
+
+@pytest.fixture(autouse=True)
+def schematic(monkeypatch):
+    """Drawn as links: what is rendered has tests of its own."""
+    monkeypatch.setattr(drawing, "rendered", lambda *_: None)
+
+
+@pytest.fixture(scope="module")
+def overview():
+    return figure(robot_story(), "overview")
+
+
+def image(drawn):
+    from matplotlib.image import imread
+
+    file = io.BytesIO()
+    drawn.savefig(file, format="png", dpi=60)
+    file.seek(0)
+    return imread(file)[:, :, :3]
+
+
+def test_a_robot_has_a_picture_of_itself_and_others_have_none():
+    assert names(robot_story()) == ALL
+    assert "robot" not in names(story())
+
+
+def test_each_joint_has_a_row_and_each_quantity_a_column(overview):
+    assert len(overview.axes) == 3 * 6
+    drawn = figure(robot_story(joints=("shoulder", "elbow")), "overview")
+    assert len(drawn.axes) == 3 * 2
+    edge = image(drawn)
+    assert np.concatenate([edge[0], edge[-1], edge[:, 0], edge[:, -1]]).min() == 1.0
+
+
+def test_rows_are_on_one_scale_and_say_how_large_the_residual_is(overview):
+    rows = [overview.axes[3 * i : 3 * i + 3] for i in range(6)]
+    limits = {row[1].get_ylim() for row in rows}
+    assert len(limits) == 1
+    sizes = [row[1].texts[0].get_text() for row in rows]
+    before = [float(size.split(" → ")[0]) for size in sizes]
+    assert int(np.argmax(before)) == ARM6.index("elbow")
+    after = [float(size.split(" → ")[1]) for size in sizes]
+    assert after == pytest.approx([1.0] * 6, abs=0.15)
+
+
+def test_the_joint_that_the_verdict_names_stands_out(overview):
+    colours = {
+        text.get_text(): text.get_color()
+        for axis in overview.axes[::3]
+        for text in axis.texts
+        if text.get_text() in ARM6
+    }
+    assert [name for name, colour in colours.items() if colour == "#0072B2"] == ["elbow"]
+
+
+def test_of_very_many_joints_the_worst_are_shown(monkeypatch):
+    from bench.gap.report import joints
+
+    monkeypatch.setattr(joints, "MOST_JOINTS", 3)
+    drawn = figure(robot_story(), "overview")
+    shown = {text.get_text() for axis in drawn.axes[::3] for text in axis.texts} & set(ARM6)
+    assert shown == {"shoulder_lift", "elbow", "wrist_1"}
+    assert "the worst 3 of 6" in drawn.get_suptitle()
+
+
+def test_a_channel_that_is_no_joint_has_a_row_of_its_own():
+    told = robot_story()
+    channels = (*told.channels[:-1], replace(told.channels[-1], name="s.shake.x"))
+    rows = rows_of(replace(told, channels=channels))
+    assert [row.name for row in rows] == [*ARM6, "s.shake.x"]
+    assert set(rows[0].channels) == {"q", "tau"}
+    assert set(rows[-1].channels) == {"q"}
+
+
+def test_the_robot_stands_as_the_run_begins():
+    told = robot_story()
+    shot = worst(told)
+    assert pose(told, shot)["elbow"] == pytest.approx(told.held_out.observed[0, 0, 2])
+    assert set(pose(told, shot)) == set(ARM6)
+    assert "elbow\nCoulomb friction: 0.31 N·m" in [
+        text.get_text() for text in figure(told, "robot").axes[0].texts
+    ]
+
+
+def test_nothing_is_marked_where_nothing_is_found():
+    drawn = figure(robot_story("adequate", causes=()), "robot")
+    assert not drawn.axes[0].collections
+
+
+def test_many_candidates_are_25_effects_and_a_fold_for_the_rest():
+    html = page(robot_story(), FIGURES)
+    shown, folded = html.split("<summary>")
+    folded = folded.split("</details>")[0]
+    total = len(robot_story().verdict.candidates)
+    assert folded.startswith(f"All {total} candidates, place by place")
+    assert folded.count("<tr") == total + 1
+    assert shown.count("<td><code>") <= 25
+    text = Reader(html).text
+    assert "<td>linear drag at joint elbow</td>" in html
+    assert "shoulder_pan" in text
+
+
+def test_the_lines_of_the_model_file_to_change():
+    html = page(robot_story(changes=(CHANGE,), unwritten=("a delay has no place in MJCF",)), {})
+    reader = Reader(html)
+    assert "What to change in the model file" in reader.text
+    assert '− <joint name="elbow" axis="0 1 0"/>' in reader.text
+    assert '+ <joint name="elbow" axis="0 1 0" frictionloss="0.31"/>' in reader.text
+    assert "A delay has no place in MJCF." in reader.text
+    assert "What to change" not in page(robot_story(), {})
+
+
+def test_texts_of_the_model_file_are_escaped():
+    evil = replace(CHANGE, element=EVIL, before=EVIL, after=EVIL, comment=EVIL)
+    html = page(robot_story(changes=(evil,), unwritten=(EVIL,)), {})
+    assert "<script" not in html
+    assert html.count("&lt;script&gt;") == 5
+
+
+def test_a_set_of_places_is_one_sentence():
+    text = Reader(page(robot_story("ambiguous", [WRISTS]), FIGURES)).text
+    assert (
+        "Not to be told apart: Coulomb friction at each of the joints wrist_1, wrist_2 and wrist_3 "
+        "change these runs so much alike that each explains them equally well." in text
+    )
+
+
+def test_the_robot_comes_first_and_is_told_to_those_who_do_not_see_it():
+    html = page(robot_story(causes=[EVERYWHERE]), FIGURES)
+    first = html.index("<img")
+    alternative = html[first : html.index(">", first)]
+    assert "The robot; marked: joint shoulder_pan (Coulomb friction: 0.3 N·m)" in alternative
+    assert "(channels in rad and N·m)" in Reader(html).text
