@@ -15,7 +15,6 @@ from bench.gap.model.watch import QUESTIONS
 from bench.gap.report.places import (
     coefficient,
     has_places,
-    is_wrong,
     lacks,
     listed,
     of_set,
@@ -27,6 +26,7 @@ from bench.gap.report.story import Place, Shown, Side, Story, Tuned
 from bench.gap.report.words import (
     clean,
     estimate,
+    is_wrong,
     joined,
     noun,
     number,

@@ -18,6 +18,7 @@ from bench.gap.report.words import (
     at,
     clean,
     estimated,
+    is_wrong,
     joined,
     kind_of,
     noun,
@@ -33,14 +34,7 @@ MOST_NAMED = 6
 """Members of a set that a sentence names; of more it says how many."""
 ADDED = frozenset({"drag.linear", "drag.quadratic", "friction.coulomb", "spring.linear"})
 """Effects whose coefficient is a difference from what the file states."""
-_WRONG = re.compile(r"^an? (wrong|misplaced) ")
-"""Nouns of what a simulation has wrong, and does not lack."""
 _MORE = {True: "larger", False: "smaller"}
-
-
-def is_wrong(effect: str) -> bool:
-    """Whether it is a number that is wrong, and nothing that is lacking."""
-    return bool(_WRONG.match(noun(effect))) or effect.startswith("numerics.")
 
 
 def of_set(names: Sequence[str], last: str = "or") -> str:
@@ -83,7 +77,8 @@ def _together(group: Sequence[str], last: str) -> str:
     bases = list(dict.fromkeys(parted(name)[0] for name in group))
     places = list(dict.fromkeys(parted(name)[1] for name in group))
     nouns = [noun(base) for base in bases]
-    return joined(nouns, last) + at(kind_of(group[0]), places, last)
+    wrong = all(is_wrong(base) for base in bases)
+    return joined(nouns, last) + at(kind_of(group[0]), places, last, wrong)
 
 
 def lacks(causes: Sequence[Cause]) -> str:
@@ -132,7 +127,7 @@ def sized(cause: Cause) -> str:
     values = list(cause.coefficients.values())
     if say is None or not place or place == FAMILY or not values:
         return ""
-    return say(at(kind_of(cause.effect), [place]).strip(), values)
+    return say(at(kind_of(cause.effect), [place], wrong=True).strip(), values)
 
 
 def too_much(cause: Cause) -> bool:
@@ -145,7 +140,6 @@ def too_much(cause: Cause) -> bool:
 def _share(what: str) -> Callable[[str, Sequence[Number]], str]:
     def say(where: str, values: Sequence[Number]) -> str:
         c = values[0].value
-        where = re.sub("^(at|in) ", "of ", where)
         return f"the {what} {where} is {percent(abs(c))} {_MORE[c > 0]} than the model file says"
 
     return say
@@ -154,7 +148,6 @@ def _share(what: str) -> Callable[[str, Sequence[Number]], str]:
 def _difference(what: str) -> Callable[[str, Sequence[Number]], str]:
     def say(where: str, values: Sequence[Number]) -> str:
         size = with_unit(number(abs(values[0].value), 2), values[0].unit)
-        where = re.sub("^(at|in) ", "of ", where)
         return f"the {what} {where} is {size} {_MORE[values[0].value > 0]} than the model file says"
 
     return say

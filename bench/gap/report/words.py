@@ -28,6 +28,8 @@ _AT = {
     "channel": ("in", "channels"),
 }
 """How a sentence leads to a place of each kind, and how it calls several."""
+_WRONG = re.compile(r"an? (wrong|misplaced) ")
+"""Beginnings of the nouns of what a simulation has wrong, and does not lack."""
 _LEAST = 1e-12
 """Probabilities below this are all the same."""
 
@@ -65,7 +67,8 @@ def _noun(name: str) -> str:
         # a verdict may name an effect of a plugin that is not loaded here
         return clean(name, 60)
     if effect.noun:
-        return clean(effect.noun, 60) + (at(kind_of(name), [place]) if place else "")
+        what = clean(effect.noun, 60)
+        return what + (at(kind_of(name), [place], wrong=is_wrong(name)) if place else "")
     clause = re.split(r"[,:;]", effect.says, maxsplit=1)[0]
     return clean(f"{name} ({clause})", 60)
 
@@ -87,9 +90,22 @@ def kind_of(effect: str) -> str:
     return kind if kind in _AT else ""
 
 
-def at(kind: str, places: Sequence[str], last: str = "or") -> str:
-    """`` at joint elbow``, `` at every joint``, `` at any of the joints a, b or c``."""
+def is_wrong(effect: str) -> bool:
+    """Whether it is a number that is wrong, and nothing that is lacking."""
+    base, _ = parted(effect)
+    try:
+        said = effects.get(base).noun
+    except InputError:
+        said = ""
+    return bool(_WRONG.match(said)) or base.startswith("numerics.")
+
+
+def at(kind: str, places: Sequence[str], last: str = "or", wrong: bool = False) -> str:
+    """`` at joint elbow``, `` at every joint``, `` at any of the joints a, b or c``; `` of joint
+    elbow`` where a number of it is wrong.
+    """
     before, several = _AT.get(kind, ("at", "places"))
+    before = "of" if wrong else before
     names = [clean(place, 40) for place in places]
     if names == [FAMILY]:
         return f" {before} every {kind}" if kind else " everywhere"

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 
 from bench.gap.report.account import account, following, headline, hiding
-from bench.gap.report.places import is_wrong, lacks, marks, of_set, without_place
+from bench.gap.report.places import lacks, marks, of_set, without_place
 from bench.gap.report.ranking import MOST_CANDIDATES, entries, ranked, short_name
 from bench.gap.report.story import Shown
-from bench.gap.report.words import name_of, noun
+from bench.gap.report.words import is_wrong, name_of, noun
 from bench.gap.verdict import Cause
 from tests.bench.figures.robots import ARM6
 from tests.bench.gap.robot_stories import (
@@ -29,6 +29,7 @@ from tests.bench.gap.stories import story
         ("friction.coulomb@elbow", "Coulomb friction at joint elbow"),
         ("input.delay@m_elbow", "an input delay at actuator m_elbow"),
         ("mass.scale@forearm", "a wrong mass of body forearm"),
+        ("inertia.armature@elbow", "a wrong armature of joint elbow"),
         ("sensor.bias@q.elbow", "a sensor bias in channel q.elbow"),
         ("friction.coulomb@*", "Coulomb friction at every joint"),
         ("mass.scale@*", "a wrong mass of every body"),
