@@ -23,6 +23,7 @@ from sims.robot.xmlfile import Files, include, tree, written
 
 FORMATS: Mapping[str, Format] = {"mujoco": "mjcf", "robot": "urdf"}
 """By the root element."""
+UNDRIVEN = "no actuators: nothing drives it unless a recording's [actuators.NAME] adds some"
 NUMBERS = (
     "body_mass", "body_inertia", "body_pos", "body_ipos", "jnt_pos", "jnt_axis",
     "jnt_stiffness", "dof_damping", "dof_armature", "dof_frictionloss",
@@ -91,6 +92,8 @@ def _robot(
         model = mends.compiled(spec)
     aliases = _fused(above, {model.body(i).name for i in range(model.nbody)})
     said = [f"MuJoCo says: {warning}" for warning in dict.fromkeys(warnings)]
+    if model.nu == 0:
+        said.insert(0, UNDRIVEN)
     settings = json.dumps([actuators, engine], sort_keys=True, default=str)
     files.add(settings.encode())
     robot = Robot(

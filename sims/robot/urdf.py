@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from xml.etree.ElementTree import Element, SubElement
 
 from sims.base import InputError, unknown
 from sims.limits import cut
 from sims.robot.links import inertials, mass, number, shapes
+from sims.robot.quiet import one_line
 from sims.robot.words import listed
-from sims.robot.xmlfile import Files, children
+from sims.robot.xmlfile import Files, children, written
 
 READ = ("link", "joint", "mujoco")
 """What is read of a robot."""
@@ -42,6 +44,7 @@ def mended(files: Files, root: Element) -> list[str]:
         notes.append(f"held to the world, as MuJoCo does with a URDF's root: {listed(heavy)}")
     notes += _once([*links.values(), *joints])
     notes += inertials(files, links, held)
+    _checked(files, root)
     notes += shapes(files, links, _compiler(root), held)
     notes += _limits(joints)
     notes += _mimics(joints)
@@ -144,6 +147,21 @@ def _compiler(root: Element) -> Element:
     block = blocks[0] if blocks else SubElement(root, "mujoco")
     found = children(block, "compiler")
     return found[0] if found else SubElement(block, "compiler")
+
+
+def _checked(files: Files, root: Element) -> None:
+    """Refuse settings for MuJoCo that it does not know: in a URDF it passes over them."""
+    import mujoco
+
+    for child in children(root, "mujoco"):
+        for setting in child:
+            alone = Element("mujoco")
+            alone.append(Element(setting.tag, setting.attrib))
+            try:
+                mujoco.MjSpec.from_string(written(alone)[0])
+            except ValueError as error:
+                said = re.sub(r", line \d+", "", one_line(error))
+                raise files.fault(setting, said) from None
 
 
 def _once(parts: Sequence[Element]) -> list[str]:

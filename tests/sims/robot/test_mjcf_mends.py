@@ -2,7 +2,7 @@
 
 import pytest
 
-from sims.robot.reading import read
+from sims.robot.reading import UNDRIVEN, read
 
 INERTIAL = '<inertial pos="0 0 0" mass="2" diaginertia="1 1 1"/>'
 MESH = '<mesh name="m" file="no.stl" scale="2 2 2"/>'
@@ -38,7 +38,7 @@ CASES = {
 @pytest.mark.parametrize(("text", "note", "mass"), CASES.values(), ids=CASES)
 def test_absent_meshes_are_left_out_where_masses_are_stated(write, text, note, mass):
     robot = read(write(text))
-    assert robot.notes == (note,)
+    assert robot.notes == (note, UNDRIVEN)
     assert robot.compiled.nmesh == 0
     assert robot.bodies[0].mass == pytest.approx(mass, abs=1e-5)
 
@@ -54,6 +54,7 @@ def test_absent_pictures_and_height_fields_are_left_out(write):
     assert robot.notes == (
         "shapes left out, and their contacts, since their file is absent: h.png",
         "left out, only seen, since the file is absent: t.png, s.png",
+        UNDRIVEN,
     )
     assert robot.compiled.ngeom == 1
 
@@ -63,7 +64,7 @@ def test_meshes_that_are_there_are_kept(write):
     path = write(mjcf('<mesh name="m" file="part.obj"/>', ""))
     write(tetrahedron, "parts/part.obj")
     robot = read(path)
-    assert robot.notes == ()
+    assert robot.notes == (UNDRIVEN,)
     assert robot.bodies[0].mass == pytest.approx(1000 / 6)
     assert robot.spec.copy().compile().nmesh == 1
     write(tetrahedron.replace("v 0 0 1", "v 0 0 2"), "parts/part.obj")
@@ -76,6 +77,7 @@ def test_inertias_that_mujoco_refuses(write):
     assert robot.notes == (
         "no body has principal moments A + B < C; the nearest are taken (kg m^2): "
         "b 0.1, 0.2, 0.36 -> 0.12, 0.22, 0.34",
+        UNDRIVEN,
     )
     assert sorted(robot.compiled.body_inertia[1]) == pytest.approx([0.12, 0.22, 0.34])
 
@@ -150,7 +152,7 @@ def test_a_mesh_that_mujoco_refuses(write):
     write("", "parts/bad.stl")
     robot = read(path)
     assert robot.compiled.nmesh == 0
-    (note,) = robot.notes
+    note, _ = robot.notes
     assert note.startswith("shapes left out, and their contacts, since their file is refused by ")
     assert note.endswith("is not finite): m")
 
