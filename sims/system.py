@@ -260,14 +260,15 @@ class Coefficient:
             exist there.
         plausible: the range one would expect, in the same order.
         of: whose unit it has where `units` are only the usual ones: ``input`` the first input's,
-            ``reading`` that of the channel it acts on, ``reading/s`` the same per second.
+            ``reading`` that of the channel it acts on, ``reading/s`` the same per second;
+            ``drive`` is a limit of the drive's force, with units of its own.
         least: what a fit may not go below, where that is not a matter of plausibility.
     """
 
     name: str
     units: tuple[str | None, str | None, str | None]
     plausible: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-    of: Literal["", "input", "reading", "reading/s"] = ""
+    of: Literal["", "input", "reading", "reading/s", "drive"] = ""
     least: float | None = None
 
     def unit(self, kind: Kind) -> str | None:
@@ -278,6 +279,8 @@ class Coefficient:
         """The unit on this system, of whose channels those named `observed` are recorded (default:
         all).
         """
+        if system.has_model:
+            return self.unit(system.kind)
         if self.of == "input" and system.inputs:
             return system.inputs[0].unit
         if self.of.startswith("reading"):

@@ -15,7 +15,7 @@ import numpy as np
 from bench.gap.assess import Assessor
 from bench.gap.causes.name import Finding, name
 from bench.gap.causes.search import Search
-from bench.gap.causes.structure import Hat
+from bench.gap.causes.structure import probes
 from bench.gap.explanation import Explanation
 from bench.gap.measure import HeldOutRuns
 from bench.gap.model.base_fit import fit_base
@@ -123,12 +123,14 @@ class _Explainer:
             say(f"{self.path}: {odd}")
         check_recording(self.recording, kind(engine=self.engine), force)
         self.fitting = World(
-            kind, self.recording, self.recording.training(), self.engine, [Hat], free
+            kind, self.recording, self.recording.training(), self.engine, probes(kind), free
         )
         held_out = self.recording.held_out()
         # The same effects in the same places, so that a fitted vector means the same there.
         self.measuring = (
-            World(kind, self.recording, held_out, self.engine, [Hat], free) if held_out else None
+            World(kind, self.recording, held_out, self.engine, probes(kind), free)
+            if held_out
+            else None
         )
         self.floor: Floor = noise_floor(self.fitting, self.recording)
         self.watch = watch

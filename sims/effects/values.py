@@ -107,4 +107,6 @@ class Limit(Value):
     says = "the actuator gives no more than a certain force"
     source = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
     at = "actuator"
-    coefficients = (Coefficient("coefficient", ("N", "N", "N*m"), ((0, 50), (0, 50), (0, 5))),)
+    coefficients = (
+        Coefficient("coefficient", ("N", "N", "N*m"), ((0, 50), (0, 50), (0, 5)), of="drive"),
+    )

@@ -129,19 +129,24 @@ class Bench:
         qpos[:n, places.positions] = positions
         qvel[:n, places.velocities] = velocities
 
-    def settle(self, controls: Array) -> None:
-        """Let filters of actuators begin at their first controls (n, nu): they were on before."""
+    def settle(self, controls: Array) -> Array:
+        """Let filters of actuators begin at their first controls (n, nu): they were on before;
+        returns activations (n, na).
+        """
         import mujoco
 
         model = self.model
+        n = len(controls)
         if not model.na:
-            return
+            return np.zeros((n, 0))
         dynamics = mujoco.mjtDyn
         filters = (int(dynamics.mjDYN_FILTER), int(dynamics.mjDYN_FILTEREXACT))
         act = self.batch.bind("act")
         for i in range(model.nu):
             if int(model.actuator_dyntype[i]) in filters:
-                act[: len(controls), int(model.actuator_actadr[i])] = controls[:, i]
+                act[:n, int(model.actuator_actadr[i])] = controls[:, i]
+        begun: Array = act[:n].copy()
+        return begun
 
     def run(self, controls: Array, forces: Array, record: Sequence[str]) -> dict[str, Array]:
         """Step n lanes S times.

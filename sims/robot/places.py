@@ -194,7 +194,7 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
         # The difference may take away what the file states, and no more.
         high = max(high, 2.0 * stated)
         low = least = -stated
-    return Coefficient(c.name, (unit,) * 3, ((low, high),) * 3, least=least)
+    return Coefficient(c.name, (unit,) * 3, ((low, high),) * 3, c.of, least)
 
 
 def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[Spot]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sims.base import Array, InputError, Scenario, unknown
 from sims.plan import Plan, Runs, felt_inputs, make_runs
 from sims.robot.forces import OVER_TIME, Forces, over_time
-from sims.robot.lanes import LANES, SIZES, Addresses, Bench, Places
+from sims.robot.lanes import LANES, Addresses, Bench, Places
 from sims.robot.model import Robot
 from sims.robot.native import FIELDS
 from sims.robot.sampling import sampled
@@ -27,6 +27,10 @@ from sims.user_toml import shown
 
 INTEGRATORS = {"Euler": 0, "RK4": 1, "implicit": 2, "implicitfast": 3}
 """MuJoCo's integrators, by their names in a model file."""
+_FIELDS = {"tau.": "qfrc_actuator", "s.": "sensordata"}
+"""Where MuJoCo has what channels show that begin so."""
+WIDTH = 128
+"""Instants of a motion that are looked at side by side."""
 SHARE = 1e-6
 """Of a step by which a run may exceed a whole number of them."""
 
@@ -88,8 +92,8 @@ class RobotSimulator(Simulated):
         super().__init__(*args, **kwargs)
         freed = self.system.freed_effects
         self._freed: list[Effect] = [effect() for effect in freed]
-        self._robotic = self.system()
-        self._addresses = Addresses(self.robot)
+        self.robotic = self.system()
+        self.addresses = Addresses(self.robot)
         self._benches: dict[tuple[bool, int], Bench] = {}
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
@@ -123,6 +127,10 @@ class RobotSimulator(Simulated):
         parts = [part for effect, c in acting if c.any() for part in effect.parts(c)]
         return tuple((effect, c) for effect, c in parts if c.any())
 
+    def acting(self, theta: Array) -> Acting:
+        """Effects at one place each with their coefficients (K, L, 1), for rows of parameters."""
+        return self._acting(theta)
+
     def simulate_lanes(
         self,
         theta: Array,
@@ -142,55 +150,75 @@ class RobotSimulator(Simulated):
         _, x, v = self._known(scenarios, initial or {})
         longest = max(s.times.size for s in runs.distinct)
         result = np.full((len(theta), longest, len(self.channels)), np.nan)
-        derived = _lanes_with(acting, len(theta), lambda e: _native(e) and FIELDS[e.of].derived)
+        derived = _lanes_with(acting, len(theta), _derives)
         asked = _lanes_with(acting, len(theta), _is_asked)
         with np.errstate(all="ignore"):  # a lane whose numbers overflow is NaN in the end
-            for run, scenario in enumerate(runs.distinct):
-                size = scenario.times.size
-                for kind in range(4):
-                    of_kind = (derived == bool(kind & 1)) & (asked == bool(kind & 2))
-                    lanes = np.flatnonzero((runs.of == run) & of_kind)
-                    for part in np.array_split(lanes, max(-(-lanes.size // LANES), 1)):
-                        if not part.size:
-                            continue
-                        work = Work(scenario, commands[run], _part(acting, part), x[part], v[part])
-                        done = self._simulate(work, bool(kind & 1), bool(kind & 2))
-                        result[part, :size] = done
+            for kind in range(4):
+                of_kind = (derived == bool(kind & 1)) & (asked == bool(kind & 2))
+                lanes = np.flatnonzero(of_kind)
+                # Lanes of one run lie together: what they share is computed once.
+                lanes = lanes[np.argsort(runs.of[lanes], kind="stable")]
+                for part in np.array_split(lanes, max(-(-lanes.size // LANES), 1)):
+                    works = [
+                        Work(
+                            runs.distinct[run],
+                            commands[run],
+                            _part(acting, own),
+                            x[own],
+                            v[own],
+                        )
+                        for run, own in _by_run(runs, part)
+                    ]
+                    done = self._simulate(
+                        works, _part(acting, part), bool(kind & 1), bool(kind & 2)
+                    )
+                    for (_, own), seen in zip(_by_run(runs, part), done, strict=True):
+                        result[own, : seen.shape[1]] = seen
         result += 0.0  # no zero is negative: whatever made it, it is the same zero
         return result
 
-    def _simulate(self, work: Work, derived: bool, asked: bool) -> Array:
-        """Observations (n, T, C) of lanes of one run and kind."""
-        times = work.scenario.times - work.scenario.times[0]
-        steps = max(int(np.ceil(times[-1] / self.step - SHARE)), 1)
+    def _simulate(
+        self, works: Sequence[Work], acting: Acting, derived: bool, asked: bool
+    ) -> list[Array]:
+        """Observations (n, T, C) of the lanes of each run, all stepped together.
+
+        Args:
+            works: the lanes, run by run.
+            acting: what acts on all of them.
+            derived: whether constants of the model follow from what acts.
+            asked: whether forces are asked for in every step.
+        """
+        if not works:
+            return []
         # What is felt now is read in the step that begins now.
         felt = self._feels()
-        made = self._stepped(work, steps + felt, derived, asked)
-        return self._shown(made, work, times, steps)
+        sizes = [self.steps_of(work.times) for work in works]
+        given = [self.controls(work, size + felt) for work, size in zip(works, sizes, strict=True)]
+        whole = Given.of(given)
+        x = np.concatenate([work.x for work in works])
+        v = np.concatenate([work.v for work in works])
+        made = self._stepped(Start(x, v, acting), whole, derived, asked)
+        seen = []
+        first = 0
+        for work, size in zip(works, sizes, strict=True):
+            own = slice(first, first + len(work.x))
+            seen.append(self._shown(made.of(own), work, work.times, size))
+            first += len(work.x)
+        return seen
+
+    def steps_of(self, times: Array) -> int:
+        """How many steps it takes to the last of some instants since the start."""
+        return max(int(np.ceil(times[-1] / self.step - SHARE)), 1)
 
     def _feels(self) -> bool:
         """Whether a channel is recorded that MuJoCo computes within a step."""
         return any(c.name.startswith(("tau.", "s.")) for c in self.channels)
 
-    def controls(self, work: Work, steps: int) -> tuple[Array, Array, dict[str, Array]]:
-        """Controls (n, S, nu) and generalised forces (n, S, nv) that are known beforehand, and what
-        each input is felt as, (n, S) by name.
-        """
+    def controls(self, work: Work, steps: int) -> Given:
+        """What lanes of one run are given over the steps."""
         n = len(work.x)
-        ends: Array = self.step * np.arange(1.0, steps + 1.0)
-        lengths = np.full((n, steps), self.step)
-        rows = np.zeros((n, 1), dtype=np.intp)
-        whole = np.broadcast_to(ends, (n, steps))
-        plan = Plan(lengths, whole, 1, rows, alike=True)
-        shifted = Plan(lengths, whole, 1, rows, alike=False)
-        runs = Runs((work.scenario,), np.zeros(n, dtype=np.intp))
-        felt = {}
-        for name, signal in work.commands.items():
-            passed = tuple(
-                (e, c) for e, c in work.acting if isinstance(e, Input) and e.signal == name
-            )
-            there = shifted if passed else plan
-            felt[name] = felt_inputs(there, runs, [{name: signal}], passed)[name]
+        felt = self.felt(work.scenario, work.commands, work.acting, n, steps)
+        begins: Array = self.step * np.arange(float(steps))
         model = self.robot.compiled
         controls = np.zeros((n, steps, model.nu))
         forces = np.zeros((n, steps, model.nv))
@@ -199,43 +227,79 @@ class RobotSimulator(Simulated):
         for joint in self.robot.joints:
             if joint.single:
                 forces[:, :, joint.velocity] = felt[f"force.{joint.name}"]
-        forces[:, :, self._addresses.velocities] += over_time(
-            self._robotic, work.acting, ends - self.step, len(self._addresses.velocities), n
-        )
-        return controls, forces, felt
+        dofs = self.addresses.velocities
+        forces[:, :, dofs] += over_time(self.robotic, work.acting, begins, len(dofs), n)
+        return Given(controls, forces, felt)
 
-    def _stepped(self, work: Work, steps: int, derived: bool, asked: bool) -> Made:
-        controls, forces, felt = self.controls(work, steps)
+    def felt(
+        self,
+        scenario: Scenario,
+        commands: Mapping[str, Array],
+        acting: Acting,
+        n: int,
+        steps: int,
+    ) -> dict[str, Array]:
+        """What n lanes feel of each input over the steps, (n, S) by name."""
+        ends = np.broadcast_to(self.step * np.arange(1.0, steps + 1.0), (n, steps))
+        lengths = np.full((n, steps), self.step)
+        rows = np.zeros((n, 1), dtype=np.intp)
+        runs = Runs((scenario,), np.zeros(n, dtype=np.intp))
+        felt = {}
+        for name, signal in commands.items():
+            passed = tuple((e, c) for e, c in acting if isinstance(e, Input) and e.signal == name)
+            plan = Plan(lengths, ends, 1, rows, alike=not passed)
+            felt[name] = felt_inputs(plan, runs, [{name: signal}], passed)[name]
+        return felt
+
+    @property
+    def wide(self) -> Bench:
+        """Lanes for looking at many instants of one motion at once."""
+        return self._bench(True, WIDTH)
+
+    def stepped(self, work: Work, given: Given, more: Sequence[str] = ()) -> Made:
+        """Step lanes of one run, whatever acts on them.
+
+        Args:
+            work: the lanes.
+            given: over the steps.
+            more: fields of MuJoCo's data to record besides.
+        """
         n = len(work.x)
-        bench = self._bench(derived, n)
-        bench.load(_filled(_natives(work.acting), n, bench.count))
-        bench.begin(work.x, work.v, self._addresses)
-        bench.settle(controls[:, 0])
-        record = ["qpos", "qvel"]
-        if any(c.name.startswith("tau.") for c in self.channels):
-            record.append("qfrc_actuator")
-        if any(c.name.startswith("s.") for c in self.channels):
-            record.append("sensordata")
-        if asked:
-            asking = Forces(self._robotic, work.acting, n, self._addresses)
-            done = bench.ask(controls, forces, felt, asking, self.step, tuple(record))
-        else:
-            done = bench.run(controls, forces, tuple(record))
-        places = self._addresses
-        x = np.concatenate([work.x[:, None], done["qpos"][:, :, places.positions]], axis=1)
-        v = np.concatenate([work.v[:, None], done["qvel"][:, :, places.velocities]], axis=1)
-        x[bench.failed] = np.nan
-        return Made(x, v, done.get("qfrc_actuator"), done.get("sensordata"), bench.failed)
+        derived = bool(_lanes_with(work.acting, n, _derives).any())
+        asked = bool(_lanes_with(work.acting, n, _is_asked).any())
+        return self._stepped(Start(work.x, work.v, work.acting), given, derived, asked, more)
 
-    def _bench(self, derived: bool, lanes: int) -> Bench:
-        # A tuner asks for one lane at a time: it shall not pay for all the others.
-        count = next(size for size in SIZES if size >= lanes)
-        if (derived, count) not in self._benches:
+    def _stepped(
+        self, start: Start, given: Given, derived: bool, asked: bool, more: Sequence[str] = ()
+    ) -> Made:
+        n = len(start.x)
+        # A lane alone shall not set the constants of all others.
+        bench = self._bench(derived, 1 if n == 1 else LANES)
+        bench.load(_filled(_natives(start.acting), n, bench.count))
+        bench.begin(start.x, start.v, self.addresses)
+        begun = bench.settle(given.controls[:, 0])
+        record = ["qpos", "qvel", *more]
+        for channel in self.channels:
+            record += [_FIELDS[kind] for kind in _FIELDS if channel.name.startswith(kind)]
+        record = list(dict.fromkeys(record))
+        if asked:
+            asking = Forces(self.robotic, start.acting, n, self.addresses)
+            done = bench.ask(given.controls, given.forces, given.felt, asking, self.step, record)
+        else:
+            done = bench.run(given.controls, given.forces, record)
+        places = self.addresses
+        x = np.concatenate([start.x[:, None], done["qpos"][:, :, places.positions]], axis=1)
+        v = np.concatenate([start.v[:, None], done["qvel"][:, :, places.velocities]], axis=1)
+        x[bench.failed] = np.nan
+        return Made(x, v, done, begun, bench.failed)
+
+    def _bench(self, derived: bool, count: int) -> Bench:
+        key = derived, count
+        if key not in self._benches:
             engine = self.engine
             assert isinstance(engine, RobotEngine)
-            settings = engine.numerics.settings()
-            self._benches[derived, count] = Bench(self.robot, derived, settings, count)
-        return self._benches[derived, count]
+            self._benches[key] = Bench(self.robot, derived, engine.numerics.settings(), count)
+        return self._benches[key]
 
     def _shown(self, made: Made, work: Work, times: Array, steps: int) -> Array:
         """What the sensors record: (n, T, C)."""
@@ -264,11 +328,9 @@ class RobotSimulator(Simulated):
                 return made.x[:, upto, number], made.v[:, upto, number]
             return made.v[:, upto, number], None
         if kind == "tau":
-            assert made.drive is not None
-            return made.drive[:, upto, self.robot.joint(of).velocity], None
-        assert made.sensors is not None
+            return made.fields["qfrc_actuator"][:, upto, self.robot.joint(of).velocity], None
         row = next(s for s in self.robot.sensors if s.name == of)
-        return made.sensors[:, upto, row.address], None
+        return made.fields["sensordata"][:, upto, row.address], None
 
     def close(self) -> None:
         """Give back the batches."""
@@ -294,26 +356,93 @@ class Work(NamedTuple):
     x: Array
     v: Array
 
+    @property
+    def times(self) -> Array:
+        """(T,) of samples, seconds since the start."""
+        result: Array = self.scenario.times - self.scenario.times[0]
+        return result
+
+
+class Start(NamedTuple):
+    """Where n lanes begin, (n, D) each, and what acts on them."""
+
+    x: Array
+    v: Array
+    acting: Acting
+
+
+class Given(NamedTuple):
+    """What n lanes are given over S steps, known beforehand.
+
+    Attributes:
+        controls: (n, S, nu).
+        forces: (n, S, nv) generalised.
+        felt: inputs, (n, S) by name.
+    """
+
+    controls: Array
+    forces: Array
+    felt: Mapping[str, Array]
+
+    @classmethod
+    def of(cls, parts: Sequence[Given]) -> Given:
+        """Lanes of several runs; shorter ones are given their last over and over."""
+        if len(parts) == 1:
+            return parts[0]
+        steps = max(part.controls.shape[1] for part in parts)
+        names = parts[0].felt
+        return cls(
+            np.concatenate([_lasting(part.controls, steps) for part in parts]),
+            np.concatenate([_lasting(part.forces, steps) for part in parts]),
+            {n: np.concatenate([_lasting(part.felt[n], steps) for part in parts]) for n in names},
+        )
+
+
+def _lasting(values: Array, steps: int) -> Array:
+    """(n, S', ...) drawn out to so many steps by their last."""
+    more = steps - values.shape[1]
+    if not more:
+        return values
+    return np.concatenate([values, np.repeat(values[:, -1:], more, axis=1)], axis=1)
+
+
+def _by_run(runs: Runs, lanes: Places) -> list[tuple[int, Places]]:
+    """Lanes that lie together by their runs."""
+    if not lanes.size:
+        return []
+    borders = np.flatnonzero(np.diff(runs.of[lanes])) + 1
+    return [(int(runs.of[own[0]]), own) for own in np.split(lanes, borders)]
+
 
 class Made(NamedTuple):
     """What MuJoCo made of n lanes.
 
     Attributes:
         x, v: (n, S + 1, D) at the beginning and after every step.
-        drive: (n, S, nv) forces of actuators in each step; None where nobody asked.
-        sensors: (n, S, k) sensor data likewise.
+        fields: what MuJoCo's data had in each step, (n, S, ...) by name.
+        begun: (n, na) activations at the beginning.
         failed: (n,) which lanes did.
     """
 
     x: Array
     v: Array
-    drive: Array | None
-    sensors: Array | None
+    fields: Mapping[str, Array]
+    begun: Array
     failed: Mask
+
+    def of(self, lanes: slice) -> Made:
+        """Some of the lanes."""
+        fields = {name: values[lanes] for name, values in self.fields.items()}
+        return Made(self.x[lanes], self.v[lanes], fields, self.begun[lanes], self.failed[lanes])
 
 
 def _native(effect: Effect) -> bool:
     return (effect.of or effect.name) in FIELDS and effect.hook in ("value", "force")
+
+
+def _derives(effect: Effect) -> bool:
+    """Whether MuJoCo derives constants from what it changes."""
+    return _native(effect) and FIELDS[effect.of or effect.name].derived
 
 
 def _natives(acting: Acting) -> Acting:

@@ -47,8 +47,8 @@ FRICTIONS = {
 """Of solreffriction and solimpfriction, by the step."""
 
 
-def served_spec(path, pose, frequency):
-    """A specification whose joints are driven by critically damped position servos."""
+def served(path, pose, frequency):
+    """A model whose joints are driven by critically damped position servos."""
     spec = read(path).spec.copy()
     for actuator in list(spec.actuators):
         spec.delete(actuator)
@@ -59,19 +59,12 @@ def served_spec(path, pose, frequency):
     inertias = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertias)
     for i, inertia in enumerate(np.diag(inertias)):
-        name = model.joint(i).name
-        servo = spec.add_actuator(name=f"s_{name}", target=name)
+        servo = spec.add_actuator(target=model.joint(i).name)
         servo.trntype = mujoco.mjtTrn.mjTRN_JOINT
         servo.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         servo.gainprm[0] = frequency**2 * inertia
         servo.biasprm[1:3] = -(frequency**2) * inertia, -2 * frequency * inertia
-    spec.compile()
-    return spec
-
-
-def served(path, pose, frequency):
-    """A model of such a specification."""
-    return served_spec(path, pose, frequency).compile()
+    return spec.compile()
 
 
 def commands(count, run, amplitude):

@@ -109,11 +109,14 @@ def _first(world: World, name: str) -> Iterator[Probe]:
     shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
     count = len(parameters)
     scaling = [i for i in range(count) if i not in shaping]
-    grids = [_grid(world, parameters[i]) for i in shaping]
+    travel = world.travel_of(name)
+    grids = [_grid(world, parameters[i], travel) for i in shaping]
     group = 0
+    leading = world.effects[name].coefficients[0]
     # Coefficients that scale at one point of the grid act together: a sine with its cosine.
     for point in product(*grids):
-        for place in scaling:
+        # Of a limit of force every small size takes all of it away.
+        for place in scaling if leading.of != "drive" else ():
             low, high = parameters[place].bounds
             c = np.zeros(count)
             c[shaping] = point
@@ -126,35 +129,45 @@ def _first(world: World, name: str) -> Iterator[Probe]:
                 signed=low < 0,
             )
         group += 1
-    leading = world.effects[name].coefficients[0]
     least, _ = parameters[0].bounds
     # Of a limit no small size is like a large one: it is tried where the input reaches it.
-    if leading.of == "input" and least == 0:
+    if leading.of == "drive" or (leading.of == "input" and least == 0):
         yield from _limits(world, name, group)
 
 
 def _limits(world: World, name: str, group: int) -> Iterator[Probe]:
     """Limits, dead bands and plays of a size that the input reaches."""
-    largest = max(_largest_input(world))
-    if not largest > 0:
+    largest = _reach(world, name)
+    if not largest.any():
         return
     for number, level in enumerate(LEVELS, start=group):
         yield Probe(
             effect=name,
             group=number,
             place=0,
-            c=np.array([level * largest]),
+            c=level * largest,
             signed=False,
             fixed=True,
         )
 
 
-def _largest_input(world: World) -> Iterator[float]:
-    """Of each run, of its first input."""
+def _reach(world: World, name: str) -> Array:
+    """(k,) of each place where an effect limits something, what is reached there."""
+    effect = world.effects[name]
+    members = getattr(effect, "members", ()) or (effect,)
+    if effect.coefficients[0].of == "drive":
+        # How large a force gets is not recorded: what is plausible has to do.
+        return np.array([p.bounds[1] for p in _parameters(world, name)])
+    return np.array([max(_largest_input(world, member.signal)) for member in members])
+
+
+def _largest_input(world: World, name: str) -> Iterator[float]:
+    """Of each run, of the input of that name; of its first one without a name."""
     for track in world.tracks:
-        signals = track.scenario.inputs.values()
-        first = next(iter(signals), np.zeros(1))
-        yield float(np.abs(first).max())
+        signals = track.scenario.inputs
+        first = next(iter(signals.values()), np.zeros(1))
+        signal = signals.get(name, np.zeros(1)) if name else first
+        yield float(np.abs(signal).max())
 
 
 def _parameters(world: World, name: str) -> Sequence[Parameter]:
@@ -164,23 +177,23 @@ def _parameters(world: World, name: str) -> Sequence[Parameter]:
     return effect_parameters(effect, system, world.channels)
 
 
-def _grid(world: World, parameter: Parameter) -> Array:
-    """Sizes to try of a coefficient that shapes."""
+def _grid(world: World, parameter: Parameter, travel: float) -> Array:
+    """Sizes to try of a coefficient that shapes, where the position has this range in a run."""
     low, high = parameter.bounds
     if parameter.unit == "Hz":
         # What comes and goes must do so once in a run, or any slow change would be periodic.
         seldom = max(low, CYCLES / world.longest)
         slowest = min(seldom, high / 2.0)
         return _frequencies(slowest, high, world.longest)
-    if _is_period(world, parameter):
-        frequencies = _frequencies(1.0 / high, 1.0 / low, world.travel)
+    if _is_period(parameter, travel):
+        frequencies = _frequencies(1.0 / high, 1.0 / low, travel)
         return 1.0 / frequencies
     return np.geomspace(low, high, SHAPES)
 
 
-def _is_period(world: World, parameter: Parameter) -> bool:
+def _is_period(parameter: Parameter, travel: float) -> bool:
     """Whether a coefficient is a period over position, of runs that go anywhere."""
-    return parameter.name.endswith(".period") and world.travel > 0
+    return parameter.name.endswith(".period") and travel > 0
 
 
 def neighbours(world: World, fit: Fit) -> Iterator[Start]:
@@ -191,19 +204,19 @@ def neighbours(world: World, fit: Fit) -> Iterator[Start]:
         for place in world.places(name):
             parameter = world.parameters[place]
             value = float(fit.theta[place])
-            for moved in _shifted(world, parameter, value):
+            for moved in _shifted(world, parameter, value, world.travel_of(name)):
                 theta = fit.theta.copy()
                 theta[place] = np.clip(moved, *parameter.bounds)
                 yield Start(fit.effects, theta, fit.states)
 
 
-def _shifted(world: World, parameter: Parameter, value: float) -> Iterator[float]:
+def _shifted(world: World, parameter: Parameter, value: float, travel: float) -> Iterator[float]:
     """A frequency or a period, by parts of a cycle faster and slower; nothing else."""
     for cycles in SHIFTS:
         if parameter.unit == "Hz":
             yield value + cycles / world.longest
-        elif _is_period(world, parameter) and value > 0:
-            frequency = 1.0 / value + cycles / world.travel
+        elif _is_period(parameter, travel) and value > 0:
+            frequency = 1.0 / value + cycles / travel
             # Slower than the longest period it might turn its sign.
             lowest = 1.0 / parameter.bounds[1]
             yield 1.0 / max(frequency, lowest)
@@ -288,13 +301,23 @@ def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
     """
     added = [(probe.effect, probe.c) for probe in probes]
     # These are the largest arrays of a search, so all is done in place.
-    values = simulate_with(world, at, added)
-    values -= at.simulated
+    values = changes_by(world, at, added)
     followed = np.isfinite(values)
     # A probe that the simulator cannot follow is a direction that changes nothing.
     if not followed.all():
         values[~followed] = 0.0
     values /= _sizes(probes)[:, None, None, None]  # (1)
+    return values
+
+
+def changes_by(world: World, at: Fit, added: Sequence[tuple[str, Array]]) -> Array:
+    """(K, R, T, C): what one more effect changes about the fitted model's runs, for each of K
+    effects with their coefficients; to first order where the simulator gives that for less.
+    """
+    if world.linear:
+        return world.responses(at.theta, at.states, added)
+    values = simulate_with(world, at, added)
+    values -= at.simulated
     return values
 
 

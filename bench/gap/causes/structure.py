@@ -19,20 +19,24 @@ of noise with a correlation phi between neighbours is (M. S. Bartlett's formula 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from bench.gap.causes.candidates import Directions, Probe, simulate_with
+from bench.gap.causes.candidates import Directions, Probe, changes_by
+from bench.gap.causes.joint_hats import JointFamily, JointHat
+from bench.gap.causes.joint_hats import families as joint_families
 from bench.gap.causes.rules import CHANCE, has_structure, is_loud, level_of
 from bench.gap.causes.score_test import ScoreTest, calibrated
 from bench.gap.model.models import Model, Models
 from bench.gap.model.surrogates import surrogates
 from bench.gap.model.world import World
 from sims.base import Array
-from sims.system import Coefficient, Force, Moment
+from sims.simulated import Simulated
+from sims.system import Coefficient, Effect, Force, Moment
 
 BINS = 7
 """Hats over the range of a variable."""
@@ -117,6 +121,11 @@ class Remains:
         return has_structure(self.p_value, self.chance, self.loud)
 
 
+def probes(kind: type[Simulated]) -> list[type[Effect]]:
+    """The effects that stand for forces of any shape on a simulator of this kind."""
+    return [JointHat] if kind.has_model else [Hat]
+
+
 def remains(models: Models, model: Model) -> Remains:
     """Test what a fitted model leaves.
 
@@ -126,7 +135,7 @@ def remains(models: Models, model: Model) -> Remains:
     """
     world, stated = models.world, models.stated
     quick = unasked(models, model)
-    if Hat.name not in world.slots:
+    if not any(probe.name in world.slots for probe in (Hat, JointHat)):
         return quick
     world.watch.look("a force of any shape")
     directions = hats(world, model)
@@ -176,25 +185,14 @@ def _error(models: Models, model: Model, channel: int) -> float:
 def hats(world: World, model: Model) -> Directions:
     """What hats over every recorded variable would change about a model."""
     labels, added = [], []
-    slow = SLOW * _fastest(world)
     size = SIZE * TYPICAL[world.simulator.system.kind]
-    for family in _families(world):
+    for label, low, high, coefficients in _shapes(world, size):
         # At this spacing each hat reaches to the centres of its neighbours.
-        width = (family.high - family.low) / (BINS - 1)
-        for centre in np.linspace(family.low, family.high, BINS):
-            labels.append(family.label)
-            coefficients = [
-                size,
-                family.variable,
-                centre,
-                width,
-                family.direction,
-                slow,
-            ]
-            added.append((Hat.name, np.array(coefficients)))
-    if not added:
-        return Directions((), np.zeros((*world.observed.shape, 0)))
-    changed = simulate_with(world, model.fit, added) - model.fit.simulated
+        width = (high - low) / (BINS - 1)
+        for centre in np.linspace(low, high, BINS):
+            labels.append(label)
+            added.append(coefficients(centre, width))
+    changed = changes_by(world, model.fit, added)
     values = np.nan_to_num(np.moveaxis(changed, 0, -1)) / size
     # A hat where no run ever is changes nothing, and would be a column of zeros.
     acting = np.flatnonzero(np.abs(values).max(axis=(0, 1, 2)) > 0)
@@ -204,6 +202,32 @@ def hats(world: World, model: Model) -> Directions:
         _, c = added[i]
         probes.append(Probe(labels[i], group=0, place=0, c=c, signed=True))
     return Directions(tuple(probes), values[..., acting])
+
+
+Shape = Callable[[float, float], tuple[str, Array]]
+"""A hat of a family by its centre and width: the effect's name, and its coefficients."""
+
+
+def _shapes(world: World, size: float) -> Iterator[tuple[str, float, float, Shape]]:
+    """Families of hats: the label, the range of the variable, and what makes one of them."""
+    if JointHat.name in world.slots:
+        for joint in joint_families(world, SLOW):
+            yield joint.label, joint.low, joint.high, partial(_on_joint, joint, size)
+        return
+    slow = SLOW * _fastest(world)
+    for family in _families(world):
+        yield family.label, family.low, family.high, partial(_anywhere, family, size, slow)
+
+
+def _on_joint(family: JointFamily, size: float, centre: float, width: float) -> tuple[str, Array]:
+    follows = family.joint, family.variable, centre, width, family.direction, family.slow
+    return JointHat.name, np.array([size, *follows])
+
+
+def _anywhere(
+    family: _Family, size: float, slow: float, centre: float, width: float
+) -> tuple[str, Array]:
+    return Hat.name, np.array([size, family.variable, centre, width, family.direction, slow])
 
 
 class _Family(NamedTuple):

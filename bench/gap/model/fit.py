@@ -97,7 +97,7 @@ class Fitter:
         if not world.apart:
             return [list(going)]
         runs, length, _ = world.observed.shape
-        unknown = int((~world.known.all(axis=0)).sum())
+        unknown = self._moved_states().size
         lanes = sum(1 + problems[i].free.size + unknown for i in going) * runs
         cost = lanes * length * self.share + ALGEBRA * len(going)
         # compiled lanes are stepped side by side, however long they are
@@ -177,7 +177,7 @@ class Fitter:
         through time once for all of them. An initial state that every run knows is no unknown.
         """
         runs, size = self.world.guess.shape
-        unknown = np.flatnonzero(~self.world.known.all(axis=0))
+        unknown = self._moved_states()
         steps = [problem.inward(start.theta) for problem, start in trials]
         moved = [
             displaced(start, problem.free, step, unknown)
@@ -198,9 +198,28 @@ class Fitter:
             part = simulated[first:last]
             first = last
             jacobian = self._derivatives(part, step, unknown)
+            if self.world.linear:
+                jacobian[..., problem.free.size :] = self._begun(start, part.shape[2])
             cost = self._cost(part[0], start.states, seen)
             points.append(Point(start, part[0], jacobian, cost))
         return points
+
+    def _moved_states(self) -> Indices:
+        """(n,) the initial states that are moved to find their derivatives: none where they come
+        from elsewhere.
+        """
+        if self.world.linear:
+            return np.array([], dtype=np.intp)
+        return np.flatnonzero(~self.world.known.all(axis=0))
+
+    def _begun(self, start: Start, samples: int) -> Array:
+        """(R, T, C, s) derivatives by initial states that come with the world; zero where a state
+        is known.
+        """
+        world = self.world
+        derivatives = world.begun(start.theta, start.states)[:, :samples]
+        kept: Array = derivatives * ~world.known[:, None, None, :]
+        return kept
 
     def _derivatives(self, part: Array, steps: Array, unknown: Indices) -> Array:
         """(R, T, C, q + s) difference quotients; zero by an initial state where it is known, which
@@ -218,7 +237,7 @@ class Fitter:
         with np.errstate(all="ignore"):
             quotients = np.moveaxis(part[1:] - part[0], 0, -1) / steps[columns]
         jacobian: Array = np.nan_to_num(quotients, nan=0.0, posinf=0.0, neginf=0.0)
-        if not known.any():
+        if columns.size == steps.size:
             return jacobian
         quotients, jacobian = jacobian, np.zeros((*part.shape[1:], steps.size))
         jacobian[..., columns] = quotients

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from sims.base import Array, InputError, Parameter, Scenario, unknown
 from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 from sims.system import Effect, Input, Sensor
+
+if TYPE_CHECKING:
+    from sims.robot.linear import Linear
 
 Indices = NDArray[np.intp]
 
@@ -76,7 +79,6 @@ class World:
         known: (R, s) initial states that are not to be estimated.
         guess: (R, s) initial states, stated or guessed.
         longest: duration of the longest run, seconds.
-        travel: the largest range of the primary coordinate in one run.
         simulations: lanes simulated so far.
         watch: says when fits have to leave off; never, unless another is put here.
         crew: who simulates and fits; this process alone, unless another is put here.
@@ -137,7 +139,8 @@ class World:
         self.known: Mask = np.array([t.known for t in self.tracks])
         self.guess: Array = np.array([t.guess for t in self.tracks])
         self.longest = self._longest()
-        self.travel = self._travel()
+        self._travels: dict[str, float] = {}
+        self._begun: Array | None = None
         self.simulations = 0
         self.watch = Watch()
         self.crew = Crew()
@@ -177,13 +180,29 @@ class World:
         # not zero: lengths of time are divided by it
         return max(track.seconds for track in self.tracks) or 1.0
 
-    def _travel(self) -> float:
-        """The range of the primary coordinate in the run where it is largest; 0 where it is not
-        recorded.
+    @property
+    def travel(self) -> float:
+        """The largest range of the primary coordinate in one run; 0 where it is not recorded."""
+        system = self.simulator.system
+        return self._range(system.coordinates[system.primary] if system.coordinates else "")
+
+    def travel_of(self, effect: str) -> float:
+        """The range of the coordinate that an effect acts on, in the run where it is largest; 0
+        where it is not recorded.
         """
         system = self.simulator.system
-        name = system.coordinates[system.primary] if system.coordinates else ""
+        coordinate = self.effects[effect].coordinate
+        place = system.primary if coordinate is None else coordinate
         # an own simulator may have no coordinates at all
+        return self._range(system.coordinates[place] if system.coordinates else "")
+
+    def _range(self, name: str) -> float:
+        """The largest range of a channel in one run, found once; 0 where it is not recorded."""
+        if name not in self._travels:
+            self._travels[name] = self._travel(name)
+        return self._travels[name]
+
+    def _travel(self, name: str) -> float:
         if name not in self.channels:
             return 0.0
         values = self.observed[:, :, self.channels.index(name)]
@@ -210,10 +229,73 @@ class World:
         """Names of the recorded channels, in the order of observations."""
         return [c.name for c in self.simulator.channels]
 
-    @property
+    @cached_property
     def effects(self) -> dict[str, Effect]:
         """Every effect at hand, by name."""
         return {effect.name: effect for effect in self.simulator.effects}
+
+    def _about(self, run: int, theta: Array, states: Array) -> Linear:
+        """The neighbourhood of one run of a model."""
+        # loaded where there is a robot alone
+        from sims.robot.linear import Linear
+
+        half = len(self.states) // 2
+        scenario = self.tracks[run].scenario
+        return Linear(self.simulator, theta, scenario, states[:half], states[half:])
+
+    @property
+    def linear(self) -> bool:
+        """Whether the simulator tells what small changes do, without simulating each of them."""
+        return self.kind.has_model
+
+    def responses(self, theta: Array, states: Array, added: Sequence[tuple[str, Array]]) -> Array:
+        """What one more effect changes about the runs, to first order: (K, R, T, C).
+
+        Args:
+            theta: (P,) parameters, without the effects that are added.
+            states: (R, s) initial states.
+            added: K effects with their coefficients.
+        """
+        runs, length, channels = self.observed.shape
+        result = np.full((len(added), runs, length, channels), np.nan)
+        calls = [(run, theta, states[run], added) for run in range(runs)]
+        for run, (values, looks) in self.crew.each(self, _responses, calls):
+            result[:, run, : values.shape[1]] = values
+            self.simulations += looks
+        return result
+
+    def begun(self, theta: Array, states: Array, anew: bool = False) -> Array:
+        """Derivatives of the runs by their initial states, (R, T, C, s): those about the first
+        model that was asked for, or about this one.
+
+        Initial states act alike in all models that are near the data, and a fit that has their
+        derivatives about another of them comes to the same end.
+
+        Args:
+            theta: (P,) parameters.
+            states: (R, s) initial states.
+            anew: take them about this model, and keep them.
+        """
+        if self._begun is None or anew:
+            runs, length, channels = self.observed.shape
+            result = np.zeros((runs, length, channels, len(self.states)))
+            calls = [(run, theta, states[run]) for run in range(runs)]
+            for run, values in self.crew.each(self, _begun, calls):
+                result[run, : values.shape[1]] = np.moveaxis(values, 0, -1)
+            self._begun = np.nan_to_num(result)
+        return self._begun
+
+    def begun_of_run(self, run: int, theta: Array, states: Array) -> Array:
+        """The same of one run, (s, T, C)."""
+        return self._about(run, theta, states).begun()
+
+    def responses_of_run(
+        self, run: int, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
+    ) -> tuple[Array, int]:
+        """The same of one run (K, T, C), and how many simulations it cost."""
+        about = self._about(run, theta, states)
+        values = about.responses([(self.effects[name], c) for name, c in added])
+        return values, about.cost
 
     def places(self, effect: str) -> range:
         """Where an effect's coefficients stand in theta."""
@@ -287,7 +369,10 @@ class World:
         )
         # what is periodic goes on from piece to piece, and what is found in one is found in all
         other.longest = self.longest
-        other.travel = self.travel
+        # found now: of pieces it would be another
+        for name in self.channels:
+            self._range(name)
+        other._travels = self._travels
         other.watch = self.watch
         other.crew = self.crew
         return other
@@ -303,6 +388,8 @@ class World:
     @cached_property
     def apart(self) -> bool:
         """Whether lanes cost as much in several calls as in one: where steps are compiled."""
+        if self.kind.has_model:
+            return True
         if self.engine != "batch":
             return False
         # loaded when something is simulated: the compiler's package is not for free
@@ -353,6 +440,16 @@ class World:
         """Give back what the engine holds."""
         self.simulator.close()
         self._fine.close()
+
+
+def _begun(world: World, *call: Any) -> Array:
+    """Derivatives of a run by its initial state, whoever takes them."""
+    return world.begun_of_run(*call)
+
+
+def _responses(world: World, *call: Any) -> tuple[Array, int]:
+    """What effects change about a run, whoever asks."""
+    return world.responses_of_run(*call)
 
 
 def _shows(effect: type[Effect], recorded: set[str]) -> bool:

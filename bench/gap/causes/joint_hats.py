@@ -1,0 +1,99 @@
+"""Forces of any shape along single joints: the hats of `bench.gap.causes.structure` where a system
+has several coordinates that are each driven and rubbed by themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.gap.model.world import World
+from sims.base import Array
+from sims.system import Coefficient, Force, Moment
+
+TIME, POSITION, SPEED = 0, 1, 2
+"""Variable of a hat."""
+ALONG, AGAINST, DRY = 0, 1, 2
+"""Direction of a hat: along the joint, against its motion in proportion to speed, or dry."""
+
+
+class JointHat(Force):
+    """A force over a stretch of time, position or speed of one joint."""
+
+    name = "probe.joint_hat"
+    says = "a force acts over a stretch of time, position or speed"
+    source = "this module"
+    of = "probe.joint_hat"
+    coefficients = tuple(
+        Coefficient(name, ("1", "1", "1"), ((-1, 1), (-1, 1), (-1, 1)))
+        for name in ("strength", "joint", "variable", "centre", "width", "direction", "slow")
+    )
+
+    def force(self, c: Array, moment: Moment) -> Array:
+        """Strength times a triangle around the centre; all lanes are of one joint."""
+        strength, joint, variable, centre, width, direction, slow = c
+        acting = np.flatnonzero(strength[:, 0])
+        if not acting.size:
+            return np.zeros_like(moment.x)
+        j = int(joint[acting[0], 0])
+        x, v = moment.x[:, j, None], moment.v[:, j, None]
+        follows = int(variable[acting[0], 0])
+        value = (moment.t, x, np.abs(v))[follows]
+        # Off, a hat has no width either, and must not divide by it.
+        height = np.maximum(1.0 - np.abs(value - centre) / np.maximum(width, 1e-12), 0.0)
+        dry = -v / (np.abs(v) + np.maximum(slow, 1e-9))
+        way = (np.ones_like(v), -v, dry)[int(direction[acting[0], 0])]
+        result = np.zeros_like(moment.x)
+        result[:, j] = (strength * height * way)[:, 0]
+        return result
+
+
+class JointFamily(NamedTuple):
+    """Hats over the range of one variable of one joint, with one direction."""
+
+    label: str
+    joint: int
+    variable: int
+    direction: int
+    low: float
+    high: float
+    slow: float
+
+
+def families(world: World, slow: float) -> Iterator[JointFamily]:
+    """Every family of hats that the recording can show.
+
+    Args:
+        world: the runs.
+        slow: share of a speed that is seldom exceeded over which dry friction turns its sign.
+    """
+    longest = world.longest
+    for joint, name in enumerate(world.simulator.system.coordinates):
+        if name not in world.channels:
+            continue
+        values = world.observed[:, :, world.channels.index(name)]
+        low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
+        speed = _fastest(world, world.channels.index(name))
+        about = slow * speed
+        yield JointFamily(f"time, along {name}", joint, TIME, ALONG, 0.0, longest, about)
+        if high > low:
+            for direction, how in ((ALONG, "along it"), (AGAINST, "against it"), (DRY, "dry")):
+                label = f"position {name}, {how}"
+                yield JointFamily(label, joint, POSITION, direction, low, high, about)
+        if speed > 0:
+            for direction, how in ((AGAINST, "against it"), (DRY, "dry")):
+                label = f"speed of {name}, {how}"
+                yield JointFamily(label, joint, SPEED, direction, 0.0, speed, about)
+
+
+def _fastest(world: World, channel: int) -> float:
+    """A speed of a joint that is seldom exceeded."""
+    rates = [np.zeros(1)]
+    for track in world.tracks:
+        if len(track.observed) > 3:
+            # Every third sample: differences of neighbours are mostly noise.
+            step = np.diff(track.scenario.times[::3])
+            rates.append(np.diff(track.observed[::3, channel]) / step)
+    return float(np.nanquantile(np.abs(np.concatenate(rates)), 0.98))

@@ -1,0 +1,234 @@
+"""What effects would change about a robot's runs, to first order (`sims.robot.tangent`), as its
+sensors would show it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sims.base import Array, Scenario
+from sims.robot.native import FIELDS
+from sims.robot.sampling import sampled
+from sims.robot.scales import scales
+from sims.robot.simulator import RobotSimulator, Work
+from sims.robot.tangent import TOGETHER, Change, Motion, Tangent
+from sims.simulated import Simulated
+from sims.system import Acting, Effect, Input, Sensor
+
+Added = tuple[Effect, Array]
+"""An effect with its coefficients (k,)."""
+BY_FORCE = frozenset({"drag.linear", "drag.quadratic", "friction.coulomb"})
+"""Effects in MuJoCo's model whose force is that of the library, so that it is asked there."""
+SPRINGS = frozenset({"spring.linear", "spring.cubic"})
+"""The same where the joint's spring rests at zero."""
+
+
+class Linear:
+    """The neighbourhood of one run of a robot.
+
+    Args:
+        simulator: the robot's.
+        theta: (dim,) parameters.
+        scenario: of the run.
+        x: (D,) initial positions.
+        v: (D,) initial velocities.
+    """
+
+    def __init__(
+        self, simulator: Simulated, theta: Array, scenario: Scenario, x: Array, v: Array
+    ) -> None:
+        assert isinstance(simulator, RobotSimulator), "a robot"
+        self._simulator = simulator
+        self._times = scenario.times - scenario.times[0]
+        self._steps = simulator.steps_of(self._times)
+        acting = simulator.acting(theta[None])
+        commands = simulator.run_inputs(scenario)
+        self._work = Work(scenario, commands, acting, x[None], v[None])
+        self._names = [c.name for c in simulator.channels if c.name.startswith(("tau.", "s."))]
+        self._motion = self._nominal()
+        self._tangent = self._neighbourhood()
+        self._known: dict[tuple[str, bytes], Change] = {}
+        nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.size))
+        unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
+        self.observed: Array = self._seen(nothing, unread, [()])[0]
+
+    def _nominal(self) -> Motion:
+        """The motion itself, with one step more than the run takes, whose beginning is its end."""
+        simulator = self._simulator
+        steps = self._steps + 1
+        given = simulator.controls(self._work, steps)
+        more = ("qfrc_actuator", "qfrc_bias", "act", "sensordata")
+        made = simulator.stepped(self._work, given, more)
+        dofs = simulator.addresses.velocities
+        carried = (made.fields["qfrc_actuator"] + made.fields["qfrc_bias"])[0][:, dofs]
+        act = made.fields["act"][0]
+        first = made.begun[0][None]
+        self._readings = {name: _reading(simulator, made.fields, name) for name in self._names}
+        return Motion(
+            x=made.x[0],
+            v=made.v[0],
+            act=np.concatenate([first, act[:-1]]),
+            controls=given.controls[0],
+            forces=given.forces[0],
+            inputs={name: u[0] for name, u in given.felt.items()},
+            carried=carried,
+            step=simulator.step,
+        )
+
+    def _neighbourhood(self) -> Tangent:
+        simulator = self._simulator
+        outputs = [_output(simulator, name) for name in self._names]
+        return Tangent(
+            simulator.wide,
+            simulator.robotic,
+            self._motion,
+            self._work.acting,
+            outputs,
+            scales(simulator.robot).force,
+            simulator.addresses,
+        )
+
+    @property
+    def cost(self) -> int:
+        """How many simulations of the run it has cost, about."""
+        return 1 + self._tangent.looks // len(self._motion.controls)
+
+    def responses(self, added: Sequence[Added]) -> Array:
+        """(K, T, C): what each of these effects changes about the run's observations."""
+        result = np.zeros((len(added), *self.observed.shape))
+        driven = self._driven(added)
+        for begin in range(0, len(added), TOGETHER):
+            part = range(begin, min(begin + TOGETHER, len(added)))
+            changes: list[Change] = []
+            sensors: list[Acting] = []
+            for owner, number in enumerate(part):
+                effect, c = added[number]
+                parts = effect.parts(c[:, None, None])
+                sensors.append(tuple((e, k) for e, k in parts if isinstance(e, Sensor)))
+                for one, k in parts:
+                    if isinstance(one, Sensor) or not k.any():
+                        continue
+                    if isinstance(one, Input):
+                        continue
+                    changes += self._changes(owner, one, k)
+                changes += [c._replace(owner=owner) for c in driven.get(number, ())]
+            states, readings = self._tangent.follow(changes, len(part))
+            result[part.start : part.stop] = self._seen(states, readings, sensors) - self.observed
+        return result
+
+    def begun(self) -> Array:
+        """(2 D, T, C): what each initial position, then each velocity, changes, per unit."""
+        states, readings = self._tangent.begun()
+        # Small enough to be linear in what sensors do.
+        small = 1e-4
+        seen = self._seen(small * states, small * readings, [()] * len(states))
+        result: Array = (seen - self.observed) / small
+        return result
+
+    def _changes(self, owner: int, effect: Effect, c: Array) -> list[Change]:
+        """What an effect that is neither of an input nor of a sensor changes in each step."""
+        name = effect.of or effect.name
+        joint = effect.coordinate
+        if name == "inertia.armature" and joint is not None:
+            series = -float(c[0, 0, 0]) * self._tangent.accelerations[:, joint]
+            return [Change(owner, joint=joint, series=series)]
+        if name not in FIELDS or name in BY_FORCE or self._springs(name, joint):
+            return self._tangent.by_force(owner, effect, c)
+        key = effect.name, c.tobytes()
+        if key not in self._known:
+            acting = (*self._work.acting, (effect, c))
+            self._known[key] = self._tangent.by_numbers(0, acting, 1.0)
+        return [self._known[key]._replace(owner=owner)]
+
+    def _springs(self, name: str, joint: int | None) -> bool:
+        if name not in SPRINGS or joint is None:
+            return False
+        simulator = self._simulator
+        rest = simulator.robot.compiled.qpos_spring[simulator.addresses.positions[joint]]
+        return bool(rest == 0.0)
+
+    def _driven(self, added: Sequence[Added]) -> dict[int, list[Change]]:
+        """The changes of effects on inputs, by number: what each feels in place of what is felt."""
+        rows: list[tuple[int, Effect, Array]] = []
+        for number, (effect, c) in enumerate(added):
+            for one, k in effect.parts(c[:, None, None]):
+                if isinstance(one, Input) and k.any():
+                    rows.append((number, one, k))
+        if not rows:
+            return {}
+        count = len(rows)
+        acting: dict[str, tuple[Effect, Array]] = {}
+        for e, c in self._work.acting:
+            if isinstance(e, Input):
+                acting[e.name] = e, np.repeat(c, count, axis=1)
+        for lane, (_, one, k) in enumerate(rows):
+            if one.name not in acting:
+                acting[one.name] = one, np.zeros((len(k), count, 1))
+            acting[one.name][1][:, lane] = k[:, 0]
+        steps = len(self._motion.controls)
+        simulator = self._simulator
+        felt = simulator.felt(
+            self._work.scenario, self._work.commands, tuple(acting.values()), count, steps
+        )
+        numbers = {f"u.{a.name}": a.id for a in simulator.robot.actuators}
+        result: dict[int, list[Change]] = {}
+        for lane, (number, one, _) in enumerate(rows):
+            if one.signal not in numbers:
+                continue
+            series = felt[one.signal][lane] - self._motion.inputs[one.signal]
+            change = Change(number, actuator=numbers[one.signal], series=series)
+            result.setdefault(number, []).append(change)
+        return result
+
+    def _seen(self, states: Array, readings: Array, sensors: Sequence[Acting]) -> Array:
+        """(n, T, C) observations of the motion changed by these, through these sensors besides."""
+        simulator, count = self._simulator, len(states)
+        upto = self._steps + 1
+        size = self._motion.x.shape[1]
+        own = tuple((e, np.repeat(c, count, axis=1)) for e, c in self._work.acting)
+        columns = []
+        for channel in simulator.channels:
+            kind, _, of = channel.name.partition(".")
+            slopes = None
+            if kind in ("q", "qd"):
+                j = simulator.system.coordinates.index(f"q.{of}")
+                x = self._motion.x[:upto, j] + states[:, :upto, j]
+                v = self._motion.v[:upto, j] + states[:, :upto, size + j]
+                values, slopes = (x, v) if kind == "q" else (v, None)
+            else:
+                place = self._names.index(channel.name)
+                values = self._readings[channel.name][:upto] + readings[:, :upto, place]
+            acting = _on(channel.name, own, sensors)
+            columns.append(sampled(values, slopes, simulator.step, self._times, acting))
+        return np.stack(columns, axis=2)
+
+
+def _on(channel: str, own: Acting, more: Sequence[Acting]) -> Acting:
+    """The sensors on a channel: the motion's own, then each lane's."""
+    acting = [(e, c) for e, c in own if isinstance(e, Sensor) and e.signal in ("", channel)]
+    added: dict[str, tuple[Effect, Array]] = {}
+    for lane, parts in enumerate(more):
+        for effect, c in parts:
+            if effect.signal not in ("", channel):
+                continue
+            if effect.name not in added:
+                added[effect.name] = effect, np.zeros((len(c), len(more), 1))
+            added[effect.name][1][:, lane] = c[:, 0]
+    return (*acting, *added.values())
+
+
+def _output(simulator: RobotSimulator, channel: str) -> tuple[str, int]:
+    """Where MuJoCo has a channel that is no state: its field, and the column."""
+    kind, _, of = channel.partition(".")
+    if kind == "tau":
+        return "qfrc_actuator", simulator.robot.joint(of).velocity
+    row = next(s for s in simulator.robot.sensors if s.name == of)
+    return "sensordata", row.address
+
+
+def _reading(simulator: RobotSimulator, fields: Mapping[str, Array], channel: str) -> Array:
+    name, column = _output(simulator, channel)
+    values: Array = fields[name][0][:, column]
+    return values
