@@ -11,12 +11,14 @@ import numpy as np
 from sims.base import Array, InputError
 from sims.robot import inertia
 from sims.robot.quiet import one_line
-from sims.robot.shapes import Left, without_mesh
+from sims.robot.shapes import Left, without_mesh, without_picture
 from sims.robot.words import listed, told
+from sims.robot.xmlfile import Files
 
 MASS = 1e-6
 """kg of a body that states none and moves."""
-ABOUT_A_MESH = re.compile(r"mesh|vert|face|stl|obj|hull|volume", re.IGNORECASE)
+ABOUT_A_MESH = re.compile(r"mesh|vert|face|stl|obj|msh|hull|volume", re.IGNORECASE)
+ABOUT_A_PICTURE = re.compile(r"png|ktx|texture|image", re.IGNORECASE)
 
 
 @dataclass
@@ -24,12 +26,14 @@ class Mends:
     """What was mended while a spec was compiled.
 
     Attributes:
+        files: what has been read.
         left: the shapes that were left out.
         balanced: bodies with their principal moments before and after.
         massless: bodies that were given a mass, by whether something hangs on them.
         slight: bodies that were given moments of inertia.
     """
 
+    files: Files
     left: Left
     balanced: list[str] = field(default_factory=list)
     massless: dict[bool, list[str]] = field(default_factory=dict)
@@ -41,7 +45,7 @@ class Mends:
         Raises:
             InputError: MuJoCo refuses the model, in its own words.
         """
-        for _ in range(2 * (len(spec.bodies) + len(spec.meshes)) + 2):
+        for _ in range(2 * (len(spec.bodies) + len(spec.meshes) + len(spec.textures)) + 2):
             try:
                 return spec.compile()
             except InputError:
@@ -50,7 +54,7 @@ class Mends:
                 said = one_line(error)
                 if not self._mended(spec, said):
                     break
-        raise InputError(f"{self.left.source}: {said}")
+        raise self.files.refused(said)
 
     def _mended(self, spec: Any, said: str) -> bool:
         found = re.search(r"Element name '(.*?)', id", said)
@@ -59,10 +63,10 @@ class Mends:
             return self._balance(spec)
         if "mass and inertia of moving bodies" in said:
             return self._weigh(spec, name)
-        what = re.sub(r"; Element.*|Error: ", "", said)
-        return bool(ABOUT_A_MESH.search(what)) and without_mesh(
-            spec, name, f"is refused by MuJoCo ({what})", self.left
-        )
+        why = f"is refused by MuJoCo ({re.sub(r'; Element.*|Error: ', '', said)})"
+        if ABOUT_A_PICTURE.search(why) and without_picture(spec, name, why, self.left):
+            return True
+        return bool(ABOUT_A_MESH.search(why)) and without_mesh(spec, name, why, self.left)
 
     def _balance(self, spec: Any) -> bool:
         before = len(self.balanced)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -73,7 +72,7 @@ def _robot(
     warnings: list[str],
 ) -> Robot:
     source, notes = str(files.path), names.renamed(root)
-    mends = Mends(Left(source))
+    mends = Mends(files, Left(source))
     if kind == "urdf":
         notes += urdf.mended(files, root)
         spec = _parsed(files, root)
@@ -133,16 +132,11 @@ def _parsed(files: Files, root: Element) -> Any:
     """The mujoco.MjSpec of the mended file."""
     import mujoco
 
-    text, elements = written(root)
+    text, files.given = written(root)
     try:
         spec = mujoco.MjSpec.from_string(text)
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
-        said = one_line(error)
-        line = re.search(r"[;,] line (\d+)", said)
-        element = None
-        if line and int(line[1]) <= len(elements):
-            element = elements[int(line[1]) - 1]
-        raise files.fault(element, re.sub(r", line \d+", "", said)) from None
+        raise files.refused(one_line(error)) from None
     spec.modelfiledir = str(files.path.parent.resolve())
     return spec
 

@@ -85,3 +85,16 @@ def without_mesh(spec: Any, name: str, why: str, left: Left) -> bool:
     for mesh in meshes:
         spec.delete(mesh)
     return bool(meshes)
+
+
+def without_picture(spec: Any, name: str, why: str, left: Left) -> bool:
+    """Put one colour in the place of a picture that MuJoCo refuses."""
+    import mujoco
+
+    for texture in [texture for texture in spec.textures if texture.name == name]:
+        left.seen.setdefault(why, []).append(texture.file or name)
+        texture.file, texture.cubefiles = "", []
+        texture.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
+        texture.width = texture.height = 1
+        return True
+    return False

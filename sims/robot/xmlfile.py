@@ -5,6 +5,7 @@ include, and written again so that a line of what is written leads back to the u
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ class Files:
         included: files that have been included, and the model file.
         size: bytes that have been read of them.
         hashed: of all that has been read.
+        given: the elements that MuJoCo was given, one begun in each line.
     """
 
     path: Path
@@ -38,11 +40,21 @@ class Files:
     included: list[Path] = field(default_factory=list)
     size: int = 0
     hashed: Any = field(default_factory=hashlib.sha256)
+    given: list[Element] = field(default_factory=list)
 
     def fault(self, element: Element | None, message: str) -> InputError:
         """The error for an element of the file."""
         place = self.places.get(element) if element is not None else None
         return InputError(f"{place or self.path}: {message}")
+
+    def refused(self, said: str) -> InputError:
+        """The error for what MuJoCo says of the text that it was given, with the line in the file
+        for that in the text.
+        """
+        line = re.search(r", line (\d+)", said)
+        number = int(line[1]) if line else 0
+        element = self.given[number - 1] if 0 < number <= len(self.given) else None
+        return self.fault(element, re.sub(r", line \d+", "", said))
 
     def content(self, path: Path, most: int) -> bytes:
         """What is in a file; its bytes enter the digest.

@@ -157,6 +157,18 @@ def test_a_mesh_that_mujoco_refuses(write):
     assert note.endswith("is not finite): m")
 
 
+def test_a_picture_that_mujoco_refuses(write):
+    assets = '<texture name="t" type="2d" file="t.png"/><material name="k" texture="t"/>'
+    path = write(mjcf(assets, geom='size="0.1" material="k"').replace("meshdir", "assetdir"))
+    write("no picture", "parts/t.png")
+    robot = read(path)
+    note, _ = robot.notes
+    assert note.startswith(
+        "left out, only seen, since the file is refused by MuJoCo (error decoding"
+    )
+    assert robot.compiled.ngeom == 1
+
+
 def test_attached_models_are_read_from_the_models_folder(write, monkeypatch):
     hand = '<mujoco><worldbody><body name="hand">{}<geom size="1" mass="3"/></body>'
     hand = f"{hand}</worldbody></mujoco>"

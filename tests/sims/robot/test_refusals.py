@@ -67,6 +67,9 @@ CASES = {
     mjcf(body=BODY.replace("<joint", '<joint damping="1e300"')): (
         ": damping of j: expected numbers within ±1e+15, found 1e+300"
     ),
+    mjcf('\n\n<tendon><fixed><joint\njoint="no" coef="1"/></fixed></tendon>'): (
+        ":4: joint 'no' not found in tendon 0"
+    ),
     # URDF
     robot(link("a")): ": none of its 0 joints moves",
     robot(link("a"), link("b"), joint("j", "a", "b", "fixed")): ": none of its 1 joints moves",
