@@ -3,7 +3,7 @@ like any other.
 
 The file names the system, the effects and every number with its interval. Loaded, it is a
 registered simulator whose nominal values are the fitted ones, so `compare`, `simulate` and every
-tuner take it.
+tuner take it. That of a robot names its model file in place of a system.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from typing import Any
 from sims import effects as library
 from sims import files
 from sims.base import InputError, Parameter, Simulator
+from sims.robot import stored
+from sims.robot.stored import StoredRobot
 from sims.simulated import Simulated, effect_parameters
 from sims.user_toml import fault, finite, known, names, read_toml, table, text
 
@@ -29,6 +31,9 @@ SPREAD = 0.2
 
 WIDTHS = 3.0
 """It reaches at least this many half widths of the number's interval to either side."""
+
+LONGEST = 40
+"""Characters of a system's name in that of its extension."""
 
 _SMALLEST = 1e-12
 """It reaches at least this far, in the number's unit, or it would be empty about 0."""
@@ -43,6 +48,7 @@ _KEYS = (
     "constants",
     "parameters",
     "effects",
+    *stored.KEYS,
 )
 """What may stand in the file."""
 
@@ -70,7 +76,7 @@ class Extended:
 
     Attributes:
         name: under which it registers.
-        system: the system's registered name.
+        system: the system's registered name, or that of the robot.
         engine: the engine it was fitted with; None for a simulator that steps itself.
         title: of the recording that it was fitted to.
         parameters: the system's own.
@@ -79,6 +85,7 @@ class Extended:
         observe: channels that the recording had.
         kind: the simulator's class of its system, where it is known: what `opened` and explain give
             knows it.
+        robot: the model file and what was added to it, where it is of a robot.
     """
 
     name: str
@@ -91,6 +98,7 @@ class Extended:
     observe: Sequence[str]
     # No part of what was fitted: a file names the system, and whoever reads it knows the class.
     kind: type[Simulated] | None = field(default=None, compare=False, repr=False)
+    robot: StoredRobot | None = None
 
     def simulator(self) -> Simulated:
         """The fitted simulator, ready to simulate: its parameters' nominal values are the fitted
@@ -105,20 +113,41 @@ class Extended:
         return simulator_of(self, self.kind)()
 
 
+def name_of(system: str) -> str:
+    """The name of what extends a system; that of a robot is its file's, which may hold anything."""
+    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", system)[:LONGEST]
+    return f"{plain if plain[:1].isalpha() else f'robot_{plain}'}_extended"
+
+
+def robot_of(kind: type[Simulated]) -> StoredRobot | None:
+    """What a file names of the robot that a simulator is of; None where it is of a system."""
+    robot: Any = kind
+    return stored.of(robot) if kind.has_model else None
+
+
 def write(extended: Extended, path: Path) -> None:
     """Write the file."""
-    files.write(path, written(extended))
+    files.write(path, written(extended, path.parent))
 
 
-def written(extended: Extended) -> str:
-    """The content of the file."""
+def written(extended: Extended, folder: Path | None = None) -> str:
+    """The content of the file.
+
+    Args:
+        extended: what was found.
+        folder: in which it will lie: from there a robot's model file is named.
+    """
     import tomli_w
 
+    if extended.robot is None:
+        engine = {"engine": extended.engine} if extended.engine else {}
+        of: dict[str, Any] = {"system": extended.system, **engine}
+    else:
+        of = extended.robot.document(folder)
     document = {
         "format": FORMAT,
         "name": extended.name,
-        "system": extended.system,
-        **({"engine": extended.engine} if extended.engine else {}),
+        **of,
         "title": extended.title,
         "observe": list(extended.observe),
         "constants": dict(extended.constants),
@@ -143,17 +172,28 @@ def read(path: Path) -> Extended:
         raise fault(path, "", wanted, document.get("format"))
     known(f"key of {path}", document, _KEYS)
     name = _name(path, document.get("name"))
-    engine = _text(path, "engine", document["engine"]) if "engine" in document else None
+    robot = stored.read_stored(path, document) if "model" in document else None
+    system, engine = (robot.path.stem, None) if robot else _system(path, document)
     return Extended(
         name=name,
-        system=_text(path, "system", document.get("system")),
+        system=system,
         engine=engine,
         title=str(document.get("title", "")),
         parameters=_numbers(path, "parameters", document.get("parameters", {})),
         effects=_effects(path, document.get("effects", {})),
         constants=_constants(path, document.get("constants", {})),
         observe=_observe(path, document.get("observe", [])),
+        robot=robot,
     )
+
+
+def _system(path: Path, document: Mapping[str, Any]) -> tuple[str, str | None]:
+    """The registered system, and the engine that steps it, if that was chosen."""
+    for key in document:
+        if key in stored.KEYS and key != "engine":
+            raise InputError(f"{path}: {key} is for a robot; expected model too, found none")
+    engine = _text(path, "engine", document["engine"]) if "engine" in document else None
+    return _text(path, "system", document.get("system")), engine
 
 
 def _name(path: Path, value: Any) -> str:
@@ -265,7 +305,8 @@ def _class_of(
         # All such classes come from this one text and may have one name: their numbers tell them
         # apart, or a tuner trained in the one would be taken for trained in the other.
         "source_digest": hashlib.sha256(written(extended).encode()).hexdigest(),
-        "made_of": tuple(library.get(name) for name in effects),
+        # An effect at a place of a robot is made of the one that it is there.
+        "made_of": tuple(library.get(name.partition("@")[0]) for name in effects),
     }
     simulator: type[Simulated] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
     # A class of a system takes these from the system when it is made; they are its own.
@@ -294,7 +335,7 @@ def _coefficients(extended: Extended, kind: type[Simulated]) -> list[Number]:
     """Every coefficient in the simulator's order."""
     values = []
     for name, numbers in extended.effects.items():
-        effect = library.get(name)
+        effect = library.find(name, kind.system)
         coefficients = effect.on(kind.system)
         known(f"coefficient of effect {name}", numbers, [c.name for c in coefficients])
         parameters = effect_parameters(effect, kind.system, extended.observe)
@@ -342,7 +383,7 @@ def opened(path: Path, find: Find) -> tuple[Extended, type[Simulated], type[Simu
     """
     extended = read(path)
     try:
-        kind = find(extended.system)
+        kind = extended.robot.simulator() if extended.robot else find(extended.system)
         if not issubclass(kind, Simulated):
             raise InputError(f"system {extended.system} takes no effects")
         refuse_extended(kind)

@@ -43,7 +43,9 @@ def check_declaration_is_complete(kind: type[Simulator]) -> None:
         names = [thing.name for thing in group]
         require(len(set(names)) == len(names), "different names", names, look)
     for thing in named:
-        require(bool(_NAME.match(thing.name)), "a name in lower case", thing.name, look)
+        # A robot's are those of its file, whatever that calls them.
+        plain = kind.has_model or bool(_NAME.match(thing.name))
+        require(plain, "a name in lower case", thing.name, look)
         require(bool(thing.unit), f"a unit for {thing.name} ('1' for a number)", "none", look)
 
 

@@ -232,7 +232,7 @@ class _Explainer:
                 for coefficient, place in zip(coefficients, places, strict=True)
             }
         return Extended(
-            f"{self.recording.system}_extended",
+            extend.name_of(self.recording.system),
             self.recording.system,
             self.engine,
             self.recording.title,
@@ -241,4 +241,5 @@ class _Explainer:
             {**self.recording.constants, **freed},
             world.channels,
             self.kind,
+            extend.robot_of(self.kind),
         )

@@ -20,6 +20,7 @@ from bench.recordings.stamps import refuse_odd
 from bench.registry import simulators
 from sims.base import Array, InputError, unknown
 from sims.extended import Extended, opened
+from sims.recording.description import model_of
 from sims.recording.recording import read_recording, system_of
 
 
@@ -39,12 +40,7 @@ def scored(
         InputError: a file cannot be read, or the recording is of another system.
     """
     extended, kind, _ = opened(model, simulators.get)
-    other = system_of(recording)
-    if other not in (extended.system, extended.name):
-        raise InputError(
-            f"{recording}: expected a recording of {extended.system}, as {model} is; "
-            f"found one of {other}"
-        )
+    _check_system(recording, extended, model)
     # Every run counts, unless asked otherwise: nothing is fitted here but initial states.
     data = read_recording(recording, kind, whole=True)
     # What the recording states of itself stands above what the model was fitted with.
@@ -73,6 +69,19 @@ def scored(
     if not np.isfinite(squares).all():
         raise InputError(f"{recording}: the simulation failed with the parameters of {model}")
     return _errors(world, squares, sigma)
+
+
+def _check_system(recording: Path, extended: Extended, model: Path) -> None:
+    """Refuse a recording of something else; another robot's shows by its channels."""
+    of_robot = model_of(recording)
+    if of_robot is not None and extended.robot is not None:
+        return
+    other = of_robot.path.name if of_robot else system_of(recording)
+    if other not in (extended.system, extended.name):
+        raise InputError(
+            f"{recording}: expected a recording of {extended.system}, as {model} is; "
+            f"found one of {other}"
+        )
 
 
 def _check_channels(recording: Path, extended: Extended, recorded: list[str]) -> None:

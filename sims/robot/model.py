@@ -5,7 +5,7 @@ the compiled model.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -119,6 +119,8 @@ class Robot:
         aliases: by link that is fused into another, the body that MuJoCo compiles.
         digest: of all that was read, in hexadecimal digits.
         rated: actuators whose second control is the rate of their first, to be put in with it.
+        actuator_tables: actuators that a recording added, by name, as it states them.
+        engine_table: step and integrator in place of the file's, as it states them.
     """
 
     path: Path
@@ -128,6 +130,8 @@ class Robot:
     aliases: Mapping[str, str] | None = None
     digest: str = ""
     rated: tuple[str, ...] = ()
+    actuator_tables: Mapping[str, Any] = field(default_factory=dict)
+    engine_table: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
     def compiled(self) -> Any:

@@ -103,6 +103,8 @@ def _robot(
         aliases=aliases,
         digest=files.hashed.hexdigest(),
         rated=rated,
+        actuator_tables=actuators,
+        engine_table=engine,
     )
     robot.__dict__["compiled"] = model  # which it would compile anew
     return robot

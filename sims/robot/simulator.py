@@ -7,6 +7,7 @@ readings are linear. What an actuator is given over a step is the mean of its co
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -19,6 +20,7 @@ from sims.robot.forces import OVER_TIME, Forces, over_time
 from sims.robot.lanes import LANES, Addresses, Bench, Places
 from sims.robot.model import Robot
 from sims.robot.native import FIELDS
+from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
 from sims.robot.system import RobotSystem, system_of
 from sims.simulated import Simulated
@@ -152,7 +154,8 @@ class RobotSimulator(Simulated):
         result = np.full((len(theta), longest, len(self.channels)), np.nan)
         derived = _lanes_with(acting, len(theta), _derives)
         asked = _lanes_with(acting, len(theta), _is_asked)
-        with np.errstate(all="ignore"):  # a lane whose numbers overflow is NaN in the end
+        # A lane whose numbers overflow is NaN in the end, and nothing is printed of it.
+        with np.errstate(all="ignore"), quiet():
             for kind in range(4):
                 of_kind = (derived == bool(kind & 1)) & (asked == bool(kind & 2))
                 lanes = np.flatnonzero(of_kind)
@@ -475,6 +478,13 @@ def _filled(acting: Acting, n: int, count: int) -> Acting:
     )
 
 
+def own_numerics(robot: Robot) -> Numerics:
+    """How the robot's file says that it is stepped."""
+    option = robot.compiled.opt
+    names = {number: name for name, number in INTEGRATORS.items()}
+    return Numerics(float(option.timestep), names[int(option.integrator)])
+
+
 def robot_simulator(
     robot: Robot, free: Sequence[str] = (), numerics: Numerics | None = None
 ) -> type[RobotSimulator]:
@@ -488,14 +498,15 @@ def robot_simulator(
     Raises:
         InputError: it has no joint that can be explained, or a name in `free` does not exist.
     """
-    option = robot.compiled.opt
-    names = {number: name for name, number in INTEGRATORS.items()}
-    own = Numerics(float(option.timestep), names[int(option.integrator)])
+    numerics = numerics or own_numerics(robot)
+    # Made at run time as it is, no text of a module tells it from another robot's.
+    told = repr((robot.digest, tuple(free), tuple(numerics)))
     declared = {
         "system": system_of(robot, free),
         "robot": robot,
-        "numerics": numerics or own,
+        "numerics": numerics,
         "free": tuple(free),
+        "source_digest": hashlib.sha256(told.encode()).hexdigest(),
         "__module__": __name__,
         "__doc__": f"The robot of {robot.path.name}.",
     }
