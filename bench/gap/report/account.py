@@ -187,7 +187,10 @@ def following(story: Story) -> Iterator[str]:
     yield gain(story)
     if verdict == "partial" or (verdict == "named" and len(story.verdict.causes) > 1):
         # The headline says what a single named cause does; here the others have their turn.
-        sayings = [f"{noun(cause.effect)}: {_says(cause)}" for cause in story.verdict.causes]
+        sayings = [
+            sized(cause) or f"{noun(cause.effect)}: {_says(cause)}"
+            for cause in story.verdict.causes
+        ]
         yield sentence("; ".join(sayings))
     if verdict == "ambiguous":
         yield "To tell them apart: " + (experiment(story) or "no experiment is proposed.")

@@ -14,7 +14,7 @@ from pathlib import Path
 from bench.gap.report.account import closes, effort, following, headline, heldout_unit, interval
 from bench.gap.report.elements import bar, code, figure, paragraph, safe, strong
 from bench.gap.report.joints import by_joint
-from bench.gap.report.places import marks
+from bench.gap.report.places import has_places, marks
 from bench.gap.report.sections import (
     candidates,
     changes,
@@ -45,9 +45,9 @@ _CUT = {
 """The same where the search was ended early."""
 _CAPTIONS = {
     "robot": (
-        "The robot as the run below begins. Blue marks are places that the verdict names: whole "
-        "where it is sure, dashed where it is one of several; circles are joints, squares "
-        "actuators, diamonds bodies, triangles sensors."
+        "The robot in the run below, where it is furthest from its beginning. Blue marks are "
+        "places that the verdict names: whole where it is sure, dashed where it is one of several; "
+        "circles are joints, squares actuators, diamonds bodies, triangles sensors."
     ),
     "overview": (
         "Above: measured and simulated; below: the residual, what is measured less what is "
@@ -70,6 +70,10 @@ _JOINTS = (
     "and on one scale for all; in the grey band 95 % of the noise would lie."
 )
 """Under the figure of a robot's run."""
+_PLACED = (
+    " Each effect stands at the place where it explains most; ticks are the same effect elsewhere."
+)
+"""Under the candidates of a robot."""
 _FEW = 5
 """Places and candidates that are read aloud in place of a figure."""
 
@@ -157,6 +161,8 @@ def _gain(story: Story) -> Iterator[str]:
 
 def _picture(story: Story, name: str, png: bytes, for_print: bool) -> str:
     caption = _JOINTS if name == "overview" and by_joint(story) else _CAPTIONS.get(name, "")
+    if name == "candidates" and has_places(story):
+        caption += _PLACED
     if for_print:
         caption += f" <span>For print: {safe(name)}.pdf</span>"
     return figure(png, safe(_alternative(story, name), 700), caption)

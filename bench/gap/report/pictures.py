@@ -114,19 +114,23 @@ def _styled() -> Iterator[None]:
 
 
 def pose(story: Story, shot: Shot) -> dict[str, float]:
-    """Positions of joints at the beginning of a run, where they were recorded."""
-    positions = {}
+    """Positions of joints where a run is furthest from its beginning; those that were recorded."""
+    joints, columns = [], []
     for c, channel in enumerate(story.channels):
         kind, _, joint = channel.name.partition(".")
-        seen = shot.side.observed[shot.row, :, c]
-        seen = seen[np.isfinite(seen)]
-        if kind == "q" and seen.size:
-            positions[joint] = float(seen[0])
-    return positions
+        values = shot.side.observed[shot.row, :, c]
+        if kind == "q" and np.isfinite(values).any():
+            joints.append(joint)
+            columns.append(np.nan_to_num(values, nan=float(values[np.isfinite(values)][0])))
+    if not joints:
+        return {}
+    motion = np.stack(columns)
+    far = np.square(motion - motion[:, :1]).sum(axis=0)
+    return dict(zip(joints, motion[:, int(np.argmax(far))].tolist(), strict=True))
 
 
 def _robot(story: Story) -> Figure:
-    """The robot as it stood at the beginning of the run that is shown."""
+    """The robot in the run that is shown, bent as far as it is there."""
     if story.robot is None:
         raise InputError(f"{story.path}: no robot was recorded")
     return robot_figure(story.robot, pose(story, worst(story)), marks(story), _WIDTHS[1])
@@ -276,7 +280,6 @@ def _candidates(story: Story) -> Figure:
     gains_panel(axes[0, 1], story, shown)
     # Whoever misses a candidate must see that not all are shown.
     some = f", the best {len(shown)} of {total}" if len(shown) < total else ""
-    some += ", each where it explains most" if has_places(story) else ""
     y = 1 - _HEADING / height
     figure.text(0.015, y, f"Candidate causes{some}", fontsize=11, va="center")
     figure.legend(*standings(story), loc="upper right", ncols=3, fontsize=8.5)

@@ -21,6 +21,7 @@ from bench.gap.report.words import (
     is_wrong,
     joined,
     kind_of,
+    name_of,
     noun,
     number,
     parted,
@@ -60,11 +61,13 @@ def _grouped(names: Sequence[str], last: str) -> list[str]:
     by_effect: dict[str, list[str]] = {}
     for name in names:
         base, place = parted(name)
-        by_effect.setdefault(base if place not in ("", FAMILY) else name, []).append(name)
+        by_effect.setdefault(base if place else name, []).append(name)
     by_place: dict[str, list[str]] = {}
     for group in by_effect.values():
         _, place = parted(group[0])
         alone = len(group) == 1 and place not in ("", FAMILY)
+        # A family stands last, behind the single places.
+        group.sort(key=lambda name: parted(name)[1] == FAMILY)
         key = f"{kind_of(group[0])} {place}" if alone else group[0]
         by_place.setdefault(key, []).extend(group)
     return [_together(group, last) for group in by_place.values()]
@@ -78,7 +81,10 @@ def _together(group: Sequence[str], last: str) -> str:
     places = list(dict.fromkeys(parted(name)[1] for name in group))
     nouns = [noun(base) for base in bases]
     wrong = all(is_wrong(base) for base in bases)
-    return joined(nouns, last) + at(kind_of(group[0]), places, last, wrong)
+    kind = kind_of(group[0])
+    spots = [place for place in places if place != FAMILY]
+    text = joined(nouns, last) + at(kind, spots, last, wrong)
+    return text if spots == places else f"{text} {last}{at(kind, [FAMILY], last, wrong)}"
 
 
 def lacks(causes: Sequence[Cause]) -> str:
@@ -191,15 +197,16 @@ def has_places(story: Story) -> bool:
 
 def marks(story: Story) -> list[Mark]:
     """The places that the verdict names, to be marked on the robot."""
-    found = []
+    found: dict[tuple[str, str, str], Mark] = {}
     for cause in story.verdict.causes:
         alone = not cause.alternatives
         for name in (cause.effect, *cause.alternatives):
-            said = noun(parted(name)[0])
+            said, kind = name_of(parted(name)[0]), kind_of(name)
             for place in _places(story, name, cause):
                 size = _size(cause, name, place) if name == cause.effect else ""
-                found.append(Mark(kind_of(name), place, f"{said}{size}", alone))
-    return found
+                # A family and a place of it are the same there: once is enough.
+                found.setdefault((kind, place, said), Mark(kind, place, f"{said}{size}", alone))
+    return list(found.values())
 
 
 def _places(story: Story, effect: str, cause: Cause) -> list[str]:

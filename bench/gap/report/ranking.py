@@ -11,6 +11,8 @@ from bench.gap.verdict import Candidate
 
 MOST_CANDIDATES = 12
 """That a figure shows."""
+MUCH = 1.3
+"""A family that scores so many times the best of its places stands for its effect."""
 
 
 class Entry(NamedTuple):
@@ -44,10 +46,16 @@ def entries(story: Story) -> list[Entry]:
     found = []
     for group in groups.values():
         # What is found stands for its effect, however much another place scores; of several, each.
-        heads = [c for c in group if c.effect in causes] or group[:1]
+        heads = [c for c in group if c.effect in causes] or [_head(group)]
         rest = tuple(c for c in group if c not in heads)
         found += [Entry(heads[0], rest), *(Entry(head) for head in heads[1:])]
     return sorted(found, key=lambda entry: entry.best.score, reverse=True)
+
+
+def _head(group: list[Candidate]) -> Candidate:
+    """The best place, unless all places together explain much more: they always explain as much."""
+    one = next((c for c in group if parted(c.effect)[1] != FAMILY), group[0])
+    return one if group[0].score < MUCH * max(one.score, 1.0) else group[0]
 
 
 def ranked(story: Story) -> list[Candidate]:

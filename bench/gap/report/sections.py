@@ -163,7 +163,10 @@ def _by_effect(story: Story) -> str:
     there = entries(story)
     for entry in there[:MOST_CANDIDATES]:
         row, mark = _candidate(story, entry.best)
-        others = [f"{_elsewhere(c)} {number(c.score, 2)}" for c in entry.elsewhere]
+        others = [
+            f"{_elsewhere(c)} {number(c.score, 2) if c.score >= 1 else '<1'}"
+            for c in entry.elsewhere
+        ]
         more = f" and {len(others) - MOST_ELSEWHERE} more" * (len(others) > MOST_ELSEWHERE)
         rows.append([*row, safe(", ".join(others[:MOST_ELSEWHERE]) + more)])
         marks.append(mark)
@@ -302,7 +305,9 @@ def changes(story: Story) -> Iterator[str]:
     if lines:
         yield f'<pre class="scroll">{chr(10).join(lines[:-1])}</pre>'
     if story.unwritten:
-        yield paragraph("What the file cannot say stands in extended.toml alone:")
+        yield paragraph(
+            "What is to be known of it, and what it cannot say (extended.toml has all):"
+        )
         yield listed(safe(sentence(text)) for text in story.unwritten)
 
 

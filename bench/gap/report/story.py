@@ -136,7 +136,7 @@ class Story:
         vague: names of base parameters that the data do not fix.
         robot: whose recording it is, to be drawn; None for systems that are no robots.
         changes: of its model file.
-        unwritten: causes that the model file cannot hold, a sentence each.
+        unwritten: what its model file cannot hold, and what is to be known of it, a sentence each.
     """
 
     title: str

@@ -65,7 +65,9 @@ WRIST = [f"friction.coulomb@wrist_{i}" for i in (1, 2, 3)]
             "or an input bias at actuator m_elbow",
         ),
         (["friction.coulomb@*", "friction.coulomb@a"],
-         "Coulomb friction at every joint or Coulomb friction at joint a"),
+         "Coulomb friction at joint a or at every joint"),
+        ([*WRIST, "friction.coulomb@*"],
+         "Coulomb friction at any of the joints wrist_1, wrist_2 or wrist_3 or at every joint"),
         (["drag.linear", "friction.coulomb"], "linear drag or Coulomb friction"),
     ],
 )  # fmt: skip
@@ -129,6 +131,8 @@ def test_what_else_remains_is_lacking_although_a_number_is_wrong():
     assert said.startswith("The mass of body elbow_link is 12 % larger than the model file says, ")
     assert said.endswith("and the simulation lacks something else that no known cause explains.")
     both = headline(robot_story("partial", [RUB, HEAVY]))
+    told = " ".join(following(robot_story("partial", [RUB, HEAVY])))
+    assert "opposes motion; the mass of body elbow_link is 12 % larger than" in told
     assert both.endswith("elbow_link, and lacks something else that no known cause explains.")
 
 
@@ -180,7 +184,7 @@ def test_marks_are_the_places_that_the_verdict_names():
     assert [mark.name for mark in wrists] == ["wrist_1", "wrist_2", "wrist_3"]
     assert not any(mark.sure for mark in wrists)
     (heavy,) = marks(robot_story(causes=[HEAVY]))
-    assert (heavy.kind, heavy.says) == ("body", "a wrong mass: +12 %")
+    assert (heavy.kind, heavy.says) == ("body", "wrong mass: +12 %")
 
 
 def test_a_family_marks_each_of_its_places():
@@ -189,6 +193,9 @@ def test_a_family_marks_each_of_its_places():
     found = marks(robot_story(causes=[late]))
     assert [mark.name for mark in found] == [f"m_{joint}" for joint in ARM6]
     assert not marks(story())
+    either = cause("friction.coulomb@elbow", alternatives=["friction.coulomb@*"])
+    there = marks(robot_story("ambiguous", [either]))
+    assert [mark.says for mark in there if mark.name == "elbow"] == ["Coulomb friction: 0.31 N·m"]
 
 
 def test_candidates_of_one_effect_are_one_entry_where_it_explains_most():
@@ -203,6 +210,18 @@ def test_candidates_of_one_effect_are_one_entry_where_it_explains_most():
     assert scores == sorted(scores, reverse=True)
     total = sum(1 + len(entry.elsewhere) for entry in there)
     assert total == len(told.verdict.candidates) > 80
+
+
+def test_a_family_stands_for_its_effect_only_where_it_explains_much_more():
+    told = robot_story(causes=())
+    scores = {"drag.linear@*": 100.0, "drag.linear@elbow": 95.0, "gravity.tilt": 1.0}
+    rows = [{**told.verdict.candidates[0].document(), "effect": n, "score": s}
+            for n, s in scores.items()]  # fmt: skip
+    heads = [entry.best.effect for entry in entries(robot_story(causes=(), candidates=rows))]
+    assert heads == ["drag.linear@elbow", "gravity.tilt"]
+    rows[0]["score"] = 300.0
+    heads = [entry.best.effect for entry in entries(robot_story(causes=(), candidates=rows))]
+    assert heads == ["drag.linear@*", "gravity.tilt"]
 
 
 def test_every_cause_stands_for_itself_among_the_candidates():
