@@ -74,7 +74,7 @@ def score(
     nothing else.
 
     Args:
-        model: extended.toml.
+        model: extended.toml, or a robot's model file, as extended.xml.
         recording: the path of ``NAME.csv``.
         held_out: count only runs that are marked so.
         force: as in `explain`.

@@ -9,6 +9,9 @@ from pathlib import Path
 from bench.commands.interrupts import INTERRUPTED, Interrupts
 from bench.commands.options import add_force, add_model, add_plugin, names, place, positive, seconds
 
+_PICTURED = (".html", ".png", ".pdf")
+"""Endings of what is for the eye: the report names the pictures."""
+
 
 def add_explain(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap explain`."""
@@ -71,7 +74,10 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
 def add_score(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap score`."""
     parser.add_argument(
-        "model", metavar="extended.toml", type=place, help="as `simgap explain` writes it"
+        "model",
+        metavar="MODEL",
+        type=place,
+        help="extended.toml as `simgap explain` writes it, or a robot's extended.xml",
     )
     parser.add_argument(
         "recording",
@@ -120,9 +126,12 @@ def _explain(options: argparse.Namespace) -> int:
     paths = explanation.write(folder)
     for line in account(explanation.story):
         print(line)
+    for line in explanation.unsaid:
+        print(line)
     print(f"\nreport  {paths[-1]}")
-    for path in paths[:2]:
-        print(f"{path.stem:7} {path}")
+    for path in paths:
+        if path.suffix not in _PICTURED:
+            print(f"{path.stem:7} {path}")
     cut = explanation.answer.cut
     return INTERRUPTED if cut is not None and cut.by == "interrupt" else 0
 

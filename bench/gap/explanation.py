@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from bench.gap.report.page import page
 from bench.gap.report.pictures import Printed
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, estimated, joined, percent
+from bench.gap.robot_files import robot_files
 from bench.gap.verdict import Cause, Verdict
 from sims import extended as extending
 from sims.base import InputError
@@ -69,7 +71,8 @@ class Explanation:
         return pictures.figure(self.story, name)
 
     def write(self, folder: str | Path) -> list[Path]:
-        """Write verdict.json, extended.toml, the figures and report.html: all of them or none.
+        """Write verdict.json, extended.toml, the figures and report.html: all of them or none. For
+        a robot also extended.xml, and extended.urdf for one from a URDF, after extended.toml.
 
         The folder is made where it is missing; files of these names in it are replaced.
 
@@ -85,6 +88,8 @@ class Explanation:
             folder / "verdict.json": self._json(),
             folder / "extended.toml": extending.written(self.extended),
         }
+        model_files, _ = self._robot_files
+        contents |= {folder / name: content for name, content in model_files.items()}
         for name, figure in figures.items():
             contents[folder / f"{name}.png"] = figure.png
             contents[folder / f"{name}.pdf"] = figure.pdf
@@ -96,6 +101,15 @@ class Explanation:
         except OSError as error:
             raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
         return list(contents)
+
+    @property
+    def unsaid(self) -> tuple[str, ...]:
+        """Of a robot: what its own file cannot say, and what is to be known of what it says."""
+        return self._robot_files[1]
+
+    @cached_property
+    def _robot_files(self) -> tuple[dict[str, str], tuple[str, ...]]:
+        return robot_files(self.extended)
 
     def _json(self) -> str:
         return json.dumps(self.answer.document(), indent=1, allow_nan=False) + "\n"

@@ -1,12 +1,12 @@
-"""The error of an extended simulator on another recording: initial states are estimated there,
-nothing else.
+"""The error of an extended simulator, or of a robot's model file, on another recording: initial
+states are estimated there, nothing else.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -17,11 +17,15 @@ from bench.gap.model.world import World
 from bench.recordings.inspection import refuse_huge
 from bench.recordings.size import check_recording
 from bench.recordings.stamps import refuse_odd
-from bench.registry import simulators
+from bench.registry import robot, simulators
 from sims.base import Array, InputError, unknown
 from sims.extended import Extended, opened
 from sims.recording.description import model_of
 from sims.recording.recording import read_recording, system_of
+from sims.simulated import Simulated
+
+_MODEL_FILES = (".xml", ".mjcf", ".urdf")
+"""Endings of a robot's files."""
 
 
 def scored(
@@ -31,7 +35,7 @@ def scored(
     counted.
 
     Args:
-        model: extended.toml.
+        model: extended.toml, or a robot's model file, as extended.xml.
         recording: the table.
         held_out: count only runs that are marked so.
         force: whether the user insists on a recording that is refused otherwise.
@@ -39,8 +43,7 @@ def scored(
     Raises:
         InputError: a file cannot be read, or the recording is of another system.
     """
-    extended, kind, _ = opened(model, simulators.get)
-    _check_system(recording, extended, model)
+    extended, kind = _opened(model, recording)
     # Every run counts, unless asked otherwise: nothing is fitted here but initial states.
     data = read_recording(recording, kind, whole=True)
     # What the recording states of itself stands above what the model was fitted with.
@@ -69,6 +72,30 @@ def scored(
     if not np.isfinite(squares).all():
         raise InputError(f"{recording}: the simulation failed with the parameters of {model}")
     return _errors(world, squares, sigma)
+
+
+def _opened(model: Path, recording: Path) -> tuple[Extended, type[Simulated]]:
+    """What is scored, and the simulator of its system."""
+    if model.suffix in _MODEL_FILES:
+        return _robot(model, recording)
+    extended, kind, _ = opened(model, simulators.get)
+    _check_system(recording, extended, model)
+    return extended, kind
+
+
+def _robot(model: Path, recording: Path) -> tuple[Extended, type[Simulated]]:
+    """A robot as its file states it: no number of it is fitted, no effect is added."""
+    from sims.robot.reading import read
+
+    stated = model_of(recording)
+    tables = stated.actuators if stated else {}
+    # A file that explain has written has the recording's actuators already.
+    there = {actuator.name for actuator in read(model).actuators}
+    lacking = {name: table for name, table in tables.items() if name not in there}
+    # An MJCF states how it is stepped; it may be what was found.
+    engine = stated.engine if stated and model.suffix == ".urdf" else {}
+    kind = cast(type[Simulated], robot(model, lacking, engine))
+    return Extended(kind.name, kind.name, None, "", {}, {}, {}, (), kind), kind
 
 
 def _check_system(recording: Path, extended: Extended, model: Path) -> None:

@@ -4,10 +4,7 @@ are those that were meant.
 
 from __future__ import annotations
 
-import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,41 +32,30 @@ _OF_URDF = ("body_mass", "body_ipos", "dof_damping", "dof_frictionloss")
 """Fields that a URDF states, beside tensors of inertia."""
 
 
-def check(robot: Robot, causes: Causes, done: Written, folder: Path) -> None:
-    """Load each file again and compare it.
+def check(robot: Robot, causes: Causes, done: Written) -> None:
+    """Load each file again, from a folder of its own, and compare it.
 
     Args:
         robot: what was read.
         causes: what was written.
         done: the files.
-        folder: where they will be; a file that is there for a moment.
 
     Raises:
         RuntimeError: a number or the motion differs; names the field. A fault of the program.
-        OSError: nothing can be written there.
     """
     import mujoco
 
-    if done.xml is not None:
-        with beside(folder, ".xml", done.xml) as path, quiet():
-            model = mujoco.MjModel.from_xml_path(str(path))
-        _compare(model, done.applied.model, "extended.xml")
-    if done.urdf is not None:
-        with beside(folder, ".urdf", done.urdf) as path:
+    with tempfile.TemporaryDirectory() as folder:
+        if done.xml is not None:
+            path = Path(folder) / "extended.xml"
+            path.write_bytes(done.xml.encode())
+            with quiet():
+                model = mujoco.MjModel.from_xml_path(str(path))
+            _compare(model, done.applied.model, path.name)
+        if done.urdf is not None:
+            path = Path(folder) / "extended.urdf"
+            path.write_bytes(done.urdf.encode())
             _check_urdf(robot, causes, path)
-
-
-@contextmanager
-def beside(folder: Path, suffix: str, text: str) -> Iterator[Path]:
-    """A file in a folder, for as long as it is needed."""
-    handle, name = tempfile.mkstemp(suffix, ".check-", folder)
-    path = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
-            file.write(text)
-        yield path
-    finally:
-        path.unlink()
 
 
 def _check_urdf(robot: Robot, causes: Causes, path: Path) -> None:

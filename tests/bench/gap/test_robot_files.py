@@ -1,0 +1,109 @@
+"""What was found in a robot stands in its own file, beside extended.toml, and can be scored."""
+
+from pathlib import Path
+
+import mujoco
+import pytest
+
+from bench.gap.explanation import Explanation
+from bench.gap.robot_files import causes_of, robot_files
+from bench.gap.score_model import scored
+from bench.registry import robot
+from sims.extended import Extended, Number
+from sims.robot import checking
+from sims.robot.model import Robot
+from sims.robot.simulator import Numerics, robot_simulator
+from tests.bench.gap.stories import story
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "robot"
+FRICTION = {"friction.coulomb@elbow": {"coefficient": Number(0.03, "N*m", 0.029, 0.031)}}
+
+
+def extended_of(kind, parameters=None, effects=None):
+    return Extended(
+        "arm2_extended", "arm2", None, "a log", parameters or {}, effects or {}, {}, ["q"], kind
+    )
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return robot(EXAMPLE / "arm2.xml")
+
+
+def test_it_is_written_with_the_rest(arm, tmp_path):
+    shown = story()
+    explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))
+    paths = explanation.write(tmp_path)
+    assert [path.name for path in paths[:3]] == ["verdict.json", "extended.toml", "extended.xml"]
+    (line,) = explanation.unsaid
+    assert "friction" in line
+    model = mujoco.MjModel.from_xml_path(str(paths[2]))
+    assert model.dof_frictionloss.tolist() == [0.0, 0.03]
+    assert "fitted to a log" in paths[2].read_text()
+
+
+def test_it_errs_by_the_noise_where_its_cause_is_true(arm, tmp_path):
+    files, _ = robot_files(extended_of(arm, effects=FRICTION))
+    path = tmp_path / "extended.xml"
+    path.write_text(files["extended.xml"])
+    log = EXAMPLE / "log.csv"
+    assert scored(EXAMPLE / "arm2.xml", log, held_out=True)["normalised_rmse"] > 10
+    found = scored(path, log, held_out=True)
+    assert found["normalised_rmse"] < 1.5
+    assert found["runs"] == 2
+    assert set(found["rmse"]) == {"q.shoulder", "q.elbow"}
+
+
+def test_freed_numbers_and_numerics_are_written(arm):
+    free = robot(EXAMPLE / "arm2.xml", free=["damping@*", "ipos@forearm"])
+    freed = {p.name: Number(0.01, p.unit, None, None) for p in free.parameters}
+    free.numerics = Numerics(0.001, "implicitfast")
+    causes = causes_of(extended_of(free, freed, FRICTION))
+    assert set(causes["mass.offset@forearm"]) == {"x", "y", "z"}
+    files, said = robot_files(extended_of(free, freed, FRICTION))
+    model = mujoco.MjModel.from_xml_string(files["extended.xml"])
+    assert model.dof_damping == pytest.approx([0.31, 0.11])
+    assert model.body_ipos[2] == pytest.approx([0.01, 0.01, -0.14])
+    assert model.opt.timestep == 0.001
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    assert len(said) == 1
+
+
+def test_a_fault_in_a_file_costs_the_file_alone(arm, monkeypatch):
+    def differs(*_):
+        raise RuntimeError("extended.xml is not as it was meant: dof_damping")
+
+    monkeypatch.setattr(checking, "check", differs)
+    files, said = robot_files(extended_of(arm, effects=FRICTION))
+    assert files == {}
+    assert said == (
+        "no model file is written, by a fault of simgap: "
+        "extended.xml is not as it was meant: dof_damping",
+    )
+
+
+def test_actuators_that_a_recording_adds_are_not_added_twice(tmp_path):
+    log = EXAMPLE / "log.csv"
+    text = (EXAMPLE / "log.toml").read_text()
+    tables = [
+        f'[actuators.m_{joint}]\njoint = "{joint}"\nkind = "motor"\n'
+        for joint in ("shoulder", "elbow")
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(log.read_text().splitlines()[:401]) + "\n")
+    bare = (EXAMPLE / "arm2.xml").read_text()
+    bare = bare[: bare.index("<actuator>")] + "</mujoco>"
+    (tmp_path / "arm2.xml").write_text(bare)
+    lines = "\n".join([text.split("[runs.5]")[0], *tables])
+    (tmp_path / "log.toml").write_text(lines)
+    alone = scored(tmp_path / "arm2.xml", tmp_path / "log.csv")
+    assert alone["normalised_rmse"] > 5
+    spec = mujoco.MjSpec.from_file(str(EXAMPLE / "arm2.xml"))
+    kind = robot_simulator(Robot(EXAMPLE / "arm2.xml", "mjcf", spec))
+    files, _ = robot_files(extended_of(kind, effects=FRICTION))
+    path = tmp_path / "extended.xml"
+    path.write_text(files["extended.xml"])
+    assert scored(path, tmp_path / "log.csv")["normalised_rmse"] < 1.5
+
+
+def test_what_is_no_robot_has_no_such_file():
+    assert robot_files(extended_of(None)) == ({}, ())
