@@ -86,7 +86,7 @@ class Explanation:
         figures = pictures.printed(self.story)
         contents: dict[Path, Content] = {
             folder / "verdict.json": self._json(),
-            folder / "extended.toml": extending.written(self.extended),
+            folder / "extended.toml": extending.written(self.extended, folder),
         }
         model_files, _ = self._robot_files
         contents |= {folder / name: content for name, content in model_files.items()}

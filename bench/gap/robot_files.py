@@ -55,13 +55,13 @@ def causes_of(extended: Extended) -> dict[str, Mapping[str, Number]]:
 
 
 def _numerics(kind: Any) -> dict[str, Mapping[str, Number]]:
-    from sims.robot.simulator import INTEGRATORS
+    from sims.robot.simulator import INTEGRATORS, own_numerics
 
-    option, numerics = kind.robot.compiled.opt, kind.numerics
+    own, numerics = own_numerics(kind.robot), kind.numerics
     changed: dict[str, Mapping[str, Number]] = {}
-    if numerics.timestep != option.timestep:
+    if numerics.timestep != own.timestep:
         changed["numerics.step"] = {"step": Number(numerics.timestep, "s", None, None)}
-    number = INTEGRATORS[numerics.integrator]
-    if number != option.integrator:
+    if numerics.integrator != own.integrator:
+        number = INTEGRATORS[numerics.integrator]
         changed["numerics.integrator"] = {"integrator": Number(number, "1", None, None)}
     return changed

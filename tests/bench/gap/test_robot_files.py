@@ -9,7 +9,7 @@ from bench.gap.explanation import Explanation
 from bench.gap.robot_files import causes_of, robot_files
 from bench.gap.score_model import scored
 from bench.registry import robot
-from sims.extended import Extended, Number
+from sims.extended import Extended, Number, robot_of
 from sims.robot import checking
 from sims.robot.model import Robot
 from sims.robot.simulator import Numerics, robot_simulator
@@ -19,10 +19,12 @@ EXAMPLE = Path(__file__).parents[3] / "examples" / "robot"
 FRICTION = {"friction.coulomb@elbow": {"coefficient": Number(0.03, "N*m", 0.029, 0.031)}}
 
 
+OBSERVED = ["q.shoulder", "q.elbow"]
+
+
 def extended_of(kind, parameters=None, effects=None):
-    return Extended(
-        "arm2_extended", "arm2", None, "a log", parameters or {}, effects or {}, {}, ["q"], kind
-    )
+    own, added, stored = parameters or {}, effects or {}, robot_of(kind) if kind else None
+    return Extended("arm2_extended", "arm2", None, "a log", own, added, {}, OBSERVED, kind, stored)
 
 
 @pytest.fixture(scope="module")
@@ -43,15 +45,17 @@ def test_it_is_written_with_the_rest(arm, tmp_path):
 
 
 def test_it_errs_by_the_noise_where_its_cause_is_true(arm, tmp_path):
-    files, _ = robot_files(extended_of(arm, effects=FRICTION))
-    path = tmp_path / "extended.xml"
-    path.write_text(files["extended.xml"])
+    shown = story()
+    explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))
+    paths = {path.name: path for path in explanation.write(tmp_path / "out")}
     log = EXAMPLE / "log.csv"
     assert scored(EXAMPLE / "arm2.xml", log, held_out=True)["normalised_rmse"] > 10
-    found = scored(path, log, held_out=True)
+    found = scored(paths["extended.xml"], log, held_out=True)
     assert found["normalised_rmse"] < 1.5
     assert found["runs"] == 2
     assert set(found["rmse"]) == {"q.shoulder", "q.elbow"}
+    same = scored(paths["extended.toml"], log, held_out=True)
+    assert found["normalised_rmse"] == pytest.approx(same["normalised_rmse"], rel=1e-6)
 
 
 def test_freed_numbers_and_numerics_are_written(arm):
