@@ -24,7 +24,9 @@ def draw_links(axis: Axes, robot: Robot, data: Any, view: View) -> None:
     """Links as lines between the anchors of joints, joints as dots with a tick along each axis."""
     for begin, end in links(robot, data):
         line = view.seen(np.stack([begin, end]))
-        axis.plot(*line.T, color=CHANCE, linewidth=5, solid_capstyle="round", zorder=1)
+        axis.plot(
+            *line.T, color=CHANCE, linewidth=5, solid_capstyle="round", zorder=1, clip_on=False
+        )
     for point in _bases(robot, data):
         x, y = view.seen(point[None])[0]
         axis.plot(x, y, "s", color=SOFT, markersize=11, zorder=2)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from bench.figures.links import draw_links
+from bench.figures.links import draw_links, links
 from bench.figures.offscreen import rendered
 from bench.figures.style import BLUE, INK, SOFT, blank
 from bench.figures.view import View, place_of, posed, view
@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 LONGEST = 4.4
 """Inches of the longer side of the drawing."""
 COLUMN = 2.1
-"""Inches of a column of labels."""
+"""Inches of a column of labels, at least."""
+LETTER = 0.083
+"""Inches of a letter of a label, on average."""
 FOOT = 0.55
 """Inches below the drawing, for the scale."""
 MOST_NAMED = 12
@@ -92,7 +94,7 @@ def robot_figure(
     seen_from = view(robot, data)
     labels = _labels(robot, data, seen_from, marks)
     sides = _sides(labels)
-    columns = [COLUMN if side else 0.3 for side in sides]
+    columns = [_breadth(side) for side in sides]
     scale = LONGEST / max(seen_from.width, seen_from.height)
     needed = max(_height(side) for side in sides)
     width, height = scale * seen_from.width, scale * seen_from.height
@@ -114,6 +116,9 @@ def robot_figure(
         draw_links(axis, robot, data, seen_from)
     else:
         axis.imshow(image, extent=(-across, across, -up, up), zorder=0, aspect="auto")
+        # Shapes may be lacking between joints: their meshes were absent, or never drawn.
+        for ends in links(robot, data):
+            axis.plot(*seen_from.seen(np.stack(ends)).T, color=SOFT, linewidth=0.7, zorder=3)
         dots = seen_from.seen(np.array([data.xanchor[j.id] for j in robot.joints]))
         axis.plot(*dots.T, "o", color=INK, markersize=3.5, zorder=4)
     _mark(axis, robot, data, seen_from, marks)
@@ -174,6 +179,14 @@ def _sides(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]]:
 
 def _height(labels: Sequence[_Label]) -> float:
     return sum(label.height for label in labels)
+
+
+def _breadth(labels: Sequence[_Label]) -> float:
+    """Inches of a column: room for its longest line, and for what leads to the place."""
+    if not labels:
+        return 0.3
+    longest = max(len(line) for label in labels for line in label.lines)
+    return max(COLUMN, 0.3 + LETTER * longest)
 
 
 def _downwards(labels: Sequence[_Label]) -> list[_Label]:

@@ -71,7 +71,9 @@ def test_a_ring_stands_at_its_joint(schematic):
 
 
 def test_labels_do_not_cover_each_other(schematic):
-    for made, pose, marks in ((arm6(), POSE6, MARKS), (arm6(shapes=False), {}, MARKS)):
+    long = Mark("body", "upper", "a name as long as any that robots' files have")
+    cases = ((arm6(), POSE6, MARKS), (arm6(shapes=False), {}, MARKS), (arm2(), {}, (long,)))
+    for made, pose, marks in cases:
         figure = robot_figure(made, pose, marks)
         draw = FigureCanvasAgg(figure).get_renderer()
         # A text knows its place once it is drawn.
