@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from bench.gap.causes.rules import VerdictName
 from bench.gap.report import pictures
 from bench.gap.report.account import closes, cut, interval
+from bench.gap.report.changes import changes
 from bench.gap.report.elements import framed
 from bench.gap.report.page import page
 from bench.gap.report.pictures import Printed
@@ -116,7 +117,22 @@ class Explanation:
 
     def _page(self, figures: Mapping[str, Printed], for_print: bool) -> str:
         drawn = {name: figure.png for name, figure in figures.items()}
-        return page(self.story, drawn, for_print)
+        return page(self._with_changes(), drawn, for_print)
+
+    def _with_changes(self) -> Story:
+        """The story with the lines of the robot's model file that change."""
+        robot, (files, said) = self.story.robot, self._robot_files
+        if robot is None:
+            return self.story
+        # A URDF's own lines are shown where there are any.
+        after = files.get("extended.urdf", files.get("extended.xml", ""))
+        same_form = robot.format == "mjcf" or "extended.urdf" in files
+        try:
+            before = robot.path.read_text(errors="replace") if same_form else ""
+        except OSError:
+            # Gone since it was read: what changes is shown without what was.
+            before = ""
+        return replace(self.story, changes=changes(before, after), unwritten=said)
 
     def __repr__(self) -> str:
         lines = [f"{self.verdict}: {self.story.title}", self._causes_in_words(), self._gain()]

@@ -291,7 +291,8 @@ def _intervals(p: Tuned) -> str:
 
 def changes(story: Story) -> Iterator[str]:
     """The lines of the robot's model file to change, before and after."""
-    if not story.changes and not story.unwritten:
+    # What is to be known of a file in which nothing changes is of no use.
+    if not story.changes and not (story.unwritten and story.verdict.causes):
         return
     yield heading("What to change in the model file")
     lines = []

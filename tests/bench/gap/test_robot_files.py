@@ -1,10 +1,13 @@
 """What was found in a robot stands in its own file, beside extended.toml, and can be scored."""
 
+from dataclasses import replace
+from html import escape
 from pathlib import Path
 
 import mujoco
 import pytest
 
+from bench.figures import robot as drawing
 from bench.gap.explanation import Explanation
 from bench.gap.robot_files import causes_of, robot_files
 from bench.gap.score_model import scored
@@ -42,6 +45,20 @@ def test_it_is_written_with_the_rest(arm, tmp_path):
     model = mujoco.MjModel.from_xml_path(str(paths[2]))
     assert model.dof_frictionloss.tolist() == [0.0, 0.03]
     assert "fitted to a log" in paths[2].read_text()
+
+
+def test_the_report_shows_the_lines_to_change(arm, tmp_path, monkeypatch):
+    monkeypatch.setattr(drawing, "rendered", lambda *_: None)
+    shown = replace(story(), robot=arm.robot)
+    explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))
+    html = (explanation.write(tmp_path)[0].parent / "report.html").read_text()
+    before = '<joint name="elbow" type="hinge" axis="0 1 0" damping="0.1" armature="0.005"/>'
+    assert f"− {escape(before)}</del>" in html
+    assert escape('armature="0.005" frictionloss="0.03"') in html
+    assert "dry friction is stiff in the file" in html
+    nothing = Explanation(shown.verdict, replace(shown, verdict=story("adequate").verdict),
+                          extended_of(arm))  # fmt: skip
+    assert "What to change" not in nothing._repr_html_()
 
 
 def test_it_errs_by_the_noise_where_its_cause_is_true(arm, tmp_path):
