@@ -11,9 +11,9 @@ import traceback
 from dataclasses import replace
 
 from tests.robots.equivalence import Rivals
-from tests.robots.items import Item
+from tests.robots.items import Item, setting_of
 from tests.robots.questions import Question
-from tests.robots.recording import realise
+from tests.robots.recording import realise, recorded
 from tests.robots.score import Mark, marked, sets_of
 
 EXPLAIN = "bench.gap.explain:explain"
@@ -60,7 +60,8 @@ def _answer(item, explain, equal):
 
 def _equal(item, verdict):
     """How the other members of the sets that hold the truth do on runs held out."""
-    rivals, ratios = Rivals(item), {}
+    rivals = Rivals(setting_of(item.name), item.effects, recorded(item))
+    ratios = {}
     truth = set(item.effects)
     for names in sets_of(verdict):
         beside = truth - set(names) if not item.family else ()

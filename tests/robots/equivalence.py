@@ -7,8 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.robots import causes, sizing
-from tests.robots.items import rng_of, setting_of
-from tests.robots.recording import recorded
+from tests.robots.items import rng_of
 from tests.robots.settings import FITTED
 from tests.robots.sizing import Gauge
 
@@ -19,18 +18,24 @@ NUDGE = 0.02
 
 
 class Rivals:
-    """Held-out errors of causes, fitted to one item's recording, in noises."""
+    """Held-out errors of causes, fitted to one recording, in noises.
 
-    def __init__(self, item):
-        self.item, self.setting = item, setting_of(item.name)
-        values = [v / self.setting.sigma for v in recorded(item)]
+    Args:
+        setting: of the recording.
+        effects: what was hidden.
+        recorded: every run, (T, C).
+    """
+
+    def __init__(self, setting, effects, recorded):
+        self.setting, self.effects = setting, effects
+        values = [v / self.setting.sigma for v in recorded]
         self.fitted, self.held = Gauge(self.setting), Gauge(self.setting, held_out=True)
         self.wanted = np.concatenate(self.fitted.beyond_states(values[:FITTED]))
         self.unseen = np.concatenate(self.held.beyond_states(values[FITTED:]))
 
     def truth(self):
         """The held-out error of what was hidden, as it is."""
-        return self._error(self.item.effects)
+        return self._error(self.effects)
 
     def ratio(self, name, beside=()):
         """The held-out error with the cause of this name, fitted, as a multiple of the truth's;
@@ -40,7 +45,7 @@ class Rivals:
             name: effect@place, or effect@* for every place.
             beside: names of what was hidden that stay as they are.
         """
-        others = {key: self.item.effects[key] for key in beside}
+        others = {key: self.effects[key] for key in beside}
         errors = [self._fitted(of, count, others) for of, count in self._forms(name)]
         return min(errors) / self.truth() if errors else None
 
@@ -53,7 +58,7 @@ class Rivals:
         chosen = places if place == "*" else [p for p in places if p == place]
         draws = SHAPES if effect in causes.SHAPES else 1
         for draw in range(draws if chosen else 0):
-            rng = rng_of(self.item.name, f"rival {name} {draw}")
+            rng = rng_of("rival", f"{name} {draw}")
             shapes = {p: causes.shape(effect, p, self.setting, rng)(1.0) for p in chosen}
             if effect == "input.saturation":
                 continue

@@ -33,8 +33,7 @@ class Gauge:
 
     def seen(self, effects):
         """Noiseless observations in noises, one (T, C) a run."""
-        step = self.step / 2 if "elastic" in effects else self.step
-        world = World(self.setting.machine, effects, foreign.plant_of(effects), step)
+        world = World(self.setting.machine, effects, foreign.plant_of(effects), self.step)
         channels, sigma = self.setting.channels, self.setting.sigma
         return [
             observed(world, run, channels, foreign.slips_of(effects, number)) / sigma
@@ -86,7 +85,12 @@ def rms(values):
 
 
 def left(change, others):
-    """What the best sum of other changes leaves of one, root mean square; each (N,)."""
+    """What the best sum of other changes leaves of one, root mean square; each (N,). What is not
+    finite leaves all.
+    """
+    others = [other for other in others if np.isfinite(other).all()]
+    if not others:
+        return rms(change)
     solution = np.linalg.lstsq(np.column_stack(others), change, rcond=None)[0]
     return rms(change - np.column_stack(others) @ solution)
 

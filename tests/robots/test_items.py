@@ -1,6 +1,7 @@
 """Questions about robots: drawn alike every time, as large as they say, told to nobody."""
 
 import csv
+import dataclasses
 
 import numpy as np
 import pytest
@@ -9,7 +10,10 @@ import tomllib
 pytest.importorskip("pinocchio", reason="pin has no wheel here")
 
 from tests.robots import causes, foreign, items, questions, recording, sizing
-from tests.robots.sensing import Noise
+from tests.robots.equivalence import Rivals
+from tests.robots.score import SAME
+from tests.robots.sensing import Noise, observed
+from tests.robots.world import Run, World
 
 
 @pytest.fixture(scope="module")
@@ -101,3 +105,25 @@ def test_a_slipping_encoder_jumps_and_stays(item):
     assert np.all(jump[before] == 0.0)
     total = sum(size for _, _, size in slips) / setting.sigma[1]
     assert jump[-1] == pytest.approx(total)
+
+
+def test_what_is_alike_in_a_servo_is_found_so_and_a_sensor_of_force_splits_it(item):
+    """A force that is constant is a command that is off: kp times as much."""
+    whole = items.setting_of(item.name)
+    runs = tuple(
+        Run(r.times[:60], {name: u[:60] for name, u in r.commands.items()}, r.q, r.v)
+        for r in whole.runs
+    )
+    for split, channels in enumerate((("q.shoulder", "q.elbow"), ("q.elbow", "tau.elbow"))):
+        noise = Noise({"q.shoulder": 5e-4, "q.elbow": 5e-4, "tau.elbow": 5e-3}, "white", 0.0, 0.0)
+        noise = dataclasses.replace(noise, sigma={name: noise.sigma[name] for name in channels})
+        setting = dataclasses.replace(whole, runs=runs, channels=channels, noise=noise)
+        hidden, rng = {"force.bias@elbow": (0.2,)}, np.random.default_rng(0)
+        world = World(setting.machine, hidden)
+        values = [noise.added(observed(world, run, channels), rng) for run in runs]
+        rivals = Rivals(setting, hidden, values)
+        assert rivals.truth() == pytest.approx(1.0, abs=0.2)
+        assert rivals.ratio("force.bias@elbow") == pytest.approx(1.0, abs=0.05)
+        assert (rivals.ratio("input.bias@m_elbow") > SAME) == bool(split)
+        assert rivals.ratio("drag.linear@elbow") > 1.5
+    assert rivals.ratio("backlash@m_elbow") is None

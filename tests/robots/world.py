@@ -62,6 +62,9 @@ class World:
         self.machine, self.effects, self.step = machine, dict(effects or {}), step
         self.plant = plant(machine, self.effects, foreign)
         self.drives = Drives.of(machine, self.effects)
+        if foreign := self.plant.elastic:
+            swing = np.sqrt(foreign.stiffness / foreign.rotor)
+            self.step = min(step, 0.5 / swing)  # Runge-Kutta is stable up to 2.8
         self.rubs = self.plant.rubs
         self.dry = bool(self.rubs.any())
 
