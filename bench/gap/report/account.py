@@ -13,15 +13,16 @@ import numpy as np
 
 from bench.gap.model.watch import QUESTIONS
 from bench.gap.report.places import (
-    coefficient,
     has_places,
     lacks,
     listed,
     of_set,
+    said_values,
     sized,
     too_much,
     without_place,
 )
+from bench.gap.report.ranking import entries
 from bench.gap.report.story import Place, Shown, Side, Story, Tuned
 from bench.gap.report.words import (
     clean,
@@ -117,7 +118,8 @@ def headline(story: Story) -> str:
         unknown = "what the simulation lacks cannot be told from them"
         return f"These data cannot fix {joined(unfixed(story))}: {unknown}."
     if verdict == "unknown" or not causes:
-        none = f"none of the {len(story.verdict.candidates)} known causes explains it"
+        none = f"none of the {len(entries(story))} known causes explains it"
+        none += " at any place" if has_places(story) else ""
         return f"Something is missing from the simulation, and {none}."
     if verdict == "ambiguous":
         return f"The simulation {lacks(causes)}: these data cannot tell which."
@@ -287,7 +289,9 @@ def looked_for(story: Story) -> str:
     if not candidates:
         return "No candidate causes were at hand."
     best = candidates[0]
-    none = f"{len(candidates)} possible causes were looked for and none stands out from chance"
+    where = " at every place" if has_places(story) else ""
+    count = f"{len(entries(story))} possible causes were looked for{where}"
+    none = f"{count} and none stands out from chance"
     promising = f"{noun(best.effect)} ({probability(best.p_value)})"
     return f"{none}; the most promising is {promising}."
 
@@ -377,14 +381,12 @@ def coefficients(cause: Cause) -> str:
     """A cause's coefficients with intervals, how unlikely it is by chance, and what would do as
     well.
     """
-    parts = []
-    for name, fitted in cause.coefficients.items():
-        parts.append(coefficient(name, fitted))
     others = ""
     if cause.alternatives:
         names = of_set(cause.alternatives)
         others = f"; {names} instead would do as well"
-    return f"{joined(parts)}; {probability(cause.p_value)}{others}."
+    parts = [text for text in (said_values(cause), probability(cause.p_value)) if text]
+    return f"{'; '.join(parts)}{others}."
 
 
 def largest(story: Story, kind: str) -> str:

@@ -129,6 +129,8 @@ def sized(cause: Cause) -> str:
     12 % larger than the model file says``; empty for what is no such number.
     """
     base, place = parted(cause.effect)
+    if base in _STEPPED:
+        return f"{_STEPPED[base]}: {clean(cause.says).rstrip('.')}"
     say = _SIZED.get(base)
     values = list(cause.coefficients.values())
     if say is None or not place or place == FAMILY or not values:
@@ -173,16 +175,33 @@ _SIZED: Mapping[str, Callable[[str, Sequence[Number]], str]] = {
     "mass.offset": _moved,
 }
 """How wrong a number of the file is, by effect."""
+_STEPPED = {
+    "numerics.step": "the time step of the model file is too long",
+    "numerics.integrator": "the integrator of the model file does not follow the motion",
+}
+"""The same of how the file has the robot stepped; what mends it is said by the cause."""
 
 
-def coefficient(name: str, fitted: Number) -> str:
-    """A coefficient with its interval; one of a family with its place."""
-    own, place = parted(name)
-    if not place:
-        return f"{clean(name, 60)} {estimated(fitted)}"
-    # Of a family of effects with one coefficient each, the place says which.
-    front = "" if own == "coefficient" else f"{clean(own, 30)} "
-    return f"{front}{estimated(fitted)} at {clean(place, 40)}"
+def values_of(cause: Cause) -> list[tuple[str, str]]:
+    """The numbers of a cause by their names, with their intervals and units."""
+    # What mends the integration was chosen, and is no estimate; an integrator is no number.
+    if cause.effect == "numerics.integrator":
+        return []
+    if cause.effect == "numerics.step":
+        steps = cause.coefficients.values()
+        return [("time step", with_unit(number(step.value), step.unit)) for step in steps]
+    return [(clean(name, 60), estimated(fitted)) for name, fitted in cause.coefficients.items()]
+
+
+def said_values(cause: Cause) -> str:
+    """The same in a row; those of a family with their places."""
+    texts = []
+    for name, text in values_of(cause):
+        own, place = parted(name)
+        # Of a family of effects with one coefficient each, the place says which.
+        front = "" if place and own == "coefficient" else f"{own} "
+        texts.append(f"{front}{text}" + (f" at {place}" if place else ""))
+    return joined(texts)
 
 
 def without_place(says: str) -> str:

@@ -11,13 +11,12 @@ import numpy as np
 
 from bench.gap.report.account import absorbed, experiment, rms, shift
 from bench.gap.report.elements import code, folded, heading, listed, paragraph, safe, strong, table
-from bench.gap.report.places import has_places, of_set, without_place
+from bench.gap.report.places import has_places, of_set, values_of, without_place
 from bench.gap.report.ranking import entries, standing
 from bench.gap.report.story import Place, Side, Story, Tuned
 from bench.gap.report.words import (
     FAMILY,
     estimate,
-    estimated,
     joined,
     name_of,
     noun,
@@ -224,8 +223,8 @@ def numbers(story: Story) -> Iterator[str]:
     for cause in story.verdict.causes:
         what = [safe(noun(cause.effect)), safe(without_place(cause.says))]
         chance = probability(cause.p_value)
-        for name, coefficient in cause.coefficients.items():
-            rows.append([*what, safe(name, 60), safe(estimated(coefficient)), chance])
+        for name, value in values_of(cause) or [("–", "–")]:
+            rows.append([*what, safe(name, 60), safe(value), chance])
     if rows:
         heads = ["cause", "what it does", "coefficient", "value (95 % interval)", "by chance"]
         yield heading("What was found, in numbers")

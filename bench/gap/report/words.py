@@ -28,6 +28,11 @@ _AT = {
     "channel": ("in", "channels"),
 }
 """How a sentence leads to a place of each kind, and how it calls several."""
+NUMERICS = {
+    "numerics.step": "too long a time step",
+    "numerics.integrator": "an integrator that does not follow the motion",
+}
+"""How a robot is stepped, where that is the cause: no effects, and wrong in the model file."""
 _WRONG = re.compile(r"an? (wrong|misplaced) ")
 """Beginnings of the nouns of what a simulation has wrong, and does not lack."""
 _LEAST = 1e-12
@@ -61,6 +66,8 @@ def _noun(name: str) -> str:
     it says.
     """
     base, place = parted(name)
+    if base in NUMERICS:
+        return NUMERICS[base]
     try:
         effect = effects.get(base)
     except InputError:
@@ -93,11 +100,13 @@ def kind_of(effect: str) -> str:
 def is_wrong(effect: str) -> bool:
     """Whether it is a number that is wrong, and nothing that is lacking."""
     base, _ = parted(effect)
+    if base in NUMERICS:
+        return True
     try:
         said = effects.get(base).noun
     except InputError:
         said = ""
-    return bool(_WRONG.match(said)) or base.startswith("numerics.")
+    return bool(_WRONG.match(said))
 
 
 def at(kind: str, places: Sequence[str], last: str = "or", wrong: bool = False) -> str:

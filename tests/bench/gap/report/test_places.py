@@ -136,6 +136,42 @@ def test_what_else_remains_is_lacking_although_a_number_is_wrong():
     assert both.endswith("elbow_link, and lacks something else that no known cause explains.")
 
 
+SHORTER = cause(
+    "numerics.step",
+    {"coefficient": {"value": 0.0005, "unit": "s", "low": None, "high": None}},
+    says="a time step of 0.0005 s follows the robot's motion",
+)
+OTHER = cause(
+    "numerics.integrator",
+    {"coefficient": {"value": 1.0, "unit": "1", "low": None, "high": None}},
+    says="integrator = RK4 follows the robot's motion",
+)
+
+
+def test_how_a_robot_is_stepped_is_wrong_and_what_mends_it_is_said():
+    told = robot_story(causes=[SHORTER])
+    assert headline(told) == (
+        "The time step of the model file is too long: a time step of 0.0005 s follows the "
+        "robot's motion."
+    )
+    text = " ".join(account(told))
+    assert "Too long a time step (numerics.step): time step 5×10⁻⁴ s; p" in text
+    both = robot_story(causes=[OTHER, RUB])
+    assert headline(both) == (
+        "The simulation lacks Coulomb friction at joint elbow, and has an integrator that does "
+        "not follow the motion."
+    )
+    assert "(numerics.integrator): p = 1×10⁻⁹." in " ".join(account(both))
+    assert not marks(told)
+
+
+def test_unknown_and_adequate_count_causes_and_not_their_places():
+    unknown = headline(robot_story("unknown", causes=()))
+    assert "none of the 16 known causes explains it at any place" in unknown
+    clean = " ".join(following(robot_story("adequate", causes=())))
+    assert "16 possible causes were looked for at every place and none stands out" in clean
+
+
 def test_what_is_wrong_and_what_is_lacking():
     assert is_wrong("mass.scale@a")
     assert is_wrong("numerics.step")
