@@ -18,7 +18,7 @@ from bench.gap.report.page import page
 from bench.gap.report.pictures import Printed
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, estimated, joined, percent
-from bench.gap.robot_files import robot_files
+from bench.gap.robot_files import RobotFiles, robot_files
 from bench.gap.verdict import Cause, Verdict
 from sims import extended as extending
 from sims.base import InputError
@@ -89,8 +89,7 @@ class Explanation:
             folder / "verdict.json": self._json(),
             folder / "extended.toml": extending.written(self.extended, folder),
         }
-        model_files, _ = self._robot_files
-        contents |= {folder / name: content for name, content in model_files.items()}
+        contents |= {folder / name: text for name, text in self._robot_files.contents.items()}
         for name, figure in figures.items():
             contents[folder / f"{name}.png"] = figure.png
             contents[folder / f"{name}.pdf"] = figure.pdf
@@ -106,33 +105,26 @@ class Explanation:
     @property
     def unsaid(self) -> tuple[str, ...]:
         """Of a robot: what its own file cannot say, and what is to be known of what it says."""
-        return self._robot_files[1]
+        return self._robot_files.said
 
     @cached_property
-    def _robot_files(self) -> tuple[dict[str, str], tuple[str, ...]]:
+    def _robot_files(self) -> RobotFiles:
         return robot_files(self.extended)
+
+    @cached_property
+    def _told(self) -> Story:
+        """The story, with what is to change in a robot's model file."""
+        files = self._robot_files
+        if not files.contents:
+            return replace(self.story, unwritten=files.said)
+        return replace(self.story, changes=changes(files.before, files.after), unwritten=files.said)
 
     def _json(self) -> str:
         return json.dumps(self.answer.document(), indent=1, allow_nan=False) + "\n"
 
     def _page(self, figures: Mapping[str, Printed], for_print: bool) -> str:
         drawn = {name: figure.png for name, figure in figures.items()}
-        return page(self._with_changes(), drawn, for_print)
-
-    def _with_changes(self) -> Story:
-        """The story with the lines of the robot's model file that change."""
-        robot, (files, said) = self.story.robot, self._robot_files
-        if robot is None:
-            return self.story
-        # A URDF's own lines are shown where there are any.
-        after = files.get("extended.urdf", files.get("extended.xml", ""))
-        same_form = robot.format == "mjcf" or "extended.urdf" in files
-        try:
-            before = robot.path.read_text(errors="replace") if same_form else ""
-        except OSError:
-            # Gone since it was read: what changes is shown without what was.
-            before = ""
-        return replace(self.story, changes=changes(before, after), unwritten=said)
+        return page(self._told, drawn, for_print)
 
     def __repr__(self) -> str:
         lines = [f"{self.verdict}: {self.story.title}", self._causes_in_words(), self._gain()]

@@ -5,7 +5,7 @@ came from a URDF.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sims.extended import Extended, Number
 
@@ -13,16 +13,31 @@ if TYPE_CHECKING:
     from sims.robot.writing import Written
 
 
-def robot_files(extended: Extended) -> tuple[dict[str, str], tuple[str, ...]]:
-    """The contents of a robot's files by their names, and what is to be known of them, one line
-    each; nothing for what is no robot.
+class RobotFiles(NamedTuple):
+    """What a robot's own files become.
+
+    Attributes:
+        contents: by name.
+        said: what they cannot hold, and what is to be known of what they hold, one line each.
+        before, after: the text of the user's file, and that of the one in its form.
+    """
+
+    contents: Mapping[str, str]
+    said: tuple[str, ...] = ()
+    before: str = ""
+    after: str = ""
+
+
+def robot_files(extended: Extended) -> RobotFiles:
+    """The files of a robot; none for what is no robot.
 
     They have been loaded again and compared; what would not be as it was meant is left out.
     """
     kind: Any = extended.kind
     if kind is None or not kind.has_model:
-        return {}, ()
+        return RobotFiles({})
     from sims.robot.checking import check
+    from sims.robot.markup import without_heading
     from sims.robot.writing import written
 
     causes = causes_of(extended)
@@ -31,8 +46,14 @@ def robot_files(extended: Extended) -> tuple[dict[str, str], tuple[str, ...]]:
         check(kind.robot, causes, done)
     except RuntimeError as error:
         # Minutes of search are not thrown away for a file.
-        return {}, (f"no model file is written, by a fault of simgap: {error}",)
-    return _named(done), done.said
+        return RobotFiles({}, (f"no model file is written, by a fault of simgap: {error}",))
+    try:
+        before = kind.robot.path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        # Gone since it was read: what changes is shown without what was.
+        before = ""
+    after = done.xml if done.urdf is None else done.urdf
+    return RobotFiles(_named(done), done.said, before, without_heading(after or ""))
 
 
 def _named(done: Written) -> dict[str, str]:

@@ -153,7 +153,7 @@ class Markup:
     def _tag(self, tag: Tag) -> bytes:
         """An element with its changes."""
         indent = self._indent(tag.begin)
-        comments = [_comment(text) + self._newline + indent for text in tag.before]
+        comments = [self._comment(text) + self._newline + indent for text in tag.before]
         if tag.text is not None:
             return b"".join([*comments, tag.text])
         if self._closed(tag) and tag.within:
@@ -169,7 +169,7 @@ class Markup:
         below = self._indent(tag.children[0].begin) if tag.children else indent + b"  "
         parts = []
         for comments, element in tag.within:
-            for line in [*map(_comment, comments), *([element.encode()] if element else [])]:
+            for line in [*map(self._comment, comments), *([element.encode()] if element else [])]:
                 parts += [self._newline + below, line]
         return b"".join(parts)
 
@@ -192,6 +192,11 @@ class Markup:
         ]
         return b"".join([*parts, text[at:]])
 
+    def _comment(self, text: str) -> bytes:
+        # Two hyphens end a comment too early, and so would one at its end.
+        safe = re.sub(r"-(?=-)", "- ", text)
+        return f"<!-- {safe} -->".encode().replace(b"\n", self._newline)
+
     def _indent(self, begin: int) -> bytes:
         """The spaces before an element on its line; none where something else stands there."""
         line = self.text[self.text.rfind(b"\n", 0, begin) + 1 : begin]
@@ -202,10 +207,19 @@ def _attribute(name: str, value: str) -> bytes:
     return f'{name}="{escape(value, {chr(34): "&quot;"})}"'.encode()
 
 
-def _comment(text: str) -> bytes:
-    # Two hyphens end a comment too early, and so would one at its end.
-    safe = re.sub(r"-(?=-)", "- ", text)
-    return f"<!-- {safe} -->".encode()
+def heading(lines: list[str]) -> str:
+    """What stands at the top of a file that was written: what it is, and a line for each of what is
+    to be known of it.
+    """
+    first, *more = lines
+    return "\n     ".join([f"{first}; written by simgap", *more])
+
+
+def without_heading(text: str) -> str:
+    """A text without what stands at its top."""
+    return re.sub(
+        r"<!-- (?:(?!-->).)*?; written by simgap.*?-->", "", text, count=1, flags=re.DOTALL
+    )
 
 
 def number(value: float) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from sims.base import Array
 from sims.robot.causes import Cause
-from sims.robot.markup import Markup, Tag, number, numbers
+from sims.robot.markup import Markup, Tag, heading, number, numbers
 from sims.robot.model import Robot
 from sims.robot.native import added, share
 
@@ -60,8 +60,8 @@ class UrdfWriter:
             said: lines that stand at its top.
         """
         fitted = f", with what was found in {self.recording}" if self.recording else ""
-        heading = [f"{self.robot.path.name}{fitted}; written by simgap", *said]
-        self.markup.root.within.insert(0, (heading, ""))
+        comment = heading([f"{self.robot.path.name}{fitted}", *said])
+        self.markup.root.within.insert(0, ([comment], ""))
         return self.markup.whole().decode()
 
     def _dynamics(self, cause: Cause, attribute: str) -> str | None:

@@ -15,7 +15,7 @@ from sims.extended import Number
 from sims.robot.causes import one_by_one
 from sims.robot.changes import CLOSE, KEPT, ROUNDS, Applied, apply
 from sims.robot.document import Document
-from sims.robot.markup import UnfitError
+from sims.robot.markup import UnfitError, heading
 from sims.robot.mjcf_out import Writer
 from sims.robot.model import Robot
 from sims.robot.precise import saved, unlike
@@ -138,13 +138,13 @@ class Edit:
         writer = Writer(document, self.original, self.applied.wanted)
         for statement in statements:
             writer.write(statement, self.applied.comments.get(statement.element, [KEPT]))
-        document.root.within.insert(0, (self._heading(), ""))
+        document.root.within.insert(0, ([self._heading()], ""))
         return document.written()
 
-    def _heading(self) -> list[str]:
+    def _heading(self) -> str:
         """What the file is, and what it does not hold."""
         fitted = f", with what was found in {self.recording}" if self.recording else ""
-        return [f"{self.robot.path.name}{fitted}; written by simgap", *self.applied.said]
+        return heading([f"{self.robot.path.name}{fitted}", *self.applied.said])
 
 
 def compiled(text: str) -> Any:

@@ -9,7 +9,7 @@ import pytest
 
 from bench.figures import robot as drawing
 from bench.gap.explanation import Explanation
-from bench.gap.robot_files import causes_of, robot_files
+from bench.gap.robot_files import RobotFiles, causes_of, robot_files
 from bench.gap.score_model import scored
 from bench.registry import robot
 from sims.extended import Extended, Number, robot_of
@@ -45,6 +45,10 @@ def test_it_is_written_with_the_rest(arm, tmp_path):
     model = mujoco.MjModel.from_xml_path(str(paths[2]))
     assert model.dof_frictionloss.tolist() == [0.0, 0.03]
     assert "fitted to a log" in paths[2].read_text()
+    report = paths[-1].read_text()
+    assert "What to change in the model file" in report
+    assert report.count('<ins class="line">') == 1
+    assert "frictionloss=&quot;0.03&quot;" in report
 
 
 def test_the_report_shows_the_lines_to_change(arm, tmp_path, monkeypatch):
@@ -81,7 +85,7 @@ def test_freed_numbers_and_numerics_are_written(arm):
     free.numerics = Numerics(0.001, "implicitfast")
     causes = causes_of(extended_of(free, freed, FRICTION))
     assert set(causes["mass.offset@forearm"]) == {"x", "y", "z"}
-    files, said = robot_files(extended_of(free, freed, FRICTION))
+    files, said, _, _ = robot_files(extended_of(free, freed, FRICTION))
     model = mujoco.MjModel.from_xml_string(files["extended.xml"])
     assert model.dof_damping == pytest.approx([0.31, 0.11])
     assert model.body_ipos[2] == pytest.approx([0.01, 0.01, -0.14])
@@ -95,7 +99,7 @@ def test_a_fault_in_a_file_costs_the_file_alone(arm, monkeypatch):
         raise RuntimeError("extended.xml is not as it was meant: dof_damping")
 
     monkeypatch.setattr(checking, "check", differs)
-    files, said = robot_files(extended_of(arm, effects=FRICTION))
+    files, said, _, _ = robot_files(extended_of(arm, effects=FRICTION))
     assert files == {}
     assert said == (
         "no model file is written, by a fault of simgap: "
@@ -120,11 +124,11 @@ def test_actuators_that_a_recording_adds_are_not_added_twice(tmp_path):
     assert alone["normalised_rmse"] > 5
     spec = mujoco.MjSpec.from_file(str(EXAMPLE / "arm2.xml"))
     kind = robot_simulator(Robot(EXAMPLE / "arm2.xml", "mjcf", spec))
-    files, _ = robot_files(extended_of(kind, effects=FRICTION))
+    files = robot_files(extended_of(kind, effects=FRICTION)).contents
     path = tmp_path / "extended.xml"
     path.write_text(files["extended.xml"])
     assert scored(path, tmp_path / "log.csv")["normalised_rmse"] < 1.5
 
 
 def test_what_is_no_robot_has_no_such_file():
-    assert robot_files(extended_of(None)) == ({}, ())
+    assert robot_files(extended_of(None)) == RobotFiles({})

@@ -45,7 +45,8 @@ def test_an_mjcf_stays_its_authors(tmp_path: Path) -> None:
     assert 'name="elbow"' in after[place + 1]
     assert 'frictionloss="0.35"' in after[place + 1]
     assert "solreffriction" in after[place + 2]
-    assert sum("fitted to log.csv" in line for line in comments) == 9
+    assert sum("fitted to log.csv" in line for line in comments) == 8
+    assert "backlash@m_elbow: 0.1" in done.xml, "what it cannot hold stands at its top"
     assert 'kp="66"' in done.xml
     assert any("backlash@m_elbow" in line for line in done.said)
     check(arm, CAUSES, done)
