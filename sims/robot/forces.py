@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sims.base import Array
-from sims.robot.lanes import Addresses
+from sims.robot.lanes import Addresses, Mask
 from sims.robot.moment import RobotMoment
 from sims.robot.system import RobotSystem
 from sims.system import Acting, Force, Friction
@@ -50,7 +50,7 @@ class Forces:
     """Forces of effects that hang on where the robot is.
 
     Attributes:
-        rubs: whether there is dry friction among them.
+        rubs: (L, D) where dry friction is among them.
 
     Args:
         system: the robot's.
@@ -70,7 +70,9 @@ class Forces:
         self._frictions = [
             (e, c) for e, c in asked if isinstance(e, Friction) and not _native(e.of)
         ]
-        self.rubs = bool(self._frictions)
+        self.rubs: Mask = np.zeros((count, len(addresses.velocities)), dtype=bool)
+        for effect, c in self._frictions:
+            self.rubs[:, effect.coordinate] |= (c != 0).any(axis=0)[:, 0]
 
     def at(
         self, t: float, x: Array, v: Array, inputs: Mapping[str, Array], carried: Array

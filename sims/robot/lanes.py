@@ -27,6 +27,7 @@ INTERRUPTED = 40_000
 """Steps of all lanes together in one call: a fraction of a second, after which Ctrl-C is heard."""
 
 Places = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 
 class Addresses:
@@ -46,7 +47,7 @@ class Addresses:
 class Asked(Protocol):
     """Effects that are asked for their forces in every step, as `sims.robot.forces.Forces`."""
 
-    rubs: bool
+    rubs: Mask
     addresses: Addresses
 
     def at(
@@ -204,9 +205,12 @@ class Bench:
         applied, drive, bias = bind("qfrc_applied"), bind("qfrc_actuator"), bind("qfrc_bias")
         loss = self.fields["dof_frictionloss"]
         own = loss[:n, dofs].copy()
-        if asking.rubs:
-            self.fields["dof_solref"][:n, dofs] = SOLREF
-            self.fields["dof_solimp"][:n, dofs] = SOLIMP
+        rubs = bool(asking.rubs.any())
+        if rubs:
+            # Where none of them rubs, the friction of the file stays as stiff as the file says.
+            lanes, joints = np.nonzero(asking.rubs)
+            self.fields["dof_solref"][lanes, dofs[joints]] = SOLREF
+            self.fields["dof_solimp"][lanes, dofs[joints]] = SOLIMP
             self._changed.update(FIELDS["friction.coulomb"].fields)
         result = self._begun(n, steps, record)
         ids = self._ids(n)
@@ -221,7 +225,7 @@ class Bench:
             ctrl[:n] = controls[:, k]
             applied[:n] = forces[:, k]
             applied[:n, dofs] += force
-            if asking.rubs:
+            if rubs:
                 loss[:n, dofs] = own + np.maximum(limit, 0.0)
             self.batch.step(ids)
             for name, values in result.items():

@@ -95,8 +95,8 @@ def _add_quadratic(fields: Fields, robot: Robot, place: str, c: Array) -> None:
 def _add_friction(fields: Fields, robot: Robot, place: str, c: Array) -> None:
     column = robot.joint(place).velocity
     loss = fields["dof_frictionloss"]
-    # Friction that the file states is taken as stiff as well, or zero would be a jump.
-    rubs = (c[0] != 0) | (loss[:, column] > 0)
+    # In the lanes where it acts alone: what is zero leaves the file as it is.
+    rubs = c[0] != 0
     loss[:, column] = added(loss[:, column], c[0])
     fields["dof_solref"][rubs, column] = SOLREF
     fields["dof_solimp"][rubs, column] = SOLIMP

@@ -85,15 +85,22 @@ def test_a_lane_moves_as_the_file_that_states_it(
     stated = moved(Batch(mujoco.MjModel.from_xml_string(ARM.replace(before, after)), 1, 1))
     plain = moved(Batch(arm.compiled, 1, 1))
     np.testing.assert_allclose(found[1], stated[0], rtol=0, atol=1e-10)
-    if place != "elbow" or effect != "friction.coulomb":
-        np.testing.assert_allclose(found[0], plain[0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found[0], plain[0], rtol=0, atol=1e-12)
     assert np.abs(stated[0] - plain[0]).max() > 1e-5
 
 
-def test_stated_friction_is_stiff_in_every_lane(tmp_path: Path) -> None:
-    """Where the file states friction, a coefficient of zero is no jump."""
-    found = lanes(robot(tmp_path), "friction.coulomb", "elbow", (1e-9,))
-    np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-7)
+def test_friction_is_stiff_in_the_lanes_where_it_acts_alone(tmp_path: Path) -> None:
+    """Where the file states friction, a lane with a coefficient of zero is what the file says,
+    though another lane has more of it.
+    """
+    arm = robot(tmp_path)
+    found = lanes(arm, "friction.coulomb", "elbow", (1e-9,))
+    plain = moved(Batch(arm.compiled, 1, 1))
+    np.testing.assert_allclose(found[0], plain[0], rtol=0, atol=1e-12)
+    stiff = ARM.replace('frictionloss="0.05"', f'frictionloss="0.05" {STIFF}')
+    stated = moved(Batch(mujoco.MjModel.from_xml_string(stiff), 1, 1))
+    np.testing.assert_allclose(found[1], stated[0], rtol=0, atol=1e-7)
+    assert np.abs(found[1] - found[0]).max() > 1e-7
 
 
 def test_every_native_effect_is_compared() -> None:
