@@ -10,7 +10,9 @@ from contextlib import suppress
 
 import numpy as np
 
+from bench.checks.arm import placed
 from bench.checks.base import CheckError, NotApplicable, require, same_bits
+from bench.checks.places import PLACE_CHECKS
 from bench.registry import SkippedError, simulators
 from sims import effects
 from sims.base import Array, InputError, Scenario
@@ -97,21 +99,24 @@ def check_declaration_is_complete(effect: type[Effect]) -> None:
             require(
                 unit is None or low < high, f"a plausible range for {c.name}", (low, high), look
             )
-    require(any(True for _ in _hosts(effect)), "a registered system that can have it", "none", look)
+    hosted = any(True for _ in _hosts(effect)) or bool(placed(effect))
+    require(hosted, "a registered system or a robot that can have it", "none", look)
 
 
-def check_contribution_is_nothing_at_zero(effect: type[Effect]) -> None:
+def check_contribution_is_nothing_at_zero(effect: type[Effect]) -> NotApplicable | None:
     """What the hook gives at zero is exactly nothing, bit for bit.
 
     Asked of the hook itself: engines leave out what is off, so a simulation would not show it.
     """
-    for host in _hosts(effect):
+    hosts = list(_hosts(effect))
+    for host in hosts:
         system, acting = host.system(), effect()
         c = np.zeros((len(effect.coefficients), 2, 1))
         same = all(
             same_bits(given, nothing) for given, nothing in _contributions(acting, c, host, system)
         )
         require(same, f"no contribution on {host.name} at zero", "one", effect.__name__)
+    return None if hosts else NO_HOST
 
 
 def _contributions(
@@ -160,14 +165,15 @@ def _moment(host: type[Simulated], system: System) -> Moment:
     )
 
 
-def check_it_shows_and_stays_finite(effect: type[Effect]) -> None:
+def check_it_shows_and_stays_finite(effect: type[Effect]) -> NotApplicable | None:
     """Somewhere inside its plausible range it changes the observation; well above the middle
     nothing becomes NaN.
 
     Several places, since a limit acts at its low end, where a force may pull a system away for
     good.
     """
-    for host in _hosts(effect):
+    hosts = list(_hosts(effect))
+    for host in hosts:
         simulator, plain, scenario = (
             _made(host, effect),
             host(engine=_engine(host)),
@@ -179,11 +185,13 @@ def check_it_shows_and_stays_finite(effect: type[Effect]) -> None:
         require(bool(np.isfinite(seen[-1]).all()), "finite observations", "others", look)
         before = plain.simulate(thetas[:1, : len(host.system.parameters)], scenario)
         require(bool((seen != before).any()), "a change inside the plausible range", "none", look)
+    return None if hosts else NO_HOST
 
 
-def check_lanes_are_independent(effect: type[Effect]) -> None:
+def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
     """A lane's observation does not depend on the coefficients of its neighbours, bit for bit."""
-    for host in _hosts(effect):
+    hosts = list(_hosts(effect))
+    for host in hosts:
         simulator, scenario = _made(host, effect), _scenario(host.system)
         lanes = np.concatenate([_theta(simulator, share) for share in (0.2, 0.5, 0.9)])
         together = simulator.simulate(lanes, scenario)
@@ -194,6 +202,7 @@ def check_lanes_are_independent(effect: type[Effect]) -> None:
             "others",
             effect.__name__,
         )
+    return None if hosts else NO_HOST
 
 
 def check_impossible_hosts_are_refused(effect: type[Effect]) -> NotApplicable | None:
@@ -212,10 +221,13 @@ def check_impossible_hosts_are_refused(effect: type[Effect]) -> NotApplicable | 
     return None if impossible else NotApplicable("every registered system can have it")
 
 
+NO_HOST = NotApplicable("no registered system can have it")
+
 EFFECT_CHECKS: tuple[Callable[[type[Effect]], NotApplicable | None], ...] = (
     check_declaration_is_complete,
     check_contribution_is_nothing_at_zero,
     check_it_shows_and_stays_finite,
     check_lanes_are_independent,
     check_impossible_hosts_are_refused,
+    *PLACE_CHECKS,
 )

@@ -17,7 +17,18 @@ import numpy as np
 from sims.base import Array
 from sims.robot.model import Robot
 from sims.robot.moment import RobotMoment
-from sims.system import Acting, Coefficient, Effect, Force, Friction, Input, Moment, Sensor, Value
+from sims.system import (
+    Acting,
+    Coefficient,
+    Effect,
+    Force,
+    Friction,
+    Input,
+    Kind,
+    Moment,
+    Sensor,
+    Value,
+)
 
 FAMILY = "*"
 """The place of a family."""
@@ -29,6 +40,7 @@ LEAD = 0.05
 """Seconds by which an input may be early, where stamps lag behind."""
 TYPICAL = {"hinge": 0.5, "slide": 5.0}
 """A force for which the plausible ranges of the library are meant: N m on a hinge, N on a slide."""
+_KINDS: Mapping[str, Kind] = {"hinge": "rotary", "slide": "linear"}
 WORDS = {
     "armature": "inertia.armature",
     "damping": "drag.linear",
@@ -311,6 +323,8 @@ def _for_one(effect: type[Effect]) -> bool:
 
 def _acts_at(effect: type[Effect], spot: Spot, found: Mapping[str, Sequence[Spot]]) -> bool:
     """Whether a place has what the effect changes."""
+    if effect.at == "joint" and effect.coefficients[0].unit(_KINDS[spot.kind]) is None:
+        return False
     if effect.at == "joint" and effect.needs == "input":
         return any(actuator.coordinate == spot.coordinate for actuator in found["actuator"])
     if issubclass(effect, Value) and effect.at == "actuator":

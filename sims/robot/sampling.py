@@ -11,7 +11,10 @@ slope is not known is linear.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
+from numpy.typing import NDArray
 
 from sims.base import Array
 from sims.plan import acts
@@ -41,12 +44,14 @@ def sampled(
         assert isinstance(effect, Sensor)
         if type(effect).times is not Sensor.times:
             instants = np.where(acts(c), effect.times(c, instants), instants)
-    filters = tuple((e, c) for e, c in sensors if isinstance(e, Sensor) and e.filters)
-    if filters:
-        grid = np.broadcast_to(ends, values.shape)
+    instants = np.clip(instants, 0.0, ends[-1])
+    result = _at(values, slopes, step, instants)
+    for some, filters in _filtering(sensors):
+        grid = np.broadcast_to(ends, (some.size, count))
         steps = np.diff(grid, axis=1, prepend=0.0)
-        values, slopes = sensed(filters, values, steps, grid), None
-    result = _at(values, slopes, step, np.clip(instants, 0.0, ends[-1]))
+        filtered = sensed(filters, values[some], steps, grid)
+        # What a filter shows has a slope that nobody knows.
+        result[some] = _at(filtered, None, step, instants[some])
     stamps = np.broadcast_to(times, (lanes, times.size))
     for effect, c in sensors:
         assert isinstance(effect, Sensor)
@@ -58,15 +63,27 @@ def sampled(
     return result
 
 
+def _filtering(sensors: Acting) -> Iterator[tuple[NDArray[np.intp], Acting]]:
+    """The lanes in which a filter acts, with the filters there; none where there is none."""
+    filters = tuple((e, c) for e, c in sensors if isinstance(e, Sensor) and e.filters)
+    on = [acts(c)[:, 0] for _, c in filters]
+    lanes = np.flatnonzero(np.any(on, axis=0)) if filters else np.empty(0, dtype=np.intp)
+    if lanes.size:
+        yield lanes, tuple((e, c[:, lanes]) for e, c in filters)
+
+
 def _at(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
     """Values (L, T) at instants (L, T)."""
     place = instants / step
     nearest = np.rint(place)
-    if (np.abs(place - nearest) < EXACT).all():
+    near = np.abs(place - nearest) < EXACT
+    if near.all():
         chosen: Array = np.take_along_axis(values, nearest.astype(np.intp), axis=1)
         return chosen
+    # What is at the end of a step shows it to the bit, whatever instants other lanes ask for.
+    place = np.where(near, nearest, place)
     last = values.shape[1] - 2
-    below = np.clip(np.floor(place + EXACT), 0, max(last, 0)).astype(np.intp)
+    below = np.clip(np.floor(place), 0, max(last, 0)).astype(np.intp)
     s = place - below
     a = np.take_along_axis(values, below, axis=1)
     b = np.take_along_axis(values, below + 1, axis=1)

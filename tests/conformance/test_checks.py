@@ -353,7 +353,62 @@ class Elsewhere(Breeze):
     asked = False
 
 
+def of_robot(moment):
+    """Whether a force is asked for at a joint of a robot: elsewhere these effects are sound."""
+    return hasattr(moment, "carried")
+
+
+class Unitless(Breeze):
+    name = "breeze.unitless"
+    coefficients = (
+        Coefficient("coefficient", ("m/s^2", "N", ""), ((-1, 2), (-1, 2), (-0.1, 0.2))),
+    )
+
+    @classmethod
+    def misses(cls, system):
+        return "" if system.kind == "linear" else "it slides alone"
+
+
+class NeverOffAtAJoint(Breeze):
+    name = "breeze.never_off_at_a_joint"
+
+    def force(self, c, moment):
+        return c[0] + 1e-9 * of_robot(moment) + 0.0 * moment.x
+
+
+class NeverOnAtAJoint(Breeze):
+    name = "breeze.never_on_at_a_joint"
+
+    def force(self, c, moment):
+        return c[0] * (not of_robot(moment)) + 0.0 * moment.x
+
+
+class GrowsWithItsNumber(Breeze):
+    name = "breeze.grows_with_its_number"
+    made = 0
+
+    def __init__(self):
+        GrowsWithItsNumber.made += 1
+        self.number = GrowsWithItsNumber.made
+
+    def force(self, c, moment):
+        return c[0] * (1.0 + self.number * of_robot(moment)) + 0.0 * moment.x
+
+
+class MixesInARobot(Breeze):
+    name = "breeze.mixes_in_a_robot"
+
+    def force(self, c, moment):
+        mean = c[0].mean() * (c[0] != 0)
+        return (mean if of_robot(moment) else c[0]) + 0.0 * moment.x
+
+
 BROKEN_EFFECTS = {
+    "check_places_are_declared": Unitless,
+    "check_nothing_at_zero_at_a_place": NeverOffAtAJoint,
+    "check_it_acts_at_its_place_alone": NeverOnAtAJoint,
+    "check_family_is_the_sum_of_its_members": GrowsWithItsNumber,
+    "check_lanes_of_a_robot_are_independent": MixesInARobot,
     "check_declaration_is_complete": Nameless,
     "check_contribution_is_nothing_at_zero": NeverOff,
     "check_it_shows_and_stays_finite": NeverOn,

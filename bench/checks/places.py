@@ -1,0 +1,204 @@
+"""Conformance of an effect at the places of a robot; each check takes the effect's class and runs
+it on the arm of `bench.checks.arm` wherever it can act there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from bench.checks.arm import OBSERVED, arm, placed, scenario
+from bench.checks.base import CheckError, NotApplicable, require, same_bits
+from sims.base import Array, InputError
+from sims.system import Effect, Force, Friction, Sensor, Value
+
+NOWHERE = NotApplicable("a robot has no place for it")
+_SHARES = (0.3, 0.9)
+"""Of a plausible range: coefficients of the lanes."""
+
+
+def check_places_are_declared(effect: type[Effect]) -> NotApplicable | None:
+    """At each place it has a name, and for each coefficient a unit and a finite range; a place that
+    does not exist is refused with those that do.
+    """
+    classes = placed(effect)
+    for one in classes:
+        look = f"{effect.__name__} at {one.place or 'the world'}"
+        named = f"{effect.name}@{one.place}" if one.place else effect.name
+        require(one.name == named, f"name {named}", one.name, look)
+        for c in one.coefficients:
+            finite = all(np.isfinite(ends).all() and ends[0] < ends[1] for ends in c.plausible)
+            require(finite, f"a finite range for {c.name}", c.plausible, look)
+            require(all(c.units), f"a unit for {c.name} ('1' for a number)", c.units, look)
+    if not classes:
+        return NOWHERE
+    places = [one.place for one in classes if one.place]
+    if places:
+        _refuses(effect, places)
+    return None
+
+
+def _refuses(effect: type[Effect], places: Sequence[str]) -> None:
+    try:
+        arm(effect).system.effect(f"{effect.name}@nowhere")
+    except InputError as error:
+        listed = all(place in str(error) for place in places)
+        require(listed, f"a message that lists {', '.join(places)}", error, effect.__name__)
+        return
+    raise CheckError(f"expected place nowhere to be refused; found it is not; see {effect.name}")
+
+
+def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | None:
+    """At each place a coefficient of zero adds no force, changes no number of the model and nothing
+    of the motion, bit for bit, whatever the lanes beside it do.
+    """
+    classes = placed(effect)
+    kind = arm(effect)
+    for one in classes:
+        look = f"{effect.__name__} at {one.place or 'the world'}"
+        c = np.zeros((len(one.coefficients), 2, 1))
+        for part, own in one().parts(c):
+            none = _acts_on(part, own, kind) == ()
+            require(none, "no contribution at zero", "one", look)
+        lanes = np.concatenate([_theta(one, 0.0), _theta(one, 0.7)])
+        seen = kind(observe=OBSERVED, effects=[one]).simulate(lanes, scenario())
+        plain = kind(observe=OBSERVED).simulate(np.empty((1, 0)), scenario())
+        require(same_bits(seen[:1] + 0.0, plain + 0.0), "the plain motion at zero", "other", look)
+    return None if classes else NOWHERE
+
+
+def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | None:
+    """Inside its plausible range it changes the motion or what is seen, well above the middle
+    nothing becomes NaN, and it touches what is at its place alone.
+    """
+    classes = placed(effect)
+    kind = arm(effect)
+    touched = {}
+    for one in classes:
+        look = f"{effect.__name__} at {one.place or 'the world'}"
+        thetas = np.concatenate([_theta(one, share) for share in (0.05, *_SHARES)])
+        seen = kind(observe=OBSERVED, effects=[one]).simulate(thetas, scenario())
+        plain = kind(observe=OBSERVED).simulate(np.empty((1, 0)), scenario())
+        # At the low end a force may pull a joint away for good.
+        require(bool(np.isfinite(seen[-1]).all()), "finite observations", "others", look)
+        shown = one.signal in ("", *OBSERVED) or not issubclass(one, Sensor)
+        require(bool((seen != plain).any()) == shown, "a change where it is seen", "none", look)
+        if issubclass(one, Sensor) and one.signal in OBSERVED:
+            others = [i for i, name in enumerate(OBSERVED) if name != one.signal]
+            same = bool((seen[:, :, others] == plain[:, :, others]).all())
+            require(same, "other channels left alone", "changes", look)
+        for part, own in one().parts(np.ones((len(one.coefficients), 2, 1))):
+            touched[part.name] = _acts_on(part, own, kind)
+    apart = len({ends for ends in touched.values() if ends}) == sum(map(bool, touched.values()))
+    require(apart, "each place to be touched by one alone", touched, effect.__name__)
+    return None if classes else NOWHERE
+
+
+def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicable | None:
+    """All members with coefficients of their own move as the family with the same, bit for bit."""
+    kind = arm(effect)
+    families = [one for one in placed(effect) if hasattr(one, "members")]
+    for whole in families:
+        members = [type(member) for member in whole.members]  # type: ignore[attr-defined]
+        one = kind(observe=OBSERVED, effects=[whole])
+        several = kind(observe=OBSERVED, effects=members)
+        # A family of one number has it at every place.
+        shared = len(one.parameters) < len(several.parameters)
+        theta = _theta(whole, 0.3)
+        each = np.tile(theta, len(members)) if shared else theta
+        require(
+            same_bits(one.simulate(theta, scenario()), several.simulate(each, scenario())),
+            "the motion of all members together",
+            "another",
+            whole.name,
+        )
+    return None if families else NotApplicable("it has no family")
+
+
+def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicable | None:
+    """A lane's observation does not hang on the lanes beside it, nor on their order, bit for bit,
+    wherever the effect acts in each of them.
+    """
+    classes = placed(effect)
+    simulator = arm(effect)(observe=OBSERVED, effects=classes)
+    rows = [np.zeros((1, len(simulator.parameters)))]
+    begin = 0
+    for one in classes:
+        end = begin + len(one.coefficients)
+        for share in _SHARES:
+            row = rows[0].copy()
+            row[:, begin:end] = _theta(one, share)
+            rows.append(row)
+        begin = end
+    lanes = np.concatenate(rows)
+    together = simulator.simulate(lanes, scenario())
+    alone = np.concatenate([simulator.simulate(row, scenario()) for row in rows])
+    turned = simulator.simulate(lanes[::-1], scenario())[::-1]
+    same = same_bits(together, alone) and same_bits(together, np.ascontiguousarray(turned))
+    require(same, "the same bits alone, among others and in any order", "others", effect.__name__)
+    return None if classes else NOWHERE
+
+
+def _theta(effect: type[Effect], share: float) -> Array:
+    """(1, K) coefficients at a share of the plausible ranges; zero for none."""
+    ends = np.array([c.plausible[0] for c in effect.coefficients])
+    return (ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))[None] * (share != 0.0)
+
+
+def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
+    """What an effect at one place touches with coefficients (K, 2, 1): fields of the model with
+    their places, coordinates that it pushes, the signal that it changes; nothing where it leaves
+    all as it is.
+    """
+    from sims.robot.native import FIELDS
+
+    if effect.of in FIELDS and isinstance(effect, Value | Force | Friction):
+        return _written(effect, c, kind)
+    if isinstance(effect, Force | Friction):
+        return _pushed(effect, c, kind)
+    return (effect.signal,) if c.any() else ()
+
+
+def _written(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
+    """Model fields that it changes, each with the places of the numbers in it."""
+    from sims.robot.native import FIELDS
+
+    robot, native = kind.robot, FIELDS[effect.of]  # type: ignore[attr-defined]
+    fields, changes = {}, []
+    for name in native.fields:
+        owner, _, field = name.rpartition(".")
+        stated = getattr(robot.compiled.opt if owner else robot.compiled, field)
+        fields[name] = np.repeat(np.array(stated)[None], 2, axis=0)
+    before = {name: values.copy() for name, values in fields.items()}
+    native.write(fields, robot, effect.place, c[:, :, 0])
+    for name, values in fields.items():
+        places = np.nonzero(values != before[name])[1]
+        changes += [(name, int(place)) for place in np.unique(places)]
+    # Of numbers that lie by place, all at one; those of the world lie by axis.
+    if effect.place and len({place for _, place in changes}) > 1:
+        raise CheckError(f"expected one place; found {changes}; see {effect.name}")
+    return tuple(changes)
+
+
+def _pushed(effect: Force | Friction, c: Array, kind: type) -> tuple[object, ...]:
+    """Coordinates along which it pushes or rubs."""
+    from sims.robot.forces import moment_of
+
+    system = kind.system()  # type: ignore[attr-defined]
+    x = np.array([[0.3, -0.4], [0.8, 0.2]])
+    inputs = {c.name: np.full((2, 1), 0.3) for c in system.inputs}
+    moment = moment_of(system, np.full((2, 1), 0.4), x, 1.0 - x, inputs, 0.5 + x)
+    if isinstance(effect, Friction):
+        return (effect.coordinate,) if np.any(effect.limit(c, moment)) else ()
+    force = effect.force(c, moment)
+    return tuple(int(joint) for joint in np.unique(np.nonzero(force)[1]))
+
+
+PLACE_CHECKS: tuple[Callable[[type[Effect]], NotApplicable | None], ...] = (
+    check_places_are_declared,
+    check_nothing_at_zero_at_a_place,
+    check_it_acts_at_its_place_alone,
+    check_family_is_the_sum_of_its_members,
+    check_lanes_of_a_robot_are_independent,
+)
