@@ -100,7 +100,7 @@ def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicabl
     kind = arm(effect)
     families = [one for one in placed(effect) if hasattr(one, "members")]
     for whole in families:
-        members = [type(member) for member in whole.members]  # type: ignore[attr-defined]
+        members = [type(member) for member in whole.members]
         one = kind(observe=OBSERVED, effects=[whole])
         several = kind(observe=OBSERVED, effects=members)
         # A family of one number has it at every place.
@@ -143,7 +143,8 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
 def _theta(effect: type[Effect], share: float) -> Array:
     """(1, K) coefficients at a share of the plausible ranges; zero for none."""
     ends = np.array([c.plausible[0] for c in effect.coefficients])
-    return (ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))[None] * (share != 0.0)
+    theta: Array = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    return theta[None] * (share != 0.0)
 
 
 def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
