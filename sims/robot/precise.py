@@ -12,7 +12,7 @@ import numpy as np
 DIGITS = 17
 """With which every number is read as what it was."""
 
-_TEXTS = ("name", "path", "text", "names_map", "signature", "tex_data")
+_TEXTS = ("name", "path", "text", "signature", "tex_data", "nbuffer")
 """Parts of the names of fields that say nothing of motion."""
 
 

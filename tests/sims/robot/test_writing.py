@@ -259,3 +259,60 @@ def test_a_delay_is_that_of_the_simulator(tmp_path: Path) -> None:
     place = [channel.name for channel in simulator.channels].index("q.elbow")
     np.testing.assert_allclose(shown[:-1, place], elbow, rtol=0, atol=1e-9)
     assert np.ptp(elbow) > 0.1
+
+
+NAMELESS = """<mujoco>
+  <worldbody>
+    <body>
+      <joint name="hip" axis="0 1 0"/>
+      <geom size="0.05" pos="0.3 0 0"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="hip" gear="3" ctrllimited="true" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_an_actuator_without_a_name_keeps_none(tmp_path: Path) -> None:
+    """What is called after its joint where it is read stays as it is in the file."""
+    path = tmp_path / "leg.xml"
+    path.write_text(NAMELESS)
+    arm = read(path)
+    causes: Causes = {f"input.lag@{arm.actuators[0].name}": {"coefficient": number(0.05, "s")}}
+    done = written(arm, causes)
+    check(arm, causes, done)
+    assert done.xml is not None
+    (line,) = done.said
+    assert line.startswith("input.lag")
+    (actuator,) = [line for line in done.xml.splitlines() if "<general" in line]
+    assert 'dyntype="filterexact" dynprm="0.05"' in actuator
+    assert "name=" not in actuator
+    assert 'gear="3" ctrllimited="true" ctrlrange="-1 1"' in actuator
+
+
+def test_a_lag_settled_at_its_first_command_is_that_of_the_simulator(tmp_path: Path) -> None:
+    """Where MuJoCo's filter begins at the first command, the motion is nearly the simulator's."""
+    from sims.base import Scenario
+    from sims.robot.simulator import robot_simulator
+
+    arm = robot(tmp_path)
+    times = np.linspace(0.0, 0.5, 501)
+    command = 0.3 + np.sin(9.0 * times)
+    simulator = robot_simulator(arm)(effects=["input.lag@m_elbow"])
+    scenario = Scenario(times=times, inputs={"u.m_elbow": command})
+    shown, direct = simulator.simulate_lanes(np.array([[0.05], [0.0]]), [scenario] * 2)
+    done = written(arm, {"input.lag@m_elbow": {"coefficient": number(0.05, "s")}})
+    assert done.xml is not None
+    model = mujoco.MjModel.from_xml_string(done.xml)
+    data = mujoco.MjData(model)
+    data.act[:] = command[0]
+    for u in command[:-1]:
+        data.ctrl[1] = u
+        mujoco.mj_step(model, data)
+    place = [channel.name for channel in simulator.channels].index("q.elbow")
+    # The simulator gives the mean over each step, MuJoCo what is there when it begins: half a step.
+    effect = abs(shown[-1, place] - direct[-1, place])
+    assert effect > 0.1
+    assert abs(data.qpos[1] - shown[-1, place]) < 0.02 * effect
