@@ -9,8 +9,11 @@ from difflib import SequenceMatcher
 from bench.gap.report.story import Change
 
 ALIKE = 0.5
-"""Share of lines that stay: where less does, the file was written anew, and has no lines before."""
+"""Share of elements that stay: where fewer do, the file was written anew, with no lines before."""
+FITTED = ", fitted to "
+"""What a comment says that names a cause."""
 _COMMENT = re.compile(r"<!--\s*(.*?)\s*-->")
+_PART = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 _HEAD = re.compile(r"<(\w+)")
 _NAME = re.compile(r"\bname\s*=\s*[\"']([^\"']*)")
 
@@ -23,7 +26,7 @@ def changes(before: str, after: str) -> tuple[Change, ...]:
         before: text of the file; empty where there is none of the same form.
         after: text of the extended one, in which a comment stands above what it changes.
     """
-    old, new = _lines(before), _lines(after)
+    old, new = _elements(before), _elements(after)
     matcher = SequenceMatcher(None, old, new, autojunk=False)
     if matcher.ratio() < ALIKE:
         return tuple(_commented(new))
@@ -34,8 +37,9 @@ def changes(before: str, after: str) -> tuple[Change, ...]:
     return tuple(found)
 
 
-def _lines(text: str) -> list[str]:
-    return [line.strip() for line in text.splitlines() if line.strip()]
+def _elements(text: str) -> list[str]:
+    """Tags and comments, one each, however they lie on lines."""
+    return [" ".join(part.split()) for part in _PART.findall(text)]
 
 
 def _block(old: Sequence[str], new: Sequence[str]) -> Iterator[Change]:
@@ -55,8 +59,7 @@ def _block(old: Sequence[str], new: Sequence[str]) -> Iterator[Change]:
 def _commented(lines: Sequence[str]) -> Iterator[Change]:
     """The elements with a comment, of a file that was written anew."""
     for line, comment in _with_comments(lines):
-        # A comment on the whole file says nothing of the element below it.
-        if "@" in comment or "fitted to" in comment:
+        if comment:
             yield Change(_element(line), "", line, comment)
 
 
@@ -65,7 +68,8 @@ def _with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
     above: list[str] = []
     for line in lines:
         if match := _COMMENT.fullmatch(line):
-            above.append(match[1])
+            # A comment on the whole file says nothing of the element below it.
+            above += [match[1]] if FITTED in match[1] else []
             continue
         yield line, "; ".join(above)
         above = []

@@ -229,13 +229,17 @@ def _one_scale(
 
 
 def _joints_of_marks(story: Story) -> set[str]:
-    """Joints of the channels and actuators that the verdict names."""
+    """Joints of the channels, actuators and bodies that the verdict names."""
+    robot = story.robot
     found = set()
     for mark in marks(story):
         if mark.kind == "channel":
             found |= {mark.name.partition(".")[2]}
-        if mark.kind == "actuator" and story.robot is not None:
-            found |= {a.joint or "" for a in story.robot.actuators if a.name == mark.name}
+        if mark.kind == "actuator" and robot is not None:
+            found |= {a.joint or "" for a in robot.actuators if a.name == mark.name}
+        if mark.kind == "body" and robot is not None:
+            of = {body.id for body in robot.bodies if body.name == mark.name}
+            found |= {j.name for j in robot.joints if int(robot.compiled.jnt_bodyid[j.id]) in of}
     return found
 
 

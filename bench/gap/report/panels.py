@@ -244,7 +244,7 @@ def scores_panel(axis: Axes, story: Story, shown: Sequence[Candidate]) -> None:
     # The number behind the longest bar needs room; without any evidence there is an axis still.
     every = [c.score for entry in entries(story) for c in entry.elsewhere if entry.best in shown]
     longest = max(*sizes, *every, 1e-9)
-    axis.set_xlim(0, 1.35 * longest)
+    axis.set_xlim(0, (1.5 if placed else 1.35) * longest)
     axis.set_xlabel(
         "score: evidence that the simulation lacks it\n(twice the gain in log likelihood)"
     )

@@ -163,8 +163,7 @@ def _by_effect(story: Story) -> str:
     for entry in there[:MOST_CANDIDATES]:
         row, mark = _candidate(story, entry.best)
         others = [
-            f"{_elsewhere(c)} {number(c.score, 2) if c.score >= 1 else '<1'}"
-            for c in entry.elsewhere
+            f"{_elsewhere(c)} {number(c.score) if c.score >= 1 else '<1'}" for c in entry.elsewhere
         ]
         more = f" and {len(others) - MOST_ELSEWHERE} more" * (len(others) > MOST_ELSEWHERE)
         rows.append([*row, safe(", ".join(others[:MOST_ELSEWHERE]) + more)])

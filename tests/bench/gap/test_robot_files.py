@@ -7,8 +7,8 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from bench.figures import robot as drawing
 from bench.gap.explanation import Explanation
+from bench.gap.report import pictures
 from bench.gap.robot_files import RobotFiles, causes_of, robot_files
 from bench.gap.score_model import scored
 from bench.registry import robot
@@ -52,7 +52,7 @@ def test_it_is_written_with_the_rest(arm, tmp_path):
 
 
 def test_the_report_shows_the_lines_to_change(arm, tmp_path, monkeypatch):
-    monkeypatch.setattr(drawing, "rendered", lambda *_: None)
+    monkeypatch.setattr(pictures, "printed", lambda _: {})
     shown = replace(story(), robot=arm.robot)
     explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))
     html = (explanation.write(tmp_path)[0].parent / "report.html").read_text()

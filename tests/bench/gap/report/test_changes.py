@@ -46,6 +46,12 @@ def test_each_changed_line_stands_with_what_it_was_and_why():
     assert elbow.comment.count("fitted to") == 2
 
 
+def test_it_does_not_matter_how_elements_lie_on_lines():
+    flat = " ".join(BEFORE.split("\n"))
+    spread = BEFORE.replace(" damping", "\n             damping")
+    assert changes(flat, AFTER) == changes(spread, AFTER) == changes(BEFORE, AFTER)
+
+
 def test_the_same_file_has_no_changes():
     assert changes(BEFORE, BEFORE) == ()
 

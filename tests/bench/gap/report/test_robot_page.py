@@ -13,7 +13,15 @@ from bench.gap.report.pictures import figure, names, pose
 from bench.gap.report.shots import worst
 from tests.bench.figures.robots import ARM6
 from tests.bench.gap.report.test_page import PIXEL, Reader
-from tests.bench.gap.robot_stories import CHANGE, EVERYWHERE, WRISTS, robot_story
+from tests.bench.gap.robot_stories import (
+    CHANGE,
+    EVERYWHERE,
+    HEAVY,
+    WRISTS,
+    cause,
+    number,
+    robot_story,
+)
 from tests.bench.gap.stories import EVIL, story
 
 ALL = ("robot", "overview", "where", "candidates")
@@ -64,14 +72,16 @@ def test_rows_are_on_one_scale_and_say_how_large_the_residual_is(overview):
     assert after == pytest.approx([1.0] * 6, abs=0.15)
 
 
+def blue(drawn):
+    texts = [text for axis in drawn.axes[::3] for text in axis.texts]
+    return [t.get_text() for t in texts if t.get_text() in ARM6 and t.get_color() == "#0072B2"]
+
+
 def test_the_joint_that_the_verdict_names_stands_out(overview):
-    colours = {
-        text.get_text(): text.get_color()
-        for axis in overview.axes[::3]
-        for text in axis.texts
-        if text.get_text() in ARM6
-    }
-    assert [name for name, colour in colours.items() if colour == "#0072B2"] == ["elbow"]
+    assert blue(overview) == ["elbow"]
+    late = cause("input.delay@m_wrist_2", {"coefficient": number(0.05, "s")})
+    drawn = figure(robot_story(causes=[HEAVY, late]), "overview")
+    assert blue(drawn) == ["elbow", "wrist_2"]
 
 
 def test_of_very_many_joints_the_worst_are_shown(monkeypatch):
