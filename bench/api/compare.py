@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING
 
 from bench import study
 from bench.figures import comparison
+from bench.problem.asked import asked
 from bench.problem.experiment import Experiment, load
 from bench.problem.problem import Problem
+from bench.problem.robots import completed
 from bench.registry import tuners as registered
 from bench.report import tables
 from bench.runs.runner import Progress
@@ -38,8 +40,11 @@ _ROWS = 200
 
 
 def compare(
-    experiment: str | Path | Experiment,
+    experiment: str | Path | Experiment | None = None,
     *,
+    model: str | Path | None = None,
+    recording: str | Path | None = None,
+    free: Sequence[str] = (),
     tuners: Sequence[str | type[Tuner]] | None = None,
     targets: int | None = None,
     seeds: int | None = None,
@@ -60,7 +65,10 @@ def compare(
     """Run an experiment: tuners x targets x seeds; returns its tables and figures.
 
     Args:
-        experiment: its name, the path of its TOML file, or itself.
+        experiment: its name, the path of its TOML file, or itself; none where a robot is tuned:
+        model: its model file, MJCF or URDF.
+        recording: a recording of it; without one it is tuned to simulations of its own.
+        free: numbers of the model file to tune, as ``damping@*`` or ``mass@forearm``.
         tuners: only these: labels, registered names, and classes, which are registered.
         targets: in each range.
         seeds: of each tuner that uses chance.
@@ -88,7 +96,7 @@ def compare(
     """
     files = [str(Path(plugin).resolve()) for plugin in plugins]
     chosen = choose(
-        given(experiment, files, trust or not jobs, isolation),
+        given(wanted(experiment, model, recording, free), files, trust or not jobs, isolation),
         None if tuners is None else [_label(tuner) for tuner in tuners],
         seeds,
         targets=targets,
@@ -143,6 +151,34 @@ def sweep(
     return [_made(one, jobs, progress, None) for one in begun]
 
 
+def wanted(
+    experiment: str | Path | Experiment | None,
+    model: str | Path | None = None,
+    recording: str | Path | None = None,
+    free: Sequence[str] = (),
+) -> str | Path | Experiment:
+    """The experiment that is named, or the one that a model file and a recording stand for.
+
+    Raises:
+        InputError: neither or both.
+    """
+    parts = {"model": model, "recording": recording, "free": free}
+    there = [name for name, value in parts.items() if value]
+    if experiment is not None:
+        if there:
+            raise InputError(
+                f"experiment {experiment} says what it tunes: leave out {', '.join(there)}, or "
+                "leave out the experiment"
+            )
+        return experiment
+    if not there:
+        raise InputError(
+            "expected an experiment (see `simgap list experiments`), or --resume DIR, or a robot: "
+            "--model FILE --free A,B"
+        )
+    return asked(model, recording, free)
+
+
 def given(
     experiment: str | Path | Experiment,
     plugins: Sequence[str | Path],
@@ -157,7 +193,8 @@ def given(
     whole = experiment if isinstance(experiment, Experiment) else load(str(experiment))
     whole = whole.chosen(trusted=whole.trusted or trust, isolation=isolation)
     admit([str(Path(plugin).resolve()) for plugin in plugins], whole)
-    return whole
+    # Whatever is left to the robot's usual commands stands in the folder of results.
+    return completed(whole)
 
 
 def _cluster(address: str | None) -> Pool | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from bench.recordings.inspection import load
 from bench.recordings.simulate import Coefficients, SimulatedRecording, Wish, make
@@ -11,8 +12,10 @@ from sims.recording.recording import Recording
 
 
 def simulate(
-    system: str,
+    system: str = "",
     *,
+    model: str | Path | None = None,
+    actuators: Mapping[str, Any] | None = None,
     parameters: Mapping[str, float] | Sequence[float] | None = None,
     effects: Mapping[str, Coefficients] | None = None,
     constants: Mapping[str, float] | None = None,
@@ -31,7 +34,9 @@ def simulate(
     """Simulate a recording whose truth is known; nothing is written before `write` is called.
 
     Args:
-        system: registered name of a simulator, e.g. ``pendulum``.
+        system: registered name of a simulator, e.g. ``pendulum``; empty where there is a model.
+        model: a robot's model file, MJCF or URDF.
+        actuators: that the model file lacks, by name, as in a recording's ``[actuators.NAME]``.
         parameters: other than their nominal values, by name; or all of them in order.
         effects: that act, with a coefficient, several in order, or some by name.
         constants: other than the system's defaults.
@@ -53,6 +58,8 @@ def simulate(
     return make(
         Wish(
             system,
+            model=model,
+            actuators=actuators or {},
             parameters={} if parameters is None else parameters,
             effects=effects or {},
             constants=constants or {},

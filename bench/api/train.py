@@ -11,6 +11,7 @@ from pathlib import Path
 from bench.figures.training import draw
 from bench.problem.experiment import Entry, Experiment, load, names
 from bench.problem.problem import Problem
+from bench.problem.robots import completed
 from bench.registry import simulators, tuners
 from bench.runs.housing import tuned_of
 from bench.runs.runner import Progress
@@ -49,12 +50,16 @@ def choose(
     Raises:
         InputError: they do not go together, or the tuner does not learn.
     """
-    if not plugins:
+    # A robot's simulator is registered nowhere: its experiment alone knows it.
+    robotic = experiment is not None and load(experiment).model
+    if not plugins and not robotic:
         simulators.get(simulator)
     chosen = load(experiment or _only(simulator)).chosen(training_budget=budget)
     chosen = chosen.chosen(trusted=trust or chosen.trusted)
     admit([str(Path(plugin).resolve()) for plugin in plugins], chosen)
-    simulators.get(simulator)
+    chosen = completed(chosen)
+    if not chosen.model:
+        simulators.get(simulator)
     if chosen.simulator != simulator:
         raise InputError(
             f"experiment {chosen.name}: its simulator is {chosen.simulator}, not {simulator}"

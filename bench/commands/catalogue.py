@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from bench.problem import experiment
+from bench.problem.robots import missing
 from bench.registry import SkippedError, simulators, tuners
 from sims import effects
 from sims.base import Channel, Simulator
@@ -28,7 +29,13 @@ def lines(what: str) -> list[str]:
 def _experiments() -> list[str]:
     """Every experiment that comes with the project: its sentence, then its tags."""
     loaded = [experiment.load(name) for name in experiment.names()]
-    return [f"{each.name:22} {each.says} [{', '.join(each.tags)}]" for each in loaded]
+    return [f"{each.name:22} {_says(each)} [{', '.join(each.tags)}]" for each in loaded]
+
+
+def _says(each: experiment.Experiment) -> str:
+    """Its sentence, and why it cannot be used here, where a robot's file is missing."""
+    reason = missing(each)
+    return f"skipped: {reason}. {each.says}" if reason else each.says
 
 
 def _systems() -> list[str]:

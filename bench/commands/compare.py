@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from bench.commands.interrupts import INTERRUPTED
 from bench.commands.options import (
     add_force,
+    add_model,
     add_plugin,
     add_trust,
     names,
@@ -40,6 +41,18 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
         metavar="EXPERIMENT",
         nargs="?",
         help="name (see `simgap list experiments`) or TOML file",
+    )
+    add_model(compare, "tune this robot in place of an experiment: an MJCF or URDF")
+    compare.add_argument(
+        "--recording",
+        metavar="FILE.csv",
+        type=place,
+        help="tune it to this recording (default: to simulations of its own)",
+    )
+    compare.add_argument(
+        "--free",
+        metavar="A,B,...",
+        help="numbers of its model file to tune, as damping@* or mass@forearm",
     )
     compare.add_argument(
         "--tuners", metavar="A,B,...", help="only these tuners, by label or registered name"
@@ -149,13 +162,11 @@ def add_plot(plot: argparse.ArgumentParser) -> None:
 
 def _chosen(options: argparse.Namespace) -> Experiment:
     """The experiment that the options of `compare` describe."""
-    from bench.api.compare import choose, given
-    from sims.base import InputError
+    from bench.api.compare import choose, given, wanted
 
-    if options.experiment is None:
-        raise InputError("expected an experiment (see `simgap list experiments`), or --resume DIR")
     trust = options.trust or not options.jobs
-    experiment = given(options.experiment, options.plugin, trust, options.isolation)
+    asked = wanted(options.experiment, options.model, options.recording, names(options.free or ""))
+    experiment = given(asked, options.plugin, trust, options.isolation)
     labels = names(options.tuners) if options.tuners else None
     changes = {name: getattr(options, name) for name in _CHANGES}
     return choose(experiment, labels, options.seeds, **changes)
@@ -169,7 +180,8 @@ def _refuse_beside_resume(options: argparse.Namespace) -> None:
     """
     from sims.base import InputError
 
-    described = ("experiment", "tuners", "seeds", "out", "salt", "isolation", *_CHANGES)
+    robot = ("model", "recording", "free")
+    described = ("experiment", *robot, "tuners", "seeds", "out", "salt", "isolation", *_CHANGES)
     given = [name for name in described if getattr(options, name) is not None]
     given += ["trust"] if options.trust else []
     if given:

@@ -20,13 +20,16 @@ def add_plugin(parser: argparse.ArgumentParser, more: str) -> None:
     )
 
 
-def add_model(parser: argparse.ArgumentParser) -> None:
-    """The option ``--model FILE``."""
+def add_model(
+    parser: argparse.ArgumentParser,
+    text: str = "take it for this robot, whatever the .toml says: an MJCF or URDF",
+) -> None:
+    """The option ``--model FILE``; `text` says what it is for."""
     parser.add_argument(
         "--model",
         type=place,
         metavar="FILE",
-        help="take it for this robot, whatever the .toml says: an MJCF or URDF",
+        help=text,
     )
 
 

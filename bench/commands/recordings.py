@@ -10,7 +10,10 @@ from bench.commands.options import add_force, add_model, add_plugin, names, plac
 
 def add_simulate(simulate: argparse.ArgumentParser) -> None:
     """The options of `simgap simulate`."""
-    simulate.add_argument("system", metavar="SYSTEM", help="see `simgap list systems`")
+    simulate.add_argument(
+        "system", metavar="SYSTEM", nargs="?", default="", help="see `simgap list systems`"
+    )
+    add_model(simulate, "simulate this robot in place of a system: an MJCF or URDF")
     for name, metavar, text in (
         (
             "theta",
@@ -23,7 +26,8 @@ def add_simulate(simulate: argparse.ArgumentParser) -> None:
         (
             "input",
             "NAME=SIGNAL",
-            "a number, sine:AMPLITUDE:HERTZ, square:A:HZ, steps:A:SECONDS, chirp:A:HZ:HZ",
+            "a number, sine:AMPLITUDE:HERTZ, square:A:HZ, steps:A:SECONDS, chirp:A:HZ:HZ, "
+            "multisine:A:HZ:HZ; several are added with ' + ' between",
         ),
         ("initial", "NAME=VALUE", "initial states, or NAME=LOW:HIGH to draw each run's"),
     ):
@@ -85,6 +89,7 @@ def _simulate(options: argparse.Namespace) -> int:
     ready(options.out)
     simulated = simulate(
         options.system,
+        model=options.model,
         observe=names(options.observe or ""),
         runs=options.runs,
         seconds=options.seconds,
@@ -115,16 +120,17 @@ def _simulate(options: argparse.Namespace) -> int:
 
 def _inspect(options: argparse.Namespace) -> int:
     from bench.figures.recording import draw
+    from bench.recordings import robotic
     from bench.recordings.inspection import load, summary
     from bench.recordings.stamps import oddities
     from bench.registry import load_plugins
 
     load_plugins(options.plugin)
     recording, kind = load(options.recording, options.system, options.model)
-    for line in summary(recording, kind):
+    for line in (*robotic.about(kind), *summary(recording, kind)):
         print(line)
-    for odd in oddities(recording, kind):
-        print(f"odd: {odd.text}")
+    for text in (*(o.text for o in oddities(recording, kind)), *robotic.odd(recording, kind)):
+        print(f"odd: {text}")
     for path in draw(
         recording,
         kind,

@@ -34,7 +34,11 @@ _CEILING = 1e4
 """1 sigma in training widths above which a figure shows no difference."""
 _LEAST_SHARE = 0.05
 """Share of a parameter in a direction below which it is not written."""
-_WHERE = {"in": "truth in training range", "wide": "truth in bounds"}
+_WHERE = {
+    "in": "truth in training range",
+    "wide": "truth in bounds",
+    "real": "recording, at nominal values",
+}
 _MARKS = (("o", BLUE), ("^", VERMILION))
 """Of the ranges, in their order."""
 _ROWS = {
@@ -59,8 +63,10 @@ def spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
     _spectra(axes[0, 0], table, len(names))
     _directions(axes[0, 1], table, names)
     figure.suptitle(f"{experiment.title or experiment.name}: what the data can know", fontsize=11)
+    real = set(table["range"]) == {"real"}
+    where = "the nominal parameters" if real else "each target's truth"
     caption = (
-        "From the Fisher information at each target's truth (Cramér–Rao bound). "
+        f"From the Fisher information at {where} (Cramér–Rao bound). "
         f"Stiff: 1 sigma below {STIFF:g} of the training width (dashed). "
         "Right: mean over targets of the squared component."
     )
@@ -86,7 +92,7 @@ def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
             markersize=3.5,
             alpha=0.75,
             linestyle="none",
-            label=f"{_WHERE.get(kind, kind)} (n = {targets})",
+            label=_WHERE.get(kind, kind) + ("" if kind == "real" else f" (n = {targets})"),
         )
     axis.axhline(STIFF, color=SOFT, linewidth=0.8, linestyle="--")
     for name, above in (("sloppy", 3), ("stiff", -9)):

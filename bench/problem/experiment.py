@@ -8,6 +8,7 @@ a run stores.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
@@ -94,7 +95,12 @@ class Experiment:
         title: heading of figures.
         says: a sentence on what it is.
         tags: words by which a list is searched, e.g. ``quick``; they change nothing.
-        simulator: registered name.
+        simulator: registered name; of a robot what tables call it, its file's name where empty.
+        model: a robot's model file (MJCF or URDF) in place of a registered simulator: relative to
+            the experiment's file, to the folder in $SIMGAP_ROBOTS or to the working directory, or
+            in an installed package as ``package://NAME/FILE``.
+        free: numbers of the model file to tune, as ``damping@*`` or ``mass@forearm``.
+        actuators: that the model file lacks, as in a recording's ``[actuators.NAME]``.
         observe: channels the tuner sees; all where empty.
         error_channel: the channel in which `obs_error` and `heldout_error` are reported; the first
             where empty.
@@ -145,6 +151,9 @@ class Experiment:
     says: str = ""
     tags: tuple[str, ...] = ()
     simulator: str = ""
+    model: str = ""
+    free: tuple[str, ...] = ()
+    actuators: Mapping[str, Any] = field(default_factory=dict)
     observe: tuple[str, ...] = ()
     error_channel: str = ""
     ranges: tuple[str, ...] = ("in", "wide")
@@ -207,6 +216,9 @@ class Experiment:
         text(who, "title", self.title)
         text(who, "says", self.says, most=WORDS)
         text(who, "same_targets_as", self.same_targets_as)
+        text(who, "model", self.model, most=WORDS)
+        for word in self.free:
+            text(who, "free", word, most=NAME)
         text(who, "tags", ", ".join(self.tags), most=WORDS)
         for entry in self.tuners:
             text(who, "tuners: label", entry.label, most=NAME)
@@ -268,6 +280,19 @@ class Experiment:
         return replace(self, tuners=chosen)
 
 
+def plain_name(text: str) -> str:
+    """A name for tables, files and command lines."""
+    return re.sub(r"[^\w.+-]+", "_", text)[:60] or "robot"
+
+
+def model_beside(model: str, experiment: Path) -> str:
+    """The path of an experiment's model file, made absolute where it lies beside the experiment's
+    file, as that of a recording is.
+    """
+    file = experiment.parent / model
+    return str(file.resolve()) if file.is_file() else model
+
+
 def names() -> list[str]:
     """The experiments that come with the project."""
     folder = resources.files("bench.experiments")
@@ -307,8 +332,13 @@ def parse(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
     tuners = entries_of(path, document.get("tuners", {}))
     given = {key: value for key, value in document.items() if key != "tuners"}
     fields = entries(path, "", given, hints)
+    if model := fields.get("model"):
+        fields["model"] = model_beside(model, path)
+        fields.setdefault("simulator", plain_name(Path(model).stem))
+    elif fields.get("free") or fields.get("actuators"):
+        raise InputError(f'{path}: free and actuators are of a robot: expected model = "FILE"')
     if not fields.get("simulator"):
-        raise InputError(f'{path}: expected simulator = "NAME", found none')
+        raise InputError(f'{path}: expected simulator = "NAME" or model = "FILE", found none')
     # Known here only: neither a worker nor a folder of results knows where this file lay.
     if "recording" in fields:
         fields["recording"] = Source(beside(fields["recording"].path, path))

@@ -18,8 +18,8 @@ from bench.problem.experiment import Experiment
 from bench.problem.identifiability import Spectrum, spectrum
 from bench.problem.practice import Practice
 from bench.problem.recorded import Measured, measured
+from bench.problem.robots import completed, kind_of
 from bench.problem.targets import Target
-from bench.registry import simulators
 from methods.base import Scene
 from sims.base import Array, InputError, Scenario, Simulator, UnitCube, adjusted, unknown
 
@@ -52,11 +52,11 @@ class Problem:
             swept = ", ".join(experiment.sweep)
             remedy = "run those that bench.problem.experiment.expand gives"
             raise InputError(f"experiment {experiment.name}: sweeps over {swept}; {remedy}")
-        self.experiment = experiment
+        self.experiment = experiment = completed(experiment)
         self.simulated = 0
         self.salt = experiment.salt if salt is None else salt
 
-        kind = simulators.get(experiment.simulator)
+        kind = kind_of(experiment)
         observe = experiment.observe or tuple(c.name for c in kind.channels)
         self.simulator = self._simulator(kind, observe, experiment.settings)
         self.world = self.simulator
@@ -184,16 +184,21 @@ class Problem:
         return self.cube.dim > 1 and self.experiment.identifiability
 
     def spectrum(self, target: Target) -> Spectrum | None:
-        """What the target's data identify; None where the truth is unknown or nothing is asked."""
-        if target.truth is None or not self.identifiable:
+        """What the target's data identify, at its truth; of a recording, whose starts share one, at
+        the nominal parameters and with the first start. None where nothing is asked.
+        """
+        again = target.truth is None and target.sealed.name != f"{target.sealed.range}-000"
+        if again or not self.identifiable:
             return None
+        nominal = np.array([parameter.nominal for parameter in self.cube.parameters])
+        at = nominal if target.truth is None else target.truth
         scenarios = target.sealed.fitting.scenarios
 
         def simulate(theta: Array) -> Array:
             # Beside `self.simulate`: what is asked here is no part of any budget.
             return np.concatenate([self.simulator.simulate(theta, s) for s in scenarios], axis=1)
 
-        return spectrum(simulate, target.truth, self.cube.parameters, self.scale)
+        return spectrum(simulate, at, self.cube.parameters, self.scale)
 
     def outside(self, truth: Array) -> float:
         """How far `truth` (dim,) lies outside the training range: the largest distance, in

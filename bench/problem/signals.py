@@ -1,4 +1,6 @@
-"""Input signals by name, for recordings made by simulation: ``sine:2:0.5`` is 2 sin(2 pi 0.5 t)."""
+"""Input signals by name, for recordings made by simulation: ``sine:2:0.5`` is 2 sin(2 pi 0.5 t),
+and ``0.3 + sine:2:0.5`` about 0.3.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +17,10 @@ _TAU = 2 * np.pi
 _MOST_CHANGES = 1e8
 """Periods or levels of a signal beyond which its frequency is a slip of the pen."""
 
+_SINES = 6
+"""Of a multisine; their frequencies are even on a logarithmic axis."""
+_RISE = 0.5
+"""Of its longest period, until it has its full size."""
 _EDGE = 1e-9
 """Share of a step by which a sample may come early and still belong to the new level: times are
 rounded."""
@@ -67,12 +73,26 @@ def _chirp(
     return signal
 
 
+def _multisine(
+    t: Array, rng: np.random.Generator, amplitude: float, low: float, high: float
+) -> Array:
+    frequencies = np.geomspace(low, high, _SINES)
+    phases = rng.uniform(0.0, _TAU, _SINES)
+    total = np.sin(_TAU * frequencies * t[:, None] + phases).sum(axis=1)
+    # From rest: a servo that is to leap has its largest error before anything has been told.
+    rise = np.minimum(t * low / _RISE, 1.0)
+    largest = float(np.abs(rise * total).max())
+    faded: Array = amplitude * rise * total / max(largest, 1e-12)
+    return faded
+
+
 _FORMS: dict[str, tuple[Callable[..., Array], str]] = {
     "constant": (_constant, "VALUE"),
     "sine": (_sine, "AMPLITUDE:HERTZ"),
     "square": (_square, "AMPLITUDE:HERTZ"),
     "steps": (_steps, "AMPLITUDE:SECONDS"),
     "chirp": (_chirp, "AMPLITUDE:HERTZ:HERTZ"),
+    "multisine": (_multisine, "AMPLITUDE:HERTZ:HERTZ"),
 }
 """Each form by name: what computes it, and the numbers that it takes."""
 
@@ -82,14 +102,24 @@ HELP = ", ".join(f"{name}:{form}" for name, (_, form) in _FORMS.items())
 
 def signal(text: str, times: Array, rng: np.random.Generator) -> Array:
     """The values (T,) at `times` (T,) of the signal that `text` describes; a plain number is
-    constant.
+    constant, and signals with `` + `` between are added.
 
     `steps` holds levels drawn by `rng` evenly within the amplitude, `chirp` sweeps from one
-    frequency to the other.
+    frequency to the other, `multisine` is a sum of sines from one to the other with phases drawn by
+    `rng`, that begins at zero and reaches the amplitude.
 
     Raises:
         InputError: no such form, or not its numbers.
     """
+    first, *others = text.split(" + ")
+    result = _one(first.strip(), times, rng)
+    for other in others:
+        result = result + _one(other.strip(), times, rng)
+    return result
+
+
+def _one(text: str, times: Array, rng: np.random.Generator) -> Array:
+    """The values of a signal that is no sum."""
     name, *given = text.split(":")
     if not given:
         name, given = "constant", [text]

@@ -16,10 +16,11 @@ import numpy as np
 from bench.problem.seeds import rng_for
 from bench.problem.signals import signal
 from bench.recordings.size import check_simulated
-from bench.registry import simulators
+from bench.registry import robot, simulators
 from sims import effects as library
 from sims.base import Array, InputError, Scenario, Simulator
 from sims.limits import BRIEFEST, FASTEST, LARGEST, cut, is_number
+from sims.recording.description import ModelFile
 from sims.recording.recording import Recording, Run
 from sims.recording.write import refuse_existing, write_recording
 from sims.simulated import Simulated
@@ -42,7 +43,9 @@ class Wish:
     """A recording to make; all numbers SI.
 
     Attributes:
-        system: registered name.
+        system: registered name; empty where there is a model.
+        model: a robot's model file, MJCF or URDF.
+        actuators: that the model file lacks, as in a recording's ``[actuators.NAME]``.
         parameters: other than their nominal values, by name; or all of them in order.
         effects: that act, with their coefficients.
         constants: other than the defaults.
@@ -60,7 +63,9 @@ class Wish:
         force: whether to make it although it needs more than this machine has.
     """
 
-    system: str
+    system: str = ""
+    model: str | Path | None = None
+    actuators: Mapping[str, Any] = field(default_factory=dict)
     parameters: Mapping[str, float] | Sequence[float] = field(default_factory=dict)
     effects: Mapping[str, Coefficients] = field(default_factory=dict)
     constants: Mapping[str, float] = field(default_factory=dict)
@@ -138,7 +143,8 @@ class _Maker:
 
     def __init__(self, wish: Wish) -> None:
         self.wish = wish
-        self.kind = kind = simulators.get(wish.system)
+        self.kind = kind = _kind(wish)
+        self.name = wish.system or kind.name
         self.usual = _usual(kind)
         self.held_out = _held_out(wish)
         self.theta = _theta(wish.parameters, kind)
@@ -162,11 +168,14 @@ class _Maker:
         scenarios = {str(number): self._scenario(number) for number in range(1, self.wish.runs + 1)}
         runs = tuple(self._run(int(name), scenario) for name, scenario in scenarios.items())
         stated = {name: sigma for name, sigma in self.noise.items() if sigma}
-        constants, system = self.simulator.constant_values, self.wish.system
+        constants, system = self.simulator.constant_values, self.name
         path = Path(f"{system}-simulated.csv")  # a name for messages; nothing lies there
-        recording = Recording(path, system, f"{system}, simulated", constants, stated, runs)
+        model = self.wish.model and ModelFile(Path(self.wish.model), self.wish.actuators, {})
+        title = f"{system}, simulated"
+        recording = Recording(path, system, title, constants, stated, runs, model=model or None)
         truth = {
             "system": system,
+            **({"model": str(Path(self.wish.model).resolve())} if self.wish.model else {}),
             "engine": self.engine or "its own",
             "seed": self.wish.seed,
             "parameters": self.theta,
@@ -186,7 +195,7 @@ class _Maker:
         if issubclass(self.kind, Simulated):
             return self.kind(values, observe, engine=self.engine, fixed=self.effects)
         if self.effects or self.engine:
-            raise InputError(f"simulator {self.wish.system} takes neither effects nor an engine")
+            raise InputError(f"simulator {self.name} takes neither effects nor an engine")
         return self.kind(values, observe)
 
     def _scenario(self, number: int) -> Scenario:
@@ -217,7 +226,15 @@ class _Maker:
         return Run(str(number), self.times, channels, scenario.inputs, {}, {}, held_out)
 
     def _rng(self, what: str, name: str, number: int) -> np.random.Generator:
-        return rng_for("simulate", self.wish.system, what, name, self.wish.seed, number)
+        return rng_for("simulate", self.name, what, name, self.wish.seed, number)
+
+
+def _kind(wish: Wish) -> type[Simulator]:
+    """The simulator that makes it."""
+    if bool(wish.system) == (wish.model is not None):
+        found = "both" if wish.system else "neither"
+        raise InputError(f"expected a system (see `simgap list systems`) or a model, found {found}")
+    return simulators.get(wish.system) if wish.model is None else robot(wish.model, wish.actuators)
 
 
 def _usual(kind: type[Simulator]) -> UsualRecording:
@@ -288,7 +305,18 @@ def _coefficients(name: str, given: Coefficients, kind: type[Simulator]) -> list
         known(f"coefficient of effect {name}", given, names)
         return [_number(f"effect {name}:", c, given.get(c, 0.0)) for c in names]
     values = [given] if isinstance(given, int | float) else list(given)
-    return [_number("effect", name, value) for value in values]
+    return [_number("effect", name, value) for value in _of_family(name, values, kind)]
+
+
+def _of_family(name: str, values: list[float], kind: type[Simulator]) -> list[float]:
+    """The coefficients of a family, where those of one place are given: the same at every place."""
+    if not name.endswith("@*") or not issubclass(kind, Simulated):
+        return values
+    effect = library.find(name, kind.system)
+    members = getattr(effect, "members", ())
+    of_one = len(members[0].coefficients) if members else 0
+    alike = len(values) == of_one < len(effect.coefficients)
+    return values * len(members) if alike else values
 
 
 def _noise(given: float | Mapping[str, float], channels: Sequence[str]) -> dict[str, float]:

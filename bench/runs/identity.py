@@ -12,8 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.problem.experiment import Entry, Experiment
+from bench.problem.robots import kind_of
 from bench.problem.targets import SealedTarget
-from bench.registry import SkippedError, simulators, tuners
+from bench.registry import SkippedError, tuners
 from bench.runs.sources import (
     SHOT_ROOMS,
     digest,
@@ -42,6 +43,7 @@ NOT_OF_A_RUN = {
     "training_budget": "matters to learned tuners alone, and is hashed with their entries",
     "identifiability": "is found beside the runs, which know nothing of it",
     "recording": "where it lies; what it holds is hashed",
+    "model": "where it lies; what it holds is hashed",
     "shot": "what is done with a tuned model afterwards",
     "salt": "which targets there are; their scenarios and observations are hashed",
     "salt_sha256": "which targets there are; their scenarios and observations are hashed",
@@ -61,6 +63,7 @@ def fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str
         if experiment.salt_sha256
         else digest(experiment.name, experiment.document()),
         "recording": digest(recording_digest(experiment)),
+        **({"model file": digest(source(kind_of(experiment)))} if experiment.model else {}),
         "plugins": plugin_files(plugins),
         "code": rooms(SHOT_ROOMS if experiment.shot else ()),
         "package versions": versions(),
@@ -70,7 +73,7 @@ def fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str
 
 def _classes(experiment: Experiment) -> list[str]:
     """Sources of an experiment's simulator and tuners; a notebook's are in no plugin file."""
-    sources = [source(simulators.get(experiment.simulator))]
+    sources = [source(kind_of(experiment))]
     for entry in experiment.tuners:
         try:
             sources.append(source(tuners.get(entry.tuner)))
@@ -127,7 +130,7 @@ class Identities:
         self._world = digest(
             what_matters(experiment, NOT_OF_A_RUN),
             recording_digest(experiment),
-            source(simulators.get(experiment.simulator)),
+            source(kind_of(experiment)),
             effect_sources(experiment.settings, experiment.world),
             rooms(),
             versions(),

@@ -150,7 +150,8 @@ def refuse_unreachable(experiment: Experiment, workers: bool = True) -> None:
     used = tuned
     if workers:
         named = effect_names(experiment.settings, experiment.world)
-        used = [(simulators, experiment.simulator), *tuned, *((effects, name) for name in named)]
+        simulated = [] if experiment.model else [(simulators, experiment.simulator)]
+        used = [*simulated, *tuned, *((effects, name) for name in named)]
     for registry, name in used:
         added = registry.snapshot().get(name)
         if added is not None and added.path is None:
@@ -258,10 +259,11 @@ def _run(results: Results, pool: Pool, progress: Progress) -> None:
 
 
 def _identify(results: Results, progress: Progress) -> None:
-    """Find what each target's data identify; only the parent process can: it takes the truth."""
+    """Find what each target's data identify; only the parent process can: where there is a truth
+    it takes that.
+    """
     problem, targets = results.problem, {job.target.sealed.name: job.target for job in results.plan}
-    known = any(target.truth is not None for target in targets.values())
-    if not (known and problem.identifiable):
+    if not problem.identifiable:
         return
     step = progress("identifiability", len(targets))
     for name, target in targets.items():

@@ -8,8 +8,9 @@ from pathlib import Path
 from bench.problem.experiment import Entry, Experiment, expand
 from bench.problem.problem import Problem
 from bench.problem.recorded import find_recording
+from bench.problem.robots import kind_of
 from bench.recordings.stamps import refuse_odd
-from bench.registry import simulators, tuners
+from bench.registry import tuners
 from bench.runs.runner import check, seeds_of
 from bench.sizes import (
     NUMBER,
@@ -116,7 +117,7 @@ def check_comparison(
         need = comparison(one, jobs, cluster)
         refuse(f"experiment {one.name}", need, machine(folder))
         if one.recording:
-            kind = simulators.get(one.simulator)
+            kind = kind_of(one)
             path = find_recording(one.recording.path)
             refuse_odd(read_recording(path, kind), kind)
 

@@ -256,5 +256,6 @@ def named_effects(*settings: Mapping[str, Any]) -> set[str]:
             value = table.get(key, ())
             # What is no list, or no effect, is the simulator's to refuse.
             if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
-                names.update(name for name in value if isinstance(name, str))
+                # At a place of a robot it is the same effect.
+                names.update(name.partition("@")[0] for name in value if isinstance(name, str))
     return names

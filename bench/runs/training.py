@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 from bench.problem.experiment import Entry, Experiment
 from bench.problem.practice import Practice
 from bench.problem.problem import Problem
+from bench.problem.robots import kind_of
 from bench.problem.seeds import stream_of
-from bench.registry import simulators, tuners
+from bench.registry import tuners
 from bench.runs.housing import housed, undisturbed
 from bench.runs.school import school
 from bench.runs.sources import (
@@ -112,6 +113,7 @@ NOT_OF_A_TRAINING = {
     "salt": "targets are met after the training",
     "salt_sha256": "targets are met after the training",
     "recording": "where it lies; what it holds is hashed",
+    "model": "where it lies; what it holds is hashed",
     "shot": "what is done with a tuned model afterwards",
     "sweep": "what is run sweeps over nothing; it has values of its own",
     "tuners": "who else trains; the key has its own tuner with its options",
@@ -125,7 +127,7 @@ def key(experiment: Experiment, entry: Entry, seed: int) -> str:
     Raises:
         InputError: the source of the tuner or the simulator cannot be told.
     """
-    simulator = simulators.get(experiment.simulator)
+    simulator = kind_of(experiment)
     hashed = digest(
         what_matters(experiment, NOT_OF_A_TRAINING),
         recording_digest(experiment),

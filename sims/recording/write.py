@@ -7,6 +7,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ def write_recording(
         raise InputError(f"{table}: expected at least one run, found none")
     texts: dict[Path, Content] = {
         table: _table(recording.runs, digits),
-        description_of(table): _description(recording, declared),
+        description_of(table): _description(recording, declared, table.parent),
     }
     publish({**texts, **(beside or {})})
 
@@ -134,12 +135,25 @@ def _cells(values: Array, digits: int) -> list[str]:
     return [shortest(v) if math.isfinite(v) else "" for v in values.tolist()]
 
 
-def _description(recording: Recording, declared: Declared) -> str:
+def _of(recording: Recording, beside: Path) -> dict[str, Any]:
+    """What a recording is of: its system, or its model file as seen from the folder `beside`."""
+    model = recording.model
+    if model is None:
+        return {"system": recording.system}
+    try:
+        file = os.path.relpath(model.path, beside)
+    except ValueError:  # on another drive
+        file = str(model.path.resolve())
+    stated = {"actuators": model.actuators, "engine": model.engine}
+    return {"model": Path(file).as_posix(), **{k: dict(v) for k, v in stated.items() if v}}
+
+
+def _description(recording: Recording, declared: Declared, beside: Path) -> str:
     import tomli_w
 
     units = {c.name: c.unit for c in (*declared.inputs, *declared.channels)}
     first = recording.runs[0]
-    document: dict[str, Any] = {"system": recording.system, "title": recording.title}
+    document: dict[str, Any] = {**_of(recording, beside), "title": recording.title}
     document["channels"] = {
         n: {"unit": units[n], **_stated(recording.noise, n)} for n in first.channels
     }

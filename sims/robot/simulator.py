@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sims import effects as library
 from sims.base import Array, InputError, Scenario, unknown
 from sims.plan import Plan, Runs, felt_inputs, make_runs
 from sims.robot.forces import OVER_TIME, Forces, over_time
@@ -501,11 +502,13 @@ def robot_simulator(
     numerics = numerics or own_numerics(robot)
     # Made at run time as it is, no text of a module tells it from another robot's.
     told = repr((robot.digest, tuple(free), tuple(numerics)))
+    system = system_of(robot, free)
     declared = {
-        "system": system_of(robot, free),
+        "system": system,
         "robot": robot,
         "numerics": numerics,
         "free": tuple(free),
+        "made_of": tuple(library.get(n) for n in {e.of: 0 for e in system.freed_effects}),
         "source_digest": hashlib.sha256(told.encode()).hexdigest(),
         "__module__": __name__,
         "__doc__": f"The robot of {robot.path.name}.",

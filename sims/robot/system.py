@@ -13,6 +13,7 @@ from sims.robot import places
 from sims.robot.model import Robot
 from sims.robot.moment import OneJoint, Slide
 from sims.robot.native import FIELDS
+from sims.robot.usual import Usual
 from sims.system import Effect, Kind, Moment, System
 
 
@@ -36,6 +37,7 @@ class RobotSystem(System):
     states: ClassVar[Mapping[str, float]] = MappingProxyType({})
     sensed: ClassVar[tuple[str, ...]] = ()
     has_model = True
+    usual_recording = Usual()
     robot: ClassVar[Robot]
     spots: ClassVar[Mapping[str, Sequence[places.Spot]]]
     alone: ClassVar[tuple[System, ...]]
@@ -93,10 +95,22 @@ class RobotSystem(System):
         """
         base, _, place = word.partition("@")
         name = places.WORDS.get(base, base)
+        if name not in library.names():
+            there = [*places.WORDS, *(other for other in library.names() if cls._has(other))]
+            raise unknown(f"number of robot {cls.name}", base, there)
         found = cls.effect(f"{name}@{place}" if place else name)
         assert found is not None
-        members = getattr(found, "members", ())
+        # What is late is late everywhere: one number for all places.
+        members = () if name in places.SHARED else getattr(found, "members", ())
         return [type(member) for member in members] or [found]
+
+    @classmethod
+    def _has(cls, name: str) -> bool:
+        """Whether it can have a registered effect anywhere."""
+        try:
+            return bool(cls.placed(library.get(name)))
+        except SkippedError:
+            return False
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """The engine alone knows it: a matrix that changes with the pose."""

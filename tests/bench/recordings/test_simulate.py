@@ -204,7 +204,7 @@ def test_signals():
     assert len(crossings) == pytest.approx(2 * 5 * 4, abs=1)
     assert "steps:AMPLITUDE:SECONDS" in HELP
     for text, message in [
-        ("noise:1", "unknown signal 'noise'; there are: chirp, constant, sine, square, steps"),
+        ("noise:1", "unknown signal 'noise'; there are: chirp, constant, multisine, sine"),
         ("sine:1", r"signal 'sine:1': expected sine:AMPLITUDE:HERTZ"),
         ("steps:1:0", "all but the first > 0"),
         ("x", "signal 'x': expected constant:VALUE"),

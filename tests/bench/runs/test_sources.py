@@ -315,6 +315,8 @@ def test_class_made_at_run_time_carries_its_digest_and_a_subclass_does_not_inher
 CHANGES = {
     "name": "another",
     "simulator": "pendulum",
+    "free": ("damping@*",),
+    "actuators": {"m": {"joint": "elbow", "kind": "motor"}},
     "observe": ("x", "v"),
     "error_channel": "v",
     "timeout": 61.0,

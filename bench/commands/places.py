@@ -1,0 +1,62 @@
+"""What `simgap list places` prints: the places of a robot, and what can act at them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import cast
+
+from bench.recordings.robotic import about
+from bench.registry import robot
+from sims import effects
+from sims.robot import places
+from sims.robot.model import Robot
+from sims.robot.simulator import RobotSimulator
+from sims.robot.system import RobotSystem
+
+
+def lines(model: Path) -> Iterator[str]:
+    """The places of a model file, its signals, and the effects of each kind of place."""
+    kind = cast(type[RobotSimulator], robot(model))
+    yield from about(kind)
+    yield from _joints(kind.robot)
+    yield from _actuators(kind)
+    for body in kind.robot.bodies:
+        links = f", with {', '.join(body.aliases)}" if body.aliases else ""
+        yield f"  {'body':9} {body.name:24} {body.mass:.4g} kg{links}"
+    for signal in kind.inputs:
+        yield f"  {'input':9} {signal.name:24} {signal.unit}"
+    for channel in kind.channels:
+        yield f"  {'channel':9} {channel.name:24} {channel.unit:9} {channel.says}"
+    yield from _effects(kind.system)
+    yield f"  --free also takes MuJoCo's words: {', '.join(places.WORDS)}"
+
+
+def _joints(robot: Robot) -> Iterator[str]:
+    for joint in robot.joints:
+        limits = "" if joint.range is None else _range(joint.range, joint.unit)
+        effort = "" if joint.effort is None else f", effort {joint.effort:g} {joint.force_unit}"
+        yield f"  {'joint':9} {joint.name:24} {joint.kind}{limits}{effort}"
+
+
+def _actuators(kind: type[RobotSimulator]) -> Iterator[str]:
+    units = {channel.name: channel.unit for channel in kind.inputs}
+    for a in kind.robot.actuators:
+        limits = "" if a.range is None else _range(a.range, units.get(f"u.{a.name}", ""))
+        yield f"  {'actuator':9} {a.name:24} {a.kind} on {a.joint or 'no joint'}{limits}"
+
+
+def _range(ends: tuple[float, float], unit: str) -> str:
+    return f", {ends[0]:.4g} to {ends[1]:.4g} {unit}"
+
+
+def _effects(system: type[RobotSystem]) -> Iterator[str]:
+    """A line for each kind of place with the effects that can act there."""
+    there: dict[str, list[str]] = {}
+    for name in effects.names():
+        effect = effects.get(name)
+        if system.placed(effect):
+            there.setdefault(effect.at, []).append(name)
+    for kind, named in there.items():
+        at = "of the world" if kind == "world" else f"at a {kind}, as {named[0]}@NAME or @*"
+        yield f"  effects {at.replace('a actuator', 'an actuator')}: {', '.join(named)}"

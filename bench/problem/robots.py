@@ -1,0 +1,113 @@
+"""The simulator of an experiment: a registered one, or that of a robot's model file."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+from typing import Any
+
+from bench.problem.experiment import Experiment
+from bench.problem.recorded import find_recording
+from bench.registry import robot, simulators
+from sims.base import InputError, Simulator
+from sims.recording.description import model_of
+from sims.recording.recording import read_recording
+from sims.registry import SkippedError
+from sims.simulated import Simulated
+
+PACKAGE = "package://"
+"""Begins the place of a model file in an installed Python package, as URDF files write it."""
+_SHARED = Path(__file__).resolve().parents[3] / "shared" / "robots"
+"""Where robots lie beside a checkout."""
+
+
+def kind_of(experiment: Experiment) -> type[Simulator]:
+    """The simulator that an experiment tunes.
+
+    Raises:
+        InputError: there is none of that name, or its model file cannot be used.
+        SkippedError: something that it needs is not here.
+    """
+    if not experiment.model:
+        return simulators.get(experiment.simulator)
+    who = f"experiment {experiment.name}"
+    if not experiment.free:
+        wanted = 'free = ["damping@*", ...] or --free, numbers of the model file to tune'
+        raise InputError(f"{who}: expected {wanted}; found none")
+    path = find_model(experiment.model, experiment.name)
+    actuators, engine = dict(experiment.actuators), {}
+    if experiment.recording:
+        stated = model_of(find_recording(experiment.recording.path), path)
+        assert stated is not None  # a model was given
+        actuators, engine = {**stated.actuators, **actuators}, dict(stated.engine)
+    return robot(path, actuators, engine, experiment.free)
+
+
+def completed(experiment: Experiment) -> Experiment:
+    """An experiment on a robot with the channels, commands and initial pose that it leaves out:
+    those of its recording, or the usual ones of the robot.
+    """
+    if not experiment.model:
+        return experiment
+    kind = kind_of(experiment)
+    changes: dict[str, Any] = {}
+    if experiment.recording:
+        path = find_recording(experiment.recording.path)
+        changes["observe"] = tuple(read_recording(path, kind).runs[0].channels)
+    elif issubclass(kind, Simulated):
+        usual = kind.system.usual_recording
+        changes["observe"] = usual.observe
+        changes["initial"] = dict(usual.initial)
+        changes["inputs"] = dict(usual.inputs)
+    left_out = {key: value for key, value in changes.items() if not getattr(experiment, key)}
+    return experiment.chosen(**left_out)
+
+
+def missing(experiment: Experiment) -> str:
+    """Why the model file of an experiment is not here; empty where it is, or where it has none."""
+    if not experiment.model:
+        return ""
+    try:
+        find_model(experiment.model, experiment.name)
+    except SkippedError as error:
+        return error.reason
+    return ""
+
+
+def find_model(path: str, name: str) -> Path:
+    """The model file of experiment `name`: in an installed package (``package://NAME/FILE``), below
+    $SIMGAP_ROBOTS, or as it stands.
+
+    Raises:
+        SkippedError: it is in none of these places.
+    """
+    if path.startswith(PACKAGE):
+        return _packaged(path, name)
+    for folder in (robots_folder(), Path()):
+        if folder is not None and (folder / path).is_file():
+            return folder / path
+    given = os.environ.get("SIMGAP_ROBOTS")
+    places = f"in {given} (SIMGAP_ROBOTS)" if given else "here (SIMGAP_ROBOTS is not set)"
+    raise SkippedError("experiment", name, f"model {path}: no such file {places}")
+
+
+def robots_folder() -> Path | None:
+    """The folder of robots' files: $SIMGAP_ROBOTS, else ``shared/robots`` beside a checkout."""
+    given = os.environ.get("SIMGAP_ROBOTS")
+    if given:
+        return Path(given)
+    return _SHARED if _SHARED.is_dir() else None
+
+
+def _packaged(path: str, name: str) -> Path:
+    package, _, inside = path.removeprefix(PACKAGE).partition("/")
+    # Its name alone is looked for: what a package does when it is imported is none of ours.
+    known = package.isidentifier() and importlib.util.find_spec(package)
+    if not known:
+        reason = f"needs {package}, not installed (pip install {package.split('_')[0]})"
+        raise SkippedError("experiment", name, reason)
+    for folder in known.submodule_search_locations or ():
+        if (file := Path(folder, inside)).is_file():
+            return file
+    raise SkippedError("experiment", name, f"model {path}: package {package} has no such file")

@@ -1,0 +1,182 @@
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from bench.problem.asked import asked
+from bench.problem.entries import Entry
+from bench.problem.experiment import load, names, parse
+from bench.problem.problem import Problem
+from bench.problem.robots import completed, find_model, kind_of, missing
+from bench.runs.identity import Identities, fingerprint
+from bench.runs.sources import effect_sources, source
+from bench.runs.training import key
+from sims import effects
+from sims.base import InputError
+from sims.registry import SkippedError
+from tests.bench.swinging import SWINGING, written
+
+ARM = {
+    "model": "swinging.xml",
+    "free": ["damping@elbow", "mass@fore"],
+    "sampling": {"rate": 50.0, "samples": 40},
+    "salt": "public",
+    "tuners": ["random"],
+}
+
+
+@pytest.fixture
+def arm(tmp_path):
+    """The experiment on the arm, whose file lies beside it; changes may be made to it."""
+    written(tmp_path)
+
+    def made(**changes):
+        return parse("arm", {**ARM, **changes}, tmp_path / "arm.toml")
+
+    return made
+
+
+def test_a_model_file_stands_instead_of_a_simulator(arm, tmp_path):
+    experiment = arm()
+    assert experiment.model == str(tmp_path / "swinging.xml"), "known from everywhere"
+    assert experiment.simulator == "swinging"
+    again = parse("arm", experiment.document(), tmp_path / "elsewhere" / "experiment.toml")
+    assert again == experiment
+    problem = Problem(experiment)
+    assert [p.name for p in problem.cube.parameters] == ["drag.linear@elbow", "mass.scale@fore"]
+    assert [c.name for c in problem.channels] == ["q.shoulder", "q.elbow"]
+    (scenario,) = problem.scenarios(np.random.default_rng(0))
+    assert set(scenario.inputs) == {"u.m_shoulder", "u.s_elbow"}
+    with pytest.raises(InputError, match="model = "):
+        parse("arm", {"tuners": ["random"]}, tmp_path / "arm.toml")
+    with pytest.raises(InputError, match=r"free and actuators are of a robot"):
+        parse("arm", {"simulator": "ball", "free": ["damping@*"]}, tmp_path / "arm.toml")
+
+
+def test_usual_commands_move_every_joint_and_keep_within_limits(arm):
+    problem = Problem(arm(sampling={"rate": 100.0, "samples": 400}))
+    controls = {"u.m_shoulder": (-3.0, 3.0), "u.s_elbow": (-0.5, 0.9)}
+    for seed in range(4):
+        (scenario,) = problem.scenarios(np.random.default_rng(seed))
+        for name, (low, high) in controls.items():
+            told = scenario.inputs[name]
+            assert low <= told.min()
+            assert told.max() <= high
+            assert abs(told[0]) < 1e-12, "it begins at the pose of the file"
+        theta = np.array([[p.nominal for p in problem.cube.parameters]])
+        q = problem.simulator.simulate(theta, scenario)[0]
+        assert (np.ptp(q, axis=0) > 0.1).all()
+        assert np.abs(q[:, 0]).max() < 1.5
+
+
+def ids(experiment):
+    """The name of a run and of a training."""
+    target = Problem(experiment).target("in", 0).sealed
+    run = Identities(experiment).run(experiment.tuners[0], target, 0, 12)
+    return run, key(experiment, Entry("regressor", "regressor"), 0)
+
+
+def test_what_a_model_file_says_enters_names_of_runs_and_of_weights(arm, tmp_path):
+    experiment = completed(arm())
+    before = ids(experiment)
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    written(moved, name="other.xml")
+    elsewhere = experiment.chosen(model=str(moved / "other.xml"))
+    assert ids(elsewhere) == before, "where a file lies and what it is called is nothing"
+    changes = (
+        {"free": ("damping@elbow", "damping@shoulder")},
+        {"settings": {"timestep": 0.0025}},
+        {"actuators": {"extra": {"joint": "elbow", "kind": "motor"}}},
+    )
+    others = [ids(experiment.chosen(**change)) for change in changes]
+    held = fingerprint(experiment, [])
+    written(tmp_path, SWINGING.replace('mass="0.8"', 'mass="0.81"'))
+    others.append(ids(experiment))
+    for run, weights in others:
+        assert run != before[0]
+        assert weights != before[1]
+    assert len({run for run, _ in others}) == len({weights for _, weights in others}) == 4
+    changed = {k for k, v in fingerprint(experiment, []).items() if held[k] != v}
+    assert changed == {"model file", "simulator and tuners"}
+
+
+def test_an_effect_at_a_place_is_hashed_as_the_effect_that_it_is():
+    settings = {"effects": ["input.delay@s_elbow"], "fixed": {"friction.coulomb@*": 0.1}}
+    expected = [source(effects.get(name)) for name in ("friction.coulomb", "input.delay")]
+    assert effect_sources(settings) == expected
+
+
+def test_names_that_do_not_exist_come_with_those_that_do(arm):
+    with pytest.raises(
+        InputError, match=r"number of robot .*'dampng'; there are: .* damping, drag"
+    ):
+        kind_of(arm(free=["dampng@*"]))
+    with pytest.raises(InputError, match=r"'elbo'; there are: \*, elbow, shoulder"):
+        kind_of(arm(free=["damping@elbo"]))
+    with pytest.raises(InputError, match=r"damping@\*.*found none"):
+        kind_of(arm(free=[]))
+    with pytest.raises(InputError, match=r"parameter .*'mass'; there are: drag.linear@elbow"):
+        Problem(arm(parameters={"mass": {"nominal": 1.0}}))
+
+
+def test_what_is_late_everywhere_is_one_number(arm):
+    several = [p.name for p in kind_of(arm(free=["damping@*"])).parameters]
+    assert several == ["drag.linear@shoulder", "drag.linear@elbow"]
+    assert [p.name for p in kind_of(arm(free=["input.delay@*"])).parameters] == ["input.delay@*"]
+
+
+def test_model_files_are_found_in_packages_and_in_the_folder_of_robots(tmp_path, monkeypatch):
+    found = find_model("package://bench/experiments/arm2.xml", "mine")
+    assert found.samefile("bench/experiments/arm2.xml")
+    monkeypatch.setenv("SIMGAP_ROBOTS", str(tmp_path))
+    written(tmp_path)
+    assert find_model("swinging.xml", "mine") == tmp_path / "swinging.xml"
+    with pytest.raises(SkippedError, match=r"experiment mine .*in .* \(SIMGAP_ROBOTS\)"):
+        find_model("nowhere.xml", "mine")
+    with pytest.raises(SkippedError, match=r"needs nopackage, not installed"):
+        find_model("package://nopackage/arm.xml", "mine")
+    with pytest.raises(SkippedError, match="package bench has no such file"):
+        find_model("package://bench/nowhere.xml", "mine")
+
+
+def test_what_a_shipped_experiment_lacks_is_said_in_the_list(tmp_path, monkeypatch):
+    from bench.commands.catalogue import lines
+
+    monkeypatch.setenv("SIMGAP_ROBOTS", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "pybullet_data", None)
+    listed = {line.split()[0]: line for line in lines("experiments")}
+    assert "skipped: model so101/so101.urdf: no such file" in listed["robot-so101"]
+    assert "skipped" not in listed["robot-arm2"]
+
+
+@pytest.mark.parametrize("name", [name for name in names() if name.startswith("robot-")])
+def test_shipped_experiments_on_robots_are_sound_and_their_numbers_show(name):
+    experiment = load(name)
+    if reason := missing(experiment):
+        pytest.skip(reason)
+    problem = Problem(experiment)
+    assert 4 <= problem.cube.dim <= 8
+    for kind in experiment.ranges:
+        target = problem.target(kind, 0)
+        assert np.isfinite(target.sealed.fitting.observed).all()
+    told = problem.spectrum(problem.target("in", 0))
+    assert told.stiff[:4].all(), "these commands tell of most numbers"
+
+
+def test_the_arm_of_the_experiments_is_that_of_the_example():
+    from pathlib import Path
+
+    shipped = Path("bench/experiments/arm2.xml").read_text()
+    assert shipped == Path("examples/robot/arm2.xml").read_text()
+
+
+def test_what_is_asked_on_a_command_line_is_an_experiment_of_its_own(tmp_path):
+    experiment = asked(written(tmp_path), None, ["damping@*"])
+    assert experiment.ranges == ("in", "wide")
+    assert experiment.noise == {"q.shoulder": 1e-3, "q.elbow": 1e-3}
+    assert set(experiment.inputs) == {"u.m_shoulder", "u.s_elbow"}, "as they will be kept"
+    json.dumps(experiment.document())
+    with pytest.raises(InputError, match="no such file"):
+        asked(tmp_path / "none.xml", None, ["damping@*"])
