@@ -65,9 +65,9 @@ _CAPTIONS = {
 }
 """Under the figures."""
 _JOINTS = (
-    "A row for each joint; blue ones are those that the verdict names. Left: measured and "
-    "simulated. Right: what is measured less what is simulated, in units of the sensor's noise σ "
-    "and on one scale for all; in the grey band 95 % of the noise would lie."
+    "A row for each joint; those that the verdict names are blue, behind a pointer. Left: "
+    "measured and simulated. Right: what is measured less what is simulated, in units of the "
+    "sensor's noise σ and on one scale for all; in the grey band 95 % of the noise would lie."
 )
 """Under the figure of a robot's run."""
 _PLACED = (
