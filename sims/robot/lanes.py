@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.base import Array
+from sims.robot.drives import Drives
 from sims.robot.model import Robot
-from sims.robot.native import FIELDS, SOLIMP, SOLREF, lanes_model
+from sims.robot.native import FIELDS, SOLIMP, SOLREF, lanes_spec
 from sims.system import Acting
 
 LANES = 64
@@ -80,7 +81,9 @@ class Bench:
         self.robot = robot
         self.derived = derived
         self.count = count
-        model = lanes_model(robot) if derived else robot.spec.copy().compile()
+        spec = lanes_spec(robot) if derived else robot.spec.copy()
+        self._drives = Drives(robot, spec, settings)
+        model = spec.compile()
         for name, value in settings.items():
             setattr(model.opt, name, value)
         # A lane that fails must be NaN: MuJoCo would reset it, and it would pass for done.
@@ -169,15 +172,16 @@ class Bench:
             spec |= int(state.mjSTATE_QFRC_APPLIED)
             given = np.concatenate([controls, forces], axis=2)
         n, steps, _ = controls.shape
-        result = self._begun(n, steps, record)
+        fields = self._drives.fields(record)
+        result = self._begun(n, steps, fields)
         for part in self._parts(n, steps):
             done = self.batch.rollout(
-                part.stop - part.start, given[:, part], spec, tuple(record), self._ids(n)
+                part.stop - part.start, given[:, part], spec, fields, self._ids(n)
             )
             for name, values in done.items():
                 result[name][:, part] = values
         self._fails(n)
-        return result
+        return self._drives.told(result)
 
     def ask(
         self,
@@ -212,7 +216,7 @@ class Bench:
             self.fields["dof_solref"][lanes, dofs[joints]] = SOLREF
             self.fields["dof_solimp"][lanes, dofs[joints]] = SOLIMP
             self._changed.update(FIELDS["friction.coulomb"].fields)
-        result = self._begun(n, steps, record)
+        result = self._begun(n, steps, self._drives.fields(record))
         ids = self._ids(n)
         ctrl[:n] = controls[:, 0]
         self.batch.forward(ids)
@@ -231,7 +235,7 @@ class Bench:
             for name, values in result.items():
                 values[:, k] = bind(name)[:n]
         self._fails(n)
-        return result
+        return self._drives.told(result)
 
     def _begun(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
         """Arrays that will hold what is recorded."""

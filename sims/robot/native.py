@@ -60,10 +60,15 @@ def lanes_model(robot: Robot) -> Any:
     MuJoCo stores less for a body that turns about its centre of mass, and refuses to move that
     centre afterwards; here it stores all. The motion is the same.
     """
+    return lanes_spec(robot).compile()
+
+
+def lanes_spec(robot: Robot) -> Any:
+    """The mujoco.MjSpec of `lanes_model`."""
     spec = robot.spec.copy()
     for body in spec.bodies:
         body.simple = False
-    return spec.compile()
+    return spec
 
 
 def added(stated: Any, c: Any) -> Any:

@@ -34,6 +34,10 @@ _FIELDS = {"tau.": "qfrc_actuator", "s.": "sensordata"}
 """Where MuJoCo has what channels show that begin so."""
 WIDTH = 128
 """Instants of a motion that are looked at side by side."""
+BEYOND, LATE = 1.1, 0.2
+"""How far beyond its end a run is simulated at most where sensors are early: times its length, and
+seconds.
+"""
 SHARE = 1e-6
 """Of a step by which a run may exceed a whole number of them."""
 
@@ -196,7 +200,7 @@ class RobotSimulator(Simulated):
             return []
         # What is felt now is read in the step that begins now.
         felt = self._feels()
-        sizes = [self.steps_of(work.times) for work in works]
+        sizes = [self.steps_of(_instants(work)) for work in works]
         given = [self.controls(work, size + felt) for work, size in zip(works, sizes, strict=True)]
         whole = Given.of(given)
         x = np.concatenate([work.x for work in works])
@@ -365,6 +369,19 @@ class Work(NamedTuple):
         """(T,) of samples, seconds since the start."""
         result: Array = self.scenario.times - self.scenario.times[0]
         return result
+
+
+def _instants(work: Work) -> Array:
+    """The last instants at which something is read in the lanes of a run, seconds since the start:
+    by a clock that runs slow the world goes on beyond the last stamp.
+    """
+    end = work.times[-1:]
+    latest = float(end[0])
+    for effect, c in work.acting:
+        if isinstance(effect, Sensor):
+            latest = max(latest, float(np.max(effect.times(c, np.broadcast_to(end, c[0].shape)))))
+    # What a fit tries far from all that can be shall not cost a thousand steps.
+    return np.array([min(latest, BEYOND * float(end[0]) + LATE)])
 
 
 class Start(NamedTuple):
