@@ -28,7 +28,7 @@ def _elastic(joint, setting, rng):
 
     def cause(strength):
         stiffness = moved * (2 * np.pi * STIFFEST) ** 2 * 0.1 / strength
-        damping = 2 * damped * np.sqrt(stiffness * moved)
+        damping = 2 * damped * float(np.sqrt(stiffness * moved))
         return {"elastic": (joint, rotor * min(strength, 1.0), stiffness, damping)}
 
     return cause

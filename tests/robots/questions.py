@@ -96,8 +96,8 @@ def digest():
     """Of the code that draws; items drawn by the same code need not be drawn again."""
     here, text = Path(__file__).parent, hashlib.sha256()
     for module in (
-        "friction", "plant", "machines", "signals", "world", "robots", "commands", "sensing",
-        "settings", "causes", "foreign", "sizing", "items", "recording",
+        "friction", "plant", "machines", "signals", "motion", "world", "robots", "commands",
+        "sensing", "settings", "causes", "foreign", "sizing", "items", "recording",
     ):  # fmt: skip
         text.update((here / f"{module}.py").read_bytes())
     return text.hexdigest()[:16]

@@ -9,43 +9,20 @@ nearly zero: it does not creep.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import brentq
 
 from tests.robots.friction import held
+from tests.robots.motion import Motion, Run
 from tests.robots.plant import plant
 from tests.robots.signals import Drives, felt
 
+__all__ = ["Motion", "Run", "World"]
 FINE, COARSE = 1e-3, 2e-3  # seconds: longest steps of data, and of what only chooses sizes
 ZENO = 10_000  # events in a step, at most
 LATER = 1e-9  # of a step: shorter ones are none
-
-
-@dataclass(frozen=True)
-class Run:
-    """What is known of a run: stamps (T,) that begin at 0, commands (T,) by actuator, and where it
-    starts.
-    """
-
-    times: np.ndarray
-    commands: dict[str, np.ndarray]
-    q: np.ndarray
-    v: np.ndarray
-
-
-@dataclass(frozen=True)
-class Motion:
-    """Positions, speeds and actuators' forces at some instants, each (T, N); the encoder's
-    positions where a joint is elastic.
-    """
-
-    times: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    force: np.ndarray
 
 
 class World:

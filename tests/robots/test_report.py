@@ -1,0 +1,53 @@
+"""The tables and the page that questions about robots leave behind."""
+
+import csv
+import json
+
+import pytest
+
+from tests.robots import report
+from tests.robots.score import marked
+from tests.robots.test_score import ITEM, OTHER, TRUE, verdict
+
+
+def row(number, item, answer, effect="friction.coulomb"):
+    made = {"kind": item.kind, "robot": item.robot, "effect": effect, "item": item.json()}
+    made |= {"question": f"{item.kind}/{item.robot}/{effect}/{number}", "error": ""}
+    heldout = {"heldout": {"gap_closed": 0.9}}
+    made |= {"verdict": answer and answer | heldout, "seconds": 2.0 * number, "processor": 1.0}
+    return made | {"mark": marked(item, answer).json()}
+
+
+@pytest.fixture
+def rows():
+    said = {"value": 0.3, "low": 0.29, "high": 0.31}
+    return [
+        row(1, ITEM, verdict((TRUE,), coefficient=said)),
+        row(2, ITEM, verdict((TRUE, OTHER))),
+        row(3, ITEM, verdict((OTHER,))),
+        row(4, ITEM, None),
+        {"question": "single/ur5-servo/mass.scale/0", "kind": "single", "item": {}},
+    ]
+
+
+def test_shares_count_what_was_asked(rows):
+    summary = report.summarised(rows)
+    shares = summary["named"]["single"]
+    counts = {how: (shares[how]["count"], shares[how]["of"]) for how in report.HOWS}
+    assert counts == {"strict": (1, 4), "few": (2, 4), "fair": (1, 4), "any": (2, 4)}
+    assert summary["coverage"]["count"] == summary["coverage"]["of"] == 1
+    assert summary["cannot show"] == ["single/ur5-servo/mass.scale/0"]
+    assert summary["failed"] == ["single/arm2-motor/friction.coulomb/4"]
+    assert ["friction.coulomb", "drag.linear", 1] in summary["confusion"]
+    assert summary["by"]["effect"]["friction.coulomb motor"]["any"]["count"] == 2
+
+
+def test_what_is_written_can_be_read_again(rows, tmp_path):
+    report.write(tmp_path, rows)
+    with (tmp_path / "items.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert [line["outcome"] for line in lines] == ["right", "set", "wrong", "failed"]
+    assert lines[0]["hidden"] == "friction.coulomb@elbow=0.3"
+    assert json.loads((tmp_path / "summary.json").read_text())["items"] == 4
+    assert "2/4 = 50.0%" in (tmp_path / "README.md").read_text()
+    assert (tmp_path / "figures" / "confusion.png").stat().st_size > 0
