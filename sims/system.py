@@ -34,6 +34,8 @@ KINDS: tuple[Kind, ...] = ("point", "linear", "rotary")
 """All kinds, in the order of a coefficient's units and ranges."""
 PlaceKind = Literal["joint", "actuator", "body", "channel", "world"]
 """Kinds of places in a robot."""
+FAMILY = "*"
+"""The place of an effect that acts at all places of its kind."""
 STANDARD_GRAVITY = 9.80665
 """m/s^2 (3rd General Conference on Weights and Measures, 1901)."""
 

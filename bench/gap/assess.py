@@ -34,6 +34,8 @@ class Assessor:
         fitting, measuring: its runs; None where none are held out.
         floor: the noise.
         engine: the engine's name; None for a simulator that steps itself.
+        before: what the simulation gave of the held-out runs before its own step was mended; None
+            where that was not at fault.
     """
 
     recording: Recording
@@ -41,6 +43,7 @@ class Assessor:
     measuring: World | None
     floor: Floor
     engine: str | None
+    before: Array | None = None
 
     def verdict(
         self, search: Search, finding: Finding, rng: np.random.Generator, started: float
@@ -128,6 +131,7 @@ class Assessor:
         if runs is None or measured is None or names not in measured:
             return None
         before, after = measured[()].simulated, measured[names].simulated
+        before = before if self.before is None else self.before
         # The base model failed there, so there is no gap to speak of.
         if not np.isfinite(before[np.isfinite(runs.observed)]).all():
             return None

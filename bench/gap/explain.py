@@ -7,6 +7,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,16 +15,18 @@ import numpy as np
 
 from bench.gap.assess import Assessor
 from bench.gap.causes.name import Finding, name
+from bench.gap.causes.rules import SWITCH
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import probes
 from bench.gap.explanation import Explanation
 from bench.gap.measure import HeldOutRuns
-from bench.gap.model.base_fit import fit_base
+from bench.gap.model.base_fit import Base, fit_base
 from bench.gap.model.crew import Crew
 from bench.gap.model.floor import Floor, noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.watch import Watch
 from bench.gap.model.world import World
+from bench.gap.steps import Coarse, with_numerics
 from bench.gap.tell import Teller
 from bench.problem.seeds import rng_for
 from bench.recordings.inspection import load
@@ -32,7 +35,7 @@ from bench.recordings.stamps import refuse_odd
 from sims import extended as extend
 from sims.base import Array, InputError
 from sims.extended import Extended
-from sims.recording.recording import Recording
+from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 
 LEAST = 2.0
@@ -113,38 +116,42 @@ class _Explainer:
             raise self._takes_no_effects()
         # The effects that it holds already could not be chosen again.
         extend.refuse_extended(kind)
-        self.kind: type[Simulated] = kind
         # A simulator that steps itself has no engine to choose.
-        self.engine = None if kind.own_engine else engine
+        usual = kind.default_engine if kind.has_model else None
+        self.engine = usual if kind.own_engine else engine
         # What is free of a robot is a number of its file, and a parameter of its simulator.
         free = () if kind.has_model else free
         # Before the worlds, which plan every step of every run.
         for odd in refuse_odd(self.recording, kind, force):
             say(f"{self.path}: {odd}")
         check_recording(self.recording, kind(engine=self.engine), force)
-        self.fitting = World(
-            kind, self.recording, self.recording.training(), self.engine, probes(kind), free
-        )
+        self.watch = watch
+        self.crew = crew
+        self.free = tuple(free)
+        self._enter(kind)
+        self.coarse: Coarse | None = None
+        self._check()
+
+    def _enter(self, kind: type[Simulated]) -> None:
+        """Take the recording for one of this simulator."""
+        self.fitting = self._world(kind, self.recording.training())
         held_out = self.recording.held_out()
         # The same effects in the same places, so that a fitted vector means the same there.
-        self.measuring = (
-            World(kind, self.recording, held_out, self.engine, probes(kind), free)
-            if held_out
-            else None
-        )
+        self.measuring = self._world(kind, held_out) if held_out else None
         self.floor: Floor = noise_floor(self.fitting, self.recording)
-        self.watch = watch
-        for part in (self.fitting, self.measuring):
-            if part is not None:
-                part.watch = watch
-                part.crew = crew
-                crew.join(part)
         # White to begin with: each likelihood finds the memory of the noise for itself.
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
+        self.kind = kind
         self.assessor = Assessor(
             self.recording, self.fitting, self.measuring, self.floor, self.engine
         )
-        self._check()
+
+    def _world(self, kind: type[Simulated], runs: Sequence[Run]) -> World:
+        world = World(kind, self.recording, runs, self.engine, probes(kind), self.free)
+        world.watch = self.watch
+        world.crew = self.crew
+        self.crew.join(world)
+        return world
 
     def _takes_no_effects(self) -> InputError:
         return InputError(
@@ -175,18 +182,19 @@ class _Explainer:
 
     def run(self) -> Explanation:
         self.say("fitting the base model")
-        base = fit_base(self.fitting, self.noise, self._given())
+        base = self._base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._fails()
         # One stream for surrogates and bootstrap: the same seed tells the same story.
         rng = rng_for("explain", self.recording.system, self.seed)
-        search = Search(self.fitting, self.noise, base.untouched, rng, self.floor.stated)
-        search.enter(base.fit)
+        search = self._search(base, rng)
         self.say("looking for what is missing")
         held_out = HeldOutRuns(self.measuring, self.noise) if self.measuring else None
         finding = name(search, held_out)
         self.say("measuring the gain")
         verdict = self.assessor.verdict(search, finding, rng, self.started)
+        if self.coarse is not None:
+            verdict = with_numerics(verdict, self.coarse)
         story = Teller(self.assessor, search, base, finding).story(verdict)
         extended = self._extended(search, finding)
         # Not earlier: an experiment is proposed by simulating further.
@@ -194,6 +202,54 @@ class _Explainer:
             if world is not None:
                 world.close()
         return Explanation(verdict, story, extended)
+
+    def _search(self, base: Base, rng: np.random.Generator) -> Search:
+        search = Search(self.fitting, self.noise, base.untouched, rng, self.floor.stated)
+        search.enter(base.fit)
+        return search
+
+    def _base(self) -> Base:
+        """The base model; of a robot with the step that the data ask for, the file's or a finer
+        one.
+        """
+        base = fit_base(self.fitting, self.noise, self._given())
+        if not self.kind.has_model:
+            return base
+        # Loaded where there is a robot alone.
+        from bench.gap.model.numerics import finer
+
+        fine = finer(self.fitting, self.noise)
+        if fine is None:
+            return base
+        coarse = self.kind, self.fitting, self.measuring
+        value = self._value(base)
+        self._enter(fine.kind)
+        other = fit_base(self.fitting, self.noise, self._given())
+        gain = self._value(other) - value
+        if gain < SWITCH:
+            # What the robot does is no nearer to its fine motion: the file's own step stands.
+            self._return(*coarse)
+            return base
+        self.say(f"stepped more finely: {fine.numerics.integrator}, {fine.numerics.timestep:g} s")
+        self.coarse = Coarse(fine, gain)
+        self.assessor = replace(self.assessor, before=self._before(base, coarse[2]))
+        return other
+
+    def _before(self, base: Base, measuring: World | None) -> Array | None:
+        """What the file's own step makes of the held-out runs; None where there are none."""
+        if measuring is None:
+            return None
+        return HeldOutRuns(measuring, self.noise).measure([base.fit.theta])[0].simulated
+
+    def _return(self, kind: type[Simulated], fitting: World, measuring: World | None) -> None:
+        """Go back to worlds that were left."""
+        self.kind, self.fitting, self.measuring = kind, fitting, measuring
+        self.assessor = Assessor(self.recording, fitting, measuring, self.floor, self.engine)
+
+    def _value(self, base: Base) -> float:
+        """Twice the log likelihood of a base model."""
+        rng = rng_for("explain", self.recording.system, self.seed)
+        return float(self._search(base, rng).base.likelihood.value)
 
     def _fails(self) -> InputError:
         """Why nothing could be simulated."""

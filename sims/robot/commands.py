@@ -230,6 +230,11 @@ COMMANDS: Mapping[str, Command] = {
 
 
 def order(cause: Cause) -> Any:
-    """Natives first, then commands in the order in which a signal passes them."""
+    """How it is stepped first, then what stands in the model, then commands in the order in which
+    a signal passes them.
+    """
+    # How stiff friction is hangs on the step.
+    if cause.effect.startswith("numerics."):
+        return -2
     names = list(COMMANDS)
     return names.index(cause.effect) if cause.effect in names else -1

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.base import Array
-from sims.robot.drives import Drives
 from sims.robot.model import Robot
-from sims.robot.native import FIELDS, SOLIMP, SOLREF, lanes_spec
+from sims.robot.native import FIELDS, SOLIMP, lanes_spec, stiff_of
+from sims.robot.quiet import quiet
 from sims.system import Acting
 
 LANES = 64
@@ -58,12 +58,48 @@ class Asked(Protocol):
         ...
 
 
+DRIVE = "simgap.drive."
+"""Beginning of the names of sensors that are added to a model."""
+
+
+def read_model(robot: Robot, derived: bool) -> Any:
+    """The compiled model of lanes, with a sensor of what actuators exert on each joint.
+
+    A sensor shows the instant at which a step begins, whatever the integrator; MuJoCo's data would
+    show the last of the instants that it looked at.
+
+    Args:
+        robot: whose.
+        derived: whether masses and centres of mass change lane by lane.
+    """
+    import mujoco
+
+    spec = lanes_spec(robot) if derived else robot.spec.copy()
+    for joint in robot.joints:
+        if joint.single:
+            spec.add_sensor(
+                name=DRIVE + joint.name,
+                type=mujoco.mjtSensor.mjSENS_JOINTACTFRC,
+                objtype=mujoco.mjtObj.mjOBJ_JOINT,
+                objname=joint.name,
+            )
+    with quiet():
+        return spec.compile()
+
+
+def drives(model: Any, robot: Robot) -> dict[str, int]:
+    """Where in its sensors' data a model of lanes has what actuators exert, by joint."""
+    singles = [joint.name for joint in robot.joints if joint.single]
+    return {name: int(model.sensor(DRIVE + name).adr[0]) for name in singles}
+
+
 class Bench:
     """Up to `LANES` simulations of a robot side by side.
 
     Attributes:
         fields: model fields of the lanes, (LANES, ...) by name, as they are.
         batch: the mujoco.batch.Batch.
+        drives: columns of the sensors' data that show what actuators exert, by joint.
 
     Args:
         robot: whose.
@@ -81,13 +117,12 @@ class Bench:
         self.robot = robot
         self.derived = derived
         self.count = count
-        spec = lanes_spec(robot) if derived else robot.spec.copy()
-        self._drives = Drives(robot, spec, settings)
-        model = spec.compile()
+        model = read_model(robot, derived)
         for name, value in settings.items():
             setattr(model.opt, name, value)
         # A lane that fails must be NaN: MuJoCo would reset it, and it would pass for done.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self.drives = drives(model, robot)
         self.batch: Any = batch.Batch(model, count, 1)
         names = {
             field
@@ -172,16 +207,15 @@ class Bench:
             spec |= int(state.mjSTATE_QFRC_APPLIED)
             given = np.concatenate([controls, forces], axis=2)
         n, steps, _ = controls.shape
-        fields = self._drives.fields(record)
-        result = self._begun(n, steps, fields)
+        result = self._begun(n, steps, record)
         for part in self._parts(n, steps):
             done = self.batch.rollout(
-                part.stop - part.start, given[:, part], spec, fields, self._ids(n)
+                part.stop - part.start, given[:, part], spec, tuple(record), self._ids(n)
             )
             for name, values in done.items():
                 result[name][:, part] = values
         self._fails(n)
-        return self._drives.told(result)
+        return result
 
     def ask(
         self,
@@ -213,10 +247,10 @@ class Bench:
         if rubs:
             # Where none of them rubs, the friction of the file stays as stiff as the file says.
             lanes, joints = np.nonzero(asking.rubs)
-            self.fields["dof_solref"][lanes, dofs[joints]] = SOLREF
+            self.fields["dof_solref"][lanes, dofs[joints]] = stiff_of(self.fields, self.robot)
             self.fields["dof_solimp"][lanes, dofs[joints]] = SOLIMP
             self._changed.update(FIELDS["friction.coulomb"].fields)
-        result = self._begun(n, steps, self._drives.fields(record))
+        result = self._begun(n, steps, record)
         ids = self._ids(n)
         ctrl[:n] = controls[:, 0]
         self.batch.forward(ids)
@@ -235,7 +269,7 @@ class Bench:
             for name, values in result.items():
                 values[:, k] = bind(name)[:n]
         self._fails(n)
-        return self._drives.told(result)
+        return result
 
     def _begun(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
         """Arrays that will hold what is recorded."""

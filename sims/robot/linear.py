@@ -4,7 +4,7 @@ sensors would show it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from sims.base import Array, Scenario
 from sims.robot.native import FIELDS
 from sims.robot.sampling import sampled
 from sims.robot.scales import scales
-from sims.robot.simulator import RobotSimulator, Work
+from sims.robot.simulator import INSTANT, RobotSimulator, Work
 from sims.robot.tangent import TOGETHER, Change, Motion, Tangent
 from sims.simulated import Simulated
 from sims.system import Acting, Effect, Input, Sensor
@@ -59,19 +59,21 @@ class Linear:
         simulator = self._simulator
         steps = self._steps + 1
         given = simulator.controls(self._work, steps)
-        more = ("qfrc_actuator", "qfrc_bias", "act", "sensordata")
+        more = ("qfrc_actuator", "qfrc_bias", "act")
         made = simulator.stepped(self._work, given, more)
         dofs = simulator.addresses.velocities
         carried = (made.fields["qfrc_actuator"] + made.fields["qfrc_bias"])[0][:, dofs]
         act = made.fields["act"][0]
         first = made.begun[0][None]
-        self._readings = {name: _reading(simulator, made.fields, name) for name in self._names}
+        data = made.fields["sensordata"][0] if self._names else np.zeros((steps, 0))
+        self._readings = {name: data[:, simulator.column(name)] for name in self._names}
         return Motion(
             x=made.x[0],
             v=made.v[0],
             act=np.concatenate([first, act[:-1]]),
             controls=given.controls[0],
             forces=given.forces[0],
+            instant=given.instant[0],
             inputs={name: u[0] for name, u in given.felt.items()},
             carried=carried,
             step=simulator.step,
@@ -79,7 +81,7 @@ class Linear:
 
     def _neighbourhood(self) -> Tangent:
         simulator = self._simulator
-        outputs = [_output(simulator, name) for name in self._names]
+        outputs = [("sensordata", simulator.column(name)) for name in self._names]
         return Tangent(
             simulator.wide,
             simulator.robotic,
@@ -172,13 +174,19 @@ class Linear:
         felt = simulator.felt(
             self._work.scenario, self._work.commands, tuple(acting.values()), count, steps
         )
-        numbers = {f"u.{a.name}": a.id for a in simulator.robot.actuators}
+        instant = felt
+        if any(name.startswith("tau.") for name in self._names):
+            given = self._work.scenario, self._work.commands, tuple(acting.values())
+            instant = simulator.felt(*given, count, steps, INSTANT)
+        numbers = {f"u.{a.name}": a.control for a in simulator.robot.actuators}
         result: dict[int, list[Change]] = {}
         for lane, (number, one, _) in enumerate(rows):
             if one.signal not in numbers:
                 continue
             series = felt[one.signal][lane] - self._motion.inputs[one.signal]
-            change = Change(number, actuator=numbers[one.signal], series=series)
+            column = numbers[one.signal]
+            at_once = instant[one.signal][lane] - self._motion.instant[:, column]
+            change = Change(number, actuator=column, series=series, instant=at_once)
             result.setdefault(number, []).append(change)
         return result
 
@@ -217,18 +225,3 @@ def _on(channel: str, own: Acting, more: Sequence[Acting]) -> Acting:
                 added[effect.name] = effect, np.zeros((len(c), len(more), 1))
             added[effect.name][1][:, lane] = c[:, 0]
     return (*acting, *added.values())
-
-
-def _output(simulator: RobotSimulator, channel: str) -> tuple[str, int]:
-    """Where MuJoCo has a channel that is no state: its field, and the column."""
-    kind, _, of = channel.partition(".")
-    if kind == "tau":
-        return "qfrc_actuator", simulator.robot.joint(of).velocity
-    row = next(s for s in simulator.robot.sensors if s.name == of)
-    return "sensordata", row.address
-
-
-def _reading(simulator: RobotSimulator, fields: Mapping[str, Array], channel: str) -> Array:
-    name, column = _output(simulator, channel)
-    values: Array = fields[name][0][:, column]
-    return values

@@ -21,11 +21,14 @@ import numpy as np
 from sims.base import Array
 from sims.robot.model import Robot
 
-SOLREF = (0.002, 1.0)
-"""Of dry friction: time constant in s and damping ratio. MuJoCo's own, 0.02 s, creeps at rest."""
-
-SOLIMP = (0.99, 0.99, 0.001, 0.5, 2.0)
-"""Of dry friction: as hard as at the end of MuJoCo's own range, everywhere."""
+SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""Of dry friction: as hard as MuJoCo allows, everywhere; what is stuck then hardly creeps."""
+SOFT = -1e-9
+"""In place of a stiffness, which dry friction has none of: so that MuJoCo reads the second number
+as a damping.
+"""
+RK4 = 1
+"""MuJoCo's number of the integrator."""
 
 SMALLEST = 1e-6
 """The least share of a mass or a gain that is left, so that none is zero or negative."""
@@ -71,6 +74,24 @@ def lanes_spec(robot: Robot) -> Any:
     return spec
 
 
+def stiff(timestep: float, integrator: int) -> tuple[float, float]:
+    """What dry friction has for `solref`: it takes the velocity away within a step, and no more.
+
+    Friction acts with a time constant 1 / b. A step of Euler or of the implicit integrators has it
+    all with b = 1 / h, beyond which it overshoots; the four looks of RK4 bear b = 2 / h. MuJoCo's
+    own, 0.02 s, creeps at rest.
+    """
+    return (SOFT, -2.0 / timestep) if integrator == RK4 else (2.0 * timestep, 1.0)
+
+
+def stiff_of(fields: Fields, robot: Robot) -> tuple[float, float]:
+    """The same of lanes, whose step stands among the fields or is the file's."""
+    option = robot.compiled.opt
+    step = fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep
+    kind = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
+    return stiff(float(step), int(kind))
+
+
 def added(stated: Any, c: Any) -> Any:
     """(1); a number below zero that the file states may stay."""
     return np.maximum(stated + c, np.minimum(stated, 0.0))
@@ -103,7 +124,7 @@ def _add_friction(fields: Fields, robot: Robot, place: str, c: Array) -> None:
     # In the lanes where it acts alone: what is zero leaves the file as it is.
     rubs = c[0] != 0
     loss[:, column] = added(loss[:, column], c[0])
-    fields["dof_solref"][rubs, column] = SOLREF
+    fields["dof_solref"][rubs, column] = stiff_of(fields, robot)
     fields["dof_solimp"][rubs, column] = SOLIMP
 
 

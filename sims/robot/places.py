@@ -18,6 +18,7 @@ from sims.base import Array
 from sims.robot.model import Robot
 from sims.robot.moment import RobotMoment
 from sims.system import (
+    FAMILY,
     Acting,
     Coefficient,
     Effect,
@@ -30,8 +31,6 @@ from sims.system import (
     Value,
 )
 
-FAMILY = "*"
-"""The place of a family."""
 SHARED = frozenset({"input.delay", "input.lag", "sensor.delay", "sensor.lag"})
 """Families of one coefficient for all places: what is late is late everywhere."""
 ALONE = frozenset({"force.periodic", "force.ripple", "friction.stribeck"})

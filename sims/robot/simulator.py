@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -19,7 +21,7 @@ from sims.base import Array, InputError, Scenario, unknown
 from sims.plan import Plan, Runs, felt_inputs, make_runs
 from sims.robot.forces import OVER_TIME, Forces, over_time
 from sims.robot.lanes import LANES, Addresses, Bench, Places
-from sims.robot.model import Robot
+from sims.robot.model import Actuator, Robot
 from sims.robot.native import FIELDS
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
@@ -30,8 +32,8 @@ from sims.user_toml import shown
 
 INTEGRATORS = {"Euler": 0, "RK4": 1, "implicit": 2, "implicitfast": 3}
 """MuJoCo's integrators, by their names in a model file."""
-_FIELDS = {"tau.": "qfrc_actuator", "s.": "sensordata"}
-"""Where MuJoCo has what channels show that begin so."""
+INSTANT = 1e-6
+"""Share of a step that is as good as its beginning."""
 WIDTH = 128
 """Instants of a motion that are looked at side by side."""
 BEYOND, LATE = 1.1, 0.2
@@ -42,7 +44,38 @@ SHARE = 1e-6
 """Of a step by which a run may exceed a whole number of them."""
 
 
+PARTS: Array = np.array([0.25, 0.5, 0.75, 1.0])
+"""Shares of a step at which it is divided, to see where in it a command changes."""
+PLAIN: Array = np.array([1.0])
+"""The same of a step that is not divided."""
 Mask = NDArray[np.bool_]
+
+
+def moments_kept(parts: Array, seen: Mask) -> Array:
+    """(n, S) what to give over each step, of means (n, S, 4) over its quarters.
+
+    A step of length h takes one control. With m its mean and D its first moment about the middle,
+
+        D = 1 / h^2 times the integral of (s - h / 2) u(s)                                 (1)
+
+    the pair that a command asks for is given by -D in the step and +D in the next one (or in the
+    step before and in this one, where a sample lies between: between samples nobody looks). A
+    command that changes within a step is then neither early nor late by a share of it.
+
+    Args:
+        parts: (n, S, 4).
+        seen: (S + 1,) at which ends of steps a sample lies.
+    """
+    weights = (np.arange(4.0) + 0.5) / 4.0 - 0.5
+    moments = (parts * weights).mean(axis=2)  # (1)
+    given: Array = parts.mean(axis=2)
+    last = parts.shape[1] - 1
+    for way, allowed in ((1, ~seen[1:]), (-1, seen[1:] & ~seen[:-1])):
+        steps = np.flatnonzero(allowed)
+        steps = steps[(steps + way >= 0) & (steps + way <= last)]
+        given[:, steps] -= way * moments[:, steps]
+        given[:, steps + way] += way * moments[:, steps]
+    return given
 
 
 class Numerics(NamedTuple):
@@ -116,6 +149,14 @@ class RobotSimulator(Simulated):
             found = shown(numerics.timestep)
             raise InputError(f"timestep must be a positive number of seconds, found {found}")
         return RobotEngine(numerics)
+
+    @classmethod
+    def stepped_by(cls, numerics: Numerics) -> type[RobotSimulator]:
+        """The same robot, stepped in another way."""
+        spec = cls.robot.spec.copy()
+        spec.option.timestep = numerics.timestep
+        spec.option.integrator = INTEGRATORS[numerics.integrator]
+        return robot_simulator(replace(cls.robot, spec=spec), cls.free)
 
     @property
     def step(self) -> float:
@@ -218,6 +259,16 @@ class RobotSimulator(Simulated):
         """How many steps it takes to the last of some instants since the start."""
         return max(int(np.ceil(times[-1] / self.step - SHARE)), 1)
 
+    @cached_property
+    def _drives(self) -> bool:
+        """Whether it is recorded what actuators exert."""
+        return any(c.name.startswith("tau.") for c in self.channels)
+
+    @cached_property
+    def _rated(self) -> frozenset[int]:
+        """Actuators that take the rate of their command besides."""
+        return frozenset(a.id for a in self.robot.actuators if a.name in self.robot.rated)
+
     def _feels(self) -> bool:
         """Whether a channel is recorded that MuJoCo computes within a step."""
         return any(c.name.startswith(("tau.", "s.")) for c in self.channels)
@@ -226,18 +277,31 @@ class RobotSimulator(Simulated):
         """What lanes of one run are given over the steps."""
         n = len(work.x)
         felt = self.felt(work.scenario, work.commands, work.acting, n, steps)
+        if self._drives:
+            instant = self.felt(work.scenario, work.commands, work.acting, n, steps, INSTANT)
+        else:
+            instant = felt
         begins: Array = self.step * np.arange(float(steps))
         model = self.robot.compiled
         controls = np.zeros((n, steps, model.nu))
         forces = np.zeros((n, steps, model.nv))
+        given = np.zeros_like(controls) if self._drives else controls
         for actuator in self.robot.actuators:
-            controls[:, :, actuator.id] = felt[f"u.{actuator.name}"]
+            name = f"u.{actuator.name}"
+            controls[:, :, actuator.control] = felt[name]
+            if self._drives:
+                given[:, :, actuator.control] = instant[name]
+            # What acts on the error's rate is given the rate of the command.
+            if actuator.id in self._rated:
+                rate = np.diff(felt[name], axis=1, prepend=felt[name][:, :1]) / self.step
+                controls[:, :, actuator.control + 1] = rate
+                given[:, :, actuator.control + 1] = rate
         for joint in self.robot.joints:
             if joint.single:
                 forces[:, :, joint.velocity] = felt[f"force.{joint.name}"]
         dofs = self.addresses.velocities
         forces[:, :, dofs] += over_time(self.robotic, work.acting, begins, len(dofs), n)
-        return Given(controls, forces, felt)
+        return Given(controls, forces, felt, given)
 
     def felt(
         self,
@@ -246,18 +310,60 @@ class RobotSimulator(Simulated):
         acting: Acting,
         n: int,
         steps: int,
+        share: float = 1.0,
     ) -> dict[str, Array]:
-        """What n lanes feel of each input over the steps, (n, S) by name."""
-        ends = np.broadcast_to(self.step * np.arange(1.0, steps + 1.0), (n, steps))
-        lengths = np.full((n, steps), self.step)
-        rows = np.zeros((n, 1), dtype=np.intp)
-        runs = Runs((scenario,), np.zeros(n, dtype=np.intp))
+        """What n lanes feel of each input over the steps, (n, S) by name: as a step has to be given
+        it, or as it is in the first share of each.
+        """
+        times = scenario.times - scenario.times[0]
+        # Where commands change with the steps a mean says all of them.
+        places = times / self.step
+        aligned = bool((np.abs(places - np.rint(places)) < SHARE).all())
+        seen = np.zeros(steps + 1, dtype=bool)
+        seen[np.clip(np.rint(places).astype(np.intp), 0, steps)] = True
+        usual = PLAIN if aligned else PARTS
+        if share < 1.0:
+            usual = np.array([share, 1.0])
         felt = {}
         for name, signal in commands.items():
+            given = partial(self._given, scenario, name, signal, steps, seen)
+            values = np.repeat(given((), 1, usual), n, axis=0)
             passed = tuple((e, c) for e, c in acting if isinstance(e, Input) and e.signal == name)
-            plan = Plan(lengths, ends, 1, rows, alike=not passed)
-            felt[name] = felt_inputs(plan, runs, [{name: signal}], passed)[name]
+            # What is given to a lane must not hang on the company that it is in.
+            lanes = np.flatnonzero(_lanes_with(passed, n, lambda _: True))
+            if lanes.size:
+                cuts = PARTS if usual is PLAIN else usual
+                values[lanes] = given(_part(passed, lanes), lanes.size, cuts)
+            felt[name] = values
         return felt
+
+    def _given(
+        self,
+        scenario: Scenario,
+        name: str,
+        signal: Array,
+        steps: int,
+        seen: Mask,
+        passed: Acting,
+        n: int,
+        cuts: Array,
+    ) -> Array:
+        """(n, S) what lanes are given of one input in steps that are divided at `cuts`."""
+        runs = Runs((scenario,), np.zeros(n, dtype=np.intp))
+        plan = self._parts_of_steps(steps, n, cuts, alike=not passed)
+        values = felt_inputs(plan, runs, [{name: signal}], passed)[name]
+        parts = values.reshape(n, steps, cuts.size)
+        return parts[:, :, 0] if cuts.size < PARTS.size else moments_kept(parts, seen)
+
+    def _parts_of_steps(self, steps: int, n: int, cuts: Array, alike: bool) -> Plan:
+        """Steps divided at these shares of them."""
+        begins: Array = self.step * np.arange(float(steps))
+        ends = (begins[:, None] + self.step * cuts).ravel()
+        lengths = np.diff(ends, prepend=0.0)
+        rows = np.zeros((n, 1), dtype=np.intp)
+        shape = n, ends.size
+        whole = np.broadcast_to(lengths, shape), np.broadcast_to(ends, shape)
+        return Plan(*whole, 1, rows, alike=alike)
 
     @property
     def wide(self) -> Bench:
@@ -287,8 +393,8 @@ class RobotSimulator(Simulated):
         bench.begin(start.x, start.v, self.addresses)
         begun = bench.settle(given.controls[:, 0])
         record = ["qpos", "qvel", *more]
-        for channel in self.channels:
-            record += [_FIELDS[kind] for kind in _FIELDS if channel.name.startswith(kind)]
+        if self._feels():
+            record.append("sensordata")
         record = list(dict.fromkeys(record))
         if asked:
             asking = Forces(self.robotic, start.acting, n, self.addresses)
@@ -299,7 +405,38 @@ class RobotSimulator(Simulated):
         x = np.concatenate([start.x[:, None], done["qpos"][:, :, places.positions]], axis=1)
         v = np.concatenate([start.v[:, None], done["qvel"][:, :, places.velocities]], axis=1)
         x[bench.failed] = np.nan
+        if self._drives:
+            self._as_given(done["sensordata"], bench, given)
         return Made(x, v, done, begun, bench.failed)
+
+    def _as_given(self, readings: Array, bench: Bench, given: Given) -> None:
+        """Let what actuators exert (n, S, k) be that of the command when each step begins, in place
+        of its mean over the step.
+        """
+        n = len(readings)
+        for actuator in self.robot.actuators:
+            apart = given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
+            if actuator.joint not in bench.drives or not apart.any():
+                continue
+            column = readings[:, :, bench.drives[actuator.joint]]
+            column += apart * self.by_control(actuator, bench)[:n, None]
+            limits = self._limits(actuator)
+            np.clip(column, *limits, out=column)
+
+    def by_control(self, actuator: Actuator, bench: Bench) -> Array:
+        """(LANES,) what one unit of an actuator's control exerts on its joint at once."""
+        gear = float(self.robot.compiled.actuator_gear[actuator.id, 0])
+        gain: Array = bench.fields["actuator_gainprm"][:, actuator.id, 0]
+        direct = actuator.kind in ("motor", "position", "velocity")
+        return gear * gain if direct else np.zeros_like(gain)
+
+    def _limits(self, actuator: Actuator) -> tuple[float, float]:
+        """Of what it exerts on its joint, as far as the file states them."""
+        gear = abs(float(self.robot.compiled.actuator_gear[actuator.id, 0]))
+        low, high = actuator.force or (-np.inf, np.inf)
+        assert actuator.joint is not None
+        effort = self.robot.joint(actuator.joint).effort or np.inf
+        return max(gear * low, -effort), min(gear * high, effort)
 
     def _bench(self, derived: bool, count: int) -> Bench:
         key = derived, count
@@ -335,10 +472,14 @@ class RobotSimulator(Simulated):
             if kind == "q":
                 return made.x[:, upto, number], made.v[:, upto, number]
             return made.v[:, upto, number], None
+        return made.fields["sensordata"][:, upto, self.column(name)], None
+
+    def column(self, channel: str) -> int:
+        """Where in its sensors' data MuJoCo has a channel that is no state."""
+        kind, _, of = channel.partition(".")
         if kind == "tau":
-            return made.fields["qfrc_actuator"][:, upto, self.robot.joint(of).velocity], None
-        row = next(s for s in self.robot.sensors if s.name == of)
-        return made.fields["sensordata"][:, upto, row.address], None
+            return self._bench(False, 1).drives[of]
+        return next(s for s in self.robot.sensors if s.name == of).address
 
     def close(self) -> None:
         """Give back the batches."""
@@ -399,11 +540,13 @@ class Given(NamedTuple):
         controls: (n, S, nu).
         forces: (n, S, nv) generalised.
         felt: inputs, (n, S) by name.
+        instant: controls as they are when each step begins.
     """
 
     controls: Array
     forces: Array
     felt: Mapping[str, Array]
+    instant: Array
 
     @classmethod
     def of(cls, parts: Sequence[Given]) -> Given:
@@ -416,6 +559,7 @@ class Given(NamedTuple):
             np.concatenate([_lasting(part.controls, steps) for part in parts]),
             np.concatenate([_lasting(part.forces, steps) for part in parts]),
             {n: np.concatenate([_lasting(part.felt[n], steps) for part in parts]) for n in names},
+            np.concatenate([_lasting(part.instant, steps) for part in parts]),
         )
 
 

@@ -52,6 +52,7 @@ class Motion:
         x, v: (S + 1, D) positions and velocities at the beginnings of steps, and at the end.
         act: (S, na) activations at the beginnings.
         controls: (S, nu).
+        instant: (S, nu) the same when each step begins.
         forces: (S, nv) generalised, known beforehand.
         inputs: (S,) what is felt of each input, by name.
         carried: (S, D) what transmissions carry.
@@ -62,6 +63,7 @@ class Motion:
     v: Array
     act: Array
     controls: Array
+    instant: Array
     forces: Array
     inputs: Mapping[str, Array]
     carried: Array
@@ -96,6 +98,7 @@ class Change(NamedTuple):
         joint: whose force it is; -1 if it is none.
         actuator: whose control it is; -1 if it is none.
         series: (S,) forces or controls; None if numbers of the model change.
+        instant: (S,) controls as they are when each step begins.
         states: (S, Z) what these do to a step.
         readings: (S, O) and to readings.
     """
@@ -104,6 +107,7 @@ class Change(NamedTuple):
     joint: int = -1
     actuator: int = -1
     series: Array | None = None
+    instant: Array | None = None
     states: Array | None = None
     readings: Array | None = None
 
@@ -305,7 +309,7 @@ class Tangent:
         for kind, quotients in kinds:
             some = [c for c in layer if getattr(c, kind) >= 0]
             if some:
-                series = np.stack([c.series for c in some if c.series is not None], axis=1)
+                series = np.stack([_series(c, numbers) for c in some], axis=1)
                 columns = quotients[:, :, [getattr(c, kind) for c in some]][self._of]
                 columns *= series[:, None, :]
                 to[:, :, [c.owner for c in some]] += columns
@@ -327,6 +331,14 @@ class Tangent:
             readings[t] = q.read_states[self._of[t]] @ states[t]
             states[t + 1] = q.states[self._of[t]] @ states[t]
         return np.moveaxis(states, 2, 0), np.moveaxis(readings, 2, 0)
+
+
+def _series(change: Change, numbers: str) -> Array:
+    """What acts over each step, or on readings at its beginning."""
+    at_once = numbers == "readings" and change.instant is not None
+    series = change.instant if at_once else change.series
+    assert series is not None
+    return series
 
 
 def _looks(motion: Motion) -> tuple[Places, Places]:

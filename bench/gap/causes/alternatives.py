@@ -17,6 +17,7 @@ from bench.gap.causes.search import Search
 from bench.gap.causes.trial import Trial
 from bench.gap.model.models import Model
 from sims.simulated import effect_parameters
+from sims.system import FAMILY
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class Alternatives:
         ordered = [name for _, name in rivals]
         alternatives = tuple(name for name in ordered if name != effect)
         # Alike is not as likely where structure is left, so there the effect found stands.
-        preferred = effect if self.structure else ordered[0]
+        preferred = effect if self.structure and effect in ordered else ordered[0]
         return Evidence(
             effect=effect,
             alternatives=alternatives,
@@ -118,7 +119,17 @@ class Alternatives:
             behind = self._behind(model, other)
             if is_alike(behind):
                 rivals.append((behind, added))
-        return rivals
+        return self._without_families(rivals)
+
+    def _without_families(self, rivals: list[tuple[float, str]]) -> list[tuple[float, str]]:
+        """The rivals without families of which one member does as well: the place is the answer."""
+        effects = self.search.world.effects
+        names = {name for _, name in rivals}
+        return [
+            (behind, name)
+            for behind, name in rivals
+            if effects[name].place != FAMILY or not names & set(effects[name].contains)
+        ]
 
     def _behind(self, model: Model, other: Model) -> float:
         """How far another model is behind, in twice the log likelihood; negative if it is ahead.
