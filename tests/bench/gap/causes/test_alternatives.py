@@ -13,6 +13,10 @@ ALIKE = model("b", merit=100.0 - 0.5 * SWITCH)
 BEHIND = model("c", merit=100.0 - 2.0 * SWITCH)
 
 
+def placed(place="", contains=()):
+    return SimpleNamespace(place=place, contains=contains)
+
+
 def evidence(
     monkeypatch, trial=None, structure=False, plausible="abc", luck=0.0, best=1e-5, **excess
 ):
@@ -22,6 +26,7 @@ def evidence(
     search = search_of(model(), BEST, ALIKE, BEHIND, excess={(n,): e for n, e in excess.items()})
     search.scanned = {frozenset(): SimpleNamespace(scores=scores)}
     search.tests = {frozenset(): best}
+    search.world = SimpleNamespace(effects={name: placed() for name in "abc"})
     monkeypatch.setattr(Alternatives, "_is_plausible", lambda self, effect: effect in plausible)
     (found,) = Alternatives(search, trial, structure).evidence(BEST)
     return found
@@ -57,3 +62,19 @@ def test_where_structure_is_left_what_it_leaves_decides_and_the_effect_stands(mo
     found = evidence(monkeypatch, structure=True, a=1.0, b=1.5, c=0.9, plausible="bc")
     assert found.alternatives == ("c",)
     assert found.preferred == "a"
+
+
+@pytest.mark.parametrize(
+    ("family", "contains", "kept"),
+    [("b", ("a",), ()), ("a", ("b",), ("b",)), ("b", ("c",), ("b",))],
+)
+def test_a_family_of_which_one_place_does_as_well_is_no_answer(monkeypatch, family, contains, kept):
+    """The place is; a family whose place is far behind stays in the set."""
+    search = search_of(model(), BEST, ALIKE, BEHIND)
+    effects = {name: placed() for name in "abc"} | {family: placed("*", contains)}
+    search.world = SimpleNamespace(effects=effects)
+    monkeypatch.setattr(Alternatives, "_is_plausible", lambda self, effect: True)
+    monkeypatch.setattr(Alternatives, "_p_value", lambda self, rest, effect, gain: 0.0)
+    (found,) = Alternatives(search, None, structure=False).evidence(BEST)
+    assert found.alternatives == kept
+    assert found.preferred == ("b" if family == "a" else "a")
