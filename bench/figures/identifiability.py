@@ -81,7 +81,8 @@ def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
         part = table[table["range"] == kind]
         targets = part["target"].nunique()
         # Marks of one direction stand side by side within 0.3, the ranges 0.4 apart.
-        within = (part.groupby("direction").cumcount() / max(targets - 1, 1) - 0.5) * 0.3
+        places = part.groupby("direction").cumcount()
+        within = (places / (targets - 1) - 0.5) * 0.3 if targets > 1 else 0.0 * places
         across = part["direction"] + within + (place - 0.5 * (len(ranges) - 1)) * 0.4
         axis.plot(
             across,
