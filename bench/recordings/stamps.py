@@ -18,10 +18,11 @@ times; then the samples lie further apart than (2), too, which nobody would reco
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
+from bench.recordings import poses
+from bench.recordings.oddity import Oddity
 from bench.sizes import INSIST
 from sims.base import Array, InputError, Simulator
 from sims.recording.recording import Recording, Run
@@ -45,20 +46,9 @@ _FEW = 10
 _UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
-class Oddity(NamedTuple):
-    """What is odd about the stamps of a run.
-
-    Attributes:
-        text: one line, without the file's name.
-        certain: whether nothing sound could look like this.
-    """
-
-    text: str
-    certain: bool
-
-
 def refuse_odd(recording: Recording, kind: type[Simulator], force: bool = False) -> list[str]:
-    """Refuse stamps that cannot be seconds; what may be is returned to be said.
+    """Refuse stamps that cannot be seconds, and positions that cannot be a robot's; what may be is
+    returned to be said.
 
     Args:
         recording: as it was read.
@@ -68,7 +58,8 @@ def refuse_odd(recording: Recording, kind: type[Simulator], force: bool = False)
     Raises:
         InputError: they cannot be, in one line.
     """
-    found = list(oddities(recording, kind))
+    # Positions of a wrong unit make stamps look odd, and not the other way round.
+    found = [*poses.odd_poses(recording, kind), *oddities(recording, kind)]
     for oddity in found:
         if oddity.certain and not force:
             raise InputError(f"{recording.path}: {oddity.text}, {INSIST}")
@@ -100,11 +91,14 @@ def _gap(run: Run) -> Oddity | None:
 def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Oddity | None:
     """Whether the run moves far more slowly than its system would."""
     # What steps itself tells nobody its forces.
-    if not issubclass(kind, Simulated) or kind.own_engine:
+    if not issubclass(kind, Simulated) or (kind.own_engine and not kind.has_model):
         return None
     system = kind.system()
     interval = float(np.median(np.diff(run.times)))
-    accelerations = _accelerations(recording, run, system)
+    if kind.has_model:
+        accelerations = poses.accelerations(run, kind)
+    else:
+        accelerations = _accelerations(recording, run, system)
     sizes = {channel.name: channel.scale for channel in system.channels}
     for column, name in enumerate(system.coordinates):
         x = run.channels.get(name)

@@ -203,8 +203,8 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
     stated = spot.stated.get(effect.name) if effect.at == "joint" else None
     if stated is not None:
         # The difference may take away what the file states, and no more.
-        high = max(high, 2.0 * stated)
-        low = least = -stated
+        high = max(high, 2.0 * abs(stated))
+        low = least = min(-stated, 0.0)
     return Coefficient(c.name, (unit,) * 3, ((low, high),) * 3, c.of, least)
 
 

@@ -114,6 +114,12 @@ def test_ranges_take_away_what_the_file_states_and_no_more(arm):
     assert numbers(at("mass.scale@fore"))[0][2:] == ((-0.5, 0.5), -0.99)
 
 
+def test_a_file_may_state_less_than_nothing():
+    pushes = system_of(made(ARM.replace('damping="0.1"', 'damping="-0.5"')))
+    (_, _, (low, high), least) = numbers(pushes.effect("drag.linear@elbow"))[0]
+    assert (low, least, high) == (0.0, 0.0, 1.0), "there is nothing to take away"
+
+
 def test_a_place_that_does_not_exist_lists_those_that_do(rail):
     with pytest.raises(InputError, match=r"unknown place .*'wrist'; there are: \*, hinge, rail"):
         rail.effect("friction.coulomb@wrist")

@@ -1,0 +1,182 @@
+"""Whether the positions of a robot's log can be what they are said to be: its joints' limits and
+the commands of its servos tell of degrees, of signs that are turned and of columns swapped.
+
+A servo's joint follows its command more or less: over the samples of all runs, with the command u
+and the position q about their means,
+
+    b = <u q> / <u^2>,    r = <u q> / sqrt(<u^2> <q^2>)                       (1)
+
+say how far it goes with it, and how alike the two are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.recordings.oddity import Oddity
+from sims.base import Array, Simulator
+from sims.recording.recording import Recording, Run
+from sims.robot.quiet import quiet
+
+BEYOND = 1.0
+"""Times the width of its range, a joint is not beyond its end, whatever its limits are worth."""
+TURNS = 8.0
+"""Turns of a joint without limits of which nobody wonders."""
+ALIKE = 0.9
+"""Of (1): a position that follows a command is at least so much like it."""
+UNLIKE = 0.7
+"""And one that has nothing to do with it less than this."""
+AGAINST = -0.3
+"""A servo that follows its command backwards has at most this slope."""
+OTHER = (40.0, 80.0)
+"""Slopes between which one of the two is in degrees: 57.3."""
+ROWS = 100
+"""Instants of a run at which its forces are looked at."""
+_SMALLER = {"rad": (np.pi / 180.0, "degrees"), "m": (1e-3, "millimetres")}
+"""What one of the smaller units is that people record in."""
+
+
+def odd_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Oddity]:
+    """What is odd about a robot's positions; nothing of what is no robot."""
+    if not kind.has_model:
+        return
+    robot: Any = kind
+    for joint in robot.robot.joints:
+        if joint.single:
+            yield from _beyond(recording, joint)
+    yield from _servos(recording, robot.robot)
+
+
+def _beyond(recording: Recording, joint: Any) -> Iterator[Oddity]:
+    """Positions beyond a joint's limits by far; the first run that has them stands for all."""
+    column = f"q.{joint.name}"
+    unit, (smaller, name) = joint.unit, _SMALLER[joint.unit]
+    for run in recording.runs:
+        values = run.channels.get(column)
+        if values is None or not np.isfinite(values).any():
+            continue
+        ends = np.array([np.nanmin(values), np.nanmax(values)])
+        found = float(ends[np.argmax(np.abs(ends))])
+        if joint.range is None:
+            if joint.kind == "hinge" and abs(found) > TURNS * 2.0 * np.pi:
+                turns = f"{abs(found) / (2.0 * np.pi):.3g} turns"
+                what = f"found {found:.4g} rad, {turns}; is the unit degrees?"
+                yield Oddity(f"run {run.name}, column {column}: {what}", False)
+                return
+            continue
+        low, high = joint.range
+        slack = BEYOND * (high - low)
+        if low - slack <= ends[0] and ends[1] <= high + slack:
+            continue
+        scaled = smaller * ends
+        fits = low - slack <= scaled[0] and scaled[1] <= high + slack
+        doubt = f"is the unit {name}?" if fits else "is the unit right?"
+        what = f"expected within {low:.4g} to {high:.4g} {unit}, the joint's range"
+        yield Oddity(f"run {run.name}, column {column}: {what}, found {found:.4g}; {doubt}", True)
+        return
+
+
+def accelerations(run: Run, kind: type[Simulator]) -> Array:
+    """(N, D) accelerations of a robot at rest in recorded positions with the recorded commands, at
+    some `ROWS` instants of the run.
+    """
+    import mujoco
+
+    robot = kind.robot  # type: ignore[attr-defined]
+    model = robot.compiled
+    data = mujoco.MjData(model)
+    joints = [joint for joint in robot.joints if joint.single]
+    found = []
+    with quiet():
+        for row in np.unique(np.linspace(0, run.times.size - 1, ROWS).astype(np.intp)):
+            mujoco.mj_resetData(model, data)
+            for joint in joints:
+                seen = run.channels.get(f"q.{joint.name}")
+                if seen is not None and np.isfinite(seen[row]):
+                    data.qpos[joint.position] = seen[row]
+                data.qfrc_applied[joint.velocity] = _at(run, f"force.{joint.name}", row)
+            for actuator in robot.actuators:
+                data.ctrl[actuator.control] = _at(run, f"u.{actuator.name}", row)
+            mujoco.mj_forward(model, data)
+            found.append([data.qacc[joint.velocity] for joint in joints])
+    return np.array(found)
+
+
+def _at(run: Run, name: str, row: int) -> float:
+    return float(run.inputs[name][row]) if name in run.inputs else 0.0
+
+
+class _Pair(NamedTuple):
+    """How a position follows a command, (1)."""
+
+    slope: float
+    like: float
+
+
+def _servos(recording: Recording, robot: Any) -> Iterator[Oddity]:
+    """Servos whose joints do what no servo does."""
+    driven = [
+        (f"u.{a.name}", f"q.{a.joint}")
+        for a in robot.actuators
+        if a.kind == "position" and a.joint is not None and _both(recording, a)
+    ]
+    pairs = {
+        (command, position): _pair(recording, command, position)
+        for command, _ in driven
+        for _, position in driven
+    }
+    for command, position in driven:
+        own = pairs[command, position]
+        if own.like > ALIKE and OTHER[0] < own.slope < OTHER[1]:
+            far = f"{own.slope:.3g} times as far as {command} says"
+            what = f"moves {far}; is its unit degrees?"
+            yield Oddity(f"column {position}: {what}", True)
+        elif own.like > ALIKE and 1.0 / OTHER[1] < own.slope < 1.0 / OTHER[0]:
+            far = f"1/{1.0 / own.slope:.3g} of what {command} says"
+            yield Oddity(
+                f"column {position}: moves {far}; is the unit of {command} degrees?", False
+            )
+        elif own.like < -ALIKE and own.slope < AGAINST:
+            yield Oddity(f"column {position}: moves against {command}; is a sign wrong?", False)
+    yield from _swapped(driven, pairs)
+
+
+def _swapped(
+    driven: list[tuple[str, str]], pairs: dict[tuple[str, str], _Pair]
+) -> Iterator[Oddity]:
+    """Two joints that follow each other's commands and not their own."""
+    for i, (command, position) in enumerate(driven):
+        for other_command, other in driven[i + 1 :]:
+            crossed = pairs[command, other].like, pairs[other_command, position].like
+            own = pairs[command, position].like, pairs[other_command, other].like
+            if min(crossed) > ALIKE and max(map(abs, own)) < UNLIKE:
+                what = f"columns {position} and {other}: each follows the other's command"
+                yield Oddity(f"{what}; are they swapped?", False)
+
+
+def _both(recording: Recording, actuator: Any) -> bool:
+    """Whether its command and its joint's position are recorded."""
+    first = recording.runs[0]
+    return f"u.{actuator.name}" in first.inputs and f"q.{actuator.joint}" in first.channels
+
+
+def _pair(recording: Recording, command: str, position: str) -> _Pair:
+    """(1) over all runs, each about its own means."""
+    squares = np.zeros(3)
+    for run in recording.runs:
+        u, q = run.inputs[command], run.channels[position]
+        seen = np.isfinite(u) & np.isfinite(q)
+        if seen.sum() > 1:
+            squares += _products(u[seen], q[seen])
+    uu, uq, qq = squares
+    if min(uu, qq) <= 0 or uq == 0:
+        return _Pair(1.0, 0.0)  # one of the two stands still: nothing is said
+    return _Pair(float(uq / uu), float(uq / np.sqrt(uu * qq)))
+
+
+def _products(u: Array, q: Array) -> Array:
+    u, q = u - u.mean(), q - q.mean()
+    return np.array([u @ u, u @ q, q @ q])
