@@ -9,7 +9,6 @@ from typing import cast
 from bench.recordings.robotic import about
 from bench.registry import robot
 from sims import effects
-from sims.robot import places
 from sims.robot.model import Robot
 from sims.robot.simulator import RobotSimulator
 from sims.robot.system import RobotSystem
@@ -29,7 +28,7 @@ def lines(model: Path) -> Iterator[str]:
     for channel in kind.channels:
         yield f"  {'channel':9} {channel.name:24} {channel.unit:9} {channel.says}"
     yield from _effects(kind.system)
-    yield f"  --free also takes MuJoCo's words: {', '.join(places.WORDS)}"
+    yield f"  --free also takes MuJoCo's words: {', '.join(kind.system.words())}"
 
 
 def _joints(robot: Robot) -> Iterator[str]:

@@ -290,7 +290,15 @@ def model_beside(model: str, experiment: Path) -> str:
     file, as that of a recording is.
     """
     file = experiment.parent / model
-    return str(file.resolve()) if file.is_file() else model
+    return str(file.resolve()) if is_there(file) else model
+
+
+def is_there(file: Path) -> bool:
+    """Whether it is a file; what no file could be called is none."""
+    try:
+        return file.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def names() -> list[str]:
@@ -335,6 +343,8 @@ def parse(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
     if model := fields.get("model"):
         fields["model"] = model_beside(model, path)
         fields.setdefault("simulator", plain_name(Path(model).stem))
+        if (called := fields["simulator"]) != plain_name(called):
+            raise fault(path, "simulator", "letters, digits and _ . + - for a robot", called)
     elif fields.get("free") or fields.get("actuators"):
         raise InputError(f'{path}: free and actuators are of a robot: expected model = "FILE"')
     if not fields.get("simulator"):

@@ -7,10 +7,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-from bench.problem.experiment import Experiment
+from bench.problem.experiment import Experiment, is_there
 from bench.problem.recorded import find_recording
 from bench.registry import robot, simulators
 from sims.base import InputError, Simulator
+from sims.limits import cut
 from sims.recording.description import model_of
 from sims.recording.recording import read_recording
 from sims.registry import SkippedError
@@ -85,11 +86,11 @@ def find_model(path: str, name: str) -> Path:
     if path.startswith(PACKAGE):
         return _packaged(path, name)
     for folder in (robots_folder(), Path()):
-        if folder is not None and (folder / path).is_file():
+        if folder is not None and is_there(folder / path):
             return folder / path
     given = os.environ.get("SIMGAP_ROBOTS")
     places = f"in {given} (SIMGAP_ROBOTS)" if given else "here (SIMGAP_ROBOTS is not set)"
-    raise SkippedError("experiment", name, f"model {path}: no such file {places}")
+    raise SkippedError("experiment", name, f"model {cut(path)}: no such file {places}")
 
 
 def robots_folder() -> Path | None:
@@ -102,12 +103,15 @@ def robots_folder() -> Path | None:
 
 def _packaged(path: str, name: str) -> Path:
     package, _, inside = path.removeprefix(PACKAGE).partition("/")
-    # Its name alone is looked for: what a package does when it is imported is none of ours.
-    known = package.isidentifier() and importlib.util.find_spec(package)
-    if not known:
+    if not (package.isidentifier() and inside):
+        wanted = f"{PACKAGE}NAME/FILE of an installed package"
+        raise InputError(f"experiment {name}: model: expected {wanted}, found '{cut(path)}'")
+    # It is looked for and not imported: what a package does then is none of ours.
+    known = importlib.util.find_spec(package)
+    if known is None:
         reason = f"needs {package}, not installed (pip install {package.split('_')[0]})"
         raise SkippedError("experiment", name, reason)
     for folder in known.submodule_search_locations or ():
         if (file := Path(folder, inside)).is_file():
             return file
-    raise SkippedError("experiment", name, f"model {path}: package {package} has no such file")
+    raise SkippedError("experiment", name, f"model {cut(path)}: package {package} has no such file")

@@ -130,6 +130,9 @@ class RobotSimulator(Simulated):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        twice = [effect.name for effect in self.effects if self.system.is_free(type(effect))]
+        if twice:
+            raise InputError(f"effect {twice[0]}: its coefficient is free already")
         freed = self.system.freed_effects
         self._freed: list[Effect] = [effect() for effect in freed]
         self.robotic = self.system()

@@ -51,10 +51,10 @@ class RobotSystem(System):
         """The effect at every place, without those that the user has declared free."""
         if effect.name not in cls._placed:
             cls._placed[effect.name] = tuple(places.classes(effect, cls.spots, FIELDS))
-        return [one for one in cls._placed[effect.name] if not cls._is_free(one)]
+        return [one for one in cls._placed[effect.name] if not cls.is_free(one)]
 
     @classmethod
-    def _is_free(cls, effect: type[Effect]) -> bool:
+    def is_free(cls, effect: type[Effect]) -> bool:
         """Whether a coefficient of it is a parameter: it can be no cause beside."""
         members = getattr(effect, "members", ())
         return effect.name in cls.freed or any(m.name in cls.freed for m in members)
@@ -96,13 +96,18 @@ class RobotSystem(System):
         base, _, place = word.partition("@")
         name = places.WORDS.get(base, base)
         if name not in library.names():
-            there = [*places.WORDS, *(other for other in library.names() if cls._has(other))]
+            there = [*cls.words(), *(other for other in library.names() if cls._has(other))]
             raise unknown(f"number of robot {cls.name}", base, there)
         found = cls.effect(f"{name}@{place}" if place else name)
         assert found is not None
         # What is late is late everywhere: one number for all places.
         members = () if name in places.SHARED else getattr(found, "members", ())
         return [type(member) for member in members] or [found]
+
+    @classmethod
+    def words(cls) -> list[str]:
+        """MuJoCo's words for numbers that its file states."""
+        return [word for word, name in places.WORDS.items() if cls._has(name)]
 
     @classmethod
     def _has(cls, name: str) -> bool:

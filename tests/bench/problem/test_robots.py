@@ -121,6 +121,20 @@ def test_names_that_do_not_exist_come_with_those_that_do(arm):
         Problem(arm(parameters={"mass": {"nominal": 1.0}}))
 
 
+def test_what_no_robot_could_be_is_one_line(arm):
+    for changes, message in (
+        ({"model": "x" * 5000}, "no such file"),
+        ({"model": "package://"}, "expected package://NAME/FILE"),
+        ({"simulator": "../x"}, "simulator: expected letters"),
+        ({"actuators": {"m": 5}}, "actuators.m: expected a table"),
+        ({"settings": {"effects": ["drag.linear@elbow"]}}, "its coefficient is free already"),
+    ):
+        with pytest.raises(InputError, match=message) as raised:
+            Problem(arm(**changes))
+        assert "\n" not in str(raised.value)
+        assert len(str(raised.value)) < 400
+
+
 def test_what_is_late_everywhere_is_one_number(arm):
     several = [p.name for p in kind_of(arm(free=["damping@*"])).parameters]
     assert several == ["drag.linear@shoulder", "drag.linear@elbow"]

@@ -105,6 +105,9 @@ def test_mends_of_a_model_are_said(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "note: not read, since MuJoCo knows no such thing: <transmission>" in said
     assert "hinge, effort 5 N*m" in said
+    words = said.partition("MuJoCo's words: ")[2]
+    assert "damping" in words
+    assert "kp" not in words, "it has no servo"
 
 
 def test_places_of_a_robot_are_listed(tmp_path, capsys):
