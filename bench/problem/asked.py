@@ -25,7 +25,7 @@ TUNERS = (
     "hybrid",
 )
 """That are compared where nobody says which."""
-TARGETS, BUDGET, TRAINING = 5, 60, 480
+TARGETS, BUDGET, TRAINING = 5, 50, 480
 """Starts or targets, simulations on each, and those that a learned tuner may learn from."""
 NOISE = 1e-3
 """rad or m, of the encoders of simulated targets."""
