@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -156,10 +155,8 @@ class RobotSimulator(Simulated):
     @classmethod
     def stepped_by(cls, numerics: Numerics) -> type[RobotSimulator]:
         """The same robot, stepped in another way."""
-        spec = cls.robot.spec.copy()
-        spec.option.timestep = numerics.timestep
-        spec.option.integrator = INTEGRATORS[numerics.integrator]
-        return robot_simulator(replace(cls.robot, spec=spec), cls.free)
+        # The robot stays as its file states it, so that a result can say what is to change there.
+        return robot_simulator(cls.robot, cls.free, numerics)
 
     @property
     def step(self) -> float:

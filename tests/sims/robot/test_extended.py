@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bench.checks import SIMULATOR_CHECKS
+from bench.gap.robot_files import causes_of
 from bench.gap.score_model import scored
 from bench.registry import load_plugins, robot, simulators
 from bench.runs.sources import source
@@ -166,6 +167,24 @@ def test_it_conforms_as_a_plugin_does(model, path):
     made = simulators.get("arm_extended")
     for check in SIMULATOR_CHECKS:
         check(made)
+
+
+def test_a_step_that_was_found_is_kept(model, path, kind, tmp_path):
+    """As explain hands it over: the robot is the file's, the step another."""
+    finer = Numerics(0.002, "implicitfast")
+    found = kind.stepped_by(finer)
+    fitted = replace(model, engine="mujoco", kind=found, robot=robot_of(found))
+    assert fitted.robot.digest == model.robot.digest
+    write(fitted, path)
+    loaded = load(path, simulators.get)
+    assert loaded.numerics == finer
+    theta = np.array([[p.nominal for p in loaded().parameters]])
+    seen = loaded().simulate(theta, SCENARIO)
+    np.testing.assert_array_equal(seen, fitted.simulator().simulate(theta, SCENARIO))
+    assert np.abs(seen - model.simulator().simulate(theta, SCENARIO)).max() > 1e-6
+    changed = causes_of(fitted)
+    assert changed["numerics.step"]["step"].value == 0.002
+    assert changed["numerics.integrator"]["integrator"].value == 3
 
 
 def test_two_models_are_told_apart(model, path, kind, tmp_path):

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 from sims.base import InputError, Scenario
 from sims.robot.model import Robot
-from sims.robot.simulator import robot_simulator
+from sims.robot.simulator import Numerics, own_numerics, robot_simulator
 from tests.sims.robot.arms import ARM
 
 PENDULUM = """
@@ -280,6 +280,18 @@ def test_lanes_give_the_same_bits_in_any_order_and_company():
     for i in range(24):
         alone = simulator.simulate(lanes[i : i + 1], runs[i])[0]
         np.testing.assert_array_equal(together[i, : len(alone)], alone)
+
+
+def test_another_step_is_that_of_a_file_that_states_it():
+    """With all that hangs on the step, as how stiff dry friction is."""
+    finer = Numerics(0.0004, "RK4")
+    other = kind_of(ARM.replace('timestep="0.001"', 'timestep="0.0004" integrator="RK4"'))
+    effects = {"friction__coulomb_at_elbow": 0.2, "mass__scale_at_fore": 0.3}
+    expected = one(other, ARM_RUN, JOINTS, **effects)
+    found = arm().stepped_by(finer)
+    assert (found.numerics, own_numerics(found.robot)) == (finer, Numerics(0.001, "Euler"))
+    np.testing.assert_array_equal(one(found, ARM_RUN, JOINTS, **effects), expected)
+    assert np.abs(one(arm(), ARM_RUN, JOINTS, **effects) - expected).max() > 1e-4
 
 
 def test_an_engine_that_cannot_be_is_one_line():
