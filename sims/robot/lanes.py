@@ -282,6 +282,17 @@ class Bench:
         self._fails(n)
         return result
 
+    def rub(self, n: int, dof: int, limit: Array) -> None:
+        """Let dry friction of at most `limit` (n,) besides act on the first n lanes of a joint."""
+        loss = self.fields["dof_frictionloss"]
+        changed = FIELDS["friction.coulomb"].fields
+        if not self._changed.issuperset(changed):
+            self._changed.update(changed)
+        # Written anew for every batch of instants: what is the lanes' own stands in the file.
+        loss[:n, dof] = self._stated["dof_frictionloss"][0, dof] + limit
+        self.fields["dof_solref"][:n, dof] = stiff_of(self.fields, self.robot)
+        self.fields["dof_solimp"][:n, dof] = SOLIMP
+
     def _begun(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
         """Arrays that will hold what is recorded."""
         return {name: np.empty((n, steps, *self.batch.bind(name).shape[1:])) for name in record}

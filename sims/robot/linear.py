@@ -10,6 +10,7 @@ import numpy as np
 
 from sims.base import Array, Scenario
 from sims.robot.native import FIELDS
+from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
 from sims.robot.scales import scales
 from sims.robot.simulator import INSTANT, RobotSimulator, Work
@@ -47,8 +48,9 @@ class Linear:
         commands = simulator.run_inputs(scenario)
         self._work = Work(scenario, commands, acting, x[None], v[None])
         self._names = [c.name for c in simulator.channels if c.name.startswith(("tau.", "s."))]
-        self._motion = self._nominal()
-        self._tangent = self._neighbourhood()
+        with np.errstate(all="ignore"), quiet():
+            self._motion = self._nominal()
+            self._tangent = self._neighbourhood()
         self._known: dict[tuple[str, bytes], Change] = {}
         nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.size))
         unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
@@ -116,13 +118,17 @@ class Linear:
                         continue
                     changes += self._changes(owner, one, k)
                 changes += [c._replace(owner=owner) for c in driven.get(number, ())]
-            states, readings = self._tangent.follow(changes, len(part))
-            result[part.start : part.stop] = self._seen(states, readings, sensors) - self.observed
+            # A change that grows beyond all numbers is none that a fit could follow.
+            with np.errstate(all="ignore"):
+                states, readings = self._tangent.follow(changes, len(part))
+                seen = self._seen(states, readings, sensors)
+            result[part.start : part.stop] = seen - self.observed
         return result
 
     def begun(self) -> Array:
         """(2 D, T, C): what each initial position, then each velocity, changes, per unit."""
-        states, readings = self._tangent.begun()
+        with np.errstate(all="ignore"):
+            states, readings = self._tangent.begun()
         # Small enough to be linear in what sensors do.
         small = 1e-4
         seen = self._seen(small * states, small * readings, [()] * len(states))
@@ -141,7 +147,8 @@ class Linear:
         key = effect.name, c.tobytes()
         if key not in self._known:
             acting = (*self._work.acting, (effect, c))
-            self._known[key] = self._tangent.by_numbers(0, acting, 1.0)
+            with quiet():
+                self._known[key] = self._tangent.by_numbers(0, acting, 1.0)
         return [self._known[key]._replace(owner=owner)]
 
     def _springs(self, name: str, joint: int | None) -> bool:

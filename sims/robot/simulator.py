@@ -158,6 +158,11 @@ class RobotSimulator(Simulated):
         # The robot stays as its file states it, so that a result can say what is to change there.
         return robot_simulator(cls.robot, cls.free, numerics)
 
+    @classmethod
+    def halved(cls) -> type[RobotSimulator]:
+        """The same robot at half its step."""
+        return cls.stepped_by(cls.numerics._replace(timestep=0.5 * cls.numerics.timestep))
+
     @property
     def step(self) -> float:
         """Seconds of a step."""

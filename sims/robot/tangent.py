@@ -9,8 +9,9 @@ z_{t+1} = F(z_t, u_t, f_t; p) with p the numbers of the model. About one motion
 are difference quotients, taken in all steps at once: a step of every lane of a batch, each lane at
 another instant. A change with forces df, controls du or numbers p + dp then moves the motion by
 
-    dz_{t+1} = A_t dz_t + B_t df_t + C_t du_t
-               + F(z_t, u_t, f_t; p + dp) - F(z_t, u_t, f_t; p)                                (2)
+    dz_{t+1} = A_t dz_t + B_t (df_t + M_t da_t) + C_t du_t                                     (2)
+
+with da_t what other numbers change about the acceleration at the same state, and M_t the inertia
 
 (the tangent or variational equations; J. Guckenheimer, P. Holmes, Nonlinear Oscillations, 1983,
 section 1.3). What effects exert is asked along the motion, all instants at once. Readings move
@@ -19,8 +20,9 @@ likewise, with their own quotients.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -40,7 +42,7 @@ POSITION, VELOCITY, CONTROL, SHARE = 1e-6, 1e-5, 1e-5, 1e-3
 size."""
 SLOW = 1e-3
 """rad/s or m/s over which dry friction turns its sign along the motion."""
-TOGETHER = 256
+TOGETHER = 128
 """Changes that go through time side by side."""
 
 
@@ -99,8 +101,8 @@ class Change(NamedTuple):
         actuator: whose control it is; -1 if it is none.
         series: (S,) forces or controls; None if numbers of the model change.
         instant: (S,) controls as they are when each step begins.
-        states: (S, Z) what these do to a step.
-        readings: (S, O) and to readings.
+        forces: (N, D) what these amount to, at each instant that is looked at.
+        readings: (N, O) and what they do to readings.
     """
 
     owner: int
@@ -108,7 +110,7 @@ class Change(NamedTuple):
     actuator: int = -1
     series: Array | None = None
     instant: Array | None = None
-    states: Array | None = None
+    forces: Array | None = None
     readings: Array | None = None
 
 
@@ -142,7 +144,11 @@ class Tangent:
         self._places = places
         self._steps = len(motion.controls)
         self._looks, self._of = _looks(motion)
+        # What is bound after a call is not there before the next one.
+        for name in ("qacc", *dict(outputs)):
+            bench.batch.bind(name)
         self.looks = 0
+        self._asked = [(e, c) for e, c in acting if _is_asked(e)]
         bench.batch.reset(stage=0)
         self._fresh = bench.batch.state.copy()
         self._base, self._read = self._advanced({}, acting)
@@ -159,8 +165,38 @@ class Tangent:
         self, moved: Mapping[str, tuple[int, float]], acting: Acting
     ) -> tuple[Array, Array]:
         """States (N, Z) and readings (N, O) after a step from each instant, with one column of the
-        state moved, or with other numbers of the model.
+        state moved.
         """
+        states, readings = [], []
+        bind, places = self._bench.batch.bind, self._places
+        for n, ids in self._placed(moved, acting):
+            self._bench.batch.step(ids)
+            parts = [bind("qpos")[:n, places.positions], bind("qvel")[:n, places.velocities]]
+            if self._motion.act.shape[1]:
+                parts.append(bind("act")[:n])
+            states.append(np.concatenate(parts, axis=1))
+            readings.append(self._readings(n))
+        return np.concatenate(states), np.concatenate(readings)
+
+    def _accelerated(self, acting: Acting) -> tuple[Array, Array]:
+        """Accelerations (N, D) at each instant, and readings (N, O)."""
+        accelerations, readings = [], []
+        for n, ids in self._placed({}, acting):
+            self._bench.batch.forward(ids)
+            accelerations.append(self._bench.batch.bind("qacc")[:n, self._places.velocities].copy())
+            readings.append(self._readings(n))
+        return np.concatenate(accelerations), np.concatenate(readings)
+
+    def _readings(self, n: int) -> Array:
+        """(n, O) of the lanes, as they are now."""
+        bind = self._bench.batch.bind
+        rows = [bind(name)[:n, column, None] for name, column in self._outputs]
+        return np.concatenate(rows, axis=1) if rows else np.zeros((n, 0))
+
+    def _placed(
+        self, moved: Mapping[str, tuple[int, float]], acting: Acting
+    ) -> Iterator[tuple[int, Places | None]]:
+        """Put the lanes at the instants, batch after batch: how many there are, and which."""
         motion, places = self._motion, self._places
         count = self._bench.count
         self.looks += self._looks.size
@@ -169,9 +205,14 @@ class Tangent:
         bind = batch.bind
         qpos, qvel, ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
         applied = bind("qfrc_applied")
-        read = {name: bind(name) for name, _ in self._outputs}
         na = motion.act.shape[1]
-        states, readings = [], []
+        targets = {
+            "q": lambda k: qpos[:, places.positions[k]],
+            "v": lambda k: qvel[:, places.velocities[k]],
+            "f": lambda k: applied[:, places.velocities[k]],
+            "u": lambda k: ctrl[:, k],
+            "a": lambda k: bind("act")[:, k],
+        }
         for begin in range(0, self._looks.size, count):
             at = self._looks[begin : begin + count]
             n = at.size
@@ -182,31 +223,14 @@ class Tangent:
             applied[:n] = motion.forces[at]
             if na:
                 bind("act")[:n] = motion.act[at]
-            targets = {
-                "q": qpos[:, places.positions[moved["q"][0]]] if "q" in moved else None,
-                "v": qvel[:, places.velocities[moved["v"][0]]] if "v" in moved else None,
-                "f": applied[:, places.velocities[moved["f"][0]]] if "f" in moved else None,
-                "u": ctrl[:, moved["u"][0]] if "u" in moved else None,
-                "a": bind("act")[:, moved["a"][0]] if "a" in moved else None,
-            }
-            for name, (_, size) in moved.items():
-                column = targets[name]
-                assert column is not None
-                column[:n] += size
+            for name, (k, size) in moved.items():
+                targets[name](k)[:n] += size
             self._ask(at, n)
-            batch.step(None if n == count else np.arange(n))
-            parts = [qpos[:n, places.positions], qvel[:n, places.velocities]]
-            if na:
-                parts.append(bind("act")[:n])
-            states.append(np.concatenate(parts, axis=1))
-            rows = [read[name][:n, column, None] for name, column in self._outputs]
-            readings.append(np.concatenate(rows, axis=1) if rows else np.zeros((n, 0)))
-        return np.concatenate(states), np.concatenate(readings)
+            yield n, None if n == count else np.arange(n)
 
     def _ask(self, at: Places, n: int) -> None:
         """Add the forces of effects that hang on where the robot is, at the lanes' own states."""
-        asked = [(e, c) for e, c in self._acting if _is_asked(e)]
-        if not asked:
+        if not self._asked:
             return
         bind, places = self._bench.batch.bind, self._places
         motion = self._motion
@@ -215,9 +239,14 @@ class Tangent:
         inputs = {name: u[at][:, None] for name, u in motion.inputs.items()}
         t: Array = motion.step * at[:, None].astype(np.float64)
         moment = moment_of(self._system, t, x, v, inputs, motion.carried[at])
-        for effect, c in asked:
+        for effect, c in self._asked:
             own = np.repeat(c, n, axis=1)
-            bind("qfrc_applied")[:n, places.velocities] += _force(effect, own, moment)
+            if isinstance(effect, Friction):
+                assert effect.coordinate is not None
+                limit = np.maximum(effect.limit(own, moment)[:, 0], 0.0)
+                self._bench.rub(n, int(places.velocities[effect.coordinate]), limit)
+            elif isinstance(effect, Force):
+                bind("qfrc_applied")[:n, places.velocities] += effect.force(own, moment)
 
     def _quotients(self) -> Quotients:
         size = self._motion.x.shape[1]
@@ -247,12 +276,35 @@ class Tangent:
 
     def by_numbers(self, owner: int, acting: Acting, change: float) -> Change:
         """The change that other numbers of the model make, as (2) has it, per `change`."""
-        states, readings = self._advanced({}, acting)
-        return Change(
-            owner,
-            states=(states - self._base) / change,
-            readings=(readings - self._read) / change,
-        )
+        accelerations, readings = self._accelerated(acting)
+        # What accelerates the robot by so much more is a force, and acts as one.
+        apart = (accelerations - self._still[0]) / change
+        force = np.einsum("nij,nj->ni", self._inertias, apart)
+        return Change(owner, forces=force, readings=(readings - self._still[1]) / change)
+
+    @cached_property
+    def _still(self) -> tuple[Array, Array]:
+        """Accelerations and readings of the motion itself."""
+        return self._accelerated(self._acting)
+
+    @cached_property
+    def _inertias(self) -> Array:
+        """(N, D, D) of the joints at each instant that is looked at."""
+        import mujoco
+
+        model = self._bench.batch.get_model(0)
+        data = mujoco.MjData(model)
+        places = self._places
+        whole = np.zeros((model.nv, model.nv))
+        found = []
+        for x in self._motion.x[self._looks]:
+            data.qpos[places.positions] = x
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_crb(model, data)
+            mujoco.mj_fullM(model, data, whole)
+            found.append(whole[np.ix_(places.velocities, places.velocities)])
+        return np.array(found)
 
     def by_force(self, owner: int, effect: Effect, c: Array) -> list[Change]:
         """The changes that an effect's force makes, one for each joint that it acts on."""
@@ -287,36 +339,47 @@ class Tangent:
             count: n.
         """
         q = self.quotients
-        moved = np.zeros((self._steps, self._base.shape[1], count))
+        size, joints = q.forces.shape[1:]
+        actuators = q.controls.shape[2]
+        # States, forces and controls below each other, so that a step is one product.
+        whole = np.zeros((self._steps + 1, size + joints + actuators, count))
+        forces, controls = whole[:-1, size : size + joints], whole[:-1, size + joints :]
+        at_once = np.zeros_like(controls) if self._outputs else controls
         read = np.zeros((self._steps, len(self._outputs), count))
-        for layer in map(list, _layers(changes)):
-            self._add(moved, layer, q.forces, q.controls, "states")
-            self._add(read, layer, q.read_forces, q.read_controls, "readings")
-        states = np.zeros((self._steps + 1, *moved.shape[1:]))
+        for change in changes:
+            owner = change.owner
+            if change.joint >= 0 and change.series is not None:
+                forces[:, change.joint, owner] += change.series
+            if change.actuator >= 0 and change.series is not None:
+                controls[:, change.actuator, owner] += change.series
+                instant = change.series if change.instant is None else change.instant
+                if self._outputs:
+                    at_once[:, change.actuator, owner] += instant
+            if change.forces is not None:
+                forces[:, :, owner] += change.forces[self._of]
+            if change.readings is not None:
+                read[:, :, owner] += change.readings[self._of]
+        step = np.concatenate([q.states, q.forces, q.controls], axis=2)
         for t in range(self._steps):
-            np.matmul(q.states[self._of[t]], states[t], out=states[t + 1])  # (2)
-            states[t + 1] += moved[t]
+            np.matmul(step[self._of[t]], whole[t], out=whole[t + 1, :size])  # (2)
+        states = whole[:, :size]
         if self._outputs:
+            # What numbers of the model change about readings is in them already.
+            seen = np.concatenate([q.read_states, q.read_forces], axis=2)
+            plain = self._plain(changes, count)
             for t in range(self._steps):
-                read[t] += q.read_states[self._of[t]] @ states[t]
+                look = self._of[t]
+                pushed = np.where(plain, whole[t, size : size + joints], 0.0)
+                read[t] += seen[look] @ np.concatenate([whole[t, :size], pushed])
+                read[t] += q.read_controls[look] @ at_once[t]
         return np.moveaxis(states, 2, 0), np.moveaxis(read, 2, 0)
 
-    def _add(
-        self, to: Array, layer: Sequence[Change], by_force: Array, by_control: Array, numbers: str
-    ) -> None:
-        """Add what changes of different owners do in each step to (S, Z, n)."""
-        kinds = (("joint", by_force), ("actuator", by_control))
-        for kind, quotients in kinds:
-            some = [c for c in layer if getattr(c, kind) >= 0]
-            if some:
-                series = np.stack([_series(c, numbers) for c in some], axis=1)
-                columns = quotients[:, :, [getattr(c, kind) for c in some]][self._of]
-                columns *= series[:, None, :]
-                to[:, :, [c.owner for c in some]] += columns
-        for change in layer:
-            values = getattr(change, numbers)
-            if values is not None:
-                to[:, :, change.owner] += values[self._of]
+    @staticmethod
+    def _plain(changes: Sequence[Change], count: int) -> Array:
+        """(n,) which owners change no numbers of the model."""
+        plain = np.ones(count, dtype=bool)
+        plain[[change.owner for change in changes if change.forces is not None]] = False
+        return plain
 
     def begun(self) -> tuple[Array, Array]:
         """Changes by the initial state, (2 D, S + 1, Z) and (2 D, S, O): one for each position and
@@ -331,14 +394,6 @@ class Tangent:
             readings[t] = q.read_states[self._of[t]] @ states[t]
             states[t + 1] = q.states[self._of[t]] @ states[t]
         return np.moveaxis(states, 2, 0), np.moveaxis(readings, 2, 0)
-
-
-def _series(change: Change, numbers: str) -> Array:
-    """What acts over each step, or on readings at its beginning."""
-    at_once = numbers == "readings" and change.instant is not None
-    series = change.instant if at_once else change.series
-    assert series is not None
-    return series
 
 
 def _looks(motion: Motion) -> tuple[Places, Places]:
@@ -356,19 +411,6 @@ def _looks(motion: Motion) -> tuple[Places, Places]:
     looked = (numbers - begins) % every == 0
     looks = np.flatnonzero(looked)
     return looks, np.cumsum(looked) - 1
-
-
-def _layers(changes: Sequence[Change]) -> list[list[Change]]:
-    """Changes in groups in which every owner has one at most."""
-    layers: list[list[Change]] = []
-    depth: dict[int, int] = {}
-    for change in changes:
-        place = depth.get(change.owner, 0)
-        depth[change.owner] = place + 1
-        if place == len(layers):
-            layers.append([])
-        layers[place].append(change)
-    return layers
 
 
 def _is_asked(effect: Effect) -> bool:

@@ -25,6 +25,8 @@ remembers explains almost anything.
 """
 PROMISING = 0.25
 """Candidates are refitted that promise at least this share of the best one's score."""
+CLOSE = 0.6
+"""The same where the scores are to first order exact."""
 SHARES = (1.0, 0.25)
 """Of the size that a score says; the score is linear, so less of it is tried too."""
 REACHES = (0.2, 0.7, 1.5)
@@ -44,7 +46,9 @@ def nominated(
     in patience.
     """
     numbered = []
-    for i in _promising(scores, most, patient):
+    # Where scores are those of the simulator's own derivatives, few can be better than they seem.
+    share = CLOSE if world.linear else PROMISING
+    for i in _promising(scores, most, patient, share):
         name = scores.effects[i]
         # The peaks of an effect are fitted apart: each may end in a minimum of its own.
         for peak, (group, scored) in enumerate(scores.peaks[i]):
@@ -56,13 +60,13 @@ def nominated(
     return _nearest(world, noise, numbered, share)
 
 
-def _promising(scores: Scores, most: int, patient: bool) -> list[int]:
+def _promising(scores: Scores, most: int, patient: bool, share: float) -> list[int]:
     """Places of the candidates to refit, the most promising first."""
     promise = scores.score - scores.chance
     order: list[int] = np.argsort(-promise, kind="stable").tolist()
     if patient:
         return order
-    good = [i for i in order if promise[i] >= PROMISING * promise[order[0]]]
+    good = [i for i in order if promise[i] >= share * promise[order[0]]]
     good = good[:most]
     by_squares = np.argsort(-scores.white, kind="stable")
     besides = by_squares[:WHITE].tolist()

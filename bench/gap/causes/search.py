@@ -79,7 +79,7 @@ class Search(Moves):
             if larger is None:
                 break
             if larger.merit > best.merit and self.missing(best, larger) <= ALPHA:
-                best = larger
+                best = self._corrected(larger)
             # Near the noise, or where all that is left may be noise, two steps at once find chance.
             elif self.excess(best) < FAR or self.quiet(best):
                 break
@@ -88,6 +88,17 @@ class Search(Moves):
                 break
         self.supported = best
         return best
+
+    def _corrected(self, model: Model) -> Model:
+        """The model without what the engine's own step leaves of it, where that can be taken
+        out.
+        """
+        if not self.world.linear:
+            return model
+        start = model.fit.start()
+        self.world.correct(start.theta, start.states)
+        self.refit([start], race=False)
+        return self.models[frozenset(model.names)]
 
     def so_far(self) -> Model:
         """What a search that has to end here supports best; nothing is simulated for it.
