@@ -326,9 +326,11 @@ def refuse_extended(kind: type[Simulated]) -> None:
     again.
     """
     if hasattr(kind, "extends"):
-        raise InputError(
-            f"simulator {kind.name} is extended already; name the system it extends, {kind.extends}"
-        )
+        robot: Any = kind
+        of = f"system it extends, {robot.extends}"
+        if kind.has_model:
+            of = f"model file it extends, --model {robot.robot.path}"
+        raise InputError(f"simulator {kind.name} is extended already; name the {of}")
 
 
 def _coefficients(extended: Extended, kind: type[Simulated]) -> list[Number]:

@@ -249,5 +249,7 @@ def test_one_that_is_extended_is_not_explained_again(path, tmp_path):
     simulator = simulators.get("arm_extended")()
     theta = np.array([[p.nominal for p in simulator.parameters]])
     table = recorded(tmp_path, simulator, theta)
-    with pytest.raises(InputError, match="arm_extended is extended already; name the system"):
+    with pytest.raises(
+        InputError, match=r"arm_extended is extended already; name the model file .*arm\.xml"
+    ):
         explain(table, system="arm_extended")
