@@ -1,5 +1,6 @@
 # make compare   a small comparison, from a bare machine to the figure (TARGETS=5 SEEDS=1 is shorter)
 # make explain   a small diagnosis: makes a recording with a hidden cause, finds it, writes the report
+# make robot     the same for a robot: an arm's model file and a log, with friction in the elbow
 # make test      the tests
 # make check     lint, types and import rules
 # make exam      hides causes in hundreds of recordings and has explain find them (about 6 minutes; QUICK=--quick)
@@ -14,7 +15,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: compare explain test check exam benchmark chaos malformed mutants reference multi install
+.PHONY: compare explain robot test check exam benchmark chaos malformed mutants reference multi install
 install: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml
@@ -36,6 +37,11 @@ explain: $(STAMP)
 	$(BIN)/simgap simulate pendulum --engine mujoco --effect drag.linear=2e-4 --noise q=0.01 qd=0.05 --out results/example/swing.csv
 	$(BIN)/simgap explain results/example/swing.csv --out results/example/explained
 	$(BIN)/simgap score results/example/explained/extended.toml results/example/swing.csv
+
+robot: $(STAMP)
+	rm -rf results/robot-example
+	$(BIN)/simgap explain examples/robot/log.csv --out results/robot-example
+	$(BIN)/simgap score results/robot-example/extended.toml examples/robot/log.csv --held-out
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
