@@ -78,10 +78,10 @@ def stiff(timestep: float, integrator: int) -> tuple[float, float]:
     """What dry friction has for `solref`: it takes the velocity away within a step, and no more.
 
     Friction acts with a time constant 1 / b. A step of Euler or of the implicit integrators has it
-    all with b = 1 / h, beyond which it overshoots; the four looks of RK4 bear b = 2 / h. MuJoCo's
-    own, 0.02 s, creeps at rest.
+    all with b = 1 / h, beyond which it overshoots; the four looks of RK4 bear b = 2.5 / h, and 3
+    chatters. MuJoCo's own, 0.02 s, creeps at rest.
     """
-    return (SOFT, -2.0 / timestep) if integrator == RK4 else (2.0 * timestep, 1.0)
+    return (SOFT, -2.5 / timestep) if integrator == RK4 else (2.0 * timestep, 1.0)
 
 
 def stiff_of(fields: Fields, robot: Robot) -> tuple[float, float]:

@@ -41,7 +41,7 @@ FRICTIONS = {
     "default": lambda step: ((0.02, 1), (0.9, 0.95, 0.001, 0.5, 2)),
     "0.002 s, 0.99": lambda step: ((0.002, 1), (0.99, 0.99, 0.001, 0.5, 2)),
     "two steps, 0.9999": lambda step: ((2 * step, 1), SOLVED),
-    "rate of 2 a step, 0.9999": lambda step: ((-1e-9, -2 / step), SOLVED),
+    "rate of 2.5 a step, 0.9999": lambda step: ((-1e-9, -2.5 / step), SOLVED),
     "rate of 4 a step, 0.9999": lambda step: ((-1e-9, -4 / step), SOLVED),
 }
 """Of solreffriction and solimpfriction, by the step."""

@@ -74,7 +74,7 @@ def test_dry_friction_in_mujoco_sticks_as_it_does_there():
     scenario = Scenario(np.arange(len(torques)) / make_log.RATE, {}, inputs)
     simulated = simulator.simulate(np.array([[make_log.FRICTION]]), scenario)[0]
     true = make_log.Arm(friction=make_log.FRICTION).simulate(np.zeros(4), torques)
-    assert np.sqrt(np.mean((simulated - true) ** 2)) < 1.2e-4
+    assert np.sqrt(np.mean((simulated - true) ** 2)) < 0.9e-4
 
 
 def test_the_log_is_what_the_script_makes():
