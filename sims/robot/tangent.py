@@ -143,7 +143,11 @@ class Tangent:
         self._sizes = sizes
         self._places = places
         self._steps = len(motion.controls)
-        self._looks, self._of = _looks(motion)
+        self._looks, self._of = looks, of = _looks(motion)
+        every = max(round(HELD / motion.step), 1)
+        numbers = np.arange(self._steps)
+        self._share: Array = (numbers - looks[of]) / every
+        self._earlier, self._later = _neighbours(looks, every)[:, of]
         # What is bound after a call is not there before the next one.
         for name in ("qacc", *dict(outputs)):
             bench.batch.bind(name)
@@ -178,10 +182,15 @@ class Tangent:
             readings.append(self._readings(n))
         return np.concatenate(states), np.concatenate(readings)
 
-    def _accelerated(self, acting: Acting) -> tuple[Array, Array]:
-        """Accelerations (N, D) at each instant, and readings (N, O)."""
+    def _accelerated(self, acting: Acting, more: Array | None = None) -> tuple[Array, Array]:
+        """Accelerations (N, D) at each instant, and readings (N, O); with more forces (N, D)."""
         accelerations, readings = [], []
+        applied = self._bench.batch.bind("qfrc_applied")
+        dofs, begin = self._places.velocities, 0
         for n, ids in self._placed({}, acting):
+            if more is not None:
+                applied[:n, dofs] += more[begin : begin + n]
+                begin += n
             self._bench.batch.forward(ids)
             accelerations.append(self._bench.batch.bind("qacc")[:n, self._places.velocities].copy())
             readings.append(self._readings(n))
@@ -276,9 +285,10 @@ class Tangent:
 
     def by_numbers(self, owner: int, acting: Acting, change: float) -> Change:
         """The change that other numbers of the model make, as (2) has it, per `change`."""
-        accelerations, readings = self._accelerated(acting)
+        accelerations, _ = self._accelerated(acting, self._meant)
+        _, readings = self._accelerated(acting)
         # What accelerates the robot by so much more is a force, and acts as one.
-        apart = (accelerations - self._still[0]) / change
+        apart = (accelerations - self.accelerations[self._looks]) / change
         force = np.einsum("nij,nj->ni", self._inertias, apart)
         return Change(owner, forces=force, readings=(readings - self._still[1]) / change)
 
@@ -286,6 +296,15 @@ class Tangent:
     def _still(self) -> tuple[Array, Array]:
         """Accelerations and readings of the motion itself."""
         return self._accelerated(self._acting)
+
+    @cached_property
+    def _meant(self) -> Array:
+        """(N, D) forces with which the acceleration at each instant is that over its step, which
+        an implicit integrator has damped, and in which the others have gone on.
+        """
+        apart = self.accelerations[self._looks] - self._still[0]
+        forces: Array = np.einsum("nij,nj->ni", self._inertias, apart)
+        return forces
 
     @cached_property
     def _inertias(self) -> Array:
@@ -356,9 +375,9 @@ class Tangent:
                 if self._outputs:
                     at_once[:, change.actuator, owner] += instant
             if change.forces is not None:
-                forces[:, :, owner] += change.forces[self._of]
+                forces[:, :, owner] += self._between(change.forces)
             if change.readings is not None:
-                read[:, :, owner] += change.readings[self._of]
+                read[:, :, owner] += self._between(change.readings)
         step = np.concatenate([q.states, q.forces, q.controls], axis=2)
         for t in range(self._steps):
             np.matmul(step[self._of[t]], whole[t], out=whole[t + 1, :size])  # (2)
@@ -373,6 +392,14 @@ class Tangent:
                 read[t] += seen[look] @ np.concatenate([whole[t, :size], pushed])
                 read[t] += q.read_controls[look] @ at_once[t]
         return np.moveaxis(states, 2, 0), np.moveaxis(read, 2, 0)
+
+    def _between(self, values: Array) -> Array:
+        """(S, k) of values (N, k) at the instants that are looked at, linear from one to the next
+        while a command holds, and beyond the last one as before it.
+        """
+        slope = values[self._later] - values[self._earlier]
+        result: Array = values[self._of] + self._share[:, None] * slope
+        return result
 
     @staticmethod
     def _plain(changes: Sequence[Change], count: int) -> Array:
@@ -409,8 +436,20 @@ def _looks(motion: Motion) -> tuple[Places, Places]:
     numbers = np.arange(steps)
     begins = np.maximum.accumulate(np.where(changes, numbers, 0))
     looked = (numbers - begins) % every == 0
-    looks = np.flatnonzero(looked)
-    return looks, np.cumsum(looked) - 1
+    return np.flatnonzero(looked), np.cumsum(looked) - 1
+
+
+def _neighbours(looks: Places, every: int) -> Places:
+    """(2, N) for each instant two that are `every` steps apart, over which values are linear: it
+    and the next one, or the one before and it where a command changes in between; itself twice
+    where neither is.
+    """
+    numbers = np.arange(looks.size)
+    after = np.append(np.diff(looks) == every, False)
+    before = np.append(False, np.diff(looks) == every)
+    earlier = np.where(after, numbers, np.where(before, numbers - 1, numbers))
+    later = np.where(after, numbers + 1, numbers)
+    return np.stack([earlier, later])
 
 
 def _is_asked(effect: Effect) -> bool:

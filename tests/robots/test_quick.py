@@ -8,7 +8,6 @@ from tests.robots import answers, questions
 
 
 @pytest.mark.slow
-@pytest.mark.skip(reason="a diagnosis of an arm of two joints takes minutes as yet")
 @pytest.mark.parametrize("question", questions.quick(), ids=lambda question: question.name)
 def test_what_is_hidden_in_an_arm_is_named(question):
     row = answers.answered(question.json(), 0, equal=False)

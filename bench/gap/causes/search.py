@@ -41,6 +41,10 @@ SKETCHED = 2
 """Models of at most so many effects are sought over short pieces."""
 TRANSFERRED = 5
 """So many of the best over short pieces are fitted to the whole runs."""
+NEAR = 100.0
+"""Models this near in twice the log likelihood are fitted again when what the engine's step leaves
+has been taken out.
+"""
 BEAM = 3
 """Models of the most merit from which the search goes on."""
 NEAREST = 2
@@ -90,15 +94,17 @@ class Search(Moves):
         return best
 
     def _corrected(self, model: Model) -> Model:
-        """The model without what the engine's own step leaves of it, where that can be taken
-        out.
+        """The model without what the engine's own step leaves of it, where that can be taken out;
+        or a simpler one that does as well then.
         """
         if not self.world.linear:
             return model
-        start = model.fit.start()
-        self.world.correct(start.theta, start.states)
-        self.refit([start], race=False)
-        return self.models[frozenset(model.names)]
+        self.world.correct(model.fit.theta, model.fit.states)
+        size = len(model.names)
+        # What a richer effect bent to may have been that alone.
+        near = [m for m in of_size(self, size) if m.merit > model.merit - NEAR]
+        self.refit([m.fit.start() for m in near], race=False)
+        return of_size(self, size)[0]
 
     def so_far(self) -> Model:
         """What a search that has to end here supports best; nothing is simulated for it.
