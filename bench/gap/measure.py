@@ -51,6 +51,9 @@ UNBOUNDED = 4.0
 """An interval wider than so many times the bounds, or the value, says that the data do not bound
 the parameter.
 """
+UNTOUCHED = 1e-200
+"""Curvature of a number that the data do not touch: small, and none that overflows when divided by.
+"""
 WORST = -9.0
 """Shares of the gap closed are cut here: how many times worse a failed model is has no meaning."""
 
@@ -192,7 +195,7 @@ def covariance(models: Models, model: Model) -> Array:
     own, left = _curvatures(models, model)
     # Parameters of any unit on one scale, so that the cut-off below means the same for each.
     powers = np.diagonal(own)
-    scale = np.sqrt(np.maximum(powers, 1e-300))
+    scale = np.sqrt(np.maximum(powers, UNTOUCHED))
     units = np.outer(scale, scale)
     scaled = left / units
     inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)

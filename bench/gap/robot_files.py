@@ -76,7 +76,7 @@ def causes_of(extended: Extended) -> dict[str, Mapping[str, Number]]:
 
 
 def _numerics(kind: Any) -> dict[str, Mapping[str, Number]]:
-    from sims.robot.simulator import INTEGRATORS, own_numerics
+    from sims.robot.numerics import INTEGRATORS, own_numerics
 
     own, numerics = own_numerics(kind.robot), kind.numerics
     changed: dict[str, Mapping[str, Number]] = {}

@@ -11,7 +11,7 @@ from bench.gap.causes.rules import VerdictName
 from bench.gap.model.numerics import Finer
 from bench.gap.verdict import Cause, Verdict
 from sims.extended import Number
-from sims.robot.simulator import INTEGRATORS
+from sims.robot.numerics import INTEGRATORS
 
 STEP, INTEGRATOR = "numerics.step", "numerics.integrator"
 _WITH: dict[VerdictName, VerdictName] = {"adequate": "named", "unknown": "partial"}

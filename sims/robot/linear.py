@@ -9,12 +9,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from sims.base import Array, Scenario
+from sims.robot.felt import INSTANT
+from sims.robot.felt import felt as felt_over
 from sims.robot.native import FIELDS
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
 from sims.robot.scales import scales
-from sims.robot.simulator import INSTANT, RobotSimulator, Work
+from sims.robot.simulator import RobotSimulator
 from sims.robot.tangent import TOGETHER, Change, Motion, Tangent
+from sims.robot.work import Work
 from sims.simulated import Simulated
 from sims.system import Acting, Effect, Input, Sensor
 
@@ -178,13 +181,11 @@ class Linear:
             acting[one.name][1][:, lane] = k[:, 0]
         steps = len(self._motion.controls)
         simulator = self._simulator
-        felt = simulator.felt(
-            self._work.scenario, self._work.commands, tuple(acting.values()), count, steps
-        )
+        given = self._work.scenario, self._work.commands, tuple(acting.values()), count, steps
+        felt = felt_over(simulator.step, *given)
         instant = felt
         if any(name.startswith("tau.") for name in self._names):
-            given = self._work.scenario, self._work.commands, tuple(acting.values())
-            instant = simulator.felt(*given, count, steps, INSTANT)
+            instant = felt_over(simulator.step, *given, INSTANT)
         numbers = {f"u.{a.name}": a.control for a in simulator.robot.actuators}
         result: dict[int, list[Change]] = {}
         for lane, (number, one, _) in enumerate(rows):

@@ -8,106 +8,32 @@ readings are linear. What an actuator is given over a step is the mean of its co
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, partial
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sims import effects as library
 from sims.base import Array, InputError, Scenario, unknown
-from sims.plan import Plan, Runs, felt_inputs, make_runs
-from sims.robot.forces import OVER_TIME, Forces, over_time
-from sims.robot.lanes import LANES, Addresses, Bench, Places
+from sims.plan import make_runs
+from sims.robot.acting import derives, filled, is_asked, lanes_with, natives, part_of
+from sims.robot.felt import INSTANT, SHARE
+from sims.robot.felt import felt as felt_over
+from sims.robot.forces import Forces, over_time
+from sims.robot.lanes import LANES, Addresses, Bench
 from sims.robot.model import Actuator, Robot
-from sims.robot.native import FIELDS
+from sims.robot.numerics import INTEGRATORS, Numerics, RobotEngine, own_numerics
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
 from sims.robot.system import RobotSystem, system_of
+from sims.robot.work import Given, Made, Start, Work, by_run, instants
 from sims.simulated import Simulated
-from sims.system import Acting, Effect, Engine, Input, Lanes, Motion, Sensor, System
+from sims.system import Acting, Effect, Engine, Sensor
 from sims.user_toml import shown
 
-INTEGRATORS = {"Euler": 0, "RK4": 1, "implicit": 2, "implicitfast": 3}
-"""MuJoCo's integrators, by their names in a model file."""
-INSTANT = 1e-6
-"""Share of a step that is as good as its beginning."""
 WIDTH = 128
 """Instants of a motion that are looked at side by side."""
-BEYOND, LATE = 1.1, 0.2
-"""How far beyond its end a run is simulated at most where sensors are early: times its length, and
-seconds.
-"""
-SHARE = 1e-6
-"""Of a step by which a run may exceed a whole number of them."""
-
-
-PARTS: Array = np.array([0.25, 0.5, 0.75, 1.0])
-"""Shares of a step at which it is divided, to see where in it a command changes."""
-PLAIN: Array = np.array([1.0])
-"""The same of a step that is not divided."""
-Mask = NDArray[np.bool_]
-
-
-def moments_kept(parts: Array, seen: Mask) -> Array:
-    """(n, S) what to give over each step, of means (n, S, 4) over its quarters.
-
-    A step of length h takes one control. With m its mean and D its first moment about the middle,
-
-        D = 1 / h^2 times the integral of (s - h / 2) u(s)                                 (1)
-
-    the pair that a command asks for is given by -D in the step and +D in the next one (or in the
-    step before and in this one, where a sample lies between: between samples nobody looks). A
-    command that changes within a step is then neither early nor late by a share of it.
-
-    Args:
-        parts: (n, S, 4).
-        seen: (S + 1,) at which ends of steps a sample lies.
-    """
-    weights = (np.arange(4.0) + 0.5) / 4.0 - 0.5
-    moments = (parts * weights).mean(axis=2)  # (1)
-    given: Array = parts.mean(axis=2)
-    last = parts.shape[1] - 1
-    for way, allowed in ((1, ~seen[1:]), (-1, seen[1:] & ~seen[:-1])):
-        steps = np.flatnonzero(allowed)
-        steps = steps[(steps + way >= 0) & (steps + way <= last)]
-        given[:, steps] -= way * moments[:, steps]
-        given[:, steps + way] += way * moments[:, steps]
-    return given
-
-
-class Numerics(NamedTuple):
-    """How MuJoCo steps: seconds, and the integrator's name."""
-
-    timestep: float
-    integrator: str
-
-    def settings(self) -> dict[str, float]:
-        """As options of a model."""
-        return {"timestep": self.timestep, "integrator": INTEGRATORS[self.integrator]}
-
-
-class RobotEngine:
-    """MuJoCo at the model's own step; `RobotSimulator` steps it."""
-
-    name = "mujoco"
-    requires: tuple[str, ...] = ("mujoco",)
-
-    def __init__(self, numerics: Numerics) -> None:
-        self.numerics = numerics
-        self.largest_step = numerics.timestep
-
-    def integrate(self, lanes: Lanes) -> Motion:
-        """Not for anything but robots."""
-        raise NotImplementedError
-
-    def refuses(self, system: type[System]) -> str:
-        """Everything that has no model file."""
-        return "" if system.has_model else "it has no model file"
-
-    def close(self) -> None:
-        """Nothing to give back."""
 
 
 class RobotSimulator(Simulated):
@@ -203,8 +129,8 @@ class RobotSimulator(Simulated):
         _, x, v = self._known(scenarios, initial or {})
         longest = max(s.times.size for s in runs.distinct)
         result = np.full((len(theta), longest, len(self.channels)), np.nan)
-        derived = _lanes_with(acting, len(theta), _derives)
-        asked = _lanes_with(acting, len(theta), _is_asked)
+        derived = lanes_with(acting, len(theta), derives)
+        asked = lanes_with(acting, len(theta), is_asked)
         # A lane whose numbers overflow is NaN in the end, and nothing is printed of it.
         with np.errstate(all="ignore"), quiet():
             for kind in range(4):
@@ -217,16 +143,16 @@ class RobotSimulator(Simulated):
                         Work(
                             runs.distinct[run],
                             commands[run],
-                            _part(acting, own),
+                            part_of(acting, own),
                             x[own],
                             v[own],
                         )
-                        for run, own in _by_run(runs, part)
+                        for run, own in by_run(runs, part)
                     ]
                     done = self._simulate(
-                        works, _part(acting, part), bool(kind & 1), bool(kind & 2)
+                        works, part_of(acting, part), bool(kind & 1), bool(kind & 2)
                     )
-                    for (_, own), seen in zip(_by_run(runs, part), done, strict=True):
+                    for (_, own), seen in zip(by_run(runs, part), done, strict=True):
                         result[own, : seen.shape[1]] = seen
         result += 0.0  # no zero is negative: whatever made it, it is the same zero
         return result
@@ -246,7 +172,7 @@ class RobotSimulator(Simulated):
             return []
         # What is felt now is read in the step that begins now.
         felt = self._feels()
-        sizes = [self.steps_of(_instants(work)) for work in works]
+        sizes = [self.steps_of(instants(work)) for work in works]
         given = [self.controls(work, size + felt) for work, size in zip(works, sizes, strict=True)]
         whole = Given.of(given)
         x = np.concatenate([work.x for work in works])
@@ -281,11 +207,9 @@ class RobotSimulator(Simulated):
     def controls(self, work: Work, steps: int) -> Given:
         """What lanes of one run are given over the steps."""
         n = len(work.x)
-        felt = self.felt(work.scenario, work.commands, work.acting, n, steps)
-        if self._drives:
-            instant = self.felt(work.scenario, work.commands, work.acting, n, steps, INSTANT)
-        else:
-            instant = felt
+        of_run = self.step, work.scenario, work.commands, work.acting, n, steps
+        felt = felt_over(*of_run)
+        instant = felt_over(*of_run, INSTANT) if self._drives else felt
         begins: Array = self.step * np.arange(float(steps))
         model = self.robot.compiled
         controls = np.zeros((n, steps, model.nu))
@@ -308,68 +232,6 @@ class RobotSimulator(Simulated):
         forces[:, :, dofs] += over_time(self.robotic, work.acting, begins, len(dofs), n)
         return Given(controls, forces, felt, given)
 
-    def felt(
-        self,
-        scenario: Scenario,
-        commands: Mapping[str, Array],
-        acting: Acting,
-        n: int,
-        steps: int,
-        share: float = 1.0,
-    ) -> dict[str, Array]:
-        """What n lanes feel of each input over the steps, (n, S) by name: as a step has to be given
-        it, or as it is in the first share of each.
-        """
-        times = scenario.times - scenario.times[0]
-        # Where commands change with the steps a mean says all of them.
-        places = times / self.step
-        aligned = bool((np.abs(places - np.rint(places)) < SHARE).all())
-        seen = np.zeros(steps + 1, dtype=bool)
-        seen[np.clip(np.rint(places).astype(np.intp), 0, steps)] = True
-        usual = PLAIN if aligned else PARTS
-        if share < 1.0:
-            usual = np.array([share, 1.0])
-        felt = {}
-        for name, signal in commands.items():
-            given = partial(self._given, scenario, name, signal, steps, seen)
-            values = np.repeat(given((), 1, usual), n, axis=0)
-            passed = tuple((e, c) for e, c in acting if isinstance(e, Input) and e.signal == name)
-            # What is given to a lane must not hang on the company that it is in.
-            lanes = np.flatnonzero(_lanes_with(passed, n, lambda _: True))
-            if lanes.size:
-                cuts = PARTS if usual is PLAIN else usual
-                values[lanes] = given(_part(passed, lanes), lanes.size, cuts)
-            felt[name] = values
-        return felt
-
-    def _given(
-        self,
-        scenario: Scenario,
-        name: str,
-        signal: Array,
-        steps: int,
-        seen: Mask,
-        passed: Acting,
-        n: int,
-        cuts: Array,
-    ) -> Array:
-        """(n, S) what lanes are given of one input in steps that are divided at `cuts`."""
-        runs = Runs((scenario,), np.zeros(n, dtype=np.intp))
-        plan = self._parts_of_steps(steps, n, cuts, alike=not passed)
-        values = felt_inputs(plan, runs, [{name: signal}], passed)[name]
-        parts = values.reshape(n, steps, cuts.size)
-        return parts[:, :, 0] if cuts.size < PARTS.size else moments_kept(parts, seen)
-
-    def _parts_of_steps(self, steps: int, n: int, cuts: Array, alike: bool) -> Plan:
-        """Steps divided at these shares of them."""
-        begins: Array = self.step * np.arange(float(steps))
-        ends = (begins[:, None] + self.step * cuts).ravel()
-        lengths = np.diff(ends, prepend=0.0)
-        rows = np.zeros((n, 1), dtype=np.intp)
-        shape = n, ends.size
-        whole = np.broadcast_to(lengths, shape), np.broadcast_to(ends, shape)
-        return Plan(*whole, 1, rows, alike=alike)
-
     @property
     def wide(self) -> Bench:
         """Lanes for looking at many instants of one motion at once."""
@@ -384,8 +246,8 @@ class RobotSimulator(Simulated):
             more: fields of MuJoCo's data to record besides.
         """
         n = len(work.x)
-        derived = bool(_lanes_with(work.acting, n, _derives).any())
-        asked = bool(_lanes_with(work.acting, n, _is_asked).any())
+        derived = bool(lanes_with(work.acting, n, derives).any())
+        asked = bool(lanes_with(work.acting, n, is_asked).any())
         return self._stepped(Start(work.x, work.v, work.acting), given, derived, asked, more)
 
     def _stepped(
@@ -394,7 +256,7 @@ class RobotSimulator(Simulated):
         n = len(start.x)
         # A lane alone shall not set the constants of all others.
         bench = self._bench(derived, 1 if n == 1 else LANES)
-        bench.load(_filled(_natives(start.acting), n, bench.count))
+        bench.load(filled(natives(start.acting), n, bench.count))
         bench.begin(start.x, start.v, self.addresses)
         begun = bench.settle(given.controls[:, 0])
         record = ["qpos", "qvel", *more]
@@ -492,164 +354,6 @@ class RobotSimulator(Simulated):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_benches": {}}
-
-
-class Work(NamedTuple):
-    """Lanes of one run.
-
-    Attributes:
-        scenario: theirs.
-        commands: its inputs (T,) by name.
-        acting: effects at one place each, with coefficients (K, n, 1).
-        x, v: (n, D) initial positions and velocities.
-    """
-
-    scenario: Scenario
-    commands: Mapping[str, Array]
-    acting: Acting
-    x: Array
-    v: Array
-
-    @property
-    def times(self) -> Array:
-        """(T,) of samples, seconds since the start."""
-        result: Array = self.scenario.times - self.scenario.times[0]
-        return result
-
-
-def _instants(work: Work) -> Array:
-    """The last instants at which something is read in the lanes of a run, seconds since the start:
-    by a clock that runs slow the world goes on beyond the last stamp.
-    """
-    end = work.times[-1:]
-    latest = float(end[0])
-    for effect, c in work.acting:
-        if isinstance(effect, Sensor):
-            latest = max(latest, float(np.max(effect.times(c, np.broadcast_to(end, c[0].shape)))))
-    # What a fit tries far from all that can be shall not cost a thousand steps.
-    return np.array([min(latest, BEYOND * float(end[0]) + LATE)])
-
-
-class Start(NamedTuple):
-    """Where n lanes begin, (n, D) each, and what acts on them."""
-
-    x: Array
-    v: Array
-    acting: Acting
-
-
-class Given(NamedTuple):
-    """What n lanes are given over S steps, known beforehand.
-
-    Attributes:
-        controls: (n, S, nu).
-        forces: (n, S, nv) generalised.
-        felt: inputs, (n, S) by name.
-        instant: controls as they are when each step begins.
-    """
-
-    controls: Array
-    forces: Array
-    felt: Mapping[str, Array]
-    instant: Array
-
-    @classmethod
-    def of(cls, parts: Sequence[Given]) -> Given:
-        """Lanes of several runs; shorter ones are given their last over and over."""
-        if len(parts) == 1:
-            return parts[0]
-        steps = max(part.controls.shape[1] for part in parts)
-        names = parts[0].felt
-        return cls(
-            np.concatenate([_lasting(part.controls, steps) for part in parts]),
-            np.concatenate([_lasting(part.forces, steps) for part in parts]),
-            {n: np.concatenate([_lasting(part.felt[n], steps) for part in parts]) for n in names},
-            np.concatenate([_lasting(part.instant, steps) for part in parts]),
-        )
-
-
-def _lasting(values: Array, steps: int) -> Array:
-    """(n, S', ...) drawn out to so many steps by their last."""
-    more = steps - values.shape[1]
-    if not more:
-        return values
-    return np.concatenate([values, np.repeat(values[:, -1:], more, axis=1)], axis=1)
-
-
-def _by_run(runs: Runs, lanes: Places) -> list[tuple[int, Places]]:
-    """Lanes that lie together by their runs."""
-    if not lanes.size:
-        return []
-    borders = np.flatnonzero(np.diff(runs.of[lanes])) + 1
-    return [(int(runs.of[own[0]]), own) for own in np.split(lanes, borders)]
-
-
-class Made(NamedTuple):
-    """What MuJoCo made of n lanes.
-
-    Attributes:
-        x, v: (n, S + 1, D) at the beginning and after every step.
-        fields: what MuJoCo's data had in each step, (n, S, ...) by name.
-        begun: (n, na) activations at the beginning.
-        failed: (n,) which lanes did.
-    """
-
-    x: Array
-    v: Array
-    fields: Mapping[str, Array]
-    begun: Array
-    failed: Mask
-
-    def of(self, lanes: slice) -> Made:
-        """Some of the lanes."""
-        fields = {name: values[lanes] for name, values in self.fields.items()}
-        return Made(self.x[lanes], self.v[lanes], fields, self.begun[lanes], self.failed[lanes])
-
-
-def _native(effect: Effect) -> bool:
-    return (effect.of or effect.name) in FIELDS and effect.hook in ("value", "force")
-
-
-def _derives(effect: Effect) -> bool:
-    """Whether MuJoCo derives constants from what it changes."""
-    return _native(effect) and FIELDS[effect.of or effect.name].derived
-
-
-def _natives(acting: Acting) -> Acting:
-    return tuple((e, c) for e, c in acting if _native(e))
-
-
-def _is_asked(effect: Effect) -> bool:
-    """Whether its force is known only when the robot is there."""
-    return effect.hook == "force" and not _native(effect) and effect.of not in OVER_TIME
-
-
-def _lanes_with(acting: Acting, count: int, which: Callable[[Effect], bool]) -> Mask:
-    """(L,) in which lanes an effect acts of those that `which` says."""
-    there = np.zeros(count, dtype=bool)
-    for effect, c in acting:
-        if which(effect):
-            there |= (c != 0).any(axis=0)[:, 0]
-    return there
-
-
-def _part(acting: Acting, lanes: Places) -> Acting:
-    parts = tuple((e, c[:, lanes]) for e, c in acting)
-    return tuple((e, c) for e, c in parts if c.any())
-
-
-def _filled(acting: Acting, n: int, count: int) -> Acting:
-    """Coefficients for all lanes of a batch, zero behind the first n."""
-    return tuple(
-        (e, np.concatenate([c, np.zeros((len(c), count - n, 1))], axis=1)) for e, c in acting
-    )
-
-
-def own_numerics(robot: Robot) -> Numerics:
-    """How the robot's file says that it is stepped."""
-    option = robot.compiled.opt
-    names = {number: name for name, number in INTEGRATORS.items()}
-    return Numerics(float(option.timestep), names[int(option.integrator)])
 
 
 def robot_simulator(

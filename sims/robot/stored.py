@@ -54,8 +54,9 @@ class StoredRobot:
             InputError: the model file is missing, cannot be read or has changed.
         """
         # Loaded here alone: most simulators have nothing to do with robots.
+        from sims.robot.numerics import Numerics, own_numerics
         from sims.robot.reading import read
-        from sims.robot.simulator import Numerics, own_numerics, robot_simulator
+        from sims.robot.simulator import robot_simulator
 
         robot = read(self.path, actuators=self.actuators, engine=self.engine)
         if self.digest is not None and robot.digest != self.digest:
@@ -67,7 +68,7 @@ class StoredRobot:
 
 def of(kind: type[RobotSimulator]) -> StoredRobot:
     """What a file has to name for a robot's simulator."""
-    from sims.robot.simulator import own_numerics
+    from sims.robot.numerics import own_numerics
 
     robot = kind.robot
     differs = kind.numerics != own_numerics(robot)
@@ -116,7 +117,7 @@ def read_stored(source: Path, document: Mapping[str, Any]) -> StoredRobot:
 
 def _numerics(source: Source, value: Any) -> dict[str, Any]:
     """``[numerics]``: a step in s, and an integrator of MuJoCo's."""
-    from sims.robot.simulator import INTEGRATORS
+    from sims.robot.numerics import INTEGRATORS
 
     given = table(source, "numerics", value)
     for key, entry in given.items():

@@ -28,10 +28,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.base import Array
+from sims.robot.acting import is_asked, natives
 from sims.robot.forces import moment_of
 from sims.robot.lanes import Addresses, Bench, Places
 from sims.robot.moment import RobotMoment
-from sims.robot.native import FIELDS
 from sims.robot.system import RobotSystem
 from sims.system import Acting, Effect, Force, Friction
 
@@ -152,7 +152,7 @@ class Tangent:
         for name in ("qacc", *dict(outputs)):
             bench.batch.bind(name)
         self.looks = 0
-        self._asked = [(e, c) for e, c in acting if _is_asked(e)]
+        self._asked = [(e, c) for e, c in acting if is_asked(e)]
         bench.batch.reset(stage=0)
         self._fresh = bench.batch.state.copy()
         self._base, self._read = self._advanced({}, acting)
@@ -452,12 +452,6 @@ def _neighbours(looks: Places, every: int) -> Places:
     return np.stack([earlier, later])
 
 
-def _is_asked(effect: Effect) -> bool:
-    from sims.robot.forces import OVER_TIME
-
-    return effect.hook == "force" and effect.of not in OVER_TIME and effect.of not in FIELDS
-
-
 def _force(effect: Effect, c: Array, moment: RobotMoment) -> Array:
     """(S, D) what an effect exerts along a motion."""
     if isinstance(effect, Force):
@@ -473,8 +467,4 @@ def _force(effect: Effect, c: Array, moment: RobotMoment) -> Array:
 
 def _repeated(acting: Acting, count: int) -> Acting:
     """One lane's coefficients for all lanes of a batch; of native effects alone."""
-    return tuple(
-        (e, np.repeat(c, count, axis=1))
-        for e, c in acting
-        if (e.of or e.name) in FIELDS and e.hook in ("value", "force")
-    )
+    return tuple((e, np.repeat(c, count, axis=1)) for e, c in natives(acting))

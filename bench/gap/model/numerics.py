@@ -20,7 +20,8 @@ import numpy as np
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
 from sims.base import Array
-from sims.robot.simulator import Numerics, RobotSimulator
+from sims.robot.numerics import Numerics
+from sims.robot.simulator import RobotSimulator
 
 MATTERS = 0.2
 """RMS error in units of the noise from which the step is asked about."""

@@ -51,6 +51,8 @@ PATIENCE = 4.0
 """A lane is given up that needs so many times the planned steps: all lanes of a call wait for the
 slowest one.
 """
+ENDLESS = 1e60
+"""A change beyond it is none: the motion explodes."""
 FREED = 5.0
 """A constant that is set free is searched from a fifth of its value to five times it."""
 
@@ -264,6 +266,8 @@ class World:
         for run, (values, looks) in self.crew.each(self, _responses, calls):
             result[:, run, : values.shape[1]] = values
             self.simulations += looks
+        # what explodes says nothing of a model near the data
+        result[~(np.abs(result) < ENDLESS)] = np.nan
         return result
 
     def begun(self, theta: Array, states: Array, anew: bool = False) -> Array:

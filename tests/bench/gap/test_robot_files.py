@@ -15,7 +15,8 @@ from bench.registry import robot
 from sims.extended import Extended, Number, robot_of
 from sims.robot import checking
 from sims.robot.model import Robot
-from sims.robot.simulator import Numerics, robot_simulator
+from sims.robot.numerics import Numerics
+from sims.robot.simulator import robot_simulator
 from tests.bench.gap.stories import story
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "robot"

@@ -13,8 +13,9 @@ from bench.registry import load_plugins, robot, simulators
 from bench.runs.sources import source
 from sims.base import InputError, Scenario
 from sims.extended import Extended, Number, load, name_of, opened, read, robot_of, write
+from sims.robot.numerics import Numerics
 from sims.robot.reading import read as read_robot
-from sims.robot.simulator import Numerics, robot_simulator
+from sims.robot.simulator import robot_simulator
 from tests.sims.robot.arms import ARM
 
 pytestmark = pytest.mark.usefixtures("fresh_registries")

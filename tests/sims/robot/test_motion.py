@@ -10,7 +10,8 @@ from scipy.integrate import solve_ivp
 
 from sims.base import InputError, Scenario
 from sims.robot.model import Robot
-from sims.robot.simulator import Numerics, own_numerics, robot_simulator
+from sims.robot.numerics import Numerics, own_numerics
+from sims.robot.simulator import robot_simulator
 from tests.sims.robot.arms import ARM
 
 PENDULUM = """

@@ -5,8 +5,9 @@ import pytest
 
 from sims import effects as library
 from sims.base import Scenario
+from sims.robot.felt import moments_kept
 from sims.robot.linear import Linear
-from sims.robot.simulator import Numerics, moments_kept
+from sims.robot.numerics import Numerics
 from tests.sims.robot.test_motion import kind_of
 
 ARM = """

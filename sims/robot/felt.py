@@ -1,0 +1,114 @@
+"""What a robot feels of its commands, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+
+from sims.base import Array, Scenario
+from sims.plan import Plan, Runs, felt_inputs
+from sims.robot.acting import Mask, lanes_with, part_of
+from sims.system import Acting, Input
+
+INSTANT = 1e-6
+"""Share of a step that is as good as its beginning."""
+SHARE = 1e-6
+"""Of a step by which a run may exceed a whole number of them."""
+PARTS: Array = np.array([0.25, 0.5, 0.75, 1.0])
+"""Shares of a step at which it is divided, to see where in it a command changes."""
+PLAIN: Array = np.array([1.0])
+"""The same of a step that is not divided."""
+
+
+def felt(
+    step: float,
+    scenario: Scenario,
+    commands: Mapping[str, Array],
+    acting: Acting,
+    n: int,
+    steps: int,
+    share: float = 1.0,
+) -> dict[str, Array]:
+    """What n lanes feel of each input over the steps, (n, S) by name: as a step has to be given
+    it, or as it is in the first share of each.
+    """
+    times = scenario.times - scenario.times[0]
+    # Where commands change with the steps a mean says all of them.
+    places = times / step
+    aligned = bool((np.abs(places - np.rint(places)) < SHARE).all())
+    seen = np.zeros(steps + 1, dtype=bool)
+    seen[np.clip(np.rint(places).astype(np.intp), 0, steps)] = True
+    usual = PLAIN if aligned else PARTS
+    if share < 1.0:
+        usual = np.array([share, 1.0])
+    felt = {}
+    for name, signal in commands.items():
+        given = partial(_given, step, scenario, name, signal, steps, seen)
+        values = np.repeat(given((), 1, usual), n, axis=0)
+        passed = tuple((e, c) for e, c in acting if isinstance(e, Input) and e.signal == name)
+        # What is given to a lane must not hang on the company that it is in.
+        lanes = np.flatnonzero(lanes_with(passed, n, lambda _: True))
+        if lanes.size:
+            cuts = PARTS if usual is PLAIN else usual
+            values[lanes] = given(part_of(passed, lanes), lanes.size, cuts)
+        felt[name] = values
+    return felt
+
+
+def _given(
+    step: float,
+    scenario: Scenario,
+    name: str,
+    signal: Array,
+    steps: int,
+    seen: Mask,
+    passed: Acting,
+    n: int,
+    cuts: Array,
+) -> Array:
+    """(n, S) what lanes are given of one input in steps that are divided at `cuts`."""
+    runs = Runs((scenario,), np.zeros(n, dtype=np.intp))
+    plan = _parts_of_steps(step, steps, n, cuts, alike=not passed)
+    values = felt_inputs(plan, runs, [{name: signal}], passed)[name]
+    parts = values.reshape(n, steps, cuts.size)
+    return parts[:, :, 0] if cuts.size < PARTS.size else moments_kept(parts, seen)
+
+
+def _parts_of_steps(step: float, steps: int, n: int, cuts: Array, alike: bool) -> Plan:
+    """Steps divided at these shares of them."""
+    begins: Array = step * np.arange(float(steps))
+    ends = (begins[:, None] + step * cuts).ravel()
+    lengths = np.diff(ends, prepend=0.0)
+    rows = np.zeros((n, 1), dtype=np.intp)
+    shape = n, ends.size
+    whole = np.broadcast_to(lengths, shape), np.broadcast_to(ends, shape)
+    return Plan(*whole, 1, rows, alike=alike)
+
+
+def moments_kept(parts: Array, seen: Mask) -> Array:
+    """(n, S) what to give over each step, of means (n, S, 4) over its quarters.
+
+    A step of length h takes one control. With m its mean and D its first moment about the middle,
+
+        D = 1 / h^2 times the integral of (s - h / 2) u(s)                                 (1)
+
+    the pair that a command asks for is given by -D in the step and +D in the next one (or in the
+    step before and in this one, where a sample lies between: between samples nobody looks). A
+    command that changes within a step is then neither early nor late by a share of it.
+
+    Args:
+        parts: (n, S, 4).
+        seen: (S + 1,) at which ends of steps a sample lies.
+    """
+    weights = (np.arange(4.0) + 0.5) / 4.0 - 0.5
+    moments = (parts * weights).mean(axis=2)  # (1)
+    given: Array = parts.mean(axis=2)
+    last = parts.shape[1] - 1
+    for way, allowed in ((1, ~seen[1:]), (-1, seen[1:] & ~seen[:-1])):
+        steps = np.flatnonzero(allowed)
+        steps = steps[(steps + way >= 0) & (steps + way <= last)]
+        given[:, steps] -= way * moments[:, steps]
+        given[:, steps + way] += way * moments[:, steps]
+    return given

@@ -1,0 +1,131 @@
+"""Lanes of a robot on their way: where they begin, what they are given, what is made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sims.base import Array, Scenario
+from sims.plan import Runs
+from sims.robot.acting import Mask
+from sims.robot.lanes import Places
+from sims.system import Acting, Sensor
+
+BEYOND, LATE = 1.1, 0.2
+"""How far beyond its end a run is simulated at most where sensors are early: times its length, and
+seconds.
+"""
+
+
+class Work(NamedTuple):
+    """Lanes of one run.
+
+    Attributes:
+        scenario: theirs.
+        commands: its inputs (T,) by name.
+        acting: effects at one place each, with coefficients (K, n, 1).
+        x, v: (n, D) initial positions and velocities.
+    """
+
+    scenario: Scenario
+    commands: Mapping[str, Array]
+    acting: Acting
+    x: Array
+    v: Array
+
+    @property
+    def times(self) -> Array:
+        """(T,) of samples, seconds since the start."""
+        result: Array = self.scenario.times - self.scenario.times[0]
+        return result
+
+
+def instants(work: Work) -> Array:
+    """The last instants at which something is read in the lanes of a run, seconds since the start:
+    by a clock that runs slow the world goes on beyond the last stamp.
+    """
+    end = work.times[-1:]
+    latest = float(end[0])
+    for effect, c in work.acting:
+        if isinstance(effect, Sensor):
+            latest = max(latest, float(np.max(effect.times(c, np.broadcast_to(end, c[0].shape)))))
+    # What a fit tries far from all that can be shall not cost a thousand steps.
+    return np.array([min(latest, BEYOND * float(end[0]) + LATE)])
+
+
+class Start(NamedTuple):
+    """Where n lanes begin, (n, D) each, and what acts on them."""
+
+    x: Array
+    v: Array
+    acting: Acting
+
+
+class Given(NamedTuple):
+    """What n lanes are given over S steps, known beforehand.
+
+    Attributes:
+        controls: (n, S, nu).
+        forces: (n, S, nv) generalised.
+        felt: inputs, (n, S) by name.
+        instant: controls as they are when each step begins.
+    """
+
+    controls: Array
+    forces: Array
+    felt: Mapping[str, Array]
+    instant: Array
+
+    @classmethod
+    def of(cls, parts: Sequence[Given]) -> Given:
+        """Lanes of several runs; shorter ones are given their last over and over."""
+        if len(parts) == 1:
+            return parts[0]
+        steps = max(part.controls.shape[1] for part in parts)
+        names = parts[0].felt
+        return cls(
+            np.concatenate([_lasting(part.controls, steps) for part in parts]),
+            np.concatenate([_lasting(part.forces, steps) for part in parts]),
+            {n: np.concatenate([_lasting(part.felt[n], steps) for part in parts]) for n in names},
+            np.concatenate([_lasting(part.instant, steps) for part in parts]),
+        )
+
+
+def _lasting(values: Array, steps: int) -> Array:
+    """(n, S', ...) drawn out to so many steps by their last."""
+    more = steps - values.shape[1]
+    if not more:
+        return values
+    return np.concatenate([values, np.repeat(values[:, -1:], more, axis=1)], axis=1)
+
+
+def by_run(runs: Runs, lanes: Places) -> list[tuple[int, Places]]:
+    """Lanes that lie together by their runs."""
+    if not lanes.size:
+        return []
+    borders = np.flatnonzero(np.diff(runs.of[lanes])) + 1
+    return [(int(runs.of[own[0]]), own) for own in np.split(lanes, borders)]
+
+
+class Made(NamedTuple):
+    """What MuJoCo made of n lanes.
+
+    Attributes:
+        x, v: (n, S + 1, D) at the beginning and after every step.
+        fields: what MuJoCo's data had in each step, (n, S, ...) by name.
+        begun: (n, na) activations at the beginning.
+        failed: (n,) which lanes did.
+    """
+
+    x: Array
+    v: Array
+    fields: Mapping[str, Array]
+    begun: Array
+    failed: Mask
+
+    def of(self, lanes: slice) -> Made:
+        """Some of the lanes."""
+        fields = {name: values[lanes] for name, values in self.fields.items()}
+        return Made(self.x[lanes], self.v[lanes], fields, self.begun[lanes], self.failed[lanes])
