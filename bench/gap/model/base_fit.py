@@ -80,7 +80,10 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
     best = min(fits, key=lambda fit: fit.cost)
     if world.linear:
         # what was taken about the first start is taken about the fitted model, for all that follow
-        world.begun(best.theta, best.states, anew=True)
+        # loaded where there is a robot alone
+        from bench.gap.model.tangents import begun
+
+        begun(world, best.theta, best.states, anew=True)
         best = Fitter(world, noise).fit([best.start()], LAST_STEPS)[0]
 
     # what the data do not touch stands wherever the search left it: nominal says more

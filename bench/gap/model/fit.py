@@ -217,7 +217,10 @@ class Fitter:
         is known.
         """
         world = self.world
-        derivatives = world.begun(start.theta, start.states)[:, :samples]
+        # loaded where there is a robot alone
+        from bench.gap.model.tangents import begun
+
+        derivatives = begun(world, start.theta, start.states)[:, :samples]
         kept: Array = derivatives * ~world.known[:, None, None, :]
         return kept
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,6 @@ from sims.base import Array, InputError, Parameter, Scenario, unknown
 from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 from sims.system import Effect, Input, Sensor
-
-if TYPE_CHECKING:
-    from sims.robot.linear import Linear
 
 Indices = NDArray[np.intp]
 
@@ -51,8 +48,6 @@ PATIENCE = 4.0
 """A lane is given up that needs so many times the planned steps: all lanes of a call wait for the
 slowest one.
 """
-ENDLESS = 1e60
-"""A change beyond it is none: the motion explodes."""
 FREED = 5.0
 """A constant that is set free is searched from a fifth of its value to five times it."""
 
@@ -83,7 +78,9 @@ class World:
         longest: duration of the longest run, seconds.
         simulations: lanes simulated so far.
         watch: says when fits have to leave off; never, unless another is put here.
-        correction: (R, T, C) what is added to all that is simulated; see `correct`.
+        correction: (R, T, C) what is added to all that is simulated, if anything is
+            (`bench.gap.model.tangents`).
+        derivatives: (R, T, C, s) by initial states, where they have been taken from a tangent.
         crew: who simulates and fits; this process alone, unless another is put here.
 
     Args:
@@ -143,7 +140,7 @@ class World:
         self.guess: Array = np.array([t.guess for t in self.tracks])
         self.longest = self._longest()
         self._travels: dict[str, float] = {}
-        self._begun: Array | None = None
+        self.derivatives: Array | None = None
         self.correction: Array | None = None
         self.simulations = 0
         self.watch = Watch()
@@ -238,70 +235,10 @@ class World:
         """Every effect at hand, by name."""
         return {effect.name: effect for effect in self.simulator.effects}
 
-    def _about(self, run: int, theta: Array, states: Array) -> Linear:
-        """The neighbourhood of one run of a model."""
-        # loaded where there is a robot alone
-        from sims.robot.linear import Linear
-
-        half = len(self.states) // 2
-        scenario = self.tracks[run].scenario
-        return Linear(self.simulator, theta, scenario, states[:half], states[half:])
-
     @property
     def linear(self) -> bool:
         """Whether the simulator tells what small changes do, without simulating each of them."""
         return self.kind.has_model
-
-    def responses(self, theta: Array, states: Array, added: Sequence[tuple[str, Array]]) -> Array:
-        """What one more effect changes about the runs, to first order: (K, R, T, C).
-
-        Args:
-            theta: (P,) parameters, without the effects that are added.
-            states: (R, s) initial states.
-            added: K effects with their coefficients.
-        """
-        runs, length, channels = self.observed.shape
-        result = np.full((len(added), runs, length, channels), np.nan)
-        calls = [(run, theta, states[run], added) for run in range(runs)]
-        for run, (values, looks) in self.crew.each(self, _responses, calls):
-            result[:, run, : values.shape[1]] = values
-            self.simulations += looks
-        # what explodes says nothing of a model near the data
-        result[~(np.abs(result) < ENDLESS)] = np.nan
-        return result
-
-    def begun(self, theta: Array, states: Array, anew: bool = False) -> Array:
-        """Derivatives of the runs by their initial states, (R, T, C, s): those about the first
-        model that was asked for, or about this one.
-
-        Initial states act alike in all models that are near the data, and a fit that has their
-        derivatives about another of them comes to the same end.
-
-        Args:
-            theta: (P,) parameters.
-            states: (R, s) initial states.
-            anew: take them about this model, and keep them.
-        """
-        if self._begun is None or anew:
-            runs, length, channels = self.observed.shape
-            result = np.zeros((runs, length, channels, len(self.states)))
-            calls = [(run, theta, states[run]) for run in range(runs)]
-            for run, values in self.crew.each(self, _begun, calls):
-                result[run, : values.shape[1]] = np.moveaxis(values, 0, -1)
-            self._begun = np.nan_to_num(result)
-        return self._begun
-
-    def begun_of_run(self, run: int, theta: Array, states: Array) -> Array:
-        """The same of one run, (s, T, C)."""
-        return self._about(run, theta, states).begun()
-
-    def responses_of_run(
-        self, run: int, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
-    ) -> tuple[Array, int]:
-        """The same of one run (K, T, C), and how many simulations it cost."""
-        about = self._about(run, theta, states)
-        values = about.responses([(self.effects[name], c) for name, c in added])
-        return values, about.cost
 
     def places(self, effect: str) -> range:
         """Where an effect's coefficients stand in theta."""
@@ -361,36 +298,6 @@ class World:
         if self.correction is not None:
             result += self.correction[runs]
         return result
-
-    def correct(self, theta: Array, states: Array) -> None:
-        """Take out of all that is simulated from now on what the engine's own step leaves of a
-        model's motion: of the first order, so that twice the change by half the step is all of it.
-
-        Below what would be asked about as a cause it is no cause, and yet would look like one: dry
-        friction that stops within a step and not at its end, as in `bench.gap.model.numerics`.
-
-        Args:
-            theta: (P,) parameters of a model that is near the data.
-            states: (R, s) its initial states.
-        """
-        if not self.linear:
-            return
-        # loaded where there is a robot alone
-        from sims.robot.simulator import RobotSimulator
-
-        assert issubclass(self.kind, RobotSimulator)
-        kind = self.kind.halved()
-        effects = [*self.library, *(effect for effect in self.extra)]
-        finer = kind(self.recording.constants, self.channels, effects=effects)
-        runs = len(self.tracks)
-        scenarios = [track.scenario for track in self.tracks]
-        lanes = np.tile(theta, (runs, 1))
-        begun = dict(zip(self.states, states.T, strict=True))
-        fine = finer.simulate_lanes(lanes, scenarios, begun)
-        coarse = self.simulator.simulate_lanes(lanes, scenarios, begun)
-        self.simulations += 3 * runs
-        left = 2.0 * (fine - coarse)
-        self.correction = np.nan_to_num(left)
 
     def over(self, runs: Sequence[Run]) -> World:
         """A world of other runs, cut or thinned from these: with the same parameters, the same
@@ -478,16 +385,6 @@ class World:
         """Give back what the engine holds."""
         self.simulator.close()
         self._fine.close()
-
-
-def _begun(world: World, *call: Any) -> Array:
-    """Derivatives of a run by its initial state, whoever takes them."""
-    return world.begun_of_run(*call)
-
-
-def _responses(world: World, *call: Any) -> tuple[Array, int]:
-    """What effects change about a run, whoever asks."""
-    return world.responses_of_run(*call)
 
 
 def _shows(effect: type[Effect], recorded: set[str]) -> bool:

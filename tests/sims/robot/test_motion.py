@@ -204,7 +204,7 @@ PUSH = 2 * 0.3 / INERTIA
         ({"clock__skew": 0.03}, lambda t: 1.03 * t),
         ({"clock__skew": -0.03}, lambda t: 0.97 * t),
     ],
-    ids=str,
+    ids=["on time", "late", "early", "a slow clock", "a fast clock"],
 )
 def test_a_late_sensor_shows_what_was_the_case(effects, felt):
     """Pushed evenly without weight and damping it follows a parabola, to its very end."""

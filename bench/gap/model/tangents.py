@@ -1,0 +1,112 @@
+"""What a robot's simulator tells without simulating each change: the tangents of its runs, and what
+its own step leaves of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bench.gap.model.world import World
+from sims.base import Array
+from sims.robot.linear import Linear
+from sims.robot.simulator import RobotSimulator
+
+ENDLESS = 1e60
+"""A change beyond it is none: the motion explodes."""
+
+
+def responses(
+    world: World, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
+) -> Array:
+    """What one more effect changes about the runs, to first order: (K, R, T, C).
+
+    Args:
+        world: the runs, of a robot.
+        theta: (P,) parameters, without the effects that are added.
+        states: (R, s) initial states.
+        added: K effects with their coefficients.
+    """
+    runs, length, channels = world.observed.shape
+    result = np.full((len(added), runs, length, channels), np.nan)
+    calls = [(run, theta, states[run], added) for run in range(runs)]
+    for run, (values, looks) in world.crew.each(world, _responses, calls):
+        result[:, run, : values.shape[1]] = values
+        world.simulations += looks
+    # what explodes says nothing of a model near the data
+    result[~(np.abs(result) < ENDLESS)] = np.nan
+    return result
+
+
+def _responses(
+    world: World, run: int, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
+) -> tuple[Array, int]:
+    """The same of one run (K, T, C), and how many simulations it cost."""
+    about = _about(world, run, theta, states)
+    values = about.responses([(world.effects[name], c) for name, c in added])
+    return values, about.cost
+
+
+def begun(world: World, theta: Array, states: Array, anew: bool = False) -> Array:
+    """Derivatives of the runs by their initial states, (R, T, C, s): those about the first
+    model that was asked for, or about this one.
+
+    Initial states act alike in all models that are near the data, and a fit that has their
+    derivatives about another of them comes to the same end.
+
+    Args:
+        world: the runs, of a robot.
+        theta: (P,) parameters.
+        states: (R, s) initial states.
+        anew: take them about this model, and keep them.
+    """
+    if world.derivatives is None or anew:
+        runs, length, channels = world.observed.shape
+        result = np.zeros((runs, length, channels, len(world.states)))
+        calls = [(run, theta, states[run]) for run in range(runs)]
+        for run, values in world.crew.each(world, _begun, calls):
+            result[run, : values.shape[1]] = np.moveaxis(values, 0, -1)
+        world.derivatives = np.nan_to_num(result)
+    return world.derivatives
+
+
+def _begun(world: World, run: int, theta: Array, states: Array) -> Array:
+    """The same of one run, (s, T, C)."""
+    return _about(world, run, theta, states).begun()
+
+
+def _about(world: World, run: int, theta: Array, states: Array) -> Linear:
+    """The neighbourhood of one run of a model."""
+    half = len(world.states) // 2
+    scenario = world.tracks[run].scenario
+    return Linear(world.simulator, theta, scenario, states[:half], states[half:])
+
+
+def correct(world: World, theta: Array, states: Array) -> None:
+    """Take out of all that is simulated from now on what the engine's own step leaves of a
+    model's motion: of the first order, so that twice the change by half the step is all of it.
+
+    Below what would be asked about as a cause it is no cause, and yet would look like one: dry
+    friction that stops within a step and not at its end, as in `bench.gap.model.numerics`.
+
+    Args:
+        world: the runs, of a robot.
+        theta: (P,) parameters of a model that is near the data.
+        states: (R, s) its initial states.
+    """
+    if not world.linear:
+        return
+    assert issubclass(world.kind, RobotSimulator)
+    kind = world.kind.halved()
+    effects = [*world.library, *(effect for effect in world.extra)]
+    finer = kind(world.recording.constants, world.channels, effects=effects)
+    runs = len(world.tracks)
+    scenarios = [track.scenario for track in world.tracks]
+    lanes = np.tile(theta, (runs, 1))
+    begun = dict(zip(world.states, states.T, strict=True))
+    fine = finer.simulate_lanes(lanes, scenarios, begun)
+    coarse = world.simulator.simulate_lanes(lanes, scenarios, begun)
+    world.simulations += 3 * runs
+    left = 2.0 * (fine - coarse)
+    world.correction = np.nan_to_num(left)
