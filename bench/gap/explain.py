@@ -186,7 +186,7 @@ class _Explainer:
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._fails()
         # One stream for surrogates and bootstrap: the same seed tells the same story.
-        rng = rng_for("explain", self.recording.system, self.seed)
+        rng = self._rng()
         search = self._search(base, rng)
         self.say("looking for what is missing")
         held_out = HeldOutRuns(self.measuring, self.noise) if self.measuring else None
@@ -248,8 +248,10 @@ class _Explainer:
 
     def _value(self, base: Base) -> float:
         """Twice the log likelihood of a base model."""
-        rng = rng_for("explain", self.recording.system, self.seed)
-        return float(self._search(base, rng).base.likelihood.value)
+        return float(self._search(base, self._rng()).base.likelihood.value)
+
+    def _rng(self) -> np.random.Generator:
+        return rng_for("explain", self.recording.system, self.seed)
 
     def _fails(self) -> InputError:
         """Why nothing could be simulated."""

@@ -64,7 +64,9 @@ def theta_for(kind, count=1, seed=0):
 
 
 def test_every_effect_of_the_library_is_measured():
-    assert set(COEFFICIENTS) == set(effects.names())
+    # What a model file states is the engine's own, and tested where robots are.
+    general = {name for name in effects.names() if effects.get(name).needs != "model"}
+    assert set(COEFFICIENTS) == general
 
 
 @pytest.mark.parametrize("engine", OTHERS)

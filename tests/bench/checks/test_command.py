@@ -80,7 +80,7 @@ def test_simulators_and_effects_are_checked_by_name(capsys):
     code, said = checked(capsys, "drag.linear")
     assert (code, said.splitlines()[-1]) == (
         0,
-        "effect drag.linear (sims.effects.drag.Linear): all 5 checks passed",
+        "effect drag.linear (sims.effects.drag.Linear): all 10 checks passed",
     )
     code, said = checked(capsys, "slider")
     assert (code, said.splitlines()[-1]) == (
@@ -95,6 +95,6 @@ def test_unknown_name_is_one_line(capsys):
     error = capsys.readouterr().err
     assert error.startswith(
         "simgap: unknown tuner, simulator or effect 'cma_ess'; "
-        "there are: arm, backlash, ball, ball-filmed, bayes"
+        "there are: actuator.damping, actuator.limit, actuator.stiffness, arm, backlash, ball"
     )
     assert error.count("\n") == 1
