@@ -17,7 +17,6 @@ from bench.gap.causes.search import Search
 from bench.gap.causes.trial import Trial
 from bench.gap.model.models import Model
 from sims.simulated import effect_parameters
-from sims.system import FAMILY
 
 
 @dataclass(frozen=True)
@@ -119,16 +118,18 @@ class Alternatives:
             behind = self._behind(model, other)
             if is_alike(behind):
                 rivals.append((behind, added))
-        return self._without_families(rivals)
+        return self._without_richer(rivals)
 
-    def _without_families(self, rivals: list[tuple[float, str]]) -> list[tuple[float, str]]:
-        """The rivals without families of which one member does as well: the place is the answer."""
+    def _without_richer(self, rivals: list[tuple[float, str]]) -> list[tuple[float, str]]:
+        """The rivals without those at a place that contain another one: a family of which one
+        member does as well, a richer law of which the plain one does.
+        """
         effects = self.search.world.effects
         names = {name for _, name in rivals}
         return [
             (behind, name)
             for behind, name in rivals
-            if effects[name].place != FAMILY or not names & set(effects[name].contains)
+            if not effects[name].place or not names & set(effects[name].contains)
         ]
 
     def _behind(self, model: Model, other: Model) -> float:

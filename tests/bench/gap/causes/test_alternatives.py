@@ -64,14 +64,17 @@ def test_where_structure_is_left_what_it_leaves_decides_and_the_effect_stands(mo
     assert found.preferred == "a"
 
 
+@pytest.mark.parametrize("place", ["*", "elbow"])
 @pytest.mark.parametrize(
     ("family", "contains", "kept"),
     [("b", ("a",), ()), ("a", ("b",), ("b",)), ("b", ("c",), ("b",))],
 )
-def test_a_family_of_which_one_place_does_as_well_is_no_answer(monkeypatch, family, contains, kept):
-    """The place is; a family whose place is far behind stays in the set."""
+def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
+    monkeypatch, family, contains, kept, place
+):
+    """The plain one is; a family whose place is far behind stays in the set."""
     search = search_of(model(), BEST, ALIKE, BEHIND)
-    effects = {name: placed() for name in "abc"} | {family: placed("*", contains)}
+    effects = {name: placed() for name in "abc"} | {family: placed(place, contains)}
     search.world = SimpleNamespace(effects=effects)
     monkeypatch.setattr(Alternatives, "_is_plausible", lambda self, effect: True)
     monkeypatch.setattr(Alternatives, "_p_value", lambda self, rest, effect, gain: 0.0)
