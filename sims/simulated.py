@@ -152,6 +152,12 @@ class Simulated(Simulator):
             raise InputError(f"theta must have shape {expected}, found {theta.shape}")
         if not len(theta):
             return np.empty((0, 0, len(self.channels)))
+        return self._simulated(theta, scenarios, initial or {})
+
+    def _simulated(
+        self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
+    ) -> Array:
+        """The same of one lane or more, checked."""
         acting = self._acting(theta)
         runs = make_runs(scenarios)
         commands = [self.run_inputs(s) for s in runs.distinct]
@@ -163,7 +169,7 @@ class Simulated(Simulator):
             filtered = any(_filters(effect) for effect, _ in sensors)
             every = 1 if filtered else plan.every
             own = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
-            constants, x, v = self._known(scenarios, initial or {})
+            constants, x, v = self._known(scenarios, initial)
             forces = _of(acting, (Force, Friction, Contact))
             lanes = Lanes(self._declared, own, constants, x, v, plan.steps, inputs, forces, every)
             observations = self._read(self.engine.integrate(lanes), lanes, plan, sensors)

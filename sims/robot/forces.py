@@ -11,6 +11,7 @@ import numpy as np
 from sims.base import Array
 from sims.robot.lanes import Addresses, Mask
 from sims.robot.moment import RobotMoment
+from sims.robot.native import FIELDS
 from sims.robot.system import RobotSystem
 from sims.system import Acting, Force, Friction
 
@@ -66,9 +67,9 @@ class Forces:
         self._count = count
         self.addresses = addresses
         asked = [(e, c) for e, c in acting if e.hook == "force" and e.of not in OVER_TIME]
-        self._forces = [(e, c) for e, c in asked if isinstance(e, Force) and not _native(e.of)]
+        self._forces = [(e, c) for e, c in asked if isinstance(e, Force) and e.of not in FIELDS]
         self._frictions = [
-            (e, c) for e, c in asked if isinstance(e, Friction) and not _native(e.of)
+            (e, c) for e, c in asked if isinstance(e, Friction) and e.of not in FIELDS
         ]
         self.rubs: Mask = np.zeros((count, len(addresses.velocities)), dtype=bool)
         for effect, c in self._frictions:
@@ -89,9 +90,3 @@ class Forces:
             assert joint is not None
             limit[:, joint] += dry.limit(c, moment)[:, 0]
         return force, limit
-
-
-def _native(name: str) -> bool:
-    from sims.robot.native import FIELDS
-
-    return name in FIELDS

@@ -110,23 +110,14 @@ class RobotSimulator(Simulated):
         """Effects at one place each with their coefficients (K, L, 1), for rows of parameters."""
         return self._acting(theta)
 
-    def simulate_lanes(
-        self,
-        theta: Array,
-        scenarios: Sequence[Scenario],
-        initial: Mapping[str, Array] | None = None,
+    def _simulated(
+        self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> Array:
-        """See `Simulated.simulate_lanes`."""
-        theta = np.asarray(theta, dtype=np.float64)
-        if theta.ndim != 2 or theta.shape != (len(scenarios), len(self.parameters)):
-            expected = (len(scenarios), len(self.parameters))
-            raise InputError(f"theta must have shape {expected}, found {theta.shape}")
-        if not len(theta):
-            return np.empty((0, 0, len(self.channels)))
+        """See `Simulated`."""
         acting = self._acting(theta)
         runs = make_runs(scenarios)
         commands = [self.run_inputs(s) for s in runs.distinct]
-        _, x, v = self._known(scenarios, initial or {})
+        _, x, v = self._known(scenarios, initial)
         longest = max(s.times.size for s in runs.distinct)
         result = np.full((len(theta), longest, len(self.channels)), np.nan)
         derived = lanes_with(acting, len(theta), derives)
