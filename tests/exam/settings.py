@@ -43,7 +43,7 @@ class Noise:
     kind: str
     phi: float
     dither: float
-    stated: bool
+    stated: bool = True
 
     def added(self, observed, rng):
         """Noiseless observations (T, C) as recorded."""

@@ -1,8 +1,6 @@
-"""What sensors make of a motion, and the noise that they add."""
+"""What sensors make of a motion."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -38,27 +36,3 @@ def observed(world, run, channels, slips=()):
         bias = world.effects.get(f"sensor.bias@{name}", (0.0,))[0]
         columns.append(column * (1 + gain) + bias)
     return np.column_stack(columns)
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Sensor noise: `sigma` by channel, its `kind`, the AR(1) coefficient, white noise in units of
-    a rounding step.
-    """
-
-    sigma: dict[str, float]
-    kind: str
-    phi: float
-    dither: float
-
-    def added(self, values, rng):
-        """Noiseless observations (T, C) as recorded."""
-        sigma = np.array(list(self.sigma.values()))
-        white = rng.standard_normal(values.shape)
-        if self.kind == "quantised":  # rounding is good for step / sqrt(12)
-            step = sigma / np.sqrt(1 / 12 + self.dither**2)
-            return np.round((values + self.dither * step * white) / step) * step
-        if self.kind == "ar1":
-            for k in range(1, len(white)):
-                white[k] = self.phi * white[k - 1] + np.sqrt(1 - self.phi**2) * white[k]
-        return values + sigma * white

@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tests.exam.settings import Noise
 from tests.robots import commands, reference, robots
 from tests.robots.machines import Machine
-from tests.robots.sensing import NOISES, Noise
+from tests.robots.sensing import NOISES
 from tests.robots.world import COARSE, Run, World
 
 RATE, SECONDS = 100, 4.0

@@ -9,10 +9,11 @@ import tomllib
 
 pytest.importorskip("pinocchio", reason="pin has no wheel here")
 
+from tests.exam.settings import Noise
 from tests.robots import causes, foreign, items, questions, recording, sizing
 from tests.robots.equivalence import Rivals
 from tests.robots.score import SAME
-from tests.robots.sensing import Noise, observed
+from tests.robots.sensing import observed
 from tests.robots.world import Run, World
 
 
