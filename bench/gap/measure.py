@@ -139,6 +139,9 @@ def central(world: World, fit: Fit, noise: Noise) -> Fit:
     bounds = _bounds_around(world, fit)
     ranges = bounds[:, 1] - bounds[:, 0]
     steps = difference_steps(fit.jacobian, noise, ranges)
+    # Derivatives by initial states that come from a tangent are no one-sided differences.
+    if world.linear:
+        steps = steps[:q]
     theta, states = _both_sides(fit, steps, bounds)
 
     # One call for both sides and all runs: the engine steps its lanes at once.
@@ -146,7 +149,7 @@ def central(world: World, fit: Fit, noise: Noise) -> Fit:
     rows = np.repeat(vectors, runs, axis=0)
     lanes = np.tile(np.arange(runs), len(vectors))
     simulated = world.simulate(rows, lanes, states.reshape(-1, size))
-    below, above = simulated.reshape(2, q + size, *fit.simulated.shape)
+    below, above = simulated.reshape(2, steps.size, *fit.simulated.shape)
 
     # Row j has moved parameter j, so its widths stand on the diagonal.
     lower, upper = theta[:, :q, fit.free]
@@ -155,12 +158,13 @@ def central(world: World, fit: Fit, noise: Noise) -> Fit:
     jacobian = np.moveaxis(above - below, 0, -1) / widths
     # A simulation that failed on one side tells nothing of the slope.
     jacobian = np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
-    return replace(fit, jacobian=jacobian)
+    own = fit.jacobian[..., q:] if world.linear else jacobian[..., q:]
+    return replace(fit, jacobian=np.concatenate([jacobian[..., :q], own], axis=3))
 
 
 def _both_sides(fit: Fit, steps: Array, bounds: Array) -> tuple[Array, Array]:
-    """Parameters (2, q + s, P) and initial states (2, q + s, R, s): on the side below and on that
-    above, each row has one number moved by its step.
+    """Parameters (2, n, P) and initial states (2, n, R, s): on the side below and on that above,
+    each row has one number moved by its step, of the first n ones.
     """
     q = fit.free.size
     theta = np.tile(fit.theta, (2, len(steps), 1))

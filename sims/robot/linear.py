@@ -54,6 +54,7 @@ class Linear:
         with np.errstate(all="ignore"), quiet():
             self._motion = self._nominal()
             self._tangent = self._neighbourhood()
+            self._built = self._tangent.looks
         self._known: dict[tuple[str, bytes], Change] = {}
         nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.size))
         unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
@@ -97,13 +98,13 @@ class Linear:
             simulator.addresses,
         )
 
-    @property
-    def cost(self) -> int:
-        """How many simulations of the run it has cost, about."""
-        return 1 + self._tangent.looks // len(self._motion.controls)
-
-    def responses(self, added: Sequence[Added]) -> Array:
-        """(K, T, C): what each of these effects changes about the run's observations."""
+    def responses(self, added: Sequence[Added]) -> tuple[Array, int]:
+        """(K, T, C): what each of these effects changes about the run's observations; and how many
+        simulations of the run it takes, about, with the neighbourhood itself.
+        """
+        before = self._tangent.looks - self._built
+        # What it costs is the same whatever was asked before.
+        self._known.clear()
         result = np.zeros((len(added), *self.observed.shape))
         driven = self._driven(added)
         for begin in range(0, len(added), TOGETHER):
@@ -126,7 +127,8 @@ class Linear:
                 states, readings = self._tangent.follow(changes, len(part))
                 seen = self._seen(states, readings, sensors)
             result[part.start : part.stop] = seen - self.observed
-        return result
+        looks = self._tangent.looks - before
+        return result, 1 + looks // len(self._motion.controls)
 
     def begun(self) -> Array:
         """(2 D, T, C): what each initial position, then each velocity, changes, per unit."""

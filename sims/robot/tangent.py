@@ -157,6 +157,8 @@ class Tangent:
         self._fresh = bench.batch.state.copy()
         self._base, self._read = self._advanced({}, acting)
         self.quotients = self._quotients()
+        # Accelerations and readings of the motion itself.
+        self._still = self._accelerated(acting)
 
     @property
     def size(self) -> int:
@@ -285,17 +287,13 @@ class Tangent:
 
     def by_numbers(self, owner: int, acting: Acting, change: float) -> Change:
         """The change that other numbers of the model make, as (2) has it, per `change`."""
-        accelerations, _ = self._accelerated(acting, self._meant)
-        _, readings = self._accelerated(acting)
+        accelerations, readings = self._accelerated(acting, self._meant)
+        if self._outputs:
+            _, readings = self._accelerated(acting)
         # What accelerates the robot by so much more is a force, and acts as one.
         apart = (accelerations - self.accelerations[self._looks]) / change
         force = np.einsum("nij,nj->ni", self._inertias, apart)
         return Change(owner, forces=force, readings=(readings - self._still[1]) / change)
-
-    @cached_property
-    def _still(self) -> tuple[Array, Array]:
-        """Accelerations and readings of the motion itself."""
-        return self._accelerated(self._acting)
 
     @cached_property
     def _meant(self) -> Array:
@@ -311,6 +309,7 @@ class Tangent:
         """(N, D, D) of the joints at each instant that is looked at."""
         import mujoco
 
+        self._bench.load(_repeated(self._acting, self._bench.count))
         model = self._bench.batch.get_model(0)
         data = mujoco.MjData(model)
         places = self._places
@@ -331,7 +330,7 @@ class Tangent:
         joints = np.flatnonzero(np.abs(force).max(axis=0) > 0)
         return [Change(owner, joint=int(j), series=force[:, j]) for j in joints]
 
-    @property
+    @cached_property
     def moment(self) -> RobotMoment:
         """All instants of the motion as one moment of S lanes, in the middle of each step."""
         motion, steps = self._motion, self._steps
@@ -341,7 +340,7 @@ class Tangent:
         v = 0.5 * (motion.v[:-1] + motion.v[1:])[:steps]
         return moment_of(self._system, t[:, None], x, v, inputs, motion.carried)
 
-    @property
+    @cached_property
     def accelerations(self) -> Array:
         """(S, D) over each step."""
         motion = self._motion

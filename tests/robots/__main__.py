@@ -8,6 +8,7 @@ drawn by the same code is kept).
 """
 
 import argparse
+import hashlib
 import json
 import multiprocessing
 import os
@@ -28,6 +29,8 @@ def main(arguments):
     path, drawn = given.out / "items.jsonl", [questions.digest(), given.seed_offset]
     sheet = questions.quick() if given.quick else questions.sheet()
     sheet = questions.spread() if given.spread else sheet
+    # In no order of what is asked, so that what is answered early is a fair sample.
+    sheet = sorted(sheet, key=lambda q: hashlib.sha256(q.name.encode()).digest())
     asked = [q for q in sheet if not given.only or fnmatch(q.name, f"{given.only}*")]
     rows = {name: row for name, row in _before(path).items() if row.get("drawn") == drawn}
     known = {name: row["item"] for name, row in rows.items() if row["item"] or not row.get("mark")}

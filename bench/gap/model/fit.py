@@ -128,14 +128,24 @@ class Fitter:
             # in its first steps even the right model may be far behind
             if race and iteration >= RACED:
                 give_up(problems, reached)
+            self._renew(problems, seen)
             trials = list(self._trials(problems, seen))
             # what comes after it sees that this was left off
             if not trials or self.world.watch.leaves(iteration / leg.all):
                 break
-            points = self._points(trials, seen)
-            for (problem, _), point in zip(trials, points, strict=True):
+            made = self._plain_points if self.world.linear else self._points
+            for (problem, _), point in zip(trials, made(trials, seen), strict=True):
                 self._judge(problem, point)
         return list(problems)
+
+    def _renew(self, problems: Sequence[Problem], seen: Mask) -> None:
+        """Take the derivatives anew of problems whose own are not good enough."""
+        stale = [p for p in problems if p.stale and not p.done]
+        if not stale:
+            return
+        points = self._points([(p, p.point.start) for p in stale], seen)
+        for problem, point in zip(stale, points, strict=True):
+            self._take(problem, point)
 
     def _problem(self, start: Start) -> Problem:
         """What of a model is fitted, and how far it may go."""
@@ -204,6 +214,20 @@ class Fitter:
             points.append(Point(start, part[0], jacobian, cost))
         return points
 
+    def _plain_points(self, trials: Sequence[_Trial], seen: Mask) -> list[Point]:
+        """The same with the derivatives of where each problem stands, which cost nothing."""
+        runs = len(self.world.guess)
+        simulated = self.world.simulate(
+            np.concatenate([np.tile(start.theta, (runs, 1)) for _, start in trials]),
+            np.tile(np.arange(runs), len(trials)),
+            np.concatenate([start.states for _, start in trials]),
+            self.share,
+        ).reshape(len(trials), runs, *self.world.observed.shape[1:])
+        return [
+            Point(start, part, problem.point.jacobian, self._cost(part, start.states, seen))
+            for (problem, start), part in zip(trials, simulated, strict=True)
+        ]
+
     def _moved_states(self) -> Indices:
         """(n,) the initial states that are moved to find their derivatives: none where they come
         from elsewhere.
@@ -250,6 +274,7 @@ class Fitter:
     def _take(self, problem: Problem, point: Point) -> None:
         """Go on from a point, with differences that suit what it responds to."""
         problem.point = point
+        problem.here, problem.stale = True, False
         problem.steps = difference_steps(point.jacobian, self.noise, problem.widths)
 
     def _residual(self, simulated: Array, seen: Mask) -> Array:
@@ -321,7 +346,10 @@ class Fitter:
         """Take a trial's point if it is better, and learn from it how much to damp."""
         gained = problem.point.cost - point.cost
         if point.cost < problem.point.cost:
-            self._take(problem, point)
+            if self.world.linear:
+                problem.point, problem.here = point, not problem.free.size
+            else:
+                self._take(problem, point)
             problem.taken(gained, point.cost)
         else:
             problem.refused()

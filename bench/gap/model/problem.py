@@ -9,6 +9,10 @@ method, IMM-REP-1999-05), here quicker in both directions: his least factor is 1
 
     λ ← λ max(0.1, 1 - (2ρ - 1)³),   ν ← 2        where F' < F, and the step is taken            (2)
     λ ← 2ν λ,                        ν ← 2ν       where it is not                                (3)
+
+Derivatives that cost much may serve for several steps (the chord method; C. T. Kelley, Iterative
+Methods for Linear and Nonlinear Equations, 1995, section 5.4.1): as long as steps keep their
+promises, so that ρ is near 1.
 """
 
 from __future__ import annotations
@@ -38,6 +42,8 @@ GROWTH = 2.0
 """Where the ν of (3) begins, and by what it grows."""
 LEAST_FACTOR = 0.1
 """The least factor of (2)."""
+KEPT = 0.2
+"""Derivatives serve for another step while ρ is no farther from 1."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +106,8 @@ class Problem:
         growth: ν.
         promised: decrease of the cost that the last step promised.
         done: whether it has converged, or is given up.
+        here: whether the point's derivatives are its own, and not those of an earlier one.
+        stale: whether they have to be taken anew before it goes on.
     """
 
     point: Point
@@ -112,6 +120,8 @@ class Problem:
     growth: float = GROWTH
     promised: float = np.inf
     done: bool = False
+    here: bool = True
+    stale: bool = False
 
     def fit(self) -> Fit:
         """What has been fitted by now."""
@@ -135,6 +145,7 @@ class Problem:
 
     def taken(self, gained: float, cost: float) -> None:
         """After a step that brought the cost down to this."""
+        self.stale = not self.here and abs(gained / max(self.promised, 1e-300) - 1.0) > KEPT
         ratio = gained / max(self.promised, 1e-300)  # (1)
         factor = max(LEAST_FACTOR, 1.0 - (2.0 * ratio - 1.0) ** 3)
         self.damping = max(self.damping * factor, LEAST_DAMPING)  # (2)
@@ -142,7 +153,10 @@ class Problem:
         self.done = gained < ENOUGH + SHARE * cost  # converged
 
     def refused(self) -> None:
-        """After a step that did not, (3)."""
+        """After a step that did not, (3), unless its derivatives were to blame."""
+        if not self.here:
+            self.stale = True
+            return
         self.damping = self.damping * GROWTH * self.growth
         self.growth = GROWTH * self.growth
 

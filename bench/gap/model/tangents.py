@@ -44,8 +44,7 @@ def _responses(
 ) -> tuple[Array, int]:
     """The same of one run (K, T, C), and how many simulations it cost."""
     about = _about(world, run, theta, states)
-    values = about.responses([(world.effects[name], c) for name, c in added])
-    return values, about.cost
+    return about.responses([(world.effects[name], c) for name, c in added])
 
 
 def begun(world: World, theta: Array, states: Array, anew: bool = False) -> Array:
@@ -77,10 +76,19 @@ def _begun(world: World, run: int, theta: Array, states: Array) -> Array:
 
 
 def _about(world: World, run: int, theta: Array, states: Array) -> Linear:
-    """The neighbourhood of one run of a model."""
-    half = len(world.states) // 2
-    scenario = world.tracks[run].scenario
-    return Linear(world.simulator, theta, scenario, states[:half], states[half:])
+    """The neighbourhood of one run of a model, which is asked more than once about most."""
+    key = run, theta.tobytes(), states.tobytes()
+    kept = world.neighbourhoods
+    about: Linear | None = kept.pop(key, None)
+    if about is None:
+        half = len(world.states) // 2
+        scenario = world.tracks[run].scenario
+        about = Linear(world.simulator, theta, scenario, states[:half], states[half:])
+    kept[key] = about
+    # Those that have not been asked for longest go.
+    for old in list(kept)[: -len(world.tracks)]:
+        del kept[old]
+    return about
 
 
 def correct(world: World, theta: Array, states: Array) -> None:

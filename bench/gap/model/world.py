@@ -81,6 +81,7 @@ class World:
         correction: (R, T, C) what is added to all that is simulated, if anything is
             (`bench.gap.model.tangents`).
         derivatives: (R, T, C, s) by initial states, where they have been taken from a tangent.
+        neighbourhoods: of runs of a robot, that were asked for last (`bench.gap.model.tangents`).
         crew: who simulates and fits; this process alone, unless another is put here.
 
     Args:
@@ -142,6 +143,7 @@ class World:
         self._travels: dict[str, float] = {}
         self.derivatives: Array | None = None
         self.correction: Array | None = None
+        self.neighbourhoods: dict[tuple[int, bytes, bytes], Any] = {}
         self.simulations = 0
         self.watch = Watch()
         self.crew = Crew()
