@@ -262,8 +262,9 @@ def _modified(world: World, probes: Sequence[Probe], acting: Mask) -> Iterator[P
     for probe, acts in zip(probes, acting, strict=True):
         if acts:
             leading.setdefault(probe.effect, probe)
-        # At its first shape a coefficient has shown already whether it acts by itself.
-        elif probe.group == 0 and not probe.fixed:
+        # At its first shape a coefficient has shown already whether it acts by itself; members of a
+        # family do not modify each other.
+        elif probe.group == 0 and not probe.fixed and not _members(world, probe.effect):
             idle.append(probe)
     modifiers: dict[str, list[Probe]] = {}
     for probe in idle:
@@ -272,6 +273,11 @@ def _modified(world: World, probes: Sequence[Probe], acting: Mask) -> Iterator[P
             modifiers.setdefault(probe.effect, []).append(probe)
     for name, members in modifiers.items():
         yield from _grid_points(world, leading[name], members)
+
+
+def _members(world: World, name: str) -> bool:
+    """Whether an effect is a family, of one coefficient for each of its places or more."""
+    return bool(getattr(world.effects[name], "members", ()))
 
 
 def _grid_points(world: World, first: Probe, modifiers: Sequence[Probe]) -> Iterator[Probe]:
