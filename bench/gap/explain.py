@@ -20,7 +20,7 @@ from bench.gap.causes.search import Search
 from bench.gap.causes.structure import probes
 from bench.gap.explanation import Explanation
 from bench.gap.measure import HeldOutRuns
-from bench.gap.model.base_fit import Base, fit_base
+from bench.gap.model.base_fit import Base, fit_base, without_step
 from bench.gap.model.crew import Crew
 from bench.gap.model.floor import Floor, noise_floor
 from bench.gap.model.noise import Noise
@@ -220,7 +220,7 @@ class _Explainer:
 
         fine = finer(self.fitting, self.noise)
         if fine is None:
-            return base
+            return without_step(self.fitting, self.noise, base)
         coarse = self.kind, self.fitting, self.measuring
         value = self._value(base)
         self._enter(fine.kind)
@@ -229,11 +229,11 @@ class _Explainer:
         if gain < SWITCH:
             # What the robot does is no nearer to its fine motion: the file's own step stands.
             self._return(*coarse)
-            return base
+            return without_step(self.fitting, self.noise, base)
         self.say(f"stepped more finely: {fine.numerics.integrator}, {fine.numerics.timestep:g} s")
         self.coarse = Coarse(fine, gain)
         self.assessor = replace(self.assessor, before=self._before(base, coarse[2]))
-        return other
+        return without_step(self.fitting, self.noise, other)
 
     def _before(self, base: Base, measuring: World | None) -> Array | None:
         """What the file's own step makes of the held-out runs; None where there are none."""

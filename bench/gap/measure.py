@@ -54,6 +54,8 @@ the parameter.
 UNTOUCHED = 1e-200
 """Curvature of a number that the data do not touch: small, and none that overflows when divided by.
 """
+ALIKE = 1e-12
+"""Share of its curvature that an initial state gets besides, so that none is like another."""
 WORST = -9.0
 """Shares of the gap closed are cut here: how many times worse a failed model is has no meaning."""
 
@@ -228,9 +230,12 @@ def _curvatures(models: Models, model: Model) -> tuple[Array, Array]:
     normal = np.matmul(j.transpose(0, 2, 1), j)
     own = normal[:, :q, :q].sum(axis=0)
     precision = 1.0 / prior_of(world) ** 2
+    # In an unstable motion all initial states may show alike.
+    powers = np.einsum("rii->ri", normal[:, q:, q:])
+    ridge = ALIKE * powers[:, :, None] * np.eye(powers.shape[1])
     # An initial state that is known is not fitted, so it takes nothing away.
     inner, cross = held(
-        normal[:, q:, q:] + np.diag(precision),
+        normal[:, q:, q:] + np.diag(precision) + ridge,
         normal[:, :q, q:],
         world.known,
     )

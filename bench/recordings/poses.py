@@ -23,6 +23,8 @@ from sims.robot.quiet import quiet
 
 BEYOND = 1.0
 """Times the width of its range, a joint is not beyond its end, whatever its limits are worth."""
+OVER = 0.02
+"""Of the width of its range, a joint may seem to be beyond its end by noise, or by an offset."""
 TURNS = 8.0
 """Turns of a joint without limits of which nobody wonders."""
 ALIKE = 0.9
@@ -70,6 +72,13 @@ def _beyond(recording: Recording, joint: Any) -> Iterator[Oddity]:
         low, high = joint.range
         slack = BEYOND * (high - low)
         if low - slack <= ends[0] and ends[1] <= high + slack:
+            over = np.array([low - ends[0], ends[1] - high])
+            if over.max() > OVER * (high - low):
+                end = int(over.argmax())
+                stop = f"joint {joint.name} of the model stops at {(low, high)[end]:.4g}"
+                what = f"goes to {ends[end]:.4g} {unit}, and {stop}; is its range right?"
+                yield Oddity(f"run {run.name}, column {column}: {what}", False)
+                return
             continue
         scaled = smaller * ends
         fits = low - slack <= scaled[0] and scaled[1] <= high + slack

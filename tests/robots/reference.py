@@ -26,19 +26,21 @@ def compiled(machine, step=None, integrator=None):
 
 
 def moved(machine, run, step=None, integrator=None):
-    """Positions (T, N) at the run's stamps, which are multiples of the step."""
+    """Positions and speeds (T, N) at the run's stamps, which are multiples of the step."""
     import mujoco
 
     model = compiled(machine, step, integrator)
     data = mujoco.MjData(model)
     places = [model.joint(name).qposadr[0] for name in machine.joints]
-    data.qpos[places], data.qvel[places] = run.q, run.v
+    rates = [model.joint(name).dofadr[0] for name in machine.joints]
+    data.qpos[places], data.qvel[rates] = run.q, run.v
     commands = np.array([run.commands[model.actuator(i).name] for i in range(model.nu)])
     rows, number = [], 0
     for k, t in enumerate(run.times.tolist()):
         while number < round(t / model.opt.timestep):
             mujoco.mj_step(model, data)
             number += 1
-        rows.append(data.qpos[places].copy())
+        rows.append((data.qpos[places].copy(), data.qvel[rates].copy()))
         data.ctrl[:] = commands[:, k]
-    return np.array(rows)
+    q, v = (np.array(part) for part in zip(*rows, strict=True))
+    return q, v

@@ -10,6 +10,7 @@ from tests.exam.settings import Noise
 from tests.robots import commands, reference, robots
 from tests.robots.machines import Machine
 from tests.robots.sensing import NOISES
+from tests.robots.signals import Drives
 from tests.robots.world import COARSE, Run, World
 
 RATE, SECONDS = 100, 4.0
@@ -69,7 +70,7 @@ def setting(name, rng, coarse=False, noise=None):
     channels, by_channel = _channels(machine, motions, sigma, rng)
     kind = noise or str(rng.choice(NOISES))
     made = Noise(by_channel, kind, float(rng.uniform(0.3, 0.8)), float(rng.uniform(0.3, 0.6)))
-    machine, left = _stepped(machine, runs, motions, sigma, coarse, rng)
+    machine, left = _stepped(machine, runs, motions, by_channel, coarse, rng)
     bare = tuple(motion.q for motion in motions)
     return Setting(
         machine, tuple(runs), channels, made, bare, _typical(machine, motions), left
@@ -160,19 +161,33 @@ def _typical(machine, motions):
     }
 
 
-def _stepped(machine, runs, motions, sigma, coarse, rng):
-    """The machine with a step of MuJoCo at which its numerics do not show, or do; and how much they
-    leave, in noises.
+def _stepped(machine, runs, motions, noises, coarse, rng):
+    """The machine with a step of MuJoCo at which its numerics do not show in any channel, or do in
+    all; and how much they leave, in noises.
     """
     choices = COARSER if coarse else tuple((step, "RK4") for step in STEPS)
     order = rng.permutation(len(choices)).tolist() if coarse else range(len(choices))
     for step, integrator in (choices[k] for k in order):
         tried = replace(machine, step=step, integrator=integrator)
-        errors = [
-            reference.moved(tried, run) - motion.q
-            for run, motion in list(zip(runs, motions, strict=True))[:FITTED]
-        ]
-        left = float(np.sqrt(np.mean(np.square(errors)))) / sigma
+        sizes = _missed(tried, list(zip(runs, motions, strict=True))[:FITTED], noises)
+        left = float(np.sqrt(np.mean(np.square(sizes))) if coarse else sizes.max())
         if (3.0 <= left <= 300.0) if coarse else left < QUIET:
             return tried, left
     raise ValueError(f"{machine.name}: MuJoCo's numerics leave {left:.2g} noises at {step} s")
+
+
+def _missed(machine, moved, noises):
+    """By how much MuJoCo misses what each channel shows, RMS in noises; (run, motion) pairs."""
+    drives, gaps = Drives.of(machine), []
+    for run, motion in moved:
+        q, v = reference.moved(machine, run)
+        u = np.zeros_like(q)
+        for joint, drive in zip(machine.driven, machine.drives, strict=True):
+            u[:, joint] = run.commands[drive.name]
+        gap = {"q": q - motion.q, "qd": v - motion.v, "tau": drives.forces(u, q, v) - motion.force}
+        columns = []
+        for name, noise in noises.items():
+            kind, _, joint = name.partition(".")
+            columns.append(gap[kind][:, machine.joints.index(joint)] / noise)
+        gaps.append(np.column_stack(columns))
+    return np.sqrt(np.mean(np.square(gaps), axis=(0, 1)))

@@ -102,7 +102,7 @@ class Search(Moves):
         # loaded where there is a robot alone
         from bench.gap.model.tangents import correct
 
-        correct(self.world, model.fit.theta, model.fit.states)
+        correct(self.world, self.noise, model.fit.theta, model.fit.states)
         size = len(model.names)
         # What a richer effect bent to may have been that alone.
         near = [m for m in of_size(self, size) if m.merit > model.merit - NEAR]

@@ -98,6 +98,18 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
     return Base(best, untouched)
 
 
+def without_step(world: World, noise: Noise, base: Base) -> Base:
+    """The base model of a robot, without what the engine's own step leaves of it."""
+    # loaded where there is a robot alone
+    from bench.gap.model.tangents import correct
+
+    correct(world, noise, base.fit.theta, base.fit.states)
+    if world.correction is None:
+        return base
+    fit = Fitter(world, noise, base.untouched).fit([base.fit.start()], LAST_STEPS)[0]
+    return replace(base, fit=fit)
+
+
 def _starts(world: World, given: Array | None) -> list[Array]:
     """Parameter vectors (P,) to begin with: the given one, or the nominal one and a grid."""
     nominal = world.nominal()

@@ -331,8 +331,12 @@ class Fitter:
             problem.stuck(residual, jacobian),  # clipped afterwards, they would spoil the rest
         )
         problem.promised = step.promised
-        # converged, or no step is short enough
-        if step.promised < ENOUGH + SHARE * at.cost or problem.damping > LARGEST_DAMPING:
+        # converged, or no step is short enough; where numbers overflow none is known
+        if (
+            not np.isfinite(step.promised)
+            or step.promised < ENOUGH + SHARE * at.cost
+            or problem.damping > LARGEST_DAMPING
+        ):
             problem.done = True
             return None
 

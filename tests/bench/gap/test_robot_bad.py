@@ -101,6 +101,10 @@ DOUBTED = {
         lambda values: values[:, [0, 1, 3, 2]],
         "columns q.shoulder and q.elbow: each follows the other's command; are they swapped?",
     ),
+    "beyond": (
+        scaled(1, 1, 3.2, 1),
+        "and joint shoulder of the model stops at 2.6; is its range right?",
+    ),
     "turns": (
         lambda values: values + np.array([0, 0, 0, 100.0]),
         "found 100.8 rad, 16 turns; is the unit degrees?",
