@@ -17,7 +17,7 @@ from bench.gap.causes.nominate import nominated
 from bench.gap.causes.score_test import Scores, ScoreTest, calibrated, tail
 from bench.gap.model.models import Model, Models
 from bench.gap.model.noise import Mask, Noise, forgets
-from bench.gap.model.problem import Fit
+from bench.gap.model.problem import Fit, Start
 from bench.gap.model.surrogates import surrogates
 from bench.gap.model.world import World
 from sims.base import Array
@@ -36,6 +36,8 @@ this.
 """
 
 
+SILENT = 0.02
+"""Excess over the noise below which nothing richer is fitted before something asks for it."""
 UNMOVED = 0.1
 """A fit that has moved by less than so many sigmas, RMS, since its directions were simulated keeps
 them: they are derivatives, and have changed by as little.
@@ -171,8 +173,30 @@ class Scored(Models):
             for start in further:
                 if patient or frozenset(start.effects) not in self.models:
                     starts.append(start)
-        if starts:
-            self.refit(starts, patient=patient)
+        if not self.world.linear or patient:
+            if starts:
+                self.refit(starts, patient=patient)
+            return
+        # Laws that are asked in every step cost most, and what they contain is often all there is.
+        names = {frozenset(start.effects) for start in starts} | set(self.models)
+        parts = {id(start): self._contained(start) & names for start in starts}
+        plain = [start for start in starts if not parts[id(start)]]
+        if plain:
+            self.refit(plain)
+        richer = [s for s in starts if parts[id(s)] and not self._explained(parts[id(s)])]
+        if richer:
+            self.refit(richer)
+
+    def _contained(self, start: Start) -> set[frozenset[str]]:
+        """The models with what one of its effects contains in that one's place."""
+        own = frozenset(start.effects)
+        effects = self.world.effects
+        return {own - {name} | {part} for name in own for part in effects[name].contains}
+
+    def _explained(self, keys: Iterable[frozenset[str]]) -> bool:
+        """Whether one of these models leaves no more than noise does."""
+        models = [self.models[key] for key in keys if key in self.models]
+        return any(self.quiet(m) and self.excess(m) < SILENT for m in models)
 
     def missing(self, model: Model, larger: Model) -> float:
         """Probability that a model which lacks nothing would seem to gain as much by becoming the

@@ -61,10 +61,12 @@ class Search(Moves):
         supported: the model that the data support as far as the search has come.
         settled: effects of a model that was compared with all its neighbours already, on fewer
             samples.
+        corrected: effects of the model of which what the engine's step leaves was taken out last.
     """
 
     supported: Model | None = None
     settled: frozenset[str] | None = None
+    corrected: frozenset[str] | None = None
     _sketch: Search | None = None
 
     def run(self) -> Model:
@@ -97,8 +99,10 @@ class Search(Moves):
         """The model without what the engine's own step leaves of it, where that can be taken out;
         or a simpler one that does as well then.
         """
-        if not self.world.linear:
+        key = frozenset(model.names)
+        if not self.world.linear or key == self.corrected:
             return model
+        self.corrected = key
         # loaded where there is a robot alone
         from bench.gap.model.tangents import correct
 
@@ -144,6 +148,9 @@ class Search(Moves):
         smaller = beam(self, size - 1)
         self.extend(smaller[:1], NOMINATED)
         first = self.best(size)
+        # What the step leaves of friction, say, would be taken for more that is missing.
+        if first is not None and self.world.linear and self.excess(first) < FAR:
+            first = self._corrected(first)
         # Each further means costs more simulations, so none is used where the data are explained.
         if first is not None and self.plain(first, ALPHA):
             return first
