@@ -158,12 +158,16 @@ class Scenario:
         initial: initial state by name, SI units; what is left out takes the system's default.
         inputs: input signals by name, each (T,), held constant from one sample to the next.
         constants: constants that differ from the simulator's own in this run.
+        linear: inputs that go straight from one sample to the next instead.
+        offset: seconds by which inputs act later than their stamps say.
     """
 
     times: Array
     initial: Mapping[str, float] = field(default_factory=dict)
     inputs: Mapping[str, Array] = field(default_factory=dict)
     constants: Mapping[str, float] = field(default_factory=dict)
+    linear: frozenset[str] = frozenset()
+    offset: float = 0.0
 
     def __post_init__(self) -> None:
         # Copies that nobody can write to: scenarios are shared by lanes and by methods.

@@ -11,6 +11,8 @@ mean, of which the integral A is piecewise linear:
 
     (A(b) - A(a)) / (b - a),    A(t) = sum of u_i (t_{i+1} - t_i) up to t  (1)
 
+Where a scenario says that it goes straight from sample to sample, A is made of parabolas instead.
+
 An effect that shifts time feels at t what was commanded at s(t); the change commanded at t is then
 felt at
 
@@ -88,7 +90,8 @@ def make_runs(scenarios: Sequence[Scenario]) -> Runs:
     groups = []
     for scenario in objects:
         signals = sorted(scenario.inputs.items())
-        content = scenario.times.tobytes(), *((name, u.tobytes()) for name, u in signals)
+        read = tuple(sorted(scenario.linear)), scenario.offset
+        content = scenario.times.tobytes(), read, *((name, u.tobytes()) for name, u in signals)
         group = by_content.setdefault(content, len(distinct))
         if group == len(distinct):
             distinct.append(scenario)
@@ -124,7 +127,7 @@ def make_plan(runs: Runs, commands: Commands, acting: Acting, largest_step: floa
     samples = max(s.times.size for s in runs.distinct)
     instants = np.stack([_padded(_since_start(s), samples) for s in runs.distinct])
     shifting = [(e, c) for e, c in acting if c.any() and _shifts(e)]
-    if not shifting:
+    if not shifting and not any(s.offset for s in runs.distinct):
         # Runs with the same instants share one row, and all that is computed from it.
         if (instants == instants[:1]).all():
             instants = instants[:1]
@@ -156,7 +159,7 @@ def _changes(runs: Runs, commands: Commands, shifting: Sequence[tuple[Effect, Ar
         rows = []
         for s, u in zip(runs.distinct, commands, strict=True):
             changed = np.diff(u[name]) != 0
-            later = _since_start(s)[1:]
+            later = np.maximum(_commanded(s)[1:], 0.0)
             rows.append(later[changed])
         size = max(row.size for row in rows)
         padded = [np.concatenate([row, np.zeros(size - row.size)]) for row in rows]
@@ -219,6 +222,12 @@ def _since_start(scenario: Scenario) -> Array:
     return seconds
 
 
+def _commanded(scenario: Scenario) -> Array:
+    """(T,) seconds since the first sample at which inputs have their values."""
+    seconds: Array = _since_start(scenario) + scenario.offset
+    return seconds
+
+
 def _padded(values: Array, size: int) -> Array:
     """`values` and their last one, over and over, up to this size."""
     more = np.full(size - values.size, values[-1])
@@ -243,8 +252,7 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
     first, *others = commands[0]
     felt = {}
     for name in others if effects else (first, *others):
-        signals = [u[name] for u in commands]
-        felt[name] = _felt(runs, signals, begin, plan.ends, plan.alike)
+        felt[name] = _felt(runs, name, commands, begin, plan.ends, plan.alike)
     if not effects:
         return felt
     # Back from the plant to the command: the last effect asks the one before it for its instants.
@@ -257,9 +265,12 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
         begin = np.where(on, effect.times(c, begin), begin)
         end = np.where(on, effect.times(c, end), end)
     # And forward with the values.
-    signals = [u[first] for u in commands]
-    means = _felt(runs, signals, begin, end, plan.alike)
-    beginnings = np.array([signal[0] for signal in signals])
+    means = _felt(runs, first, commands, begin, end, plan.alike)
+    for effect, c, on in effects:
+        if isinstance(effect, Input) and effect.between:
+            other = _felt(runs, first, commands, begin, end, plan.alike, other=True)
+            means = np.where(on, means + c[0] * (other - means), means)
+    beginnings = np.array([u[first][0] for u in commands])
     return {first: _passed(effects, plan, means, beginnings[runs.of, None]), **felt}
 
 
@@ -311,20 +322,30 @@ def _lasting(steps: Array) -> Indices:
     return last
 
 
-def _felt(runs: Runs, signals: Sequence[Array], begin: Array, end: Array, alike: bool) -> Array:
+def _felt(
+    runs: Runs,
+    name: str,
+    commands: Commands,
+    begin: Array,
+    end: Array,
+    alike: bool,
+    other: bool = False,
+) -> Array:
     """Means (L, S) of each lane's signal from `begin` to `end` (L, S); of lanes that are alike only
-    the first of each run is looked at.
+    the first of each run is looked at. With `other`, a signal that holds between samples goes
+    straight, and one that goes straight holds.
     """
-    count = len(signals) if alike else len(begin)
+    count = len(commands) if alike else len(begin)
     result = np.empty((count, begin.shape[1]))
     # All lanes of a run in one call.
     by_run = np.argsort(runs.of, kind="stable")
     borders = np.flatnonzero(np.diff(runs.of[by_run])) + 1
     for lanes in np.split(by_run, borders):
         run = runs.of[lanes[0]]
-        times = _since_start(runs.distinct[run])
+        scenario = runs.distinct[run]
+        means = _straight_means if (name in scenario.linear) != other else _means
         to, of = (slice(run, run + 1), lanes[:1]) if alike else (lanes, lanes)
-        result[to] = _means(times, signals[run], begin[of], end[of])
+        result[to] = means(_commanded(scenario), commands[run][name], begin[of], end[of])
     return runs.spread(result) if alike else result
 
 
@@ -347,6 +368,32 @@ def _means(times: Array, values: Array, begin: Array, end: Array) -> Array:
         over = _area(times, values, area, b) - _area(times, values, area, a)
         value[crossing] = over / (b - a)  # (1)
     return value
+
+
+def _straight_means(times: Array, values: Array, begin: Array, end: Array) -> Array:
+    """The same of the signal that goes straight from values[i] at times[i] to the next, and is as
+    at its ends before and after.
+    """
+    halves = 0.5 * (values[:-1] + values[1:]) * np.diff(times)
+    area = np.concatenate([[0.0], np.cumsum(halves)])
+    value = np.interp(0.5 * (begin + end), times, values)
+    # A mean over part of one straight stretch is its middle; over more of them, (1).
+    first = np.searchsorted(times, begin, side="right")
+    crossing = np.searchsorted(times, end, side="left") > first
+    if crossing.any():
+        a, b = begin[crossing], end[crossing]
+        over = _straight_area(times, values, area, b) - _straight_area(times, values, area, a)
+        value[crossing] = over / (b - a)  # (1)
+    result: Array = value
+    return result
+
+
+def _straight_area(times: Array, values: Array, area: Array, t: Array) -> Array:
+    """A(t) of (1) of a signal that goes straight, with `area` (T,) that up to each of `times`."""
+    place = np.clip(np.searchsorted(times, t, side="right") - 1, 0, times.size - 1)
+    here = np.interp(t, times, values)
+    result: Array = area[place] + 0.5 * (values[place] + here) * (t - times[place])
+    return result
 
 
 def _area(times: Array, values: Array, area: Array, t: Array) -> Array:

@@ -454,6 +454,9 @@ class Input(Effect):
     hook = "input"
     at: ClassVar[PlaceKind] = "actuator"
     needs = "input"
+    between: ClassVar[bool] = False
+    """Whether its first coefficient is the share with which the signal goes from sample to sample
+    as the recording does not say: straight where it is said to hold."""
 
     def times(self, c: Array, t: Array) -> Array:  # noqa: ARG002
         """The instants (L, S) of the commanded signal that are felt at instants t (L, S)."""

@@ -69,7 +69,14 @@ def scenario_of(run: Run, simulator: Simulator, constants: Mapping[str, float]) 
         for name, value in first.items()
         if name in simulator.states and np.isfinite(value)
     }
-    return Scenario(run.times, {**start, **run.initial}, run.inputs, {**constants, **run.constants})
+    return Scenario(
+        run.times,
+        {**start, **run.initial},
+        run.inputs,
+        {**constants, **run.constants},
+        run.linear,
+        run.offset,
+    )
 
 
 def beside(path: str, experiment: Path) -> str:

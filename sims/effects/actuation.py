@@ -2,6 +2,8 @@
 
 With u the command, w what the plant feels and c the coefficient:
 
+* (0) hold: w = u + c (v - u), with v the command that goes straight from sample to sample where
+  the recording says that it holds, or holds where it is said to go straight
 * (1) gain: w = (1 + c) u
 * (2) bias: w = u + c
 * (3) delay: w(t) = u(t - c)
@@ -35,9 +37,22 @@ _WIDTH = ((0, 2), (0, 2), (0, 0.2))
 """Plausible widths of dead band and play, in the units of `_USUAL`."""
 _LIMIT = ((0, 10), (0, 10), (0, 2))
 """Plausible limits, in the units of `_USUAL`."""
+_DELAY = (-0.05, 0.2)
+"""Plausible delays, s: stamps may be late by a sample or two, so that a command seems to lead."""
 _FEEDBACK = "K. J. Astrom, R. M. Murray, Feedback Systems (2008)"
 _NONLINEAR = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
 _PLAY = "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
+
+
+class Hold(Input):
+    """Between samples, the command as the recording does not say; mixed where c is a share."""
+
+    name = "input.hold"
+    noun = "an input read the other way between samples"
+    says = "between two samples the input goes straight instead of holding, or holds instead"
+    source = "K. J. Astrom, B. Wittenmark, Computer-Controlled Systems (1997), chapter 7"
+    coefficients = (Coefficient("coefficient", _PURE, ((0, 1), (0, 1), (0, 1))),)
+    between = True  # (0), where means over steps are taken: `sims.plan`
 
 
 class Gain(Input):
@@ -73,9 +88,9 @@ class Delay(Input):
 
     name = "input.delay"
     noun = "an input delay"
-    says = "the input acts later than commanded"
+    says = "the input acts later than commanded, or its stamps are late where it is negative"
     source = _FEEDBACK
-    coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
+    coefficients = (Coefficient("coefficient", _TIME, (_DELAY, _DELAY, _DELAY)),)
 
     def times(self, c: Array, t: Array) -> Array:
         """Earlier instants."""

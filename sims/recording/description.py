@@ -28,8 +28,13 @@ _KEYS = (
     "constants",
     "runs",
     "extra",
+    "time",
 )
 """What may stand in the file."""
+
+HOLDS = ("zero", "linear")
+"""What an input does from one sample to the next: it holds its value, or goes straight to the next
+one."""
 
 _NEVER = 1e12
 """Times the usual size of a channel, and that part of it, which no sensor's noise is."""
@@ -64,6 +69,8 @@ class Description:
         constants: known numbers, SI units.
         runs: by name, only those the description mentions.
         extra: units of columns that belong to no channel or input, as written.
+        linear: inputs that go straight from one sample to the next.
+        offset: seconds by which inputs act later than their stamps say.
     """
 
     system: str
@@ -74,6 +81,8 @@ class Description:
     constants: Mapping[str, float]
     runs: Mapping[str, RunMarks]
     extra: Mapping[str, str]
+    linear: frozenset[str] = frozenset()
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -167,6 +176,8 @@ def read_description(path: Path, declared: Declared) -> Description:
         constants=constants,
         runs=runs,
         extra=_extra(path, meta, declared),
+        linear=frozenset(name for name, column in inputs.items() if _hold(path, name, column)),
+        offset=_offset(path, meta),
     )
 
 
@@ -219,7 +230,7 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
     where, usual = f"{kind} {name}", f'unit = "{unit}"'
     own = table(path, where, value, f"a table with {usual}")
     # The noise of a signal that is put in is nothing that a simulation could use.
-    allowed = ("unit", "noise") if kind == "channel" else ("unit",)
+    allowed = ("unit", "noise") if kind == "channel" else ("unit", "hold")
     _known(path, f"{kind}s.{name}", own, allowed)
     # No unit is no SI unit: a log in degrees without a word of it would be read as radians.
     stated = text(path, where, own.get("unit"), f"{usual} or one that converts to it")
@@ -227,6 +238,21 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
         return _Column(scale(stated, unit), own)
     except InputError as error:
         raise InputError(f"{path}: {where}: {error}") from None
+
+
+def _hold(path: Path, name: str, column: _Column) -> bool:
+    """Whether an input goes straight from one sample to the next."""
+    hold = column.table.get("hold", "zero")
+    if hold not in HOLDS:
+        raise fault(path, f"inputs.{name}.hold", " or ".join(f'"{one}"' for one in HOLDS), hold)
+    return bool(hold == "linear")
+
+
+def _offset(path: Path, meta: Mapping[str, Any]) -> float:
+    """Seconds by which inputs act later than their stamps say."""
+    time = table(path, "time", meta.get("time", {}))
+    _known(path, "time", time, ("offset",))
+    return finite(path, "time.offset", time.get("offset", 0.0))
 
 
 def _noises(path: Path, channels: Mapping[str, _Column], declared: Declared) -> dict[str, float]:

@@ -46,6 +46,8 @@ class Run:
         held_out: for measuring only, never for fitting.
         extra: columns that no channel or input of the system is, each (T,), in the units they are
             written in.
+        linear: inputs that go straight from one sample to the next; the others hold.
+        offset: seconds by which inputs act later than their stamps say.
     """
 
     name: str
@@ -56,6 +58,8 @@ class Run:
     initial: Mapping[str, float]
     held_out: bool
     extra: Mapping[str, Array] = field(default_factory=dict)
+    linear: frozenset[str] = frozenset()
+    offset: float = 0.0
 
     def __repr__(self) -> str:
         # A cell of a notebook that ends in a run would print all of its samples.
@@ -161,6 +165,8 @@ def _run(table: Path, part: TableRun, about: Description) -> Run:
         marks.initial,
         bool(marks.held_out),
         extra,
+        about.linear,
+        about.offset,
     )
 
 

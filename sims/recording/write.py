@@ -158,7 +158,12 @@ def _description(recording: Recording, declared: Declared, beside: Path) -> str:
         n: {"unit": units[n], **_stated(recording.noise, n)} for n in first.channels
     }
     if first.inputs:
-        document["inputs"] = {n: {"unit": units[n]} for n in first.inputs}
+        document["inputs"] = {
+            n: {"unit": units[n], **({"hold": "linear"} if n in first.linear else {})}
+            for n in first.inputs
+        }
+    if first.offset:
+        document["time"] = {"offset": first.offset}
     if first.extra:
         document["extra"] = {n: {"unit": recording.extra.get(n, "1")} for n in first.extra}
     if recording.constants:

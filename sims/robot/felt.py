@@ -34,7 +34,7 @@ def felt(
     """What n lanes feel of each input over the steps, (n, S) by name: as a step has to be given
     it, or as it is in the first share of each.
     """
-    times = scenario.times - scenario.times[0]
+    times = scenario.times - scenario.times[0] + scenario.offset
     # Where commands change with the steps a mean says all of them.
     places = times / step
     aligned = bool((np.abs(places - np.rint(places)) < SHARE).all())

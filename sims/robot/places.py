@@ -31,12 +31,10 @@ from sims.system import (
     Value,
 )
 
-SHARED = frozenset({"input.delay", "input.lag", "sensor.delay", "sensor.lag"})
+SHARED = frozenset({"input.delay", "input.hold", "input.lag", "sensor.delay", "sensor.lag"})
 """Families of one coefficient for all places: what is late is late everywhere."""
 ALONE = frozenset({"force.periodic", "force.ripple", "friction.stribeck"})
 """Effects without a family: what shapes them differs from place to place."""
-LEAD = 0.05
-"""Seconds by which an input may be early, where stamps lag behind."""
 TYPICAL = {"hinge": 0.5, "slide": 5.0}
 """A force for which the plausible ranges of the library are meant: N m on a hinge, N on a slide."""
 _KINDS: Mapping[str, Kind] = {"hinge": "rotary", "slide": "linear"}
@@ -198,8 +196,6 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
         low, high = share * low, share * high
     if effect.name == "inertia.armature":
         high = 3.0 * spot.inertia
-    if effect.name == "input.delay":
-        low = -LEAD
     stated = spot.stated.get(effect.name) if effect.at == "joint" else None
     if stated is not None:
         # The difference may take away what the file states, and no more.

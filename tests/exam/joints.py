@@ -20,6 +20,7 @@ TOLERANCES = {"rtol": 1e-8, "atol": 1e-10}
 SHORT = 0.011  # seconds: up to here a method of fifth order is cheaper than one of eighth
 # Share of its half width over which a region's borders are soft: the solver keeps its order.
 EDGE = 0.05
+STRAIGHT = 10  # parts of an interval in which a command that goes straight is held
 
 Law = Callable[[float, float, float], float]
 
@@ -52,6 +53,8 @@ def felt(scenario, effects, until) -> list[Piece]:
     if "u" not in scenario.inputs:
         return [Piece(0.0, until, 0.0, effects.get("input.bias", [0.0])[0], 0.0)]
     levels, edges, lag = np.array(scenario.inputs["u"]), scenario.times - scenario.times[0], 0.0
+    if "input.hold" in effects:
+        levels, edges = _straight(levels, edges, effects["input.hold"][0])
     for name, c in effects.items():
         if name in ("input.deadband", "input.saturation", "backlash") and lag:
             raise NotImplementedError(f"{name} behind input.lag")
@@ -71,6 +74,14 @@ def felt(scenario, effects, until) -> list[Piece]:
             )
             state = pieces[-1].at(pieces[-1].end)
     return pieces
+
+
+def _straight(levels, edges, share):
+    """Levels in so many parts of each interval that they go straight, as far as `share` says."""
+    parts = (np.arange(STRAIGHT) + 0.5) / STRAIGHT
+    fine = levels[:-1, None] + share * np.diff(levels)[:, None] * parts
+    begins = edges[:-1, None] + np.diff(edges)[:, None] * np.arange(STRAIGHT) / STRAIGHT
+    return np.append(fine.ravel(), levels[-1]), np.append(begins.ravel(), edges[-1])
 
 
 def _play(levels, width):

@@ -39,7 +39,7 @@ def shape(name, setting, rng):
 
 def largest(name):
     """The largest strength that is asked."""
-    return 0.97 if name == "input.saturation" else LARGEST
+    return {"input.saturation": 0.97, "input.hold": 1.0}.get(name, LARGEST)
 
 
 def _direction(far, setting, rng, *behind):

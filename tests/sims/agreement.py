@@ -41,6 +41,7 @@ COEFFICIENTS = {
     "input.deadband": (None, 0.4, 0.02),
     "input.delay": (None, 0.017, 0.017),
     "input.gain": (None, 0.1, 0.1),
+    "input.hold": (None, 1.0, 1.0),
     "input.lag": (None, 0.04, 0.04),
     "input.saturation": (None, 1.5, 0.05),
     "lift.magnus": ((0.3, 0.1), None, None),

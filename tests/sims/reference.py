@@ -75,6 +75,9 @@ class Plant:
         for place, name in enumerate(self.names):
             shift = self.effects.get("input.delay", [0.0])[0] if place == 0 else 0.0
             u = held(self.case, name, t - shift)
+            if place == 0 and "input.hold" in self.effects:
+                straight = np.interp(t - shift, self.case.t, self.case.inputs[name])
+                u += self.effects["input.hold"][0] * (straight - u)
             for effect, c in self.effects.items() if place == 0 else ():
                 if effect == "input.gain":
                     u *= 1.0 + c[0]

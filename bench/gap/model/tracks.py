@@ -67,7 +67,7 @@ def tracked(
     fixed = {*run.initial, *_hidden(simulator)}
     return Track(
         name=run.name,
-        scenario=Scenario(run.times, {}, run.inputs, constants),
+        scenario=Scenario(run.times, {}, run.inputs, constants, run.linear, run.offset),
         observed=np.stack(columns, axis=1),
         guess=np.array([guesses[name] for name in states]),
         known=np.array([name in fixed for name in states]),

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from sims.base import Scenario
+from sims.slider.simulator import Slider
 from tests.sims.effects.worlds import run
 
 TIMES = np.arange(0, 3, 0.02)
@@ -42,6 +44,38 @@ def test_input_lag_is_the_step_response(lag):
 def test_input_gain_and_bias():
     assert felt({"input.gain": -0.25}, STEP) == pytest.approx(0.75 * STEP[:-1], abs=1e-9)
     assert felt({"input.bias": -0.25}, STEP) == pytest.approx(STEP[:-1] - 0.25, abs=1e-9)
+
+
+def test_input_hold_goes_straight_from_sample_to_sample():
+    """A mean over each interval of half the ends' sum; a share of it mixes."""
+    wave = 2 * np.sin(4 * TIMES)
+    middles = 0.5 * (wave[1:] + wave[:-1])
+    assert felt({"input.hold": 1.0}, wave) == pytest.approx(middles, abs=1e-9)
+    mixed = 0.7 * wave[:-1] + 0.3 * middles
+    assert felt({"input.hold": 0.3}, wave) == pytest.approx(mixed, abs=1e-9)
+
+
+def moved(effects=(), coefficients=(), **stated):
+    """A driven slider whose recording says more of its inputs."""
+    times = np.arange(0, 3, 0.02)
+    given = Scenario(times, {}, {"u": 2 * np.sin(4 * times)}, **stated)
+    return Slider(effects=list(effects)).simulate(np.array([[2.0, *coefficients]]), given)[0]
+
+
+def test_what_a_recording_states_is_what_the_effects_do():
+    straight = moved(linear=frozenset({"u"}))
+    assert straight == pytest.approx(moved(["input.hold"], [1.0]), abs=1e-9)
+    assert moved(["input.hold"], [1.0], linear=frozenset({"u"})) == pytest.approx(moved(), abs=1e-9)
+    for late in (0.013, -0.013):
+        assert moved(offset=late) == pytest.approx(moved(["input.delay"], [late]), abs=2e-5)
+    assert np.abs(straight - moved()).max() > 1e-3
+
+
+def test_a_straight_command_moves_a_slider_as_its_integral_says():
+    ramp = Scenario(np.arange(0, 2.01, 0.5), {}, {"u": 3.0 * np.arange(0, 2.01, 0.5)}, linear={"u"})
+    x, v = Slider().simulate(np.array([[2.0]]), ramp)[0].T
+    assert v == pytest.approx(0.75 * ramp.times**2, abs=1e-9)  # 3 t on 2 kg
+    assert x == pytest.approx(0.25 * ramp.times**3, abs=1e-4)
 
 
 def test_a_chain_starts_settled():
