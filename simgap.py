@@ -24,7 +24,7 @@ _WHERE = {
     "bench": ("__version__",),
     "bench.api.compare": ("Compared", "compare", "sweep"),
     "bench.api.explain": ("explain", "score"),
-    "bench.api.recordings": ("read_recording", "simulate"),
+    "bench.api.recordings": ("import_logs", "read_recording", "simulate"),
     "bench.checks": ("parametrize",),
     "bench.gap.explanation": ("Explanation",),
     "bench.problem.experiment": ("Experiment",),

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from bench import __version__
 from bench.api.compare import Compared, compare, sweep
 from bench.api.explain import explain, score
-from bench.api.recordings import read_recording, simulate
+from bench.api.recordings import import_logs, read_recording, simulate
 from bench.checks import parametrize
 from bench.gap.explanation import Explanation
 from bench.problem.experiment import Experiment
@@ -84,6 +84,7 @@ __all__ = [
     "effects",
     "explain",
     "from_callback",
+    "import_logs",
     "load_plugins",
     "main",
     "parametrize",

@@ -16,6 +16,7 @@ from bench.commands.check import add_check
 from bench.commands.compare import add_compare, add_plot, add_status, add_verify
 from bench.commands.explain import add_explain, add_score
 from bench.commands.film import add_film, add_track
+from bench.commands.importing import add_import
 from bench.commands.interrupts import INTERRUPTED
 from bench.commands.listing import add_list
 from bench.commands.recordings import add_inspect, add_simulate
@@ -29,6 +30,7 @@ COMMANDS = (
     ("check", add_check, "run the conformance suite on a tuner, a simulator or an effect"),
     ("plot", add_plot, "write table and figures of a comparison again, or of several together"),
     ("simulate", add_simulate, "write a recording of a simulated system, its truth apart"),
+    ("import", add_import, "describe a robot's logs as they lie, so that every command reads them"),
     ("inspect", add_inspect, "summarise and draw a recording"),
     ("explain", add_explain, "show what a simulation gets wrong on a recording, and why"),
     ("score", add_score, "error of an extended simulator on another recording"),

@@ -1,4 +1,4 @@
-"""`simgap.simulate` and `simgap.read_recording`."""
+"""`simgap.simulate`, `simgap.read_recording` and `simgap.import_logs`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from bench.recordings.importing import Imported, checked, describe
 from bench.recordings.inspection import load
 from bench.recordings.simulate import Coefficients, SimulatedRecording, Wish, make
+from sims.base import InputError
 from sims.recording.recording import Recording
+from sims.recording.write import refuse_existing
+from sims.robot.reading import read
 
 
 def simulate(
@@ -89,3 +93,30 @@ def read_recording(path: str | Path, system: str | None = None) -> Recording:
         InputError: anything malformed, in one line.
     """
     return load(Path(path), system)[0]
+
+
+def import_logs(
+    logs: str | Path | Sequence[str | Path], model: str | Path, out: str | Path
+) -> Imported:
+    """Describe a robot's logs as they lie: write the toml by which every command reads them.
+
+    Args:
+        logs: files of one run, or folders that each hold those of one.
+        model: what they are of, MJCF or URDF.
+        out: NAME.toml, a new file.
+
+    Returns:
+        What was guessed, and what could not be told.
+
+    Raises:
+        InputError: the logs cannot be read or nothing in them is the robot's, in one line; then
+            nothing is written.
+    """
+    given = [logs] if isinstance(logs, str | Path) else list(logs)
+    path = Path(out)
+    if path.suffix != ".toml":
+        raise InputError(f"expected a description to write, NAME.toml, found '{path}'")
+    refuse_existing([path])
+    made = describe([Path(log) for log in given], read(Path(model)), Path(model), path.parent)
+    checked(path, made.text)
+    return made

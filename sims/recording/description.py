@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from sims.base import Channel, InputError, Simulator
+from sims.recording.mapping import Sources, read_sources
 from sims.recording.units import Scale, scale
 from sims.system import System
 from sims.user_toml import checked, fault, finite, known, read_toml, table, text
@@ -70,7 +71,7 @@ class Description:
         runs: by name, only those the description mentions.
         extra: units of columns that belong to no channel or input, as written.
         linear: inputs that go straight from one sample to the next.
-        offset: seconds by which inputs act later than their stamps say.
+        sources: where the columns stand.
     """
 
     system: str
@@ -81,8 +82,8 @@ class Description:
     constants: Mapping[str, float]
     runs: Mapping[str, RunMarks]
     extra: Mapping[str, str]
-    linear: frozenset[str] = frozenset()
-    offset: float = 0.0
+    linear: frozenset[str]
+    sources: Sources
 
 
 @dataclass(frozen=True)
@@ -137,12 +138,12 @@ def system_of(path: str | Path) -> str:
 
 
 def description_of(table: Path) -> Path:
-    """`NAME.toml` beside the table.
+    """`NAME.toml` beside the table; itself where it is named in place of the table.
 
     Raises:
         InputError: `table` cannot be the name of one.
     """
-    if not table.name or table.suffix == ".toml":
+    if not table.name:
         raise InputError(f"expected a recording's table, NAME.csv, found '{table}'")
     return table.with_suffix(".toml")
 
@@ -177,7 +178,11 @@ def read_description(path: Path, declared: Declared) -> Description:
         runs=runs,
         extra=_extra(path, meta, declared),
         linear=frozenset(name for name, column in inputs.items() if _hold(path, name, column)),
-        offset=_offset(path, meta),
+        sources=read_sources(
+            path,
+            meta,
+            {name: column.table for name, column in (*channels.items(), *inputs.items())},
+        ),
     )
 
 
@@ -230,7 +235,7 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
     where, usual = f"{kind} {name}", f'unit = "{unit}"'
     own = table(path, where, value, f"a table with {usual}")
     # The noise of a signal that is put in is nothing that a simulation could use.
-    allowed = ("unit", "noise") if kind == "channel" else ("unit", "hold")
+    allowed = ("unit", "column", "file", "noise" if kind == "channel" else "hold")
     _known(path, f"{kind}s.{name}", own, allowed)
     # No unit is no SI unit: a log in degrees without a word of it would be read as radians.
     stated = text(path, where, own.get("unit"), f"{usual} or one that converts to it")
@@ -246,13 +251,6 @@ def _hold(path: Path, name: str, column: _Column) -> bool:
     if hold not in HOLDS:
         raise fault(path, f"inputs.{name}.hold", " or ".join(f'"{one}"' for one in HOLDS), hold)
     return bool(hold == "linear")
-
-
-def _offset(path: Path, meta: Mapping[str, Any]) -> float:
-    """Seconds by which inputs act later than their stamps say."""
-    time = table(path, "time", meta.get("time", {}))
-    _known(path, "time", time, ("offset",))
-    return finite(path, "time.offset", time.get("offset", 0.0))
 
 
 def _noises(path: Path, channels: Mapping[str, _Column], declared: Declared) -> dict[str, float]:
@@ -299,7 +297,7 @@ def _run(path: Path, name: str, value: Any, declared: Declared) -> RunMarks:
     where = f"runs.{name}"
     own = table(path, where, value)
     allowed = [c.name for c in declared.constants]
-    _known(path, where, own, ("constants", "initial", "held_out", *allowed))
+    _known(path, where, own, ("constants", "initial", "held_out", "folder", *allowed))
     held_out = own.get("held_out")
     if held_out is not None:
         checked(path, f"{where}.held_out", held_out, bool, "true or false")

@@ -26,6 +26,7 @@ from sims.recording.description import (
     read_description,
     system_of,
 )
+from sims.recording.mapping import read_logs
 from sims.recording.table import TableRun, read_table
 from sims.recording.units import SAME, Scale
 
@@ -117,7 +118,12 @@ def read_recording(path: str | Path, declared: Declared, whole: bool = False) ->
     table = Path(path)
     description = description_of(table)
     about = read_description(description, declared)
-    parts = read_table(table, list(about.channels), list(about.inputs), list(about.extra))
+    columns = list(about.channels), list(about.inputs)
+    if about.sources.stated:
+        parts = read_logs(table.with_suffix(".csv"), about.sources, *columns, about.linear)
+    else:
+        table = table.with_suffix(".csv") if table.suffix == ".toml" else table
+        parts = read_table(table, *columns, list(about.extra))
     check_names(description, about.runs, [part.name for part in parts])
     runs = [_run(table, part, about) for part in parts]
     kept = tuple(runs) if whole else _split(description, runs)
@@ -154,8 +160,8 @@ def _run(table: Path, part: TableRun, about: Description) -> Run:
     marks = about.runs.get(part.name, _UNMARKED)
     channels = {n: _converted(table, part, n, s) for n, s in about.channels.items()}
     inputs = {n: _converted(table, part, n, s) for n, s in about.inputs.items()}
-    # no system reads them, so they keep their unit
-    extra = {name: part.columns[name] for name in about.extra}
+    # no system reads them, so they keep their unit; of logs nobody has asked for any
+    extra = {name: part.columns[name] for name in about.extra if name in part.columns}
     return Run(
         part.name,
         part.times,
@@ -166,7 +172,7 @@ def _run(table: Path, part: TableRun, about: Description) -> Run:
         bool(marks.held_out),
         extra,
         about.linear,
-        about.offset,
+        about.sources.offset,
     )
 
 

@@ -180,9 +180,6 @@ def test_bad_files_are_one_line(folder, capsys, tmp_path):
     assert "none.csv" in faulty(capsys, "explain", tmp_path / "none.csv").replace(
         "none.toml", "none.csv"
     )
-    assert "expected a recording's table, NAME.csv" in faulty(
-        capsys, "explain", folder / "swing.toml"
-    )
     assert "none.toml: no such file" in faulty(
         capsys, "score", tmp_path / "none.toml", folder / "swing.csv"
     )

@@ -1,0 +1,38 @@
+"""The command `simgap import`."""
+
+from __future__ import annotations
+
+import argparse
+
+from bench.commands.options import place
+
+
+def add_import(parser: argparse.ArgumentParser) -> None:
+    """The options of `simgap import`."""
+    parser.add_argument(
+        "logs",
+        metavar="LOG",
+        nargs="+",
+        type=place,
+        help="files of one run, or folders that each hold a run: .csv, .tsv, .npz, .parquet",
+    )
+    parser.add_argument(
+        "--model", metavar="FILE", type=place, required=True, help="what they are of: MJCF or URDF"
+    )
+    parser.add_argument(
+        "--out", metavar="NAME.toml", type=place, required=True, help="file to write, a new one"
+    )
+    parser.set_defaults(command=_import)
+
+
+def _import(options: argparse.Namespace) -> int:
+    from bench.api.recordings import import_logs
+
+    made = import_logs(options.logs, options.model, options.out)
+    print(f"{options.out}: {len(made.guessed)} guesses, each marked there; nothing was copied")
+    for line in made.guessed:
+        print(f"guess: {line}")
+    for line in made.untold:
+        print(f"not told: {line}")
+    print(f"next: simgap inspect {options.out}")
+    return 0

@@ -1,0 +1,306 @@
+"""`simgap import`: a description of logs as they lie, every guess in it marked."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from bench.recordings import guess
+from bench.recordings.guess import Column
+from bench.recordings.inspection import load
+from sims.base import Array, InputError
+from sims.recording.logs import Log, logs_in, read_log
+from sims.robot.model import Joint, Robot
+from sims.robot.scales import scales
+
+QUICK, DAMPED = 20.0, 0.7
+"""rad/s and share of critical damping of a servo whose gains nobody has stated."""
+TABLES = (".csv", ".tsv", ".npz", ".parquet")
+"""Endings of what is taken from a folder; other texts may be anything."""
+_PREFIX = {"position": "q", "velocity": "qd"}
+
+
+@dataclass
+class Imported:
+    """What has been made of logs.
+
+    Attributes:
+        text: the description.
+        guessed: what was guessed, a line each.
+        untold: what could not be told, a line each.
+    """
+
+    text: str
+    guessed: list[str] = field(default_factory=list)
+    untold: list[str] = field(default_factory=list)
+
+
+def describe(logs: Sequence[Path], robot: Robot, model: Path, beside: Path) -> Imported:
+    """The description of logs of a robot.
+
+    Args:
+        logs: files of one run, or folders that each hold those of one.
+        robot: what they are of.
+        model: its model file.
+        beside: the folder where the description will stand.
+
+    Raises:
+        InputError: they cannot be read, or there is nothing in them that a robot has.
+    """
+    runs = runs_of(logs)
+    _name, files = next(iter(runs.items()))
+    return _Describing(robot, model, beside, runs, {p.name: read_log(p) for p in files}).made()
+
+
+def runs_of(logs: Sequence[Path]) -> dict[str, list[Path]]:
+    """Files by run: those of each folder, or the files themselves as one run.
+
+    Raises:
+        InputError: there is no log.
+    """
+    files = [path for path in logs if not path.is_dir()]
+    runs: dict[str, list[Path]] = {}
+    for folder in (path for path in logs if path.is_dir()):
+        inside = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
+        for one in inside:
+            own = [path for path in logs_in(one) if path.suffix.lower() in TABLES]
+            if own:
+                runs[one.name] = own
+    if files and runs:
+        raise InputError("expected files of one run, or folders of one run each, found both")
+    if files:
+        runs = {"": files}
+        folders = {path.parent for path in files}
+        if len(folders) > 1:
+            raise InputError("expected the files of one run in one folder; name the folders")
+    if not runs:
+        found = ", ".join(map(str, logs))
+        raise InputError(f"{found}: expected logs ({', '.join(TABLES)}), found none")
+    return runs
+
+
+def checked(path: Path, text: str) -> None:
+    """Write a description, and read what it describes; what cannot be read is not left there.
+
+    Raises:
+        InputError: it cannot be written, or read.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    try:
+        load(path)
+    except BaseException:
+        path.unlink()
+        raise
+
+
+class _Describing:
+    def __init__(
+        self,
+        robot: Robot,
+        model: Path,
+        beside: Path,
+        runs: Mapping[str, list[Path]],
+        logs: Mapping[str, Log],
+    ) -> None:
+        self.robot, self.model, self.beside, self.runs, self.logs = robot, model, beside, runs, logs
+        self.joints = [joint for joint in robot.joints if joint.single]
+        self.made_of = Imported("")
+        self.channels: dict[str, tuple[Column, str, str]] = {}
+        self.inputs: dict[str, tuple[Column, str, str]] = {}
+        self.added: dict[str, Joint] = {}
+        self.seconds: dict[str, Array] = {}
+
+    def made(self) -> Imported:
+        """The description."""
+        time, unit = self._time()
+        columns = [
+            Column(file, name, log.column(name))
+            for file, log in self.logs.items()
+            for name in log.names()
+            if name != time
+        ]
+        self._positions(columns)
+        self._rates(columns)
+        self._commands(columns)
+        if not self.channels:
+            there = ", ".join(f"{c.file}: {c.name}" for c in columns[:12])
+            raise InputError(
+                f"{next(iter(self.logs.values())).path}: no column is a joint's position by name, "
+                f"number or range; there are {there}; write the description by hand"
+            )
+        self._say_rest(columns)
+        self.made_of.text = self._text(time, unit)
+        return self.made_of
+
+    def _time(self) -> tuple[str, str]:
+        """The column of stamps and its unit, the same in all files."""
+        found: dict[str, str] = {}
+        for file, log in self.logs.items():
+            columns = [Column(file, name, log.column(name)) for name in log.names()]
+            time = guess.time_of(columns)
+            if time is None:
+                raise InputError(
+                    f"{log.path}: no column increases from row to row; expected one of stamps"
+                )
+            unit = guess.unit_of_time(time.values)
+            if unit is None:
+                interval = float(np.median(np.diff(time.values)))
+                raise InputError(
+                    f"{log.path}, column {time.name}: stamps {interval:g} apart are no log's in s, "
+                    "ms, us or ns"
+                )
+            found.setdefault(time.name, unit)
+            self.seconds[file] = guess.UNITS[unit] * (time.values - time.values[0])
+            if len(found) > 1 or found.get(time.name) != unit:
+                raise InputError(
+                    f"{log.path}: its stamps are called {time.name} ({unit}), those of the files "
+                    f"before {', '.join(f'{n} ({u})' for n, u in found.items())}; "
+                    "give them one name"
+                )
+        ((name, unit),) = found.items()
+        rate = 1.0 / float(np.median(np.diff(next(iter(self.seconds.values())))))
+        self.made_of.guessed.append(f"time: column {name} in {unit}, {rate:.4g} Hz")
+        return name, unit
+
+    def _by_joint(self, columns: Sequence[Column]) -> list[tuple[Column, Joint, str]]:
+        """Columns of one kind with their joints, and why."""
+        found = []
+        plain = []
+        for column in columns:
+            joint = guess.joint_of(column, self.joints)
+            if joint is not None:
+                found.append((column, joint, "by its name"))
+            else:
+                plain.append(column)
+        groups: dict[tuple[str, str], list[Column]] = {}
+        for column in plain:
+            groups.setdefault((column.file, column.name.rstrip("0123456789[]")), []).append(column)
+        for group in groups.values():
+            numbered = guess.numbered(group, self.joints)
+            for column in group:
+                if column.name in numbered:
+                    found.append((column, numbered[column.name], "by the model's order of joints"))
+        return found
+
+    def _positions(self, columns: Sequence[Column]) -> None:
+        mine = [c for c in columns if guess.role_of(c) in ("position", None)]
+        for column, joint, why in self._by_joint(mine):
+            unit = guess.unit_of_position(column.values, joint)
+            name = f"q.{joint.name}"
+            if unit is None:
+                low, high = joint.range or (-np.inf, np.inf)
+                ends = f"{np.nanmin(column.values):.4g} to {np.nanmax(column.values):.4g}"
+                self._untold(column, f"goes from {ends}, {joint.name} from {low:.4g} to {high:.4g}")
+            elif name in self.channels:
+                self._untold(column, f"{name} is {self.channels[name][0].name} already")
+            else:
+                self.channels[name] = column, unit, f"{why}; in {unit} by its range"
+
+    def _rates(self, columns: Sequence[Column]) -> None:
+        mine = [c for c in columns if guess.role_of(c) == "velocity"]
+        for column, joint, why in self._by_joint(mine):
+            position = self.channels.get(f"q.{joint.name}")
+            if guess.still(column.values):
+                self._untold(column, "never changes")
+            elif position is None or position[0].file != column.file:
+                self._untold(column, f"no position of {joint.name} beside it tells its unit")
+            else:
+                own, unit, _ = position
+                rate = guess.unit_of_rate(column.values, own.values, self.seconds[own.file], unit)
+                if rate is None:
+                    self._untold(column, f"is not the derivative of {own.name}")
+                else:
+                    says = f"{why}; in {rate}, as the derivative of {own.name}"
+                    self.channels[f"qd.{joint.name}"] = column, rate, says
+
+    def _commands(self, columns: Sequence[Column]) -> None:
+        mine = [c for c in columns if guess.role_of(c) == "command"]
+        actuators = {a.joint: a for a in self.robot.actuators if a.joint}
+        for column, joint, why in self._by_joint(mine):
+            own = actuators.get(joint.name)
+            if own is None and self.robot.actuators:
+                self._untold(column, f"no actuator drives {joint.name}")
+                continue
+            name = own.name if own is not None else f"m_{joint.name}"
+            kind = own.kind if own is not None else "position"
+            unit = guess.unit_of_position(column.values, joint)
+            if kind != "position":
+                unit = joint.force_unit if kind == "motor" else f"{joint.unit}/s"
+            if unit is None or f"u.{name}" in self.inputs:
+                self._untold(column, f"is no command of {joint.name} in rad or deg")
+                continue
+            if own is None:
+                self.added[name] = joint
+            self.inputs[f"u.{name}"] = column, unit, f"{why}; in {unit}"
+
+    def _untold(self, column: Column, why: str) -> None:
+        self.made_of.untold.append(f"{column.file}, column {column.name}: {why}; left out")
+
+    def _say_rest(self, columns: Sequence[Column]) -> None:
+        """Columns of which nothing has been said."""
+        used = {(c.file, c.name) for c, *_ in (*self.channels.values(), *self.inputs.values())}
+        said = " ".join(self.made_of.untold)
+        for column in columns:
+            if (column.file, column.name) in used or f"column {column.name}:" in said:
+                continue
+            force = guess.role_of(column) == "force"
+            why = "its unit cannot be told" if force else "what it is cannot be told"
+            self._untold(column, why)
+        missing = [j.name for j in self.joints if f"q.{j.name}" not in self.channels]
+        if missing:
+            self.made_of.untold.append(f"joints without a position: {', '.join(missing)}")
+
+    def _text(self, time: str, unit: str) -> str:
+        lines = [f"model = {_quoted(self._from(self.model))}", ""]
+        lines += ["[time]", f"column = {_quoted(time)}", f"unit = {_quoted(unit)}  # guess", ""]
+        for run, files in self.runs.items():
+            if run:
+                lines += [f"[runs.{_key(run)}]", f"folder = {_quoted(self._from(files[0].parent))}"]
+                lines.append("")
+        alone = next(iter(self.logs.values())).path.parent if "" in self.runs else None
+        for name, joint in self.added.items():
+            lines += self._actuator(name, joint)
+        for kind, signals in (("channels", self.channels), ("inputs", self.inputs)):
+            for name, (column, of, why) in signals.items():
+                file = self._from(alone / column.file) if alone is not None else column.file
+                lines += [f"[{kind}.{_quoted(name)}]  # guess: {why}", f"file = {_quoted(file)}"]
+                lines += [f"column = {_quoted(column.name)}", f"unit = {_quoted(of)}", ""]
+                self.made_of.guessed.append(f"{name}: {column.file}, column {column.name}, {why}")
+        return "\n".join(lines).rstrip("\n") + "\n"
+
+    def _actuator(self, name: str, joint: Joint) -> list[str]:
+        """A servo whose gains nobody knows."""
+        inertia = scales(self.robot).inertia[self.joints.index(joint)]
+        kp, kv = inertia * QUICK**2, 2.0 * DAMPED * QUICK * inertia
+        self.made_of.untold.append(
+            f"gains of the servo of {joint.name}: kp and kv are those of one of {QUICK:g} rad/s; "
+            f"state them, or free actuator.stiffness@{name}"
+        )
+        lines = [f"[actuators.{_key(name)}]", f"joint = {_quoted(joint.name)}"]
+        lines += ['kind = "position"  # guess: its commands are positions']
+        return [*lines, f"kp = {kp:.4g}  # not known", f"kv = {kv:.4g}  # not known", ""]
+
+    def _from(self, path: Path) -> str:
+        try:
+            return Path(os.path.relpath(path, self.beside)).as_posix()
+        except ValueError:  # on another drive
+            return path.resolve().as_posix()
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _key(name: str) -> str:
+    bare = name.replace("_", "").replace("-", "")
+    return name if bare.isascii() and bare.isalnum() else _quoted(name)

@@ -1,0 +1,234 @@
+"""Where the columns of a recording stand in logs that were not written for it: the words `file`,
+`column`, `[time]` and `runs.NAME.folder` of a description.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sims.base import Array, InputError, frozen
+from sims.limits import BRIEFEST, LATEST, NAME
+from sims.recording.logs import Log, read_log
+from sims.recording.table import TableRun
+from sims.recording.units import scale
+from sims.user_toml import finite, known, table, text
+
+TIME = ("offset", "column", "unit")
+"""What may stand in `[time]`."""
+SAME_INSTANT = 1e-9
+"""Seconds by which stamps of two files may differ and be one."""
+
+
+class Source(NamedTuple):
+    """Where a signal stands: a file as seen from its run's folder, and a column of it."""
+
+    file: str
+    column: str
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Where all of a recording stands.
+
+    Attributes:
+        signals: of each channel and input.
+        time: the column of stamps, in every file.
+        second: what a stamp's unit is worth, seconds.
+        offset: seconds by which inputs act later than their stamps say.
+        folders: of each run, as seen from the description; none where there is one run.
+        stated: whether any of it is said: else the table is one that was written for simgap.
+    """
+
+    signals: Mapping[str, Source]
+    time: str
+    second: float
+    offset: float
+    folders: Mapping[str, str] = field(default_factory=dict)
+    stated: bool = False
+
+
+def read_sources(
+    path: Path, meta: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]]
+) -> Sources:
+    """What a description says of where its columns stand.
+
+    Args:
+        path: of the description.
+        meta: all of it.
+        columns: the table of each channel and input.
+
+    Raises:
+        InputError: it is malformed.
+    """
+    time = table(path, "time", meta.get("time", {}))
+    known(f"entry in [time] of {path}", time, TIME)
+    stamps = text(path, "time.column", time.get("column", "t"))
+    unit = text(path, "time.unit", time.get("unit", "s"))
+    try:
+        second = scale(unit, "s").gain
+    except InputError as error:
+        raise InputError(f"{path}: time.unit: {error}") from None
+    signals = {}
+    for name, own in columns.items():
+        file = text(path, f"{name}.file", own.get("file", ""))
+        column = text(path, f"{name}.column", own.get("column", name))
+        signals[name] = Source(file, column)
+    folders = {}
+    for name, marks in table(path, "runs", meta.get("runs", {})).items():
+        if isinstance(marks, dict) and "folder" in marks:
+            folders[name] = text(path, f"runs.{name}.folder", marks["folder"])
+    said = any({"file", "column"} & own.keys() for own in columns.values())
+    return Sources(
+        signals,
+        stamps,
+        second,
+        finite(path, "time.offset", time.get("offset", 0.0)),
+        folders,
+        bool(said or folders or {"column", "unit"} & time.keys()),
+    )
+
+
+def read_logs(
+    path: Path,
+    sources: Sources,
+    channels: Sequence[str],
+    inputs: Sequence[str],
+    linear: frozenset[str],
+) -> list[TableRun]:
+    """The runs of a recording whose columns stand in logs.
+
+    A run's rows are all instants at which a sensor or an input has a stamp, from the first sample
+    of a sensor to the last: a sensor's cells are empty between its own stamps, and an input has at
+    each what it holds, or what it goes through on its way, there. So nothing is resampled.
+
+    Args:
+        path: the table that is meant where a signal has no file.
+        sources: where everything stands.
+        channels: names of what was measured.
+        inputs: names of what was put in.
+        linear: inputs that go straight from sample to sample.
+
+    Raises:
+        InputError: anything malformed, in one line.
+    """
+    runs = []
+    for name, folder in (sources.folders or {"": ""}).items():
+        here = path.parent / folder
+        if len(name) > NAME:
+            raise InputError(f"{path}: the name of run {name[:40]}… is too long")
+        parts = _Parts(here, path.name, sources, (*channels, *inputs))
+        for own, rows in parts.runs(name):
+            runs.append(parts.joined(own, rows, channels, inputs, linear))
+    return runs
+
+
+class _Parts:
+    """The files of one folder."""
+
+    def __init__(self, folder: Path, usual: str, sources: Sources, signals: Sequence[str]) -> None:
+        self.sources = sources
+        files = {name: sources.signals[name].file or usual for name in signals}
+        self.logs: dict[str, Log] = {
+            name: read_log(folder / Path(file)) for name, file in files.items()
+        }
+
+    def runs(self, name: str) -> list[tuple[str, Array | None]]:
+        """Names of the runs in these files, each with the rows of it; all rows where there is one
+        run.
+        """
+        first = next(iter(self.logs.values()))
+        alone = all(log.path == first.path for log in self.logs.values())
+        if name or not alone or "run" not in first.columns:
+            return [(name or "1", None)]
+        numbers = first.column("run")
+        order = list(dict.fromkeys(numbers.tolist()))
+        return [(f"{number:g}", numbers == number) for number in order]
+
+    def joined(
+        self,
+        name: str,
+        rows: Array | None,
+        channels: Sequence[str],
+        inputs: Sequence[str],
+        linear: frozenset[str],
+    ) -> TableRun:
+        """One run of them."""
+        stamps = {}
+        for log in self.logs.values():
+            if log.path not in stamps:
+                stamps[log.path] = self._stamps(log, rows)
+        # Clocks of robots count from 1970: what is left of a second there is too coarse for rates.
+        zero = min(own[0] for own in stamps.values())
+        stamps = {path: self.sources.second * (own - zero) for path, own in stamps.items()}
+        measured = np.unique(np.concatenate([stamps[self.logs[c].path] for c in channels]))
+        given = [stamps[self.logs[u].path] for u in inputs]
+        times = np.unique(np.concatenate([measured, *given]))
+        times = times[(times >= measured[0]) & (times <= measured[-1])]
+        times = times[np.diff(times, prepend=-np.inf) > SAME_INSTANT]
+        path = self.logs[channels[0]].path
+        if times.size < 2 or times[-1] - times[0] < BRIEFEST:
+            raise InputError(f"{path}: run {name!r}: expected at least two instants, found one")
+        columns = {}
+        for channel in channels:
+            log = self.logs[channel]
+            values = self._values(log, channel, rows)
+            if not np.isfinite(values).any():
+                raise InputError(f"{log.path}: column {channel} has no sample; leave it out")
+            cells = np.full(times.size, np.nan)
+            places = np.searchsorted(times, stamps[log.path] - SAME_INSTANT)
+            inside = (places < times.size) & (stamps[log.path] >= times[0] - SAME_INSTANT)
+            cells[places[inside]] = values[inside]
+            columns[channel] = frozen(cells)
+        for name_, own in zip(inputs, given, strict=True):
+            columns[name_] = frozen(self._given(name_, own, times, rows, name_ in linear))
+        return TableRun(name, frozen(times), columns)
+
+    def _values(self, log: Log, signal: str, rows: Array | None) -> Array:
+        values = log.column(self.sources.signals[signal].column)
+        return values if rows is None else values[rows]
+
+    def _given(
+        self, signal: str, stamps: Array, times: Array, rows: Array | None, straight: bool
+    ) -> Array:
+        """(T,) an input at all instants."""
+        log = self.logs[signal]
+        values = self._values(log, signal, rows)
+        missing = np.flatnonzero(~np.isfinite(values))
+        if missing.size:
+            row = int(missing[0]) + 2
+            raise InputError(
+                f"{log.path}, {log.rows} {row}, column {self.sources.signals[signal].column}: "
+                f"expected a number, found none; what was put in is known at every stamp"
+            )
+        if straight:
+            return np.interp(times, stamps, values)
+        places = np.searchsorted(stamps, times + SAME_INSTANT, side="right") - 1
+        held: Array = values[np.maximum(places, 0)]
+        return held
+
+    def _stamps(self, log: Log, rows: Array | None) -> Array:
+        """(T,) the stamps of a file, in their unit."""
+        stamps = log.column(self.sources.time)
+        stamps = stamps if rows is None else stamps[rows]
+        where = f"{log.path}, column {self.sources.time}"
+        if not np.isfinite(stamps).all():
+            row = int(np.flatnonzero(~np.isfinite(stamps))[0]) + 2
+            raise InputError(f"{where}, {log.rows} {row}: expected a stamp, found none")
+        if np.abs(stamps).max() * self.sources.second > LATEST:
+            raise InputError(
+                f"{where}: expected stamps in the unit that [time] states, found {stamps[0]:.12g}; "
+                "is it milliseconds or less?"
+            )
+        bad = np.flatnonzero(np.diff(stamps) <= 0)
+        if bad.size:
+            row = int(bad[0]) + 3
+            raise InputError(
+                f"{where}, {log.rows} {row}: expected more than {stamps[bad[0]]:.12g}, found "
+                f"{stamps[bad[0] + 1]:.12g}; take out rows that came twice or late"
+            )
+        return stamps
