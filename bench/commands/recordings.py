@@ -75,6 +75,17 @@ def add_inspect(inspect: argparse.ArgumentParser) -> None:
     inspect.add_argument(
         "--out", metavar="DIR", type=place, help="folder for the figure (default: results/inspect)"
     )
+    inspect.add_argument(
+        "--check",
+        action="store_true",
+        help="say what the recording can fix, before any fit; exit code 1 if a free number is "
+        "not identifiable",
+    )
+    inspect.add_argument(
+        "--free",
+        metavar="A,B,...",
+        help="with --check: constants, or numbers of a model file, that are to be estimated",
+    )
     add_plugin(inspect, "systems")
     inspect.set_defaults(command=_inspect)
 
@@ -124,8 +135,11 @@ def _inspect(options: argparse.Namespace) -> int:
     from bench.recordings.inspection import load, summary
     from bench.recordings.stamps import oddities
     from bench.registry import load_plugins
+    from sims.base import InputError
 
     load_plugins(options.plugin)
+    if options.free and not options.check:
+        raise InputError("--free says what --check asks about; give --check besides")
     recording, kind = load(options.recording, options.system, options.model)
     for line in (*robotic.about(kind), *summary(recording, kind)):
         print(line)
@@ -137,4 +151,14 @@ def _inspect(options: argparse.Namespace) -> int:
         options.out or Path("results/inspect", options.recording.resolve().parent.name),
     ):
         print(path)
-    return 0
+    return _checked(options) if options.check else 0
+
+
+def _checked(options: argparse.Namespace) -> int:
+    """Say what the recording can fix; 1 if a free number is none of it."""
+    from bench.gap.check import check, told
+
+    free = names(options.free or "")
+    numbers = check(options.recording, options.system, options.model, free)
+    print("", *told(numbers), sep="\n")
+    return int(any(n.free and n.word == "not identifiable" for n in numbers))

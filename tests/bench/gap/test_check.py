@@ -1,0 +1,98 @@
+"""The check before the fit: what it calls identifiable is, and what is mixed up is named."""
+
+import numpy as np
+import pytest
+
+from bench.cli import main
+from bench.gap.check import check, told
+from bench.gap.explain import explain
+from sims.base import InputError, Scenario
+from sims.recording.recording import Recording, Run
+from sims.recording.write import write_recording
+from sims.slider.simulator import Slider
+
+NOISE = 1e-3
+
+
+def recorded(folder, moved=True, mass=2.0, seed=0, damping=0.0):
+    """Runs of a slider that is pushed, or left alone, with an encoder's noise."""
+    rng, times = np.random.default_rng(seed), np.arange(150) / 50.0
+    runs = []
+    for number in range(3):
+        force = 2 * np.sin(3 * times + number) if moved else np.zeros(150)
+        run = Scenario(times, {}, {"u": force})
+        simulator = Slider(observe=["x"], effects=["drag.linear"])
+        x = simulator.simulate(np.array([[mass, damping]]), run)[0, :, 0]
+        seen = x + NOISE * rng.standard_normal(150)
+        runs.append(Run(str(number), times, {"x": seen}, {"u": force}, {}, {}, number == 2))
+    path = folder / "log.csv"
+    about = Recording(path, "slider", "", {}, {"x": NOISE}, tuple(runs))
+    write_recording(path, about, Slider)
+    return path
+
+
+def test_the_width_is_that_of_the_fit(tmp_path):
+    path = recorded(tmp_path, damping=0.5)
+    by_name = {number.name: number for number in check(path)}
+    explained = explain(path)
+    (cause,) = explained.causes
+    (number,) = cause.coefficients.values()
+    assert cause.effect == "drag.linear"
+    half = 0.5 * (number.high - number.low)
+    assert by_name["drag.linear"].half == pytest.approx(half, rel=0.3)
+    assert by_name["drag.linear"].word == "identifiable"
+
+
+@pytest.mark.slow
+def test_what_is_called_identifiable_has_intervals_that_hold(tmp_path):
+    held = []
+    for seed in range(60):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        mass = 1.0 + 0.05 * seed
+        path = recorded(folder, mass=mass, seed=seed)
+        (number,) = [n for n in check(path) if n.free]
+        assert number.name == "mass"
+        assert number.word == "identifiable"
+        estimate = explain(path).answer.parameters["mass"].value
+        held.append(abs(estimate - mass) < number.half)
+    assert 0.88 <= np.mean(held) <= 1.0
+
+
+def test_a_motion_that_does_not_happen_fixes_nothing(tmp_path, capsys):
+    path = recorded(tmp_path, moved=False)
+    (mass,) = [n for n in check(path) if n.free]
+    assert mass.word == "not identifiable"
+    out = tmp_path / "out"
+    assert main(["inspect", str(path), "--check", "--out", str(out)]) == 1
+    said = capsys.readouterr().out
+    assert "not identifiable free  mass" in said
+
+
+def test_what_is_mixed_up_is_named(tmp_path, capsys):
+    path = recorded(tmp_path)
+    by_name = {number.name: dict(number.mixed) for number in check(path)}
+    assert by_name["input.delay"]["input.hold"] > 0.99
+    assert by_name["force.bias"]["input.bias"] > 0.999
+    # A gain of the input is a mass: beside the mass, which is free, nothing is left of it.
+    (gain,) = [n for n in check(path) if n.name == "input.gain"]
+    assert gain.word == "not identifiable"
+    assert main(["inspect", str(path), "--check", "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "mixed up with" in said
+    assert "  not identifiable cause input.gain" in said
+
+
+def test_free_numbers_are_asked_about_with_the_check_alone(tmp_path, capsys):
+    path = recorded(tmp_path)
+    assert main(["inspect", str(path), "--free", "mass", "--out", str(tmp_path / "out")]) == 2
+    assert "give --check besides" in capsys.readouterr().err
+    with pytest.raises(InputError, match="no such file"):
+        check(tmp_path / "none.csv")
+
+
+def test_many_causes_are_counted(tmp_path):
+    numbers = check(recorded(tmp_path))
+    lines = told(numbers, most=3)
+    assert lines[4].startswith("  ... and ")
+    assert lines[-1].startswith("causes: ")
