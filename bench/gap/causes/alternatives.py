@@ -149,13 +149,28 @@ class Alternatives:
                 left = trial.excess(other.names)
                 ratios.append(ratio_of(left, trial.excess(model.names)))
             return behind_in_excess(ratios)
-        behind = model.merit - other.merit
+        behind = self._merit(model) - self._merit(other)
         # Held-out runs are further data, so their likelihoods multiply.
         if trial is not None:
             mine = trial.measured[model.names]
             others = trial.measured[other.names]
             behind += mine.merit - others.merit
         return behind
+
+    def _merit(self, model: Model) -> float:
+        """Of a robot's model, without what its effects might gain by chance where they have but one
+        shape: what differs between two of those is that one may not be negative, say, and where
+        commands have one sign a dead band is a bias.
+        """
+        world = self.search.world
+        if not world.linear:
+            return model.merit
+        system, lucky = world.simulator.system, 0.0
+        for name in model.names:
+            parameters = effect_parameters(world.effects[name], system, world.channels)
+            if not any(parameter.bounds[0] > 0 for parameter in parameters):
+                lucky += self.search.chance_of(name)
+        return model.merit + lucky
 
     def _is_plausible(self, effect: str) -> bool:
         """Whether an effect explains the gap with coefficients that one would expect."""

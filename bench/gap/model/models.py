@@ -108,7 +108,7 @@ class Models:
         found = _LOST
         if np.isfinite(fit.cost):
             found = likelihood(self.residual(fit), self.seen, free)
-        chance = sum(self._chance(name) for name in fit.effects)
+        chance = sum(self.chance_of(name) for name in fit.effects)
         merit = found.value - free * self._price - chance  # (1)
 
         # the order in which effects were added makes no difference
@@ -127,7 +127,7 @@ class Models:
         count = int(self.seen.sum())
         return float(np.log(max(count, FEWEST)))
 
-    def _chance(self, name: str) -> float:
+    def chance_of(self, name: str) -> float:
         """What an effect costs beside that, its part of the last term of (1)."""
         slot = self.world.slots[name]
         # few shapes gain less by chance than their coefficients pay

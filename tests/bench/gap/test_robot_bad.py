@@ -157,3 +157,26 @@ def test_a_log_of_something_else_is_one_line(name, tmp_path):
     with pytest.raises(InputError, match=message) as error:
         explain(table_of(tmp_path, **given))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+def test_commands_in_degrees_are_a_gain_of_the_command(tmp_path):
+    explained = explain(table_of(tmp_path, scaled(57.3, 1, 1, 1)))
+    (cause,) = explained.causes
+    assert cause.effect == "input.gain@m_shoulder"
+    assert cause.coefficients["coefficient"].value == pytest.approx(1 / 57.3 - 1, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_an_encoder_that_is_a_quarter_turn_off_is_named_with_its_place(tmp_path):
+    explained = explain(table_of(tmp_path, lambda v: v + np.array([0, 0, 0, 1.57])))
+    (cause,) = explained.causes
+    assert cause.effect == "sensor.bias@q.elbow"
+    assert cause.coefficients["coefficient"].value == pytest.approx(1.57, abs=5e-3)
+
+
+@pytest.mark.slow
+def test_swapped_joints_have_no_cause_that_would_explain_them(tmp_path):
+    explained = explain(table_of(tmp_path, lambda v: v[:, [0, 1, 3, 2]]))
+    assert explained.answer.verdict in ("unknown", "partial")
+    assert [c.effect for c in explained.causes if not c.effect.startswith("numerics.")] == []
