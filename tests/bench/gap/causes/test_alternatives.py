@@ -26,7 +26,7 @@ def evidence(
     search = search_of(model(), BEST, ALIKE, BEHIND, excess={(n,): e for n, e in excess.items()})
     search.scanned = {frozenset(): SimpleNamespace(scores=scores)}
     search.tests = {frozenset(): best}
-    search.world = SimpleNamespace(effects={name: placed() for name in "abc"})
+    search.world = SimpleNamespace(effects={name: placed() for name in "abc"}, linear=False)
     monkeypatch.setattr(Alternatives, "_is_plausible", lambda self, effect: effect in plausible)
     (found,) = Alternatives(search, trial, structure).evidence(BEST)
     return found
@@ -75,9 +75,33 @@ def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
     """The plain one is; a family whose place is far behind stays in the set."""
     search = search_of(model(), BEST, ALIKE, BEHIND)
     effects = {name: placed() for name in "abc"} | {family: placed(place, contains)}
-    search.world = SimpleNamespace(effects=effects)
+    search.world = SimpleNamespace(effects=effects, linear=False)
     monkeypatch.setattr(Alternatives, "_is_plausible", lambda self, effect: True)
     monkeypatch.setattr(Alternatives, "_p_value", lambda self, rest, effect, gain: 0.0)
     (found,) = Alternatives(search, None, structure=False).evidence(BEST)
     assert found.alternatives == kept
     assert found.preferred == ("b" if family == "a" else "a")
+
+
+@pytest.mark.parametrize(("least", "alternatives"), [(-1.0, ("b",)), (0.1, ())])
+def test_what_one_of_two_signs_gains_by_chance_is_no_reason_about_a_robot(
+    least, alternatives, monkeypatch
+):
+    """What has shapes to choose from pays for them."""
+    search = search_of(model(), BEST, model("b", merit=100.0 - 3.0 * SWITCH))
+    system = SimpleNamespace(channels=())
+    search.world = SimpleNamespace(
+        effects={"a": placed(), "b": placed()},
+        linear=True,
+        channels=(),
+        simulator=SimpleNamespace(system=system),
+    )
+    search.chance_of = {"a": 0.0, "b": 3.0 * SWITCH}.get
+    monkeypatch.setattr(
+        "bench.gap.causes.alternatives.effect_parameters",
+        lambda *_: [SimpleNamespace(bounds=(least, 1.0))],
+    )
+    monkeypatch.setattr(Alternatives, "_is_plausible", lambda self, effect: True)
+    monkeypatch.setattr(Alternatives, "_p_value", lambda self, rest, effect, gain: 0.0)
+    (found,) = Alternatives(search, None, structure=False).evidence(BEST)
+    assert found.alternatives == alternatives
