@@ -15,6 +15,7 @@ from bench.recordings.guess import Column
 from bench.recordings.inspection import load
 from sims.base import Array, InputError
 from sims.recording.logs import Log, logs_in, read_log
+from sims.recording.write import publish
 from sims.robot.model import Joint, Robot
 from sims.robot.scales import scales
 
@@ -92,10 +93,9 @@ def checked(path: Path, text: str) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    publish({path: text})
     try:
         load(path)
     except BaseException:
@@ -123,12 +123,17 @@ class _Describing:
     def made(self) -> Imported:
         """The description."""
         time, unit = self._time()
-        columns = [
-            Column(file, name, log.column(name))
+        every = [
+            Column(file, name, np.where(np.isfinite(values), values, np.nan))
             for file, log in self.logs.items()
             for name in log.names()
+            for values in (log.column(name),)
             if name != time
         ]
+        columns = [column for column in every if np.isfinite(column.values).any()]
+        for column in every:
+            if np.isnan(column.values).all():
+                self._untold(column, "has no number")
         self._positions(columns)
         self._rates(columns)
         self._commands(columns)
