@@ -39,6 +39,7 @@ from bench.recordings.inspection import load
 from sims.base import Array, InputError
 from sims.recording.recording import Recording
 from sims.simulated import Simulated, effect_parameters
+from sims.system import FAMILY
 
 Word = Literal["identifiable", "weak", "not identifiable"]
 
@@ -186,7 +187,7 @@ class _Checked:
     def _causes(self) -> list[Number]:
         """Every cause by itself, beside the free numbers; families are their members."""
         world = self.world
-        names = [name for name in world.library if not hasattr(world.effects[name], "members")]
+        names = [name for name in world.library if world.effects[name].place != FAMILY]
         found = directions(world, self.fit, names)
         shown = np.where(self.seen[..., None], found.values, 0.0) / self.noise.sigma[:, None]
         runs, _, _, count = shown.shape
@@ -218,11 +219,8 @@ class _Checked:
                 for (other, _), j in best.items()
                 if other != name and powers[j] > 0
             ]
-            label = (
-                name if parameter.name == name else f"{name} {parameter.name.rpartition('.')[2]}"
-            )
             single = sum(1 for own, _ in best if own == name) == 1
-            label = name if single else label
+            label = name if single else f"{name} {parameter.name.rpartition('.')[2]}"
             if probe.fixed:
                 # A limit or a gap is no matter of proportion: it shows where it is reached.
                 own = _number(label, False, parameter.unit, 0.0, parameter.bounds, mixed)
@@ -267,10 +265,7 @@ def told(numbers: Sequence[Number], most: int = 40) -> list[str]:
     lines = ["what this recording can fix (95 %, white noise assumed; a cause each by itself):"]
     rows = [number for number in numbers if number.free]
     causes = [number for number in numbers if not number.free]
-    for word in ("not identifiable", "weak", "identifiable"):
-        own = [number for number in causes if number.word == word]
-        rows += own if word != "identifiable" else []
-    rows += [number for number in causes if number.word == "identifiable"]
+    rows += [number for word in reversed(_WORDS) for number in causes if number.word == word]
     for number in rows[:most]:
         half = f"±{number.half:.2g} {number.unit}" if np.isfinite(number.half) else "untouched"
         if np.isnan(number.half):

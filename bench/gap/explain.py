@@ -215,12 +215,18 @@ class _Explainer:
         base = fit_base(self.fitting, self.noise, self._given())
         if not self.kind.has_model:
             return base
+        base = self._stepped(base)
+        # What is asked about as a cause comes first: it would not be seen afterwards.
+        return without_step(self.fitting, self.noise, base)
+
+    def _stepped(self, base: Base) -> Base:
+        """The base model with the step that the data ask for; its worlds are the explainer's."""
         # Loaded where there is a robot alone.
         from bench.gap.model.numerics import finer
 
         fine = finer(self.fitting, self.noise)
         if fine is None:
-            return without_step(self.fitting, self.noise, base)
+            return base
         coarse = self.kind, self.fitting, self.measuring
         value = self._value(base)
         self._enter(fine.kind)
@@ -229,11 +235,11 @@ class _Explainer:
         if gain < SWITCH:
             # What the robot does is no nearer to its fine motion: the file's own step stands.
             self._return(*coarse)
-            return without_step(self.fitting, self.noise, base)
+            return base
         self.say(f"stepped more finely: {fine.numerics.integrator}, {fine.numerics.timestep:g} s")
         self.coarse = Coarse(fine, gain)
         self.assessor = replace(self.assessor, before=self._before(base, coarse[2]))
-        return without_step(self.fitting, self.noise, other)
+        return other
 
     def _before(self, base: Base, measuring: World | None) -> Array | None:
         """What the file's own step makes of the held-out runs; None where there are none."""

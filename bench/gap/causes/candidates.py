@@ -27,6 +27,7 @@ from bench.gap.model.problem import Fit, Start
 from bench.gap.model.world import World
 from sims.base import Array, Parameter
 from sims.simulated import effect_parameters
+from sims.system import FAMILY
 
 SMALL = 1e-4
 """Share of a plausible range at which a direction is first taken."""
@@ -264,7 +265,7 @@ def _modified(world: World, probes: Sequence[Probe], acting: Mask) -> Iterator[P
             leading.setdefault(probe.effect, probe)
         # At its first shape a coefficient has shown already whether it acts by itself; members of a
         # family do not modify each other.
-        elif probe.group == 0 and not probe.fixed and not _members(world, probe.effect):
+        elif probe.group == 0 and not probe.fixed and world.effects[probe.effect].place != FAMILY:
             idle.append(probe)
     modifiers: dict[str, list[Probe]] = {}
     for probe in idle:
@@ -273,11 +274,6 @@ def _modified(world: World, probes: Sequence[Probe], acting: Mask) -> Iterator[P
             modifiers.setdefault(probe.effect, []).append(probe)
     for name, members in modifiers.items():
         yield from _grid_points(world, leading[name], members)
-
-
-def _members(world: World, name: str) -> bool:
-    """Whether an effect is a family, of one coefficient for each of its places or more."""
-    return bool(getattr(world.effects[name], "members", ()))
 
 
 def _grid_points(world: World, first: Probe, modifiers: Sequence[Probe]) -> Iterator[Probe]:

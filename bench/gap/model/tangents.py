@@ -117,7 +117,7 @@ def correct(world: World, noise: Noise, theta: Array, states: Array) -> None:
     if not world.linear:
         return
     assert issubclass(world.kind, RobotSimulator)
-    effects = [*world.library, *(effect for effect in world.extra)]
+    effects = [*world.library, *world.extra]
     runs = len(world.tracks)
     scenarios = [track.scenario for track in world.tracks]
     lanes = np.tile(theta, (runs, 1))
