@@ -28,6 +28,7 @@ def explain(
     force: bool = False,
     budget: float | None = None,
     jobs: int | None = None,
+    whole: bool = False,
     say: Callable[[str], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float, str], None] | None = None,
@@ -48,6 +49,7 @@ def explain(
             answer's ``cut`` says what was not asked any more. None: it comes to its end.
         jobs: processes that work at once, where that pays; None: one for each core. The answer does
             not depend on it.
+        whole: look at all of a long recording of a robot; else at pieces from all over it.
         say: told what is being done.
         stop: asked between two steps of the search; True ends it as a budget does.
         progress: told the share that is done, as far as can be known, and what is looked at.
@@ -64,7 +66,7 @@ def explain(
         raise InputError(f"jobs: expected a whole number of at least 1, found {jobs!r}")
     watch = Watch(budget, stop, progress)
     given = system, engine, seed, free, tuner, say, force
-    return explaining.explain(recording, *given, watch, jobs or cores(), model)
+    return explaining.explain(recording, *given, watch, jobs or cores(), model, whole)
 
 
 def score(

@@ -96,7 +96,11 @@ def read_recording(path: str | Path, system: str | None = None) -> Recording:
 
 
 def import_logs(
-    logs: str | Path | Sequence[str | Path], model: str | Path, out: str | Path
+    logs: str | Path | Sequence[str | Path],
+    model: str | Path,
+    out: str | Path,
+    *,
+    held_out: Sequence[str] = (),
 ) -> Imported:
     """Describe a robot's logs as they lie: write the toml by which every command reads them.
 
@@ -104,6 +108,7 @@ def import_logs(
         logs: files of one run, or folders that each hold those of one.
         model: what they are of, MJCF or URDF.
         out: NAME.toml, a new file.
+        held_out: runs that no fit is to see; every third one without.
 
     Returns:
         What was guessed, and what could not be told.
@@ -117,6 +122,7 @@ def import_logs(
     if path.suffix != ".toml":
         raise InputError(f"expected a description to write, NAME.toml, found '{path}'")
     refuse_existing([path])
-    made = describe([Path(log) for log in given], read(Path(model)), Path(model), path.parent)
+    paths = [Path(log) for log in given]
+    made = describe(paths, read(Path(model)), Path(model), path.parent, held_out)
     checked(path, made.text)
     return made

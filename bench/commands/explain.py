@@ -66,6 +66,11 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
         help="processes that work at once, where that pays; the answer is the same with any number "
         "(default: one for each core)",
     )
+    parser.add_argument(
+        "--whole",
+        action="store_true",
+        help="look at all of a long recording of a robot (default: at pieces from all over it)",
+    )
     add_plugin(parser, "systems")
     add_force(parser)
     parser.set_defaults(command=_explain)
@@ -118,6 +123,7 @@ def _explain(options: argparse.Namespace) -> int:
             force=options.force,
             budget=options.budget,
             jobs=options.jobs,
+            whole=options.whole,
             say=look.say,
             stop=interrupts.asked,
             progress=look.show,

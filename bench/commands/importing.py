@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from bench.commands.options import place
+from bench.commands.options import names, place
 
 
 def add_import(parser: argparse.ArgumentParser) -> None:
@@ -22,13 +22,19 @@ def add_import(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="NAME.toml", type=place, required=True, help="file to write, a new one"
     )
+    parser.add_argument(
+        "--held-out",
+        metavar="A,B,...",
+        default="",
+        help="runs that no fit is to see (default: every third one)",
+    )
     parser.set_defaults(command=_import)
 
 
 def _import(options: argparse.Namespace) -> int:
     from bench.api.recordings import import_logs
 
-    made = import_logs(options.logs, options.model, options.out)
+    made = import_logs(options.logs, options.model, options.out, held_out=names(options.held_out))
     print(f"{options.out}: {len(made.guessed)} guesses, each marked there; nothing was copied")
     for line in made.guessed:
         print(f"guess: {line}")

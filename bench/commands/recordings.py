@@ -132,6 +132,7 @@ def _simulate(options: argparse.Namespace) -> int:
 def _inspect(options: argparse.Namespace) -> int:
     from bench.figures.recording import draw
     from bench.recordings import robotic
+    from bench.recordings.census.census import census
     from bench.recordings.inspection import load, summary
     from bench.recordings.stamps import oddities
     from bench.registry import load_plugins
@@ -145,6 +146,8 @@ def _inspect(options: argparse.Namespace) -> int:
         print(line)
     for text in (*(o.text for o in oddities(recording, kind)), *robotic.odd(recording, kind)):
         print(f"odd: {text}")
+    for finding in census(recording, kind):
+        print(f"finding: {finding.line}")
     for path in draw(
         recording,
         kind,

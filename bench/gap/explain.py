@@ -30,6 +30,7 @@ from bench.gap.steps import Coarse, with_numerics
 from bench.gap.tell import Teller
 from bench.problem.seeds import rng_for
 from bench.recordings.inspection import load
+from bench.recordings.pieces import cut
 from bench.recordings.size import check_recording
 from bench.recordings.stamps import refuse_odd
 from sims import extended as extend
@@ -59,6 +60,7 @@ def explain(
     watch: Watch | None = None,
     jobs: int = 1,
     model: str | Path | None = None,
+    whole: bool = False,
 ) -> Explanation:
     """Explain a recording.
 
@@ -74,23 +76,27 @@ def explain(
         watch: says when the search has to end, and is told how far it is.
         jobs: processes that work at once; the answer does not depend on it.
         model: take it for this robot, whatever the description says: a model file.
+        whole: look at all of a long recording of a robot, not at pieces of it.
 
     Raises:
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
             or the search was ended before anything could be simulated.
     """
     with closing(Crew(jobs)) as crew:
-        subject = _Subject(recording, system, model)
+        subject = _Subject(recording, system, model, whole)
         given = engine, seed, tuple(free), tuner, say, force
         return _Explainer(subject, *given, watch or Watch(), crew).run()
 
 
 class _Subject(NamedTuple):
-    """What is explained: a recording, and what it is taken for if not for what it says."""
+    """What is explained: a recording, what it is taken for if not for what it says, and whether all
+    of it is looked at.
+    """
 
     source: str | Path | Recording
     system: str | None
     model: str | Path | None
+    whole: bool
 
 
 class _Explainer:
@@ -110,7 +116,7 @@ class _Explainer:
         self.seed = seed
         self.tuner = tuner
         self.say = say
-        self.recording, kind = load(*subject, free)
+        self.recording, kind = load(subject.source, subject.system, subject.model, free)
         self.path = self.recording.path
         if not issubclass(kind, Simulated):
             raise self._takes_no_effects()
@@ -124,6 +130,12 @@ class _Explainer:
         # Before the worlds, which plan every step of every run.
         for odd in refuse_odd(self.recording, kind, force):
             say(f"{self.path}: {odd}")
+        self.notes: tuple[str, ...] = ()
+        if not subject.whole:
+            self.recording, note = cut(self.recording, kind)
+            self.notes = (note,) if note else ()
+            for note in self.notes:
+                say(note)
         check_recording(self.recording, kind(engine=self.engine), force)
         self.watch = watch
         self.crew = crew
@@ -195,7 +207,7 @@ class _Explainer:
         verdict = self.assessor.verdict(search, finding, rng, self.started)
         if self.coarse is not None:
             verdict = with_numerics(verdict, self.coarse)
-        story = Teller(self.assessor, search, base, finding).story(verdict)
+        story = Teller(self.assessor, search, base, finding, self.notes).story(verdict)
         extended = self._extended(search, finding)
         # Not earlier: an experiment is proposed by simulating further.
         for world in (self.fitting, self.measuring):

@@ -29,12 +29,14 @@ class Teller:
         search: that has found it.
         base: the fit of the base model.
         finding: what was found.
+        notes: what else is to be borne in mind, a sentence each.
     """
 
     assessor: Assessor
     search: Search
     base: Base
     finding: Finding
+    notes: tuple[str, ...] = ()
 
     def story(self, verdict: Verdict) -> Story:
         """The story of a verdict on the finding."""
@@ -118,6 +120,7 @@ class Teller:
         if untouched:
             names = ", ".join(untouched)
             yield f"the recording does not touch {names}: kept at the nominal value"
+        yield from self.notes
 
     def _why(self) -> Iterator[str]:
         """Why the verdict is what it is, the most important first."""

@@ -33,16 +33,17 @@ def kind_of(experiment: Experiment) -> type[Simulator]:
     if not experiment.model:
         return simulators.get(experiment.simulator)
     who = f"experiment {experiment.name}"
-    if not experiment.free:
-        wanted = 'free = ["damping@*", ...] or --free, numbers of the model file to tune'
-        raise InputError(f"{who}: expected {wanted}; found none")
     path = find_model(experiment.model, experiment.name)
-    actuators, engine = dict(experiment.actuators), {}
+    free, actuators, engine = experiment.free, dict(experiment.actuators), {}
     if experiment.recording:
         stated = model_of(find_recording(experiment.recording.path), path)
         assert stated is not None  # a model was given
         actuators, engine = {**stated.actuators, **actuators}, dict(stated.engine)
-    return robot(path, actuators, engine, experiment.free)
+        free = free or stated.free
+    if not free:
+        wanted = 'free = ["damping@*", ...] or --free, numbers of the model file to tune'
+        raise InputError(f"{who}: expected {wanted}; found none")
+    return robot(path, actuators, engine, free)
 
 
 def completed(experiment: Experiment) -> Experiment:

@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from bench.recordings import guess
+from bench.recordings.census import rates
 from bench.recordings.guess import Column
 from bench.recordings.inspection import load
 from sims.base import Array, InputError
 from sims.recording.logs import Log, logs_in, read_log
+from sims.recording.recording import Run
 from sims.recording.write import publish
 from sims.robot.model import Joint, Robot
 from sims.robot.scales import scales
+from sims.user_toml import known
 
 QUICK, DAMPED = 20.0, 0.7
 """rad/s and share of critical damping of a servo whose gains nobody has stated."""
 TABLES = (".csv", ".tsv", ".npz", ".parquet")
 """Endings of what is taken from a folder; other texts may be anything."""
-_PREFIX = {"position": "q", "velocity": "qd"}
+_GAINS = "actuator.stiffness", "actuator.damping"
+"""What nobody has stated of a servo that a model file lacks."""
 
 
 @dataclass
@@ -41,7 +45,9 @@ class Imported:
     untold: list[str] = field(default_factory=list)
 
 
-def describe(logs: Sequence[Path], robot: Robot, model: Path, beside: Path) -> Imported:
+def describe(
+    logs: Sequence[Path], robot: Robot, model: Path, beside: Path, held_out: Collection[str] = ()
+) -> Imported:
     """The description of logs of a robot.
 
     Args:
@@ -49,13 +55,16 @@ def describe(logs: Sequence[Path], robot: Robot, model: Path, beside: Path) -> I
         robot: what they are of.
         model: its model file.
         beside: the folder where the description will stand.
+        held_out: runs that no fit is to see.
 
     Raises:
-        InputError: they cannot be read, or there is nothing in them that a robot has.
+        InputError: they cannot be read, there is nothing in them that a robot has, or no such run.
     """
     runs = runs_of(logs)
+    known("run held out", held_out, [name for name in runs if name])
     _name, files = next(iter(runs.items()))
-    return _Describing(robot, model, beside, runs, {p.name: read_log(p) for p in files}).made()
+    read = {path.name: read_log(path) for path in files}
+    return _Describing(robot, model, beside, runs, read, held_out).made()
 
 
 def runs_of(logs: Sequence[Path]) -> dict[str, list[Path]]:
@@ -111,7 +120,9 @@ class _Describing:
         beside: Path,
         runs: Mapping[str, list[Path]],
         logs: Mapping[str, Log],
+        held_out: Collection[str],
     ) -> None:
+        self.held_out = held_out
         self.robot, self.model, self.beside, self.runs, self.logs = robot, model, beside, runs, logs
         self.joints = [joint for joint in robot.joints if joint.single]
         self.made_of = Imported("")
@@ -222,11 +233,21 @@ class _Describing:
             else:
                 own, unit, _ = position
                 rate = guess.unit_of_rate(column.values, own.values, self.seconds[own.file], unit)
+                late = self._late(own, column)
                 if rate is None:
                     self._untold(column, f"is not the derivative of {own.name}")
+                elif late is not None:
+                    behind = f"{late.samples:.2g} samples {late.word} the derivative of {own.name}"
+                    self._untold(column, f"is {behind}, filtered or stamped at another time")
                 else:
                     says = f"{why}; in {rate}, as the derivative of {own.name}"
                     self.channels[f"qd.{joint.name}"] = column, rate, says
+
+    def _late(self, position: Column, rate: Column) -> rates.Late | None:
+        """Whether a velocity follows behind its position, of which a model would make a cause."""
+        times = self.seconds[position.file]
+        shown = {"q": position.values, "v": rate.values}
+        return rates.late([Run("", times, shown, {}, {}, {}, False)], "q", "v")
 
     def _commands(self, columns: Sequence[Column]) -> None:
         mine = [c for c in columns if guess.role_of(c) == "command"]
@@ -266,12 +287,16 @@ class _Describing:
             self.made_of.untold.append(f"joints without a position: {', '.join(missing)}")
 
     def _text(self, time: str, unit: str) -> str:
-        lines = [f"model = {_quoted(self._from(self.model))}", ""]
+        lines = [f"model = {_quoted(self._from(self.model))}"]
+        if self.added:
+            names = ", ".join(_quoted(f"{name}@*") for name in _GAINS)
+            lines.append(f"free = [{names}]  # not known: they are estimated")
+        lines.append("")
         lines += ["[time]", f"column = {_quoted(time)}", f"unit = {_quoted(unit)}  # guess", ""]
         for run, files in self.runs.items():
             if run:
                 lines += [f"[runs.{_key(run)}]", f"folder = {_quoted(self._from(files[0].parent))}"]
-                lines.append("")
+                lines += [*["held_out = true"] * (run in self.held_out), ""]
         alone = next(iter(self.logs.values())).path.parent if "" in self.runs else None
         for name, joint in self.added.items():
             lines += self._actuator(name, joint)
@@ -288,8 +313,7 @@ class _Describing:
         inertia = scales(self.robot).inertia[self.joints.index(joint)]
         kp, kv = inertia * QUICK**2, 2.0 * DAMPED * QUICK * inertia
         self.made_of.untold.append(
-            f"gains of the servo of {joint.name}: kp and kv are those of one of {QUICK:g} rad/s; "
-            f"state them, or free actuator.stiffness@{name}"
+            f"gains of the servo of {joint.name}: free, from those of one of {QUICK:g} rad/s on"
         )
         lines = [f"[actuators.{_key(name)}]", f"joint = {_quoted(joint.name)}"]
         lines += ['kind = "position"  # guess: its commands are positions']

@@ -49,7 +49,7 @@ def load(
         source: the table's path, or a recording that is in memory already.
         system: take it for this system, whatever it says of itself.
         model: take it for this robot: a model file.
-        free: numbers of a robot's model file that are tuned.
+        free: numbers of a robot's model file that are tuned; those of its description without.
 
     Raises:
         InputError: it cannot be read, or there is no such system.
@@ -78,7 +78,7 @@ def kind_of(
     else:
         of_file = None if system is not None else model_of(path, model)
     if of_file is not None and system is None:
-        return robot(of_file.path, of_file.actuators, of_file.engine, free)
+        return robot(of_file.path, of_file.actuators, of_file.engine, free or of_file.free)
     name = system or (source.system if isinstance(source, Recording) else system_of(path))
     try:
         return simulators.get(name)

@@ -23,6 +23,7 @@ _KEYS = (
     "model",
     "actuators",
     "engine",
+    "free",
     "title",
     "channels",
     "inputs",
@@ -94,11 +95,13 @@ class ModelFile:
         path: of its model file.
         actuators: that the file lacks, by name.
         engine: time step and integrator other than the file's.
+        free: numbers that nobody knows, and that are estimated unless others are asked for.
     """
 
     path: Path
     actuators: Mapping[str, Any]
     engine: Mapping[str, Any]
+    free: tuple[str, ...] = ()
 
 
 def model_of(path: str | Path, model: str | Path | None = None) -> ModelFile | None:
@@ -121,7 +124,15 @@ def model_of(path: str | Path, model: str | Path | None = None) -> ModelFile | N
         model = description.parent / text(description, "model", meta["model"])
     actuators = table(description, "actuators", meta.get("actuators", {}))
     engine = table(description, "engine", meta.get("engine", {}))
-    return ModelFile(Path(model), actuators, engine)
+    return ModelFile(Path(model), actuators, engine, _free(description, meta))
+
+
+def _free(path: Path, meta: Mapping[str, Any]) -> tuple[str, ...]:
+    """The numbers of a robot that its recording leaves free."""
+    given = meta.get("free", [])
+    if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
+        raise fault(path, "free", 'names, as ["damping@*"]', given)
+    return tuple(given)
 
 
 def system_of(path: str | Path) -> str:
@@ -156,6 +167,8 @@ def read_description(path: Path, declared: Declared) -> Description:
     """
     meta = read_toml(path)
     _known(path, "", meta, _KEYS)
+    if "free" in meta and "model" not in meta:
+        raise fault(path, "free", "it with model = FILE alone (else --free A,B)", meta["free"])
     title = text(path, "title", meta.get("title", path.stem))
     channels = _columns(path, "channel", meta, declared.channels)
     inputs = _columns(path, "input", meta, declared.inputs)

@@ -68,6 +68,23 @@ class Run:
         use = "held out" if self.held_out else "for fitting"
         return f"<run {self.name}: {self.times.size} samples, {seconds:.4g} s, {use}>"
 
+    def part(self, rows: slice, name: str = "") -> Run:
+        """Some of its samples as a run; of another name where one is given."""
+
+        def cut(signals: Mapping[str, Array]) -> dict[str, Array]:
+            return {key: values[rows] for key, values in signals.items()}
+
+        return replace(
+            self,
+            name=name or self.name,
+            times=self.times[rows],
+            channels=cut(self.channels),
+            inputs=cut(self.inputs),
+            # a known initial state is that of the whole run's beginning
+            initial={} if rows.start else self.initial,
+            extra=cut(self.extra),
+        )
+
 
 @dataclass(frozen=True, repr=False)
 class Recording:
@@ -218,7 +235,10 @@ def _halves(path: Path, run: Run) -> tuple[Run, ...]:
     """A run's beginning, and its last third held out."""
     count = len(run.times)
     cut = (2 * count) // _THIRD
-    parts = _slice(run, slice(None, cut), False), _slice(run, slice(cut, None), True)
+    parts = (
+        replace(run.part(slice(cut)), held_out=False),
+        replace(run.part(slice(cut, None)), held_out=True),
+    )
     for part in parts:
         measured = any(np.isfinite(values).any() for values in part.channels.values())
         if len(part.times) < 2 or not measured:
@@ -227,22 +247,3 @@ def _halves(path: Path, run: Run) -> tuple[Run, ...]:
                 "expected at least 4, with samples in both parts"
             )
     return parts
-
-
-def _slice(run: Run, part: slice, held_out: bool) -> Run:
-    """A part of a run, as a run."""
-
-    def cut(signals: Mapping[str, Array]) -> dict[str, Array]:
-        return {name: values[part] for name, values in signals.items()}
-
-    # a known initial state is that of the run's beginning
-    initial = run.initial if part.start is None else {}
-    return replace(
-        run,
-        times=run.times[part],
-        channels=cut(run.channels),
-        inputs=cut(run.inputs),
-        initial=initial,
-        held_out=held_out,
-        extra=cut(run.extra),
-    )

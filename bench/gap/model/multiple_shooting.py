@@ -15,7 +15,6 @@ find is where fits of the whole runs begin, which join them; it decides nothing.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -59,20 +58,7 @@ def _cut(run: Run) -> list[Run]:
     # pieces are equally long, but samples may be missing in one of them
     if any(seen[part].sum() < LEAST // HOLES for part in parts):
         return [run]
-    return [_piece(run, number, part) for number, part in enumerate(parts)]
-
-
-def _piece(run: Run, number: int, part: slice) -> Run:
-    """A piece of a run; what is known of the beginning is known of the first one alone."""
-    return replace(
-        run,
-        name=f"{run.name}.{number}",
-        times=run.times[part],
-        channels={name: values[part] for name, values in run.channels.items()},
-        inputs={name: values[part] for name, values in run.inputs.items()},
-        initial=run.initial if number == 0 else {},
-        extra={},
-    )
+    return [run.part(part, f"{run.name}.{n}") for n, part in enumerate(parts)]
 
 
 def whole(world: World, found: Fit) -> Start:

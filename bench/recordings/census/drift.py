@@ -1,0 +1,141 @@
+"""Whether the clock of the sensors drifts against that of the commands.
+
+What a position y makes of a command u is taken for linear with a finite memory,
+
+    p(t) = c + d t + sum_k h_k <u>_k(t),  <u>_k the mean of u over the k-th stretch before t   (1)
+
+so that slow and fast commands each have the lag that the drive gives them. A position that falls
+ever more behind by a share e of the time is
+
+    y(t) = p(t - T - e t) = p - (T + e t) p' + ...                                             (2)
+
+and least squares for T and e is the shift at which the two are most alike (cross-correlation's
+maximum, to first order; C. Knapp, G. Carter, IEEE Trans. ASSP 24(4), 320, 1976). The error of e is
+that of sums over blocks longer than the memory, since what (1) leaves is not white (W. Newey,
+K. West, Econometrica 55, 703, 1987).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.recordings.census.finding import Finding
+from sims.base import Array, Simulator
+from sims.recording.recording import Recording, Run
+from sims.simulated import Simulated
+
+GRID = 8000
+"""Instants of a run, at most, at which the two are compared."""
+EDGES = (-2, -1, 0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+"""Bounds of the stretches of (1), in instants before the one in question."""
+BLOCKS = 4
+"""Blocks of a run, without which it tells nothing of its error."""
+FEW = (9.0, 9.0, 9.0, 2.7, 1.9, 1.6, 1.43, 1.35, 1.3, 1.25, 1.2, 1.18, 1.16, 1.14, 1.12, 1.1, 1.05)
+"""Times the error that so few blocks tell is too small (Student's t at 95 %, one block lost)."""
+ROUGH = 0.01
+"""Share of the drift that (2) leaves out."""
+LIKE = 0.9
+"""Share of a position's variance that (1) explains at least."""
+LEAST = 2e-5
+"""Drift that is told: clocks of ordinary quartz differ by less."""
+SURE = 4.0
+"""Standard deviations beyond chance."""
+
+
+class _Estimate(NamedTuple):
+    drift: float
+    error: float
+
+
+def drifts(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
+    """The drift over all runs and driven coordinates, where there is one."""
+    found = [
+        estimate
+        for command, position in _driven(kind)
+        for run in recording.runs
+        if command in run.inputs and position in run.channels
+        for estimate in _estimate(run, command, position)
+    ]
+    if not found:
+        return
+    drift, error = _pooled(found)
+    if abs(drift) < max(LEAST, SURE * error):
+        return
+    word = "fast" if drift > 0 else "slow"
+    yield Finding(
+        "drift",
+        f"the sensors' clock runs {1e6 * abs(drift):.3g} ppm (±{2e6 * error:.2g}) {word} against "
+        "the commands'",
+        "stamp both by one clock; explain's clock.skew finds and removes it",
+    )
+
+
+def _driven(kind: type[Simulator]) -> list[tuple[str, str]]:
+    """Inputs with the positions that follow them."""
+    if not issubclass(kind, Simulated):
+        return []
+    if kind.has_model:
+        robot: Any = kind
+        return [(f"u.{a.name}", f"q.{a.joint}") for a in robot.robot.actuators if a.joint]
+    return [(u.name, name) for u in kind.inputs for name in kind.system.coordinates]
+
+
+def _estimate(run: Run, command: str, position: str) -> Iterator[_Estimate]:
+    """(2) of one run; nothing where (1) does not explain it."""
+    t, u, y = run.times, run.inputs[command], run.channels[position]
+    seen = np.isfinite(y)
+    if seen.sum() < 2 * len(EDGES) or not (np.nanstd(y) > 0 and np.std(u) > 0):
+        return
+    step = max(float(np.median(np.diff(t))), float(t[-1] - t[0]) / GRID)
+    grid = np.arange(t[0], t[-1], step)
+    own = np.interp(grid, t[seen], y[seen])
+    memory = _memory(np.interp(grid, t, u))
+    inner = slice(EDGES[-1], len(grid) + EDGES[0])
+    time = (grid - grid.mean())[inner]
+    own, memory = own[inner], memory[inner]
+    if time.size < BLOCKS * EDGES[-1] or not np.std(own) > 0:
+        return
+    smooth = np.column_stack([np.ones_like(time), time, memory])
+    answer, *_ = np.linalg.lstsq(smooth, own, rcond=1e-10)
+    predicted = smooth @ answer  # (1)
+    if np.var(own - predicted) > (1.0 - LIKE) * np.var(own):
+        return
+    rate = np.gradient(predicted, step)
+    basis, _ = np.linalg.qr(np.column_stack([smooth, rate]))
+    late = -time * rate
+    late = late - basis @ (basis.T @ late)
+    power = float(late @ late)
+    if not power > 0:
+        return
+    drift = float(late @ own) / power
+    rest = own - basis @ (basis.T @ own) - drift * late
+    sums = np.add.reduceat(late * rest, np.arange(0, time.size, EDGES[-1]))
+    error = FEW[min(len(sums), len(FEW) - 1)] * float(np.sqrt(sums @ sums)) / power
+    yield _Estimate(drift, float(np.hypot(error, ROUGH * drift)))
+
+
+def _memory(u: Array) -> Array:
+    """(N, K) means of a command over the stretches of (1)."""
+    total = np.concatenate([[0.0], np.cumsum(u)])
+    at = np.arange(u.size)
+    columns = []
+    for begin, end in pairwise(EDGES):
+        first, last = (np.clip(at - bound + 1, 0, u.size) for bound in (end, begin))
+        columns.append((total[last] - total[first]) / (end - begin))
+    return np.column_stack(columns)
+
+
+def _pooled(found: list[_Estimate]) -> _Estimate:
+    """Their mean by weight; where they scatter more than their errors say, with that scatter."""
+    drifts, errors = np.array(found).T
+    weights = np.maximum(errors, 1e-12) ** -2.0
+    drift = float(weights @ drifts / weights.sum())
+    error = float(weights.sum() ** -0.5)
+    if len(found) > 1:
+        scatter = float(weights @ (drifts - drift) ** 2) / (len(found) - 1)
+        error *= max(scatter, 1.0) ** 0.5
+    return _Estimate(drift, error)

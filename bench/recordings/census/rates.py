@@ -1,0 +1,179 @@
+"""Channels that contradict each other: a velocity that is not the derivative of its position.
+
+Over a stretch of samples a position q goes as far as its velocity v adds up to,
+
+    dq = q_b - q_a,    s = integral of v from a to b (trapezoids),    g = <dq s> / <s^2>      (1)
+
+g is 1 where both are right, -1 where one sign is wrong, 57.3 where one is in degrees. A velocity
+that is filtered, or stamped late, follows the derivative later by
+
+    T = -<(s - dq) dv> / <dv^2>,    dv = v_b - v_a                                             (2)
+
+since s falls behind dq by T dv to first order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.recordings.census.finding import Finding
+from bench.recordings.noise import estimated
+from sims.base import Array, Simulator
+from sims.recording.recording import Recording, Run
+from sims.simulated import Simulated
+
+OFF = 0.05
+"""Of (1): a slope that is off by so much is told, if it is also off beyond chance."""
+LIKE = 0.8
+"""Correlation below which a velocity has nothing to do with its position."""
+LATE = 0.5
+"""Intervals: (2) that is told."""
+SURE = 4.0
+"""Standard deviations beyond chance."""
+STRETCH = 5
+"""Samples of a stretch, at least."""
+SEEN = 10.0
+"""Noises by which a position changes over a stretch, if it can be."""
+_UNITS = {180.0 / np.pi: "degrees", 1e3: "thousandths"}
+"""Ratios that a wrong unit makes."""
+
+
+def contradictions(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
+    """Velocities that are not the derivative of their position, by sign, unit, size or time."""
+    if not issubclass(kind, Simulated):
+        return
+    system = kind.system
+    for position, rate in zip(system.coordinates, system.rates, strict=True):
+        runs = [run for run in recording.runs if {position, rate} <= run.channels.keys()]
+        if runs:
+            yield from _pair(runs, position, rate)
+
+
+class _Stretches(NamedTuple):
+    """dq, s, dv of (1) and (2), and the length of an interval."""
+
+    gone: Array
+    added: Array
+    faster: Array
+    interval: float
+
+
+def _pair(runs: list[Run], position: str, rate: str) -> Iterator[Finding]:
+    found = _stretches(runs, position, rate)
+    if found is None:
+        return
+    gone, added, *_ = found
+    power, along = float(added @ added), float(gone @ added)
+    like = along / np.sqrt(power * float(gone @ gone))
+    if abs(like) < LIKE:
+        yield Finding(
+            "contradiction",
+            f"{rate} has little to do with the derivative of {position} (correlation {like:.2f})",
+            "is it of another joint? correct the columns, or leave it out",
+        )
+        return
+    # Noise of the one makes (1) too small, noise of the other its inverse: the truth lies between.
+    slope, other = along / power, float(gone @ gone) / along
+    rest = gone - slope * added
+    doubt = float(np.sqrt(rest @ rest / max(gone.size - 1, 1) / power))
+    size = f"{position} goes {slope:.3g} times as far as {rate} adds up to"
+    off = max(OFF, SURE * doubt)
+    if slope < 0:
+        yield Finding("contradiction", size, f"a sign is wrong: turn that of {rate}")
+    elif slope > 1.0 + off or other < 1.0 - off:
+        yield Finding("contradiction", size, _remedy(abs(np.log(slope)), rate))
+    elif (behind := _late(found, slope)) is not None:
+        yield Finding(
+            "contradiction",
+            f"{rate} is {1e3 * abs(behind.seconds):.2g} ms (±{2e3 * behind.error:.1g}, "
+            f"{behind.samples:.2g} samples) {behind.word} the derivative of {position}",
+            "it is filtered, or stamped at another time: trust the position, or leave it out",
+        )
+
+
+def _remedy(ratio: float, rate: str) -> str:
+    """What to do about velocities that are wrong by a ratio, as its logarithm."""
+    for factor, word in _UNITS.items():
+        if abs(ratio - np.log(factor)) < 0.1:
+            return f"one of the two is in {word}: correct its unit"
+    return f"correct the unit or the gain of {rate}, or leave it out"
+
+
+class Late(NamedTuple):
+    """How far a velocity follows behind the derivative of its position: seconds, their error
+    (1 sigma), and samples without sign.
+    """
+
+    seconds: float
+    error: float
+    samples: float
+
+    @property
+    def word(self) -> str:
+        """Whether it follows or leads."""
+        return "behind" if self.seconds > 0 else "ahead of"
+
+
+def late(runs: list[Run], position: str, rate: str) -> Late | None:
+    """How far a velocity, right by sign and unit, is behind; None where it is not, or cannot be
+    told.
+    """
+    found = _stretches(runs, position, rate)
+    if found is None:
+        return None
+    return _late(found, float(found.gone @ found.added) / float(found.added @ found.added))
+
+
+def _late(found: _Stretches, slope: float) -> Late | None:
+    """(2), where it is told."""
+    gone, added, faster, interval = found
+    behind = slope * added - gone
+    power = float(faster @ faster)
+    if not power > 0:
+        return None
+    seconds = -float(behind @ faster) / power
+    rest = behind + seconds * faster
+    error = float(np.sqrt(rest @ rest / max(rest.size - 1, 1) / power))
+    if abs(seconds) < max(LATE * interval, SURE * error):
+        return None
+    return Late(seconds, error, abs(seconds) / interval)
+
+
+def _stretches(runs: list[Run], position: str, rate: str) -> _Stretches | None:
+    """Stretches over which the position changes well beyond its noise; None if there are too
+    few.
+    """
+    noise = estimated((run.times, run.channels[position]) for run in runs)
+    sigma = max(float(np.nan_to_num(noise.sigma)), noise.step)
+    speeds = np.concatenate([np.abs(run.channels[rate]) for run in runs])
+    intervals = np.concatenate([np.diff(run.times) for run in runs])
+    if not intervals.size or not np.nanmax(speeds, initial=0.0) > 0:
+        return None
+    interval = float(np.median(intervals))
+    moves = np.concatenate([np.abs(np.diff(run.channels[position])) for run in runs])
+    usual = float(np.sqrt(np.nanmean(moves**2))) if np.isfinite(moves).any() else 0.0
+    if not usual > 0:
+        return None
+    # Long enough to be seen, and no longer: over a whole swing the two add up to nothing.
+    length = int(np.clip(np.ceil(SEEN * sigma / usual), STRETCH, 50))
+    parts = [_of(run, position, rate, length) for run in runs]
+    gone, added, faster = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+    seen = np.isfinite(gone) & np.isfinite(added) & np.isfinite(faster)
+    if seen.sum() < 20 or not (added[seen] @ added[seen] > 0 and gone[seen] @ gone[seen] > 0):
+        return None
+    return _Stretches(gone[seen], added[seen], faster[seen], interval)
+
+
+def _of(run: Run, position: str, rate: str, length: int) -> tuple[Array, Array, Array]:
+    q, v, t = run.channels[position], run.channels[rate], run.times
+    areas = 0.5 * (v[1:] + v[:-1]) * np.diff(t)
+    ends = np.arange(0, q.size, length)
+    if ends.size < 2:
+        return np.empty(0), np.empty(0), np.empty(0)
+    # A sample that is missing spoils the stretch that it lies in, and no other.
+    added = np.add.reduceat(areas, ends[:-1])
+    added[-1] = areas[ends[-2] : ends[-1]].sum()
+    return np.diff(q[ends]), added, np.diff(v[ends])
