@@ -159,7 +159,8 @@ def _inspect(options: argparse.Namespace) -> int:
 
 def _checked(options: argparse.Namespace) -> int:
     """Say what the recording can fix; 1 if a free number is none of it."""
-    from bench.gap.check import check, told
+    from bench.gap.check import check
+    from bench.gap.identify import told
 
     free = names(options.free or "")
     numbers = check(options.recording, options.system, options.model, free)

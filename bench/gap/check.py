@@ -1,81 +1,25 @@
-"""The check before the fit: can *this* recording fix a number, and what is it mixed up with?
-
-With D the derivatives of all that is recorded by the numbers in question, in units of the noise and
-without what the initial states of each run absorb, the covariance that a fit would have is the
-inverse of the Fisher information
-
-    F = D'D,    cov = F^-1                                                                     (1)
-
-(E. Walter, L. Pronzato, Identification of Parametric Models from Experimental Data, 1997, chapter
-4; C. Brun, P. Reichert, H. R. Kuensch, Water Resources Research 37(4), 1015, 2001, for what is weak
-and what is collinear). Numbers that are free are looked at together; a cause by itself, beside
-them, since one is asked about at a time. Two causes are mixed up where their derivatives are nearly
-parallel,
-
-    corr = |d_i'd_j| / (|d_i| |d_j|)                                                           (2)
-
-Noise is taken for white, and the model for what it is where it fits the recording now.
-"""
+"""The check before the fit: can *this* recording fix a number, and what is it mixed up with?"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from bench.gap.causes.candidates import directions
-from bench.gap.measure import Z95, central
+from bench.gap.identify import Number, identified
+from bench.gap.measure import central
 from bench.gap.model.base_fit import fit_base
 from bench.gap.model.crew import Crew
-from bench.gap.model.fit import prior_of
 from bench.gap.model.floor import noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
 from bench.recordings.inspection import load
-from sims.base import Array, InputError
+from bench.recordings.pieces import cut
+from sims.base import InputError
 from sims.recording.recording import Recording
-from sims.simulated import Simulated, effect_parameters
-from sims.system import FAMILY
-
-Word = Literal["identifiable", "weak", "not identifiable"]
-
-NARROW, WIDE = 0.1, 1.0
-"""Widths of an interval, shares of a number's range, up to which it is identifiable, and weak."""
-FAINT = 5.0
-"""Noises by which a limit changes all samples together that can just be told to be there."""
-MIXED = 0.95
-"""Correlation from which two numbers are mixed up."""
-MOST = 4
-"""Others that are named, at most."""
-
-
-@dataclass(frozen=True)
-class Number:
-    """What a recording can say of one number.
-
-    Attributes:
-        name: of a parameter, or of a cause with its coefficient.
-        free: whether it is a parameter that a fit has anyway.
-        unit: of it.
-        half: half the width of its 95 % interval; infinite where the recording does not touch it,
-            NaN of a limit, which shows or does not.
-        low, high: its plausible range.
-        word: identifiable, weak or not identifiable.
-        mixed: others that it is mixed up with, and by what correlation.
-    """
-
-    name: str
-    free: bool
-    unit: str
-    half: float
-    low: float
-    high: float
-    word: Word
-    mixed: tuple[tuple[str, float], ...]
+from sims.simulated import Simulated
 
 
 def check(
@@ -100,6 +44,7 @@ def check(
     recording, kind = load(source, system, model, free)
     if not issubclass(kind, Simulated):
         raise InputError(f"{recording.path}: simulator {recording.system} takes no effects")
+    recording, _ = cut(recording, kind)
     engine = kind.default_engine if kind.own_engine else "batch"
     constants = () if kind.has_model else tuple(free)
     with closing(Crew(jobs)) as crew:
@@ -107,179 +52,13 @@ def check(
         world.crew = crew
         crew.join(world)
         floor = noise_floor(world, recording)
-        numbers = _Checked(world, Noise(floor.sigma, np.zeros(len(floor.sigma)))).numbers()
-        world.close()
-    return numbers
-
-
-class _Checked:
-    def __init__(self, world: World, noise: Noise) -> None:
-        self.world, self.noise = world, noise
-        self.seen = np.isfinite(world.observed)
+        noise = Noise(floor.sigma, np.zeros(len(floor.sigma)))
         base = fit_base(world, noise)
         if not np.isfinite(base.fit.cost):
             raise InputError(
-                f"{world.recording.path}: the simulation fails wherever a fit begins; "
+                f"{recording.path}: the simulation fails wherever a fit begins; "
                 "check constants, units, inputs and initial states"
             )
-        self.fit = central(world, base.fit, noise)
-        q = self.fit.free.size
-        jacobian = np.where(self.seen[..., None], self.fit.jacobian, 0.0)
-        jacobian /= noise.sigma[:, None]
-        runs = len(jacobian)
-        flat = jacobian.reshape(runs, -1, jacobian.shape[3])
-        # A known initial state absorbs nothing.
-        self.states = flat[..., q:] * ~world.known[:, None, :]
-        self.parameters = self._without_states(flat[..., :q])
-
-    def numbers(self) -> tuple[Number, ...]:
-        """Free ones first, then causes, the surest first."""
-        free = self._free()
-        causes = sorted(
-            self._causes(), key=lambda n: np.nan_to_num(n.half) / max(n.high - n.low, 1e-300)
-        )
-        return (*free, *causes)
-
-    def _without_states(self, columns: Array) -> Array:
-        """(N, k) columns (R, n, k) without what each run's initial state absorbs."""
-        b = self.states
-        precision = np.diag(prior_of(self.world) ** -2.0)
-        normal = np.matmul(b.transpose(0, 2, 1), b) + precision
-        inner = np.linalg.solve(normal, np.matmul(b.transpose(0, 2, 1), columns))
-        left: Array = columns - np.matmul(b, inner)
-        runs, samples, count = left.shape
-        return left.reshape(runs * samples, count)
-
-    def _free(self) -> list[Number]:
-        """The parameters, all of them at once, by (1)."""
-        own = self.parameters
-        scale = np.sqrt(np.einsum("nk,nk->k", own, own))
-        touched = scale > 0
-        covariance = np.full((scale.size, scale.size), np.inf)
-        unit = own[:, touched] / scale[touched]
-        inverse = np.linalg.pinv(unit.T @ unit, rcond=1e-13, hermitian=True)
-        values, vectors = np.linalg.eigh(unit.T @ unit)
-        lost = vectors[:, values < 1e-12]
-        inverse = inverse + 1e12 * lost @ lost.T
-        places = np.ix_(touched, touched)
-        covariance[places] = inverse / np.outer(scale[touched], scale[touched])
-        numbers = []
-        for i, place in enumerate(self.fit.free.tolist()):
-            parameter = self.world.parameters[place]
-            sd = np.sqrt(max(float(covariance[i, i]), 0.0))
-            mixed = []
-            for j, other in enumerate(self.fit.free.tolist()):
-                if i != j and np.isfinite(covariance[i, j]) and touched[i] and touched[j]:
-                    corr = covariance[i, j] / np.sqrt(covariance[i, i] * covariance[j, j])
-                    mixed.append((self.world.parameters[other].name, float(abs(corr))))
-            low, high = parameter.bounds
-            numbers.append(
-                _number(parameter.name, True, parameter.unit, Z95 * sd, (low, high), mixed)
-            )
-        # What the runs do not touch was frozen by the fit.
-        for place in sorted(set(self.world.base.tolist()) - set(self.fit.free.tolist())):
-            parameter = self.world.parameters[place]
-            numbers.append(
-                _number(parameter.name, True, parameter.unit, np.inf, parameter.bounds, ())
-            )
-        return numbers
-
-    def _causes(self) -> list[Number]:
-        """Every cause by itself, beside the free numbers; families are their members."""
-        world = self.world
-        names = [name for name in world.library if world.effects[name].place != FAMILY]
-        found = directions(world, self.fit, names)
-        shown = np.where(self.seen[..., None], found.values, 0.0) / self.noise.sigma[:, None]
-        runs, _, _, count = shown.shape
-        columns = self._without_states(shown.reshape(runs, -1, count))
-        if self.parameters.shape[1]:
-            basis, _ = np.linalg.qr(self.parameters)
-            columns = columns - basis @ (basis.T @ columns)
-        powers = np.sqrt(np.einsum("nk,nk->k", columns, columns))
-        # Of several shapes of a coefficient the one that shows best stands for it.
-        best: dict[tuple[str, int], int] = {}
-        limits = {probe.effect for probe in found.probes if probe.fixed}
-        for k, probe in enumerate(found.probes):
-            if probe.effect in limits and not probe.fixed:
-                continue
-            key = probe.effect, probe.place
-            if key not in best or powers[k] > powers[best[key]]:
-                best[key] = k
-        units = columns / np.maximum(powers, 1e-300)
-        alike = np.abs(units.T @ units)
-        numbers = []
-        for (name, place), k in best.items():
-            parameter = effect_parameters(
-                world.effects[name], world.simulator.system, world.channels
-            )[place]
-            probe = found.probes[k]
-            half = Z95 / powers[k] if powers[k] > 0 else np.inf
-            mixed = [
-                (other, float(alike[k, j]))
-                for (other, _), j in best.items()
-                if other != name and powers[j] > 0
-            ]
-            single = sum(1 for own, _ in best if own == name) == 1
-            label = name if single else f"{name} {parameter.name.rpartition('.')[2]}"
-            if probe.fixed:
-                # A limit or a gap is no matter of proportion: it shows where it is reached.
-                own = _number(label, False, parameter.unit, 0.0, parameter.bounds, mixed)
-                numbers.append(replace(own, half=np.nan, word=_shown(float(powers[k]))))
-                continue
-            numbers.append(_number(label, False, parameter.unit, half, parameter.bounds, mixed))
-        return numbers
-
-
-def _shown(noises: float) -> Word:
-    """Of a limit that changes this much, in noises."""
-    if noises < FAINT:
-        return "not identifiable"
-    return "weak" if noises < FAINT / NARROW else "identifiable"
-
-
-def _number(
-    name: str,
-    free: bool,
-    unit: str,
-    half: float,
-    bounds: tuple[float, float],
-    mixed: Sequence[tuple[str, float]],
-) -> Number:
-    low, high = bounds
-    share = 2.0 * half / max(high - low, 1e-300)
-    word: Word = "not identifiable"
-    if share <= WIDE:
-        word = "identifiable" if share <= NARROW else "weak"
-    near = sorted((m for m in mixed if m[1] > MIXED), key=lambda m: -m[1])
-    others = tuple(dict(near[::-1]).items())[::-1][:MOST]
-    return Number(name, free, unit, float(half), low, high, word, others)
-
-
-def told(numbers: Sequence[Number], most: int = 40) -> list[str]:
-    """Lines that say it: free numbers, then causes, those that show least last.
-
-    Args:
-        numbers: of `check`.
-        most: causes to tell one by one; the others are counted.
-    """
-    lines = ["what this recording can fix (95 %, white noise assumed; a cause each by itself):"]
-    rows = [number for number in numbers if number.free]
-    causes = [number for number in numbers if not number.free]
-    rows += [number for word in reversed(_WORDS) for number in causes if number.word == word]
-    for number in rows[:most]:
-        half = f"±{number.half:.2g} {number.unit}" if np.isfinite(number.half) else "untouched"
-        if np.isnan(number.half):
-            half = "a limit within reach"
-        other = ", ".join(f"{name} ({corr:.3f})" for name, corr in number.mixed)
-        mixed = f"; mixed up with {other}" if other else ""
-        kind = "free" if number.free else "cause"
-        span = f"{number.low:.3g} to {number.high:.3g}"
-        lines.append(f"  {number.word:16s} {kind:5s} {number.name}: {half} of {span}{mixed}")
-    if len(rows) > most:
-        lines.append(f"  ... and {len(rows) - most} more causes that are identifiable or weak")
-    counts = [f"{sum(n.word == w for n in causes)} {w}" for w in _WORDS]
-    lines.append(f"causes: {', '.join(counts)}")
-    return lines
-
-
-_WORDS: tuple[Word, ...] = ("identifiable", "weak", "not identifiable")
+        numbers = identified(world, noise, central(world, base.fit, noise))
+        world.close()
+    return numbers

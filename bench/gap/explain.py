@@ -19,6 +19,7 @@ from bench.gap.causes.rules import SWITCH
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import probes
 from bench.gap.explanation import Explanation
+from bench.gap.freeze import frozen
 from bench.gap.measure import HeldOutRuns
 from bench.gap.model.base_fit import Base, fit_base, without_step
 from bench.gap.model.crew import Crew
@@ -216,7 +217,7 @@ class _Explainer:
         return Explanation(verdict, story, extended)
 
     def _search(self, base: Base, rng: np.random.Generator) -> Search:
-        search = Search(self.fitting, self.noise, base.untouched, rng, self.floor.stated)
+        search = Search(self.fitting, self.noise, base.frozen, rng, self.floor.stated)
         search.enter(base.fit)
         return search
 
@@ -227,9 +228,22 @@ class _Explainer:
         base = fit_base(self.fitting, self.noise, self._given())
         if not self.kind.has_model:
             return base
-        base = self._stepped(base)
+        base = self._frozen(self._stepped(base))
         # What is asked about as a cause comes first: it would not be seen afterwards.
         return without_step(self.fitting, self.noise, base)
+
+    def _frozen(self, base: Base) -> Base:
+        """The base model without free numbers of the robot that the data cannot fix.
+
+        A system has few parameters, and without them nothing is told: there the verdict says so.
+        """
+        if self.watch.left() or not np.isfinite(base.fit.cost):
+            return base
+        kept = frozen(self.fitting, self.noise, base, lambda base: self._search(base, self._rng()))
+        if kept.vague:
+            names = ", ".join(self.fitting.parameters[i].name for i in sorted(kept.vague))
+            self.say(f"frozen, as the recording cannot fix it beside the others: {names}")
+        return kept
 
     def _stepped(self, base: Base) -> Base:
         """The base model with the step that the data ask for; its worlds are the explainer's."""

@@ -11,13 +11,14 @@ from bench.gap.assess import Assessor
 from bench.gap.causes.name import Finding
 from bench.gap.causes.rules import CHANCE
 from bench.gap.causes.search import Search
+from bench.gap.identify import Number, identified
 from bench.gap.model.base_fit import Base
 from bench.gap.report import show
 from bench.gap.report.places import of_set
 from bench.gap.report.story import Place, Shown, Side, Story, Tuned
 from bench.gap.verdict import Verdict
 from sims.base import Array
-from sims.extended import Number
+from sims.extended import Number as Estimate
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,16 @@ class Teller:
             tuple(self._why()),
             self.finding.vague,
             show.robot_of(world),
+            fixable=self._fixable(),
         )
+
+    def _fixable(self) -> tuple[Number, ...]:
+        """What the recording can say at all, by what was simulated about the base model anyway."""
+        key: frozenset[str] = frozenset()
+        scanned = self.search.scanned.get(key) or self.search.former.get(key)
+        if scanned is None:
+            return ()
+        return identified(self.search.world, self.search.noise, scanned.at, scanned.directions)
 
     def _held_out(self, sigma: Array) -> tuple[Side | None, list[Place]]:
         """The held-out runs and where their gap is; None and nothing where none was measured."""
@@ -97,7 +107,7 @@ class Teller:
         after = self.assessor.numbers(self.search, self.finding.model)
         for i in world.base.tolist():
             parameter = world.parameters[i]
-            touched = i not in self.base.untouched
+            touched = i not in self.base.frozen
             yield Tuned(
                 parameter.name,
                 parameter.unit,
@@ -120,6 +130,10 @@ class Teller:
         if untouched:
             names = ", ".join(untouched)
             yield f"the recording does not touch {names}: kept at the nominal value"
+        vague = [world.parameters[i].name for i in sorted(self.base.vague)]
+        if vague:
+            names = ", ".join(vague)
+            yield f"the recording does not fix {names} beside the others: kept at the nominal value"
         yield from self.notes
 
     def _why(self) -> Iterator[str]:
@@ -158,7 +172,7 @@ def _named(effects: list[str]) -> str:
     return f"{effects[0]} and {', '.join(effects[1:])}"
 
 
-def _triple(number: Number) -> tuple[float, float, float]:
+def _triple(number: Estimate) -> tuple[float, float, float]:
     """Value and interval as figures have them: NaN where the data give no bound."""
     low = np.nan if number.low is None else number.low
     high = np.nan if number.high is None else number.high

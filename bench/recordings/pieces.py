@@ -3,7 +3,7 @@ all over a recording tell nearly as much as the whole of it.
 
 A search costs about
 
-    steps x derivatives of a step x joints^2                                                     (1)
+    steps x joints^2                                                                             (1)
 
 since candidates grow with the joints, and a step with their number. Pieces lie evenly over each run
 and begin where its commands have been quiet, so that what was commanded before is over.
@@ -19,14 +19,12 @@ import numpy as np
 from sims.base import Array, Simulator
 from sims.recording.recording import Recording, Run
 
-MOST = 1.5e6
-"""(1) from which on a recording is cut: about a minute of six joints at a step of 2 ms."""
-PIECE = 4.0
+MOST = 5e5
+"""(1) from which on a recording is cut: half a minute of six joints at a step of 2 ms."""
+PIECE = 2.0
 """Seconds of a piece, if runs are no shorter."""
 QUIET = 0.2
 """Seconds before a piece in which its commands change little."""
-_EVALUATIONS = {"RK4": 4.0}
-"""Derivatives of a step by integrator; one otherwise."""
 
 
 class Cut(NamedTuple):
@@ -49,10 +47,9 @@ def cut(recording: Recording, kind: type[Simulator]) -> Cut:
     if not kind.has_model:
         return Cut(recording, "")
     robot: Any = kind
-    step, integrator = robot.numerics
+    step, _ = robot.numerics
     joints = sum(joint.single for joint in robot.robot.joints)
-    second = _EVALUATIONS.get(integrator, 1.0) * joints**2 / step
-    budget = MOST / second
+    budget = MOST * step / joints**2
     kept: list[Run] = []
     notes = []
     for word, runs in (("fitting", recording.training()), ("measuring", recording.held_out())):

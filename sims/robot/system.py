@@ -14,7 +14,7 @@ from sims.robot.model import Robot
 from sims.robot.moment import OneJoint, Slide
 from sims.robot.native import FIELDS
 from sims.robot.usual import Usual
-from sims.system import Effect, Kind, Moment, System
+from sims.system import FAMILY, Effect, Kind, Moment, System
 
 
 class RobotSystem(System):
@@ -86,6 +86,9 @@ class RobotSystem(System):
         if registered.at == "body" and place in (cls.robot.aliases or {}):
             return cls.effect(f"{base}@{cls.robot.body(place).name}")
         there = [one.place for one in known.values() if one.place]
+        if place == FAMILY and len(there) == 1:
+            # Of one place every one of that kind is that place, and no family.
+            return known[f"{base}@{there[0]}"]
         raise unknown(f"place of effect {base} in robot {cls.name}", place, there or ["none"])
 
     @classmethod

@@ -184,7 +184,7 @@ def _without_motion(search: Search) -> Finding:
 
 
 def unfixed(search: Search, base: Model) -> tuple[str, ...]:
-    """Base parameters that shape the data and are not fixed by them."""
+    """Base parameters that shape the data and are not fixed by them, the widest first."""
     variances = np.diagonal(covariance(search, base))
     spread = np.sqrt(np.maximum(variances, 0.0))
     parameters = [search.world.parameters[place] for place in base.fit.free]
@@ -192,8 +192,8 @@ def unfixed(search: Search, base: Model) -> tuple[str, ...]:
     for parameter, sd in zip(parameters, spread.tolist(), strict=True):
         low, high = parameter.bounds
         if not rules.is_fixed(sd, low, high):
-            vague.append(parameter.name)
-    return tuple(vague)
+            vague.append((sd / (high - low), parameter.name))
+    return tuple(name for _, name in sorted(vague, key=lambda one: -one[0]))
 
 
 def _trial(search: Search, model: Model, held_out: HeldOutRuns) -> Trial:

@@ -47,12 +47,18 @@ fitted model follows.
 
 @dataclass(frozen=True)
 class Base:
-    """The fitted base model: its fit, and which parameters the data do not touch, which stay
-    nominal.
+    """The fitted base model: its fit, and which parameters stay nominal, since the data do not
+    touch them, or do not fix them beside the others.
     """
 
     fit: Fit
     untouched: frozenset[int]
+    vague: frozenset[int] = frozenset()
+
+    @property
+    def frozen(self) -> frozenset[int]:
+        """All parameters that stay nominal."""
+        return self.untouched | self.vague
 
 
 def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
@@ -106,7 +112,7 @@ def without_step(world: World, noise: Noise, base: Base) -> Base:
     correct(world, noise, base.fit.theta, base.fit.states)
     if world.correction is None:
         return base
-    fit = Fitter(world, noise, base.untouched).fit([base.fit.start()], LAST_STEPS)[0]
+    fit = Fitter(world, noise, base.frozen).fit([base.fit.start()], LAST_STEPS)[0]
     return replace(base, fit=fit)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from bench.gap.report.account import closes, effort, following, headline, heldout_unit, interval
 from bench.gap.report.elements import bar, code, figure, paragraph, safe, strong
+from bench.gap.report.fixable import fixable
 from bench.gap.report.joints import by_joint
 from bench.gap.report.places import has_places, marks
 from bench.gap.report.sections import (
@@ -92,6 +93,7 @@ def page(story: Story, drawn: Mapping[str, bytes], for_print: bool = True) -> st
         *_opening(story),
         pictures.get("robot", ""),
         pictures.get("overview", ""),
+        *fixable(story),
         *why(story),
         *where(story, pictures.get("where", "")),
         *candidates(story, pictures.get("candidates", "")),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from bench.gap.identify import Number
 from bench.gap.verdict import Verdict
 from sims.base import Array
 from sims.robot.model import Robot
@@ -137,6 +138,7 @@ class Story:
         robot: whose recording it is, to be drawn; None for systems that are no robots.
         changes: of its model file.
         unwritten: what its model file cannot hold, and what is to be known of it, a sentence each.
+        fixable: what the recording can say of each number and cause; empty where nobody knows.
     """
 
     title: str
@@ -154,3 +156,4 @@ class Story:
     robot: Robot | None = None
     changes: tuple[Change, ...] = ()
     unwritten: tuple[str, ...] = ()
+    fixable: tuple[Number, ...] = ()

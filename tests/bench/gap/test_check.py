@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from bench.cli import main
-from bench.gap.check import check, told
+from bench.gap.check import check
 from bench.gap.explain import explain
+from bench.gap.identify import told
 from sims.base import InputError, Scenario
 from sims.recording.recording import Recording, Run
 from sims.recording.write import write_recording

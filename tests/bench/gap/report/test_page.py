@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from bench.gap.identify import Number
 from bench.gap.report.elements import framed
 from bench.gap.report.page import page
 from bench.gap.report.sections import errors_of
@@ -247,3 +248,26 @@ def test_in_a_frame_the_page_stays_whole(figures):
     assert reader.tags == ["iframe"]
     assert attributes["srcdoc"] == html
     assert attributes["sandbox"] == ""
+
+
+def test_what_the_recording_can_fix_comes_before_any_verdict(figures):
+    numbers = (
+        Number("inertia", True, "kg*m^2", 1e-5, 0.001, 0.01, "identifiable", ()),
+        Number("<b>mass", True, "kg", np.inf, 0.1, 1.0, "not identifiable", (("inertia", 0.998),)),
+        Number("drag.linear", False, "1", 1e-4, 0.0, 1.0, "identifiable", (("drag.quadratic", 1),)),
+        Number("drag.quadratic", False, "1", 0.1, 0.0, 1.0, "weak", ()),
+        Number("sensor.drift", False, "1", np.inf, 0.0, 1.0, "not identifiable", ()),
+    )
+    text = page(story("named", fixable=numbers), figures)
+    said = Reader(text).text
+    assert "Of 3 causes, each by itself, this recording can fix 1 well, 1 roughly and 1 not" in said
+    assert "Not to be seen here, whether it acts or not: sensor.drift ." in said
+    assert "from each other, by their first effects: drag.linear , drag.quadratic ." in said
+    assert cells(text, "<code>inertia</code>")[1:3] == ["identifiable", "±1×10⁻⁵ kg*m^2"]
+    assert "&lt;b&gt;mass" in text
+    assert "not identifiable – 0.1 to 1 inertia (1.00)" in said
+    assert said.index("What this recording can fix") < said.index("Where the gap is")
+
+
+def test_where_nobody_knows_there_is_no_word_of_it(figures):
+    assert "What this recording can fix" not in Reader(page(story("named"), figures)).text
