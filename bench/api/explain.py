@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from bench.gap import explain as explaining
 from bench.gap.explanation import Explanation
@@ -15,9 +15,12 @@ from bench.recordings.simulate import SimulatedRecording
 from sims.base import InputError
 from sims.recording.recording import Recording
 
+Source: TypeAlias = str | Path | Recording | SimulatedRecording
+"""What holds a recording."""
+
 
 def explain(
-    recording: str | Path | Recording | SimulatedRecording,
+    recording: Source | Sequence[Source],
     *,
     system: str | None = None,
     model: str | Path | None = None,
@@ -36,7 +39,8 @@ def explain(
     """Show what the simulation of a recording gets wrong, name the cause, extend the simulator.
 
     Args:
-        recording: the path of ``NAME.csv``, or a recording that was read or simulated.
+        recording: the path of ``NAME.csv``, or a recording that was read or simulated; several of
+            one system are explained together, and each beside that by itself.
         system: take it for this system, whatever the description says.
         model: take it for this robot, whatever the description says: an MJCF or URDF.
         engine: pybullet, mujoco or batch; a simulator that steps itself has its own.
@@ -58,15 +62,17 @@ def explain(
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
             or the budget is no number above 0, or ended before anything could be simulated.
     """
-    if isinstance(recording, SimulatedRecording):
-        recording = recording.recording
+    each = [recording] if isinstance(recording, Source) else list(recording)
+    sources = [one.recording if isinstance(one, SimulatedRecording) else one for one in each]
+    if not sources:
+        raise InputError("expected a recording, found none")
     if budget is not None and not budget > 0:
         raise InputError(f"budget: expected a number of seconds above 0, found {budget!r}")
     if jobs is not None and jobs < 1:
         raise InputError(f"jobs: expected a whole number of at least 1, found {jobs!r}")
     watch = Watch(budget, stop, progress)
     given = system, engine, seed, free, tuner, say, force
-    return explaining.explain(recording, *given, watch, jobs or cores(), model, whole)
+    return explaining.explain(sources, *given, watch, jobs or cores(), model, whole)
 
 
 def score(

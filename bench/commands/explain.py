@@ -16,10 +16,12 @@ _PICTURED = (".html", ".png", ".pdf")
 def add_explain(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap explain`."""
     parser.add_argument(
-        "recording",
+        "recordings",
         metavar="RECORDING.csv",
         type=place,
-        help="the table; its .toml stands beside it",
+        nargs="+",
+        help="the table; its .toml stands beside it. Several of one system, in the order of time, "
+        "are explained together, and what each says by itself is compared",
     )
     parser.add_argument(
         "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
@@ -113,7 +115,7 @@ def _explain(options: argparse.Namespace) -> int:
         refuse_full(options.out)
     with Look() as look, Interrupts() as interrupts:
         explanation = explain(
-            options.recording,
+            options.recordings,
             system=options.system,
             model=options.model,
             engine=options.engine,
@@ -128,7 +130,7 @@ def _explain(options: argparse.Namespace) -> int:
             stop=interrupts.asked,
             progress=look.show,
         )
-    folder = options.out or stamped(Path("results"), f"explain-{options.recording.stem}")
+    folder = options.out or stamped(Path("results"), f"explain-{options.recordings[0].stem}")
     paths = explanation.write(folder)
     for line in account(explanation.story):
         print(line)

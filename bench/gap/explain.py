@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from bench.gap.model.world import World
 from bench.gap.steps import Coarse, with_numerics
 from bench.gap.tell import Teller
 from bench.problem.seeds import rng_for
-from bench.recordings.inspection import load
+from bench.recordings.joined import load_all
 from bench.recordings.pieces import cut
 from bench.recordings.size import check_recording
 from bench.recordings.stamps import refuse_odd
@@ -47,10 +47,11 @@ SPARE = 4
 HUGE = 1e9
 """Values so many times a channel's typical size are none."""
 Say = Callable[[str], None]
+Source: TypeAlias = str | Path | Recording
 
 
 def explain(
-    recording: str | Path | Recording,
+    recording: Source | Sequence[Source],
     system: str | None = None,
     engine: str = "batch",
     seed: int = 0,
@@ -66,7 +67,8 @@ def explain(
     """Explain a recording.
 
     Args:
-        recording: the path of the table, or a recording that is in memory.
+        recording: the path of the table, or a recording that is in memory; of several, their runs
+            are explained together.
         system: take it for this system, whatever the description says.
         engine: pybullet, mujoco or batch; a simulator that steps itself has its own.
         seed: of the surrogates and the bootstrap.
@@ -84,7 +86,8 @@ def explain(
             or the search was ended before anything could be simulated.
     """
     with closing(Crew(jobs)) as crew:
-        subject = _Subject(recording, system, model, whole)
+        sources = [recording] if isinstance(recording, Source) else list(recording)
+        subject = _Subject(sources, system, model, whole)
         given = engine, seed, tuple(free), tuner, say, force
         return _Explainer(subject, *given, watch or Watch(), crew).run()
 
@@ -94,7 +97,7 @@ class _Subject(NamedTuple):
     of it is looked at.
     """
 
-    source: str | Path | Recording
+    sources: Sequence[Source]
     system: str | None
     model: str | Path | None
     whole: bool
@@ -117,7 +120,7 @@ class _Explainer:
         self.seed = seed
         self.tuner = tuner
         self.say = say
-        self.recording, kind = load(subject.source, subject.system, subject.model, free)
+        self.recording, kind = load_all(subject.sources, subject.system, subject.model, free)
         self.path = self.recording.path
         if not issubclass(kind, Simulated):
             raise self._takes_no_effects()

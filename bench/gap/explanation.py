@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING
 from bench.gap.causes.rules import VerdictName
 from bench.gap.report import pictures
 from bench.gap.report.account import closes, cut, interval
+from bench.gap.report.agreement import HEAD, rows
 from bench.gap.report.changes import changes
 from bench.gap.report.elements import framed
 from bench.gap.report.page import page
@@ -72,8 +75,9 @@ class Explanation:
         return pictures.figure(self.story, name)
 
     def write(self, folder: str | Path) -> list[Path]:
-        """Write verdict.json, extended.toml, the figures and report.html: all of them or none. For
-        a robot also extended.xml, and extended.urdf for one from a URDF, after extended.toml.
+        """Write verdict.json, extended.toml, the figures and report.html: all of them or none. Of
+        several runs also apart.csv, and for a robot extended.xml, and extended.urdf for one from a
+        URDF, after extended.toml.
 
         The folder is made where it is missing; files of these names in it are replaced.
 
@@ -89,6 +93,8 @@ class Explanation:
             folder / "verdict.json": self._json(),
             folder / "extended.toml": extending.written(self.extended, folder),
         }
+        if apart := rows(self.story):
+            contents[folder / "apart.csv"] = _csv(apart)
         contents |= {folder / name: text for name, text in self._robot_files.contents.items()}
         for name, figure in figures.items():
             contents[folder / f"{name}.png"] = figure.png
@@ -147,6 +153,20 @@ class Explanation:
         """The report for a notebook's cell, in a frame of its own so that its styles stay there."""
         # Nothing lies beside a cell: no file is named for print.
         return framed(self._page(pictures.printed(self.story), for_print=False))
+
+
+def _csv(found: Sequence[tuple[object, ...]]) -> str:
+    """A table with the columns of `agreement.HEAD`."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(HEAD)
+    # What begins like a formula is one to a spreadsheet; names are from files.
+    writer.writerows([_plain(cell) for cell in row] for row in found)
+    return text.getvalue()
+
+
+def _plain(cell: object) -> object:
+    return f"'{cell}" if isinstance(cell, str) and cell[:1] in "=+-@" else cell
 
 
 def _in_words(cause: Cause) -> str:

@@ -164,6 +164,15 @@ def central(world: World, fit: Fit, noise: Noise) -> Fit:
     return replace(fit, jacobian=np.concatenate([jacobian[..., :q], own], axis=3))
 
 
+def derived(models: Models, fit: Fit) -> Fit:
+    """`central` of a fit, simulated once for all who ask."""
+    known = models.derived.get(id(fit))
+    # A number of an object that is gone may come again: the object itself decides.
+    if known is None or known[0] is not fit:
+        known = models.derived[id(fit)] = fit, central(models.world, fit, models.noise)
+    return known[1]
+
+
 def _both_sides(fit: Fit, steps: Array, bounds: Array) -> tuple[Array, Array]:
     """Parameters (2, n, P) and initial states (2, n, R, s): on the side below and on that above,
     each row has one number moved by its step, of the first n ones.
@@ -219,7 +228,7 @@ def _curvatures(models: Models, model: Model) -> tuple[Array, Array]:
     """(q, q) the first sum of (2), and both together, which (2) inverts."""
     world = models.world
     q = model.fit.free.size
-    fit = central(world, model.fit, models.noise)
+    fit = derived(models, model.fit)
     # What the model leaves is the noise, whatever the recording states of it.
     sigma = np.maximum(model.likelihood.sigma, 1e-300)
     noise = Noise(sigma, model.likelihood.phi)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.gap.apart import Apart, Spread, spreads
 from bench.gap.assess import Assessor
 from bench.gap.causes.name import Finding
 from bench.gap.causes.rules import CHANCE
@@ -64,7 +65,38 @@ class Teller:
             self.finding.vague,
             show.robot_of(world),
             fixable=self._fixable(),
+            apart=self._apart(),
         )
+
+    def _apart(self) -> Apart:
+        """What runs, logs and loads say by themselves, of the base model and of what was found."""
+        if self.finding.cut is not None or self.finding.vague:
+            return Apart()
+        before = spreads(self.search, self.finding.base)
+        after = spreads(self.search, self.finding.model) if self.finding.model.names else before
+        return Apart(before, after, self._rival())
+
+    def _rival(self) -> tuple[Spread, ...]:
+        """Of one cause: what its best rival's coefficients would have to be in each group."""
+        if len(self.finding.causes) != 1:
+            return ()
+        (cause,) = self.finding.causes
+        alike = {cause.effect, *cause.alternatives, *self.finding.model.names}
+        singles = [m for m in self.search.models.values() if len(m.names) == 1]
+        others = [
+            model
+            for model in singles
+            if not alike & set(model.names)
+            and np.isfinite(model.merit)
+            # A number that moves is to be seen in effects that are one number.
+            and len(self.search.world.places(model.names[0])) == 1
+        ]
+        if not others:
+            return ()
+        best = max(others, key=lambda model: model.merit)
+        (name,) = best.names
+        own = [one for one in spreads(self.search, best) if one.number.startswith(name)]
+        return tuple(own)
 
     def _fixable(self) -> tuple[Number, ...]:
         """What the recording can say at all, by what was simulated about the base model anyway."""

@@ -49,6 +49,7 @@ class Run:
             written in.
         linear: inputs that go straight from one sample to the next; the others hold.
         offset: seconds by which inputs act later than their stamps say.
+        log: that it is of, where several recordings were joined.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Run:
     extra: Mapping[str, Array] = field(default_factory=dict)
     linear: frozenset[str] = frozenset()
     offset: float = 0.0
+    log: str = ""
 
     def __repr__(self) -> str:
         # A cell of a notebook that ends in a run would print all of its samples.

@@ -70,6 +70,7 @@ class Models:
         stated: (C,) whether the recording states the noise of each channel.
         models: what was fitted.
         chances: what each effect gains by chance about the base model.
+        derived: fits whose derivatives were taken again from both sides, each with what it was.
     """
 
     world: World
@@ -79,6 +80,7 @@ class Models:
     stated: Mask
     models: dict[frozenset[str], Model] = field(default_factory=dict)
     chances: dict[str, float] = field(default_factory=dict)
+    derived: dict[int, tuple[Fit, Fit]] = field(default_factory=dict)
     _drawn: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

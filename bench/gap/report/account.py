@@ -12,6 +12,7 @@ from textwrap import wrap
 import numpy as np
 
 from bench.gap.model.watch import QUESTIONS
+from bench.gap.report.agreement import told
 from bench.gap.report.places import (
     has_places,
     lacks,
@@ -93,6 +94,9 @@ def details(story: Story) -> Iterator[str]:
     if story.parameters:
         sentences = [moves(story, p) for p in story.parameters]
         yield "Parameters: " + " ".join(sentences)
+    # Of one log whose runs agree there is nothing to say.
+    if any(not one.agree or one.by == "log" for one in (*story.apart.after, *story.apart.before)):
+        yield "Which number to trust: " + " ".join(told(story))
     if story.remains:
         yield "What remains: " + " ".join(sentence(text) for text in story.remains)
     # Where causes cannot be told apart the experiment stands right below the headline.

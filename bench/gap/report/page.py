@@ -12,6 +12,7 @@ from math import isfinite
 from pathlib import Path
 
 from bench.gap.report.account import closes, effort, following, headline, heldout_unit, interval
+from bench.gap.report.agreement import agreement
 from bench.gap.report.elements import bar, code, figure, paragraph, safe, strong
 from bench.gap.report.fixable import fixable
 from bench.gap.report.joints import by_joint
@@ -98,6 +99,7 @@ def page(story: Story, drawn: Mapping[str, bytes], for_print: bool = True) -> st
         *where(story, pictures.get("where", "")),
         *candidates(story, pictures.get("candidates", "")),
         *numbers(story),
+        *agreement(story),
         *changes(story),
         *remains(story),
         *reading(),

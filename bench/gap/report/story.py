@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from bench.gap.apart import Apart
 from bench.gap.identify import Number
 from bench.gap.verdict import Verdict
 from sims.base import Array
@@ -139,6 +140,7 @@ class Story:
         changes: of its model file.
         unwritten: what its model file cannot hold, and what is to be known of it, a sentence each.
         fixable: what the recording can say of each number and cause; empty where nobody knows.
+        apart: what runs, logs and loads say of the numbers by themselves.
     """
 
     title: str
@@ -157,3 +159,4 @@ class Story:
     changes: tuple[Change, ...] = ()
     unwritten: tuple[str, ...] = ()
     fixable: tuple[Number, ...] = ()
+    apart: Apart = field(default_factory=Apart)

@@ -1,0 +1,115 @@
+"""Several recordings of one system as one, each run with the log that it is of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.recordings.inspection import load
+from sims.base import InputError, Simulator
+from sims.recording.recording import Recording, Run
+
+
+def load_all(
+    sources: Sequence[str | Path | Recording],
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+) -> tuple[Recording, type[Simulator]]:
+    """Recordings as one, and the simulator that they are of; arguments as those of `load`.
+
+    Each holds out what it would hold out alone. A constant that they state differently is one of
+    their runs; a noise that they state differently is the root of the mean of its squares.
+
+    Raises:
+        InputError: one cannot be read, or they are not of one system with the same channels.
+    """
+    loaded = [load(source, system, model, free) for source in sources]
+    first, kind = loaded[0]
+    if len(loaded) == 1:
+        return first, kind
+    for recording, other in loaded[1:]:
+        _refuse_other(first, kind, recording, other)
+    recordings = [recording for recording, _ in loaded]
+    names = _names([recording.path for recording in recordings])
+    constants = {
+        key: value
+        for key, value in first.constants.items()
+        if all(recording.constants.get(key) == value for recording in recordings)
+    }
+    usual = {c.name: c.value for c in kind.constants}
+    differing = {key for recording in recordings for key in recording.constants} - set(constants)
+    runs = [
+        replace(
+            run,
+            name=f"{name}: {run.name}",
+            log=name,
+            constants={key: _constant(key, recording, run, usual) for key in differing}
+            | dict(run.constants),
+        )
+        for name, recording in zip(names, recordings, strict=True)
+        for run in recording.runs
+    ]
+    joined = replace(
+        first,
+        title=f"{first.title} and {len(loaded) - 1} more logs",
+        constants=constants,
+        noise=_noise(recordings),
+        runs=tuple(runs),
+    )
+    return joined, kind
+
+
+def _constant(key: str, recording: Recording, run: Run, usual: dict[str, float]) -> float:
+    return run.constants.get(key, recording.constants.get(key, usual.get(key, np.nan)))
+
+
+def _refuse_other(
+    first: Recording, kind: type[Simulator], other: Recording, of: type[Simulator]
+) -> None:
+    """Refuse what cannot be one recording with the first."""
+    robots = kind.has_model and of.has_model
+    if (kind.has_model or of.has_model) != robots or of.name != kind.name:
+        raise InputError(
+            f"{other.path}: expected a log of {kind.name} as {first.path}, found one of {of.name}; "
+            "explain it by itself"
+        )
+    if robots and vars(of)["source_digest"] != vars(kind)["source_digest"]:
+        raise InputError(
+            f"{other.path}: expected the model file, the actuators and the free numbers of "
+            f"{first.path}, found others; state the same, or give --model and --free"
+        )
+    ours, theirs = first.runs[0], other.runs[0]
+    for what, one, two in (
+        ("channels", set(ours.channels), set(theirs.channels)),
+        ("inputs", set(ours.inputs), set(theirs.inputs)),
+    ):
+        if one != two:
+            raise InputError(
+                f"{other.path}: expected the {what} of {first.path}, {', '.join(sorted(one))}, "
+                f"found {', '.join(sorted(two)) or 'none'}"
+            )
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """A short name for each log: its stem, with its folder where stems are alike."""
+    stems = [path.stem for path in paths]
+    if len(set(stems)) == len(stems):
+        return stems
+    longer = [f"{path.parent.name}/{path.stem}" for path in paths]
+    if len(set(longer)) == len(longer):
+        return longer
+    return [f"{number}/{name}" for number, name in enumerate(longer, start=1)]
+
+
+def _noise(recordings: Sequence[Recording]) -> dict[str, float]:
+    """Noise that all of them state."""
+    shared = set(recordings[0].noise).intersection(*(r.noise for r in recordings))
+    return {
+        name: float(np.sqrt(np.mean([recording.noise[name] ** 2 for recording in recordings])))
+        for name in recordings[0].noise
+        if name in shared
+    }
