@@ -32,6 +32,7 @@ def explain(
     budget: float | None = None,
     jobs: int | None = None,
     whole: bool = False,
+    pieces: float | None = None,
     say: Callable[[str], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float, str], None] | None = None,
@@ -54,6 +55,8 @@ def explain(
         jobs: processes that work at once, where that pays; None: one for each core. The answer does
             not depend on it.
         whole: look at all of a long recording of a robot; else at pieces from all over it.
+        pieces: seconds of the pieces that every run is cut into, each with an initial state of its
+            own: for motion that drifts or is unstable.
         say: told what is being done.
         stop: asked between two steps of the search; True ends it as a budget does.
         progress: told the share that is done, as far as can be known, and what is looked at.
@@ -70,9 +73,11 @@ def explain(
         raise InputError(f"budget: expected a number of seconds above 0, found {budget!r}")
     if jobs is not None and jobs < 1:
         raise InputError(f"jobs: expected a whole number of at least 1, found {jobs!r}")
+    if pieces is not None and not pieces > 0:
+        raise InputError(f"pieces: expected a number of seconds above 0, found {pieces!r}")
     watch = Watch(budget, stop, progress)
     given = system, engine, seed, free, tuner, say, force
-    return explaining.explain(sources, *given, watch, jobs or cores(), model, whole)
+    return explaining.explain(sources, *given, watch, jobs or cores(), model, whole, pieces)
 
 
 def score(

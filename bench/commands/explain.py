@@ -73,6 +73,13 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="look at all of a long recording of a robot (default: at pieces from all over it)",
     )
+    parser.add_argument(
+        "--pieces",
+        type=seconds,
+        metavar="S",
+        help="cut runs into pieces of S seconds, each with an initial state of its own: for motion "
+        "that drifts or is unstable",
+    )
     add_plugin(parser, "systems")
     add_force(parser)
     parser.set_defaults(command=_explain)
@@ -126,6 +133,7 @@ def _explain(options: argparse.Namespace) -> int:
             budget=options.budget,
             jobs=options.jobs,
             whole=options.whole,
+            pieces=options.pieces,
             say=look.say,
             stop=interrupts.asked,
             progress=look.show,

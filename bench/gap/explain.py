@@ -63,6 +63,7 @@ def explain(
     jobs: int = 1,
     model: str | Path | None = None,
     whole: bool = False,
+    pieces: float | None = None,
 ) -> Explanation:
     """Explain a recording.
 
@@ -80,6 +81,7 @@ def explain(
         jobs: processes that work at once; the answer does not depend on it.
         model: take it for this robot, whatever the description says: a model file.
         whole: look at all of a long recording of a robot, not at pieces of it.
+        pieces: seconds of the pieces that runs are cut into; None where they are not.
 
     Raises:
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
@@ -87,7 +89,7 @@ def explain(
     """
     with closing(Crew(jobs)) as crew:
         sources = [recording] if isinstance(recording, Source) else list(recording)
-        subject = _Subject(sources, system, model, whole)
+        subject = _Subject(sources, system, model, whole, pieces)
         given = engine, seed, tuple(free), tuner, say, force
         return _Explainer(subject, *given, watch or Watch(), crew).run()
 
@@ -101,6 +103,7 @@ class _Subject(NamedTuple):
     system: str | None
     model: str | Path | None
     whole: bool
+    pieces: float | None
 
 
 class _Explainer:
@@ -134,12 +137,10 @@ class _Explainer:
         # Before the worlds, which plan every step of every run.
         for odd in refuse_odd(self.recording, kind, force):
             say(f"{self.path}: {odd}")
-        self.notes: tuple[str, ...] = ()
-        if not subject.whole:
-            self.recording, note = cut(self.recording, kind)
-            self.notes = (note,) if note else ()
-            for note in self.notes:
-                say(note)
+        self.recording, note = cut(self.recording, kind, subject.pieces, subject.whole)
+        self.notes = (note,) if note else ()
+        for note in self.notes:
+            say(note)
         check_recording(self.recording, kind(engine=self.engine), force)
         self.watch = watch
         self.crew = crew

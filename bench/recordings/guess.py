@@ -129,7 +129,9 @@ def words_of(text: str) -> list[str]:
 
 def role_of(column: Column) -> Role | None:
     """What a column is by its name, else by its file's; None if neither says it."""
-    own, file = set(words_of(column.name)), set(words_of(column.file.rpartition(".")[0]))
+    # A topic of a bag has no ending.
+    stem = column.file.rpartition(".")[0] or column.file
+    own, file = set(words_of(column.name)), set(words_of(stem))
     if own & WORDS["command"] or file & WORDS["command"]:
         return "command"
     for kinds in (own, file):

@@ -7,6 +7,7 @@ import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +15,9 @@ from bench.recordings import guess
 from bench.recordings.census import rates
 from bench.recordings.guess import Column
 from bench.recordings.inspection import load
+from bench.recordings.servos import Following, following
 from sims.base import Array, InputError
+from sims.recording.bags import ENDINGS, TIME, is_bag
 from sims.recording.logs import Log, logs_in, read_log
 from sims.recording.recording import Run
 from sims.recording.write import publish
@@ -23,7 +26,7 @@ from sims.robot.scales import scales
 from sims.user_toml import known
 
 QUICK, DAMPED = 20.0, 0.7
-"""rad/s and share of critical damping of a servo whose gains nobody has stated."""
+"""rad/s and share of critical damping of a servo whose gains nobody has stated or shown."""
 TABLES = (".csv", ".tsv", ".npz", ".parquet")
 """Endings of what is taken from a folder; other texts may be anything."""
 _GAINS = "actuator.stiffness", "actuator.damping"
@@ -62,36 +65,63 @@ def describe(
     """
     runs = runs_of(logs)
     known("run held out", held_out, [name for name in runs if name])
-    _name, files = next(iter(runs.items()))
-    read = {path.name: read_log(path) for path in files}
+    files = next(iter(runs.values()))
+    read = {files.name(path): read_log(path) for path in files.paths}
     return _Describing(robot, model, beside, runs, read, held_out).made()
 
 
-def runs_of(logs: Sequence[Path]) -> dict[str, list[Path]]:
-    """Files by run: those of each folder, or the files themselves as one run.
+class Files(NamedTuple):
+    """The logs of one run, and the folder, or the bag, that they are in."""
+
+    folder: Path
+    paths: list[Path]
+
+    def name(self, path: Path) -> str:
+        """What a description calls a log."""
+        return path.relative_to(self.folder).as_posix()
+
+
+def runs_of(logs: Sequence[Path]) -> dict[str, Files]:
+    """Logs by run: those of each folder or bag, or the files themselves as one run.
 
     Raises:
         InputError: there is no log.
     """
-    files = [path for path in logs if not path.is_dir()]
-    runs: dict[str, list[Path]] = {}
-    for folder in (path for path in logs if path.is_dir()):
-        inside = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
+    files = [path for path in logs if not path.is_dir() and not is_bag(path)]
+    runs: dict[str, Files] = {}
+    for folder in (path for path in logs if path not in files):
+        inside = [folder] if is_bag(folder) else [folder, *sorted(folder.iterdir())]
         for one in inside:
-            own = [path for path in logs_in(one) if path.suffix.lower() in TABLES]
+            if is_bag(one):
+                own = [path for path in logs_in(one) if _is_log(path)]
+            elif one.is_dir():
+                own = [path for path in logs_in(one) if path.suffix.lower() in TABLES]
+            else:
+                continue
             if own:
-                runs[one.name] = own
+                runs[one.stem if one.is_file() else one.name] = Files(one, own)
     if files and runs:
         raise InputError("expected files of one run, or folders of one run each, found both")
     if files:
-        runs = {"": files}
         folders = {path.parent for path in files}
         if len(folders) > 1:
             raise InputError("expected the files of one run in one folder; name the folders")
+        runs = {"": Files(folders.pop(), files)}
     if not runs:
         found = ", ".join(map(str, logs))
-        raise InputError(f"{found}: expected logs ({', '.join(TABLES)}), found none")
+        kinds = ", ".join((*TABLES, *ENDINGS))
+        raise InputError(f"{found}: expected logs ({kinds}), found none")
     return runs
+
+
+def _is_log(topic: Path) -> bool:
+    """Whether a topic holds numbers whose stamps increase."""
+    try:
+        log = read_log(topic)
+    except InputError:
+        return False
+    times = log.column(TIME)
+    return bool(times.size > 2 and (np.diff(times) > 0).all())
 
 
 def checked(path: Path, text: str) -> None:
@@ -118,7 +148,7 @@ class _Describing:
         robot: Robot,
         model: Path,
         beside: Path,
-        runs: Mapping[str, list[Path]],
+        runs: Mapping[str, Files],
         logs: Mapping[str, Log],
         held_out: Collection[str],
     ) -> None:
@@ -130,10 +160,12 @@ class _Describing:
         self.inputs: dict[str, tuple[Column, str, str]] = {}
         self.added: dict[str, Joint] = {}
         self.seconds: dict[str, Array] = {}
+        self.time, self.unit = "", ""
+        self._read = {log.path: log for log in logs.values()}
 
     def made(self) -> Imported:
         """The description."""
-        time, unit = self._time()
+        time, unit = self.time, self.unit = self._time()
         every = [
             Column(file, name, np.where(np.isfinite(values), values, np.nan))
             for file, log in self.logs.items()
@@ -295,9 +327,9 @@ class _Describing:
         lines += ["[time]", f"column = {_quoted(time)}", f"unit = {_quoted(unit)}  # guess", ""]
         for run, files in self.runs.items():
             if run:
-                lines += [f"[runs.{_key(run)}]", f"folder = {_quoted(self._from(files[0].parent))}"]
+                lines += [f"[runs.{_key(run)}]", f"folder = {_quoted(self._from(files.folder))}"]
                 lines += [*["held_out = true"] * (run in self.held_out), ""]
-        alone = next(iter(self.logs.values())).path.parent if "" in self.runs else None
+        alone = self.runs[""].folder if "" in self.runs else None
         for name, joint in self.added.items():
             lines += self._actuator(name, joint)
         for kind, signals in (("channels", self.channels), ("inputs", self.inputs)):
@@ -311,13 +343,53 @@ class _Describing:
     def _actuator(self, name: str, joint: Joint) -> list[str]:
         """A servo whose gains nobody knows."""
         inertia = scales(self.robot).inertia[self.joints.index(joint)]
-        kp, kv = inertia * QUICK**2, 2.0 * DAMPED * QUICK * inertia
-        self.made_of.untold.append(
-            f"gains of the servo of {joint.name}: free, from those of one of {QUICK:g} rad/s on"
+        found = self._following(name, joint)
+        quick, damped = found or (QUICK, DAMPED)
+        kp, kv = inertia * quick**2, 2.0 * damped * quick * inertia
+        what = "as it follows its command" if found else "as of any hobby servo"
+        self.made_of.guessed.append(
+            f"gains of the servo of {joint.name}: of one of {quick:.3g} rad/s and {damped:.2g} of "
+            f"critical damping, {what}; free"
         )
         lines = [f"[actuators.{_key(name)}]", f"joint = {_quoted(joint.name)}"]
         lines += ['kind = "position"  # guess: its commands are positions']
-        return [*lines, f"kp = {kp:.4g}  # not known", f"kv = {kv:.4g}  # not known", ""]
+        return [*lines, f"kp = {kp:.4g}  # guess", f"kv = {kv:.4g}  # guess", ""]
+
+    def _following(self, name: str, joint: Joint) -> Following | None:
+        """How a joint follows the command of its servo, over all runs."""
+        (u, unit, _), there = self.inputs[f"u.{name}"], self.channels.get(f"q.{joint.name}")
+        if there is None:
+            return None
+        q, own, _ = there
+        sizes = {"deg": np.pi / 180.0, "mm": 1e-3}
+        shown = []
+        for run in self.runs:
+            command, position = self._signal(run, u), self._signal(run, q)
+            if command is None or position is None:
+                continue
+            # A command holds until the next one.
+            held = np.searchsorted(command[0], position[0], side="right") - 1
+            values = command[1][np.clip(held, 0, command[1].size - 1)]
+            scaled = sizes.get(unit, 1.0) * values, sizes.get(own, 1.0) * position[1]
+            shown.append((position[0], *scaled))
+        return following(shown)
+
+    def _signal(self, run: str, column: Column) -> tuple[Array, Array] | None:
+        """Stamps in s and values of a column in one run; None where it lacks the file or that."""
+        files = self.runs[run]
+        paths = [path for path in files.paths if files.name(path) == column.file]
+        if not paths:
+            return None
+        log = self._log(paths[0])
+        if not {column.name, self.time} <= set(log.names()):
+            return None
+        return guess.UNITS[self.unit] * log.column(self.time), log.column(column.name)
+
+    def _log(self, path: Path) -> Log:
+        """A log, read once."""
+        if path not in self._read:
+            self._read[path] = read_log(path)
+        return self._read[path]
 
     def _from(self, path: Path) -> str:
         try:

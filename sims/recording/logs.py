@@ -1,4 +1,5 @@
-"""Logs as their loggers wrote them: a CSV of any layout, a NumPy archive, a Parquet file.
+"""Logs as their loggers wrote them: a CSV of any layout, a NumPy archive, a Parquet file, a topic
+of a bag.
 
 A column is named as the log names it, ``positions[2]`` being the third entry of what holds a list
 or a vector in each row. Nothing is unpickled.
@@ -17,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.base import Array, InputError, frozen
+from sims.recording import bags
 from sims.user_toml import shown
 
 FORMATS = (".csv", ".tsv", ".txt", ".npz", ".parquet")
@@ -114,6 +116,13 @@ def read_log(path: str | Path) -> Log:
         InputError: it cannot be read, in one line.
     """
     path = Path(path)
+    bag = bags.bag_of(path)
+    if bag is not None:
+        about = bag[0].stat()
+        return _read_topic(Stamp(path, about.st_mtime_ns, about.st_size))
+    if bags.is_bag(path):
+        there = ", ".join(bags.topics(path))
+        raise InputError(f"{path}: a bag; name a topic of it, as {path.name}/TOPIC: {there}")
     if not path.is_file():
         raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
     kind = path.suffix.lower()
@@ -124,6 +133,17 @@ def read_log(path: str | Path) -> Log:
     if about.st_size > LARGEST:
         raise InputError(f"{path}: has {about.st_size / 1e9:.1f} GB; at most 2 are read")
     return _read(Stamp(path, about.st_mtime_ns, about.st_size))
+
+
+@lru_cache(maxsize=8)
+def _read_topic(stamp: Stamp) -> Log:
+    """A topic of a bag, read once."""
+    bag = bags.bag_of(stamp.path)
+    assert bag is not None  # it is one that was asked for
+    columns = bags.read_topic(*bag)
+    if len(columns) < 2 or not columns[bags.TIME].size:
+        raise InputError(f"{stamp.path}: expected messages with numbers, found none")
+    return Log(stamp.path, columns, (), "message")
 
 
 @lru_cache(maxsize=8)
@@ -316,7 +336,10 @@ _READERS: Mapping[str, Callable[[Path], Log]] = {
 
 
 def logs_in(folder: Path) -> Iterator[Path]:
-    """The logs of a folder, in order of name."""
+    """The logs of a folder, or the topics of a bag, in order of name."""
+    if bags.is_bag(folder):
+        yield from (folder / topic for topic in bags.topics(folder))
+        return
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in FORMATS and path.is_file():
             yield path

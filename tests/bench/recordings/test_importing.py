@@ -75,10 +75,35 @@ def test_a_robot_without_actuators_gets_servos_whose_gains_are_not_known(arm, tm
     (tmp_path / "arm.xml").write_text(ARM)
     files = logged(tmp_path, *motion(tmp_path / "arm.xml"))
     made = simgap.import_logs(files, bare, tmp_path / "log.toml")
-    assert any("gains of the servo of elbow" in line for line in made.untold)
+    assert any("gains of the servo of elbow" in line for line in made.guessed)
     _, kind = load(tmp_path / "log.toml")
     assert [a.kind for a in kind.robot.actuators] == ["position", "position"]
-    assert "# not known" in made.text
+    assert 'free = ["actuator.stiffness@*", "actuator.damping@*"]  # not known' in made.text
+    assert kind.free == ("actuator.stiffness@*", "actuator.damping@*")
+
+
+def test_runs_that_are_held_out_by_name(arm, tmp_path):
+    folders = []
+    for name in ("one", "two", "three"):
+        (tmp_path / name).mkdir()
+        logged(tmp_path / name, *motion(arm))
+        folders.append(tmp_path / name)
+    simgap.import_logs(folders, arm, tmp_path / "log.toml", held_out=["one"])
+    recording, _ = load(tmp_path / "log.toml")
+    assert [run.name for run in recording.held_out()] == ["one"]
+    with pytest.raises(
+        InputError, match=r"unknown run held out 'four'; there are: one, three, two"
+    ):
+        simgap.import_logs(folders, arm, tmp_path / "other.toml", held_out=["four"])
+    assert not (tmp_path / "other.toml").exists()
+
+
+def test_a_velocity_that_is_late_is_left_out(arm, tmp_path):
+    commands, positions, rates = motion(arm)
+    late = np.vstack([rates[:2], rates[:-2]])
+    made = simgap.import_logs(logged(tmp_path, commands, positions, late), arm, tmp_path / "l.toml")
+    assert "qd.shoulder" not in made.text
+    assert any("samples behind the derivative of Shoulder Pos" in line for line in made.untold)
 
 
 def test_what_cannot_be_is_left_out_and_said(arm, tmp_path):
