@@ -6,7 +6,7 @@
 # make exam      hides causes in hundreds of recordings and has explain find them (about 6 minutes; QUICK=--quick)
 # make benchmark measurements printed as ratios
 # make chaos     100 kills at random moments; what is resumed must equal what was never disturbed (about 10 minutes)
-# make malformed ten thousand malformed files, folders and arguments to every command (about 5 minutes; KINDS="films weights")
+# make malformed twelve thousand malformed files, folders and arguments to every command (about 5 minutes; KINDS="films weights")
 # make mutants   two hundred wrong changes, each of which a test must notice (about 10 minutes; ONLY="budget noise", JOBS=4)
 # make reference the comparison of results/reference/comparison again, below results/ (about 10 minutes)
 # make multi     the comparison of results/reference/multi again, below results/ (about 15 minutes; TUNERS=a,b,... for others)

@@ -1,4 +1,4 @@
-"""All ten thousand malformed inputs: ``python -m tests.malformed [--cases N] [KIND ...]``.
+"""All twelve thousand malformed inputs: ``python -m tests.malformed [--cases N] [KIND ...]``.
 
 Each fault is said once, by where it was raised, with a case that shows it; exits with 1 if there
 are any.

@@ -15,9 +15,9 @@ from tests.malformed.spoil import bytes_of, documents, spoilt, tables
 
 SHARES = {
     "experiments": 2400, "plugins": 800, "folders": 2000, "recordings": 2000, "models": 700,
-    "weights": 300, "films": 100, "arguments": 1700,
+    "weights": 300, "films": 100, "arguments": 1700, "logs": 2000,
 }  # fmt: skip
-"""How many of each kind; 10,000 in all."""
+"""How many of each kind; 12,000 in all."""
 PIECES = [
     "from methods.base import Tuner", "import numpy as np", "class Good(Tuner):\n    pass",
     "class Random(Tuner): pass", "class Odd(Tuner):\n    name = 3",
@@ -128,6 +128,24 @@ def recordings(draw):
     return Case(command, files, owns=("out", "film"), numbers=command[0] in ("score", "inspect"))
 
 
+@st.composite
+def logs(draw):
+    """A log of any format, or what describes one, spoilt; imported or inspected."""
+    files = {"arm.xml": sound.ARM, "log.csv": sound.logs()["log.csv"]}
+    if draw(st.integers(0, 3)) == 0:
+        files["mapped.toml"] = draw(documents(sound.MAPPED, MAPPED))
+        if draw(st.booleans()):
+            files["log.csv"] = draw(tables(files["log.csv"]))
+        return Case(("inspect", "mapped.toml", "--out", "out"), files, owns=("out",))
+    name = draw(st.sampled_from([name for name, data in sound.logs().items() if data]))
+    whole = sound.logs()[name]
+    files[name] = draw(tables(whole) if name.endswith(".csv") else bytes_of(whole))
+    command = ("import", name, "--model", "arm.xml", "--out", "made.toml")
+    return Case(command, files, owns=("made.toml",))
+
+
+MAPPED = ("free", "time", "file", "column", "unit", "offset", "hold", "folder", "model", "engine",
+          "actuators", "oops")  # fmt: skip
 RECORDED = ("constants", "noise", "inputs", "initial", "runs", "extra", "parameters", "effects",
             "held_out", "units", "system", "oops")  # fmt: skip
 
@@ -198,6 +216,7 @@ def strategies(bases):
         "plugins": plugins(),
         "folders": folders(bases),
         "recordings": recordings(),
+        "logs": logs(),
         "models": models(),
         "weights": weights(bases),
         "films": films(bases),

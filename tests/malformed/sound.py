@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import os
+import tempfile
 from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
+import numpy as np
+import pandas as pd
 import tomli_w
 
 from bench.api.recordings import simulate
@@ -147,3 +151,72 @@ def trains(experiment: str, out: str) -> list[str]:
     """A training of the plugin's learner."""
     plugin = ["--plugin", str(LEARNER), "--trust", "--out", out]
     return ["train", "learner", "pendulum", "--experiment", experiment, *plugin]
+
+
+ARM = b"""<mujoco model="arm"><compiler angle="radian" autolimits="true"/><worldbody>
+<body><joint name="hip" axis="0 1 0" range="-2 2"/><geom size="0.1" pos="0 0 -0.3"/>
+<body pos="0 0 -0.6"><joint name="knee" axis="0 1 0" range="-2 2"/>
+<geom size="0.1" pos="0 0 -0.3"/></body></body></worldbody>
+<actuator><position name="m_hip" joint="hip" kp="100" kv="10"/>
+<position name="m_knee" joint="knee" kp="100" kv="10"/></actuator></mujoco>"""
+MAPPED = {
+    "model": "arm.xml", "free": ["damping@*"],
+    "time": {"column": "stamp", "unit": "ms", "offset": 0.01},
+    "channels": {"q.hip": {"file": "log.csv", "column": "position[0]", "unit": "deg"},
+                 "q.knee": {"file": "log.csv", "column": "position[1]", "unit": "deg"}},
+    "inputs": {"u.m_hip": {"file": "log.csv", "column": "command_hip", "unit": "deg",
+                           "hold": "linear"}},
+    "runs": {"1": {"held_out": False}},
+}  # fmt: skip
+"""What describes the log in CSV."""
+
+
+@cache
+def logs():
+    """The same motion of two joints as every format holds it, by the name of the file."""
+    times = np.arange(60) * 0.02
+    q = np.degrees(np.column_stack([np.sin(3 * times), 0.5 * np.cos(2 * times)]))
+    u = np.degrees(np.column_stack([np.sin(3 * times + 0.1), 0.5 * np.cos(2 * times + 0.1)]))
+    rows = ["stamp,position,command_hip,command_knee,note"]
+    for t, (a, b), (c, d) in zip(1e3 * times, q, u, strict=True):
+        rows.append(f'{t:.0f},"[{a:.4f}, {b:.4f}]",{c:.4f},{d:.4f},ok')
+    columns = {"stamp": 1e3 * times, "position": q, "command": u}
+    archive, parquet = io.BytesIO(), io.BytesIO()
+    np.savez(archive, **columns)
+    flat = {"stamp": 1e3 * times, "position_hip": q[:, 0], "position_knee": q[:, 1]}
+    pd.DataFrame({**flat, "command_hip": u[:, 0]}).to_parquet(parquet)
+    text = "\n".join(rows)
+    plain = [line.split('"') for line in rows[1:]]
+    table = ["stamp;position hip;position knee"]
+    table += [f"{a.rstrip(',')};" + b.strip("[]").replace(", ", ";") for a, b, _ in plain]
+    return {
+        "log.csv": text.encode(),
+        "comma.csv": "\n".join(table).replace(".", ",").encode(),
+        "log.npz": archive.getvalue(),
+        "log.parquet": parquet.getvalue(),
+        "log.mcap": _bag(times, np.radians(q)),
+    }
+
+
+def _bag(times, q):
+    """A bag of a topic; empty where rosbags is not installed."""
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        return b""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    state = types.types["sensor_msgs/msg/JointState"]
+    header = types.types["std_msgs/msg/Header"]
+    stamp = types.types["builtin_interfaces/msg/Time"]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bag"
+        with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            topic = writer.add_connection("/joint_states", state.__msgtype__, typestore=types)
+            for t, own in zip(times, q, strict=True):
+                head = header(stamp(1000, round(1e9 * t)), "")
+                one = state(head, ["hip", "knee"], own, 0 * own, 0 * own)
+                raw = types.serialize_cdr(one, state.__msgtype__)
+                writer.write(topic, round(1e9 * (1000 + t)), raw)
+        (file,) = path.glob("*.mcap")
+        return file.read_bytes()

@@ -1,0 +1,151 @@
+"""The measured arm and drive, from logs as they lie: ``python -m tests.benchmarks.real_robots``.
+
+The arm goes from its folder to a verdict in two commands, which are run as a user would; then the
+model that it began with, the same with its gains tuned, and the extended one each predict the six
+motions that no fit has seen, from where they begin: RMSE by joint and motion, in mrad. Of the drive
+what was found stands beside what is published. With ``--explained DIR`` a folder that is there is
+taken; else explain runs, which takes a quarter of an hour.
+"""
+
+import argparse
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from bench.gap.model.world import World
+from bench.recordings.inspection import load
+from bench.registry import simulators
+from sims.extended import opened
+
+ROBOTS = Path(os.environ.get("SIMGAP_ROBOTS", Path(__file__).parents[3] / "shared" / "robots"))
+FITTED = ("chirp_sweep", "multisine")
+EMPS = """<mujoco model="emps"><option timestep="0.001" integrator="implicitfast"/>
+<worldbody><body name="carriage"><joint name="screw" type="slide" axis="1 0 0"/>
+<geom name="block" type="box" size="0.2 0.2 0.1" mass="100"/></body></worldbody>
+<actuator><motor name="drive" joint="screw" gear="1"/></actuator></mujoco>
+"""
+EMPS_LOG = """model = "emps.xml"
+free = ["mass@carriage"]
+title = "EMPS: a motor and ball screw move a carriage, 1 kHz"
+[time]
+column = "t"
+[channels."q.screw"]
+file = "{file}"
+column = "x"
+unit = "m"
+noise = 2.4e-5
+[inputs."u.drive"]
+file = "{file}"
+column = "u"
+unit = "N"
+"""
+
+
+def simgap(*arguments):
+    """The installed command."""
+    command = Path(sys.executable).with_name("simgap")
+    subprocess.run([str(command), *map(str, arguments)], check=True)
+
+
+def so101(out, explained):
+    folder = ROBOTS / "so101"
+    log = out / "so101.toml"
+    log.unlink(missing_ok=True)
+    motions = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    held_out = [name for name in motions if name not in FITTED]
+    model = folder / "so101.urdf"
+    simgap("import", folder, "--model", model, "--out", log, "--held-out", ",".join(held_out))
+    if explained is None:
+        explained = out / "explained"
+        shutil.rmtree(explained, ignore_errors=True)
+        simgap("explain", log, "--out", explained)
+    recording, _ = load(log)
+    runs = recording.held_out()
+    extended, of_file, _ = opened(explained / "extended.toml", simulators.get)
+    world = World(of_file, recording, runs, "batch", candidates=list(extended.effects))
+    after = world.nominal()
+    for place, parameter in enumerate(world.parameters[: world.own]):
+        after[place] = extended.parameters[parameter.name].value
+    before = world.nominal()
+    for place, parameter in enumerate(world.parameters[: world.own]):
+        before[place] = tuned(explained)[parameter.name]
+    for name, numbers in extended.effects.items():
+        coefficients = world.effects[name].on(world.simulator.system)
+        for place, coefficient in zip(world.places(name), coefficients, strict=True):
+            after[place] = numbers[coefficient.name].value
+    models = {"as imported": world.nominal(), "gains tuned": before, "extended": after}
+    errors = {name: by_run(world, theta) for name, theta in models.items()}
+    table(
+        out / "table.md", world, runs, errors, json.loads((explained / "verdict.json").read_text())
+    )
+
+
+def tuned(explained):
+    """The base model's parameters, as apart.csv has them."""
+    with (explained / "apart.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["model"] == "base"]
+    return {row["number"]: float(row["value"]) for row in rows if row["group"] == "all"}
+
+
+def by_run(world, theta):
+    """(R, C) RMSE of a model that begins where each run begins."""
+    runs = np.arange(len(world.tracks))
+    simulated = world.simulate(np.tile(theta, (runs.size, 1)), runs, world.guess)
+    return np.sqrt(np.nanmean((world.observed - simulated) ** 2, axis=1))
+
+
+def table(path, world, runs, errors, verdict):
+    joints = [name.partition(".")[2] for name in world.channels]
+    lines = [
+        f"| motion (not fitted) | model | {' | '.join(joints)} |",
+        "|---" * (len(joints) + 2) + "|",
+    ]
+    for r, run in enumerate(runs):
+        for name, rmse in errors.items():
+            cells = " | ".join(f"{1e3 * value:.1f}" for value in rmse[r])
+            lines.append(f"| {run.name} | {name} | {cells} |")
+    for name, rmse in errors.items():
+        cells = " | ".join(f"{1e3 * value:.1f}" for value in np.sqrt((rmse**2).mean(axis=0)))
+        lines.append(f"| **all six** | {name} | {cells} |")
+    causes = [" or ".join([c["effect"], *c["alternatives"]]) for c in verdict["causes"]]
+    said = f"{verdict['verdict']}: {'; '.join(causes)}; {verdict['seconds']:.0f} s"
+    path.write_text(
+        "RMSE in mrad (gripper: its own radians)\n\n" + "\n".join(lines) + f"\n\n{said}\n"
+    )
+    print(path.read_text())
+
+
+def emps(out, explained):
+    (out / "emps.xml").write_text(EMPS)
+    (out / "emps.toml").write_text(EMPS_LOG.format(file=ROBOTS / "emps" / "recording.csv"))
+    if explained is None:
+        explained = out / "explained"
+        shutil.rmtree(explained, ignore_errors=True)
+        simgap("explain", out / "emps.toml", "--pieces", 0.5, "--out", explained)
+    verdict = json.loads((explained / "verdict.json").read_text())
+    mass = 100.0 * (1.0 + verdict["parameters"]["mass.scale@carriage"]["value"])
+    print(f"mass {mass:.2f} kg (95.11 published)")
+    for cause in verdict["causes"]:
+        print(cause["effect"], cause["alternatives"], cause["coefficients"])
+    print(verdict["verdict"], verdict["heldout"], f"{verdict['seconds']:.0f} s")
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("which", choices=("so101", "emps"))
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--explained", type=Path)
+    options = parser.parse_args()
+    out = options.out or Path("results/reference/real") / options.which
+    out.mkdir(parents=True, exist_ok=True)
+    {"so101": so101, "emps": emps}[options.which](out, options.explained)
+
+
+if __name__ == "__main__":
+    main()
