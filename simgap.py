@@ -23,6 +23,7 @@ from os.path import abspath, dirname, realpath
 _WHERE = {
     "bench": ("__version__",),
     "bench.api.compare": ("Compared", "compare", "sweep"),
+    "bench.api.design": ("NextRecording", "design"),
     "bench.api.explain": ("explain", "score"),
     "bench.api.recordings": ("import_logs", "read_recording", "simulate"),
     "bench.checks": ("parametrize",),

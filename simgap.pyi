@@ -3,6 +3,7 @@ from collections.abc import Sequence
 
 from bench import __version__
 from bench.api.compare import Compared, compare, sweep
+from bench.api.design import NextRecording, design
 from bench.api.explain import explain, score
 from bench.api.recordings import import_logs, read_recording, simulate
 from bench.checks import parametrize
@@ -65,6 +66,7 @@ __all__ = [
     "Input",
     "InputError",
     "Moment",
+    "NextRecording",
     "OwnSimulator",
     "Parameter",
     "Practice",
@@ -81,6 +83,7 @@ __all__ = [
     "Tuner",
     "__version__",
     "compare",
+    "design",
     "effects",
     "explain",
     "from_callback",

@@ -14,6 +14,7 @@ from typing import NoReturn
 from bench import __version__
 from bench.commands.check import add_check
 from bench.commands.compare import add_compare, add_plot, add_status, add_verify
+from bench.commands.design import add_design
 from bench.commands.explain import add_explain, add_score
 from bench.commands.film import add_film, add_track
 from bench.commands.importing import add_import
@@ -33,6 +34,7 @@ COMMANDS = (
     ("import", add_import, "describe a robot's logs as they lie, so that every command reads them"),
     ("inspect", add_inspect, "summarise and draw a recording"),
     ("explain", add_explain, "show what a simulation gets wrong on a recording, and why"),
+    ("design", add_design, "design the next recording, by which what is open would be settled"),
     ("score", add_score, "error of an extended simulator on another recording"),
     ("film", add_film, "render a recorded ball as a video"),
     ("track", add_track, "track a ball in a video; write a recording"),

@@ -65,10 +65,7 @@ def explain(
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
             or the budget is no number above 0, or ended before anything could be simulated.
     """
-    each = [recording] if isinstance(recording, Source) else list(recording)
-    sources = [one.recording if isinstance(one, SimulatedRecording) else one for one in each]
-    if not sources:
-        raise InputError("expected a recording, found none")
+    sources = sources_of(recording)
     if budget is not None and not budget > 0:
         raise InputError(f"budget: expected a number of seconds above 0, found {budget!r}")
     if jobs is not None and jobs < 1:
@@ -78,6 +75,18 @@ def explain(
     watch = Watch(budget, stop, progress)
     given = system, engine, seed, free, tuner, say, force
     return explaining.explain(sources, *given, watch, jobs or cores(), model, whole, pieces)
+
+
+def sources_of(recording: Source | Sequence[Source]) -> list[str | Path | Recording]:
+    """One or several, each as a path or as what was read.
+
+    Raises:
+        InputError: there is none.
+    """
+    each = [recording] if isinstance(recording, Source) else list(recording)
+    if not each:
+        raise InputError("expected a recording, found none")
+    return [one.recording if isinstance(one, SimulatedRecording) else one for one in each]
 
 
 def score(

@@ -18,6 +18,7 @@ from bench.gap.causes.name import Finding, name
 from bench.gap.causes.rules import SWITCH
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import probes
+from bench.gap.design import Design, design
 from bench.gap.explanation import Explanation
 from bench.gap.freeze import frozen
 from bench.gap.measure import HeldOutRuns
@@ -91,7 +92,38 @@ def explain(
         sources = [recording] if isinstance(recording, Source) else list(recording)
         subject = _Subject(sources, system, model, whole, pieces)
         given = engine, seed, tuple(free), tuner, say, force
-        return _Explainer(subject, *given, watch or Watch(), crew).run()
+        with closing(_Explainer(subject, *given, watch or Watch(), crew)) as explainer:
+            return explainer.run()
+
+
+class Proposed(NamedTuple):
+    """An explanation, and the recording that would say more; None where no run would."""
+
+    explanation: Explanation
+    design: Design | None
+
+
+def explain_and_design(
+    recording: Source | Sequence[Source],
+    seconds: float,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+    say: Say = lambda _: None,
+    watch: Watch | None = None,
+    jobs: int = 1,
+) -> Proposed:
+    """Explain recordings, and design the next one, of so many seconds at most; the other arguments
+    are those of `explain`.
+    """
+    with closing(Crew(jobs)) as crew:
+        sources = [recording] if isinstance(recording, Source) else list(recording)
+        subject = _Subject(sources, system, model, whole=False, pieces=None)
+        given = "batch", 0, tuple(free), None, say, False
+        with closing(_Explainer(subject, *given, watch or Watch(), crew)) as explainer:
+            explanation = explainer.run()
+            say("designing the next recording")
+            return Proposed(explanation, explainer.design(seconds))
 
 
 class _Subject(NamedTuple):
@@ -147,6 +179,7 @@ class _Explainer:
         self.free = tuple(free)
         self._enter(kind)
         self.coarse: Coarse | None = None
+        self.found: tuple[Search, Finding] | None = None
         self._check()
 
     def _enter(self, kind: type[Simulated]) -> None:
@@ -212,13 +245,30 @@ class _Explainer:
         verdict = self.assessor.verdict(search, finding, rng, self.started)
         if self.coarse is not None:
             verdict = with_numerics(verdict, self.coarse)
+        self.found = search, finding
         story = Teller(self.assessor, search, base, finding, self.notes).story(verdict)
-        extended = self._extended(search, finding)
-        # Not earlier: an experiment is proposed by simulating further.
+        return Explanation(verdict, story, self._extended(search, finding))
+
+    def close(self) -> None:
+        """Let go of what simulates; not earlier, since experiments are proposed by simulating."""
         for world in (self.fitting, self.measuring):
             if world is not None:
                 world.close()
-        return Explanation(verdict, story, extended)
+
+    def design(self, seconds: float) -> Design | None:
+        """The next recording, after `run`: that which splits the first set of causes that is open,
+        else that which narrows the numbers of what stands.
+        """
+        if self.found is None:
+            return None
+        search, finding = self.found
+        for cause in finding.causes:
+            rest = {name for name in finding.model.names if name != cause.effect}
+            keys = [frozenset({*rest, other}) for other in cause.alternatives]
+            rivals = [search.models[key] for key in keys if key in search.models]
+            if rivals:
+                return design(search, finding.model, rivals, seconds)
+        return design(search, finding.model, (), seconds)
 
     def _search(self, base: Base, rng: np.random.Generator) -> Search:
         search = Search(self.fitting, self.noise, base.frozen, rng, self.floor.stated)

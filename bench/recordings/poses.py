@@ -11,7 +11,7 @@ say how far it goes with it, and how alike the two are.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,6 +112,32 @@ def accelerations(run: Run, kind: type[Simulator]) -> Array:
             mujoco.mj_forward(model, data)
             found.append([data.qacc[joint.velocity] for joint in joints])
     return np.array(found)
+
+
+def contacts(kind: type[Simulator], positions: Mapping[str, Array]) -> frozenset[tuple[int, int]]:
+    """Pairs of a robot's geoms that touch at some of `ROWS` instants of a motion.
+
+    Args:
+        kind: simulates the robot.
+        positions: (N,) of each joint, rad or m, by channel; joints without stay where they begin.
+    """
+    import mujoco
+
+    robot = kind.robot  # type: ignore[attr-defined]
+    model = robot.compiled
+    data = mujoco.MjData(model)
+    count = max((values.size for values in positions.values()), default=0)
+    found = set()
+    with quiet():
+        for row in np.unique(np.linspace(0, max(count - 1, 0), ROWS).astype(np.intp)):
+            mujoco.mj_resetData(model, data)
+            for joint in robot.joints:
+                values = positions.get(f"q.{joint.name}")
+                if joint.single and values is not None and np.isfinite(values[row]):
+                    data.qpos[joint.position] = values[row]
+            mujoco.mj_forward(model, data)
+            found |= {(int(min(pair)), int(max(pair))) for pair in data.contact.geom[: data.ncon]}
+    return frozenset(found)
 
 
 def _at(run: Run, name: str, row: int) -> float:

@@ -1,0 +1,106 @@
+"""`simgap.design`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bench.api.explain import Source, sources_of
+from bench.gap import explain as explaining
+from bench.gap.design import Design
+from bench.gap.explanation import Explanation
+from bench.gap.model.crew import cores
+from bench.gap.model.watch import Watch
+from sims.base import InputError
+from sims.recording.write import publish, refuse_existing
+
+LONGEST = 600.0
+"""Seconds of a run that is designed."""
+
+
+@dataclass(frozen=True)
+class NextRecording:
+    """What to record next.
+
+    Attributes:
+        explanation: of what there is so far.
+        design: the run; None where none can be simulated that stays within its limits.
+    """
+
+    explanation: Explanation
+    design: Design | None
+
+    def lines(self) -> list[str]:
+        """What to record, and what it would bring, in words."""
+        found = self.design
+        if found is None:
+            return ["no run could be simulated that stays within the limits of what moves"]
+        begin = ", ".join(f"{name} = {value:.4g}" for name, value in found.initial.items())
+        lines = [f"record next: {found.says}; begin near {begin}"]
+        if found.by == "T":
+            names = ", ".join(found.between)
+            odds = f"{math.sqrt(found.gain):.3g} noises once every number is fitted again"
+            will = "that settles it" if found.settles else "no run of this kind settles it"
+            lines.append(f"the nearest two of {names} differ there by {odds}: {will}")
+        else:
+            lines.append(
+                "nothing is open: it narrows what is known of all numbers together "
+                f"{math.exp(min(found.gain, 50.0)):.3g} times"
+            )
+        return lines
+
+    def write(self, path: str | Path) -> None:
+        """Write the commands: ``t`` in s and a column for each input, in the SI units of
+        `simgap list systems`, held from row to row.
+
+        Raises:
+            InputError: there is no run, or the file is there already.
+        """
+        if self.design is None:
+            raise InputError("there is no run to write")
+        path = Path(path)
+        refuse_existing([path])
+        columns = [self.design.times, *self.design.inputs.values()]
+        rows = ["t," + ",".join(self.design.inputs) if self.design.inputs else "t"]
+        rows += [",".join(f"{value:.9g}" for value in row) for row in np.column_stack(columns)]
+        publish({path: "\n".join(rows) + "\n"})
+
+
+def design(
+    recording: Source | Sequence[Source],
+    *,
+    seconds: float = 4.0,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+    jobs: int | None = None,
+    say: Callable[[str], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[float, str], None] | None = None,
+) -> NextRecording:
+    """Design the next recording: commands that split causes which these runs cannot tell apart, or
+    that narrow the numbers that stand; within the limits of joints and commands, by simulation.
+
+    Args:
+        recording: what there is so far, as for `explain`.
+        seconds: how long the next run may last.
+        system: as for `explain`.
+        model: as for `explain`.
+        free: as for `explain`.
+        jobs: as for `explain`.
+        say: as for `explain`.
+        stop: as for `explain`.
+        progress: as for `explain`.
+
+    Raises:
+        InputError: as `explain`, or the seconds are no number above 0.
+    """
+    if not 0 < seconds <= LONGEST:
+        raise InputError(f"seconds: expected 0 to {LONGEST:g}, found {seconds!r}")
+    watch = Watch(None, stop, progress)
+    given = sources_of(recording), seconds, system, model, free, say, watch, jobs or cores()
+    return NextRecording(*explaining.explain_and_design(*given))

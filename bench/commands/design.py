@@ -1,0 +1,71 @@
+"""The command `simgap design`."""
+
+from __future__ import annotations
+
+import argparse
+
+from bench.commands.options import add_model, add_plugin, names, place, positive, seconds
+
+
+def add_design(parser: argparse.ArgumentParser) -> None:
+    """The options of `simgap design`."""
+    parser.add_argument(
+        "recordings",
+        metavar="RECORDING.csv",
+        type=place,
+        nargs="+",
+        help="what there is so far, as for `simgap explain`",
+    )
+    parser.add_argument(
+        "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
+    )
+    add_model(parser)
+    parser.add_argument(
+        "--out",
+        metavar="NAME.csv",
+        type=place,
+        required=True,
+        help="commands to write, a new file: t in s and a column for each input",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=seconds,
+        metavar="S",
+        default=4.0,
+        help="how long the next run may last (default: 4)",
+    )
+    parser.add_argument("--free", metavar="A,B,...", default="", help="as for `simgap explain`")
+    parser.add_argument("--jobs", type=positive, metavar="N", help="processes that work at once")
+    add_plugin(parser, "systems")
+    parser.set_defaults(command=_design)
+
+
+def _design(options: argparse.Namespace) -> int:
+    from bench.api.design import design
+    from bench.commands.interrupts import Interrupts
+    from bench.commands.progress import Look
+    from bench.registry import load_plugins
+    from sims.recording.write import refuse_existing
+
+    load_plugins(options.plugin)
+    refuse_existing([options.out])
+    with Look() as look, Interrupts() as interrupts:
+        proposed = design(
+            options.recordings,
+            seconds=options.seconds,
+            system=options.system,
+            model=options.model,
+            free=names(options.free),
+            jobs=options.jobs,
+            say=look.say,
+            stop=interrupts.asked,
+            progress=look.show,
+        )
+    print(proposed.explanation)
+    for line in proposed.lines():
+        print(line)
+    if proposed.design is None:
+        return 1
+    proposed.write(options.out)
+    print(f"commands {options.out}")
+    return 0
