@@ -42,10 +42,17 @@ class NextRecording:
         begin = ", ".join(f"{name} = {value:.4g}" for name, value in found.initial.items())
         lines = [f"record next: {found.says}; begin near {begin}"]
         if found.by == "T":
-            names = ", ".join(found.between)
-            odds = f"{math.sqrt(found.gain):.3g} noises once every number is fitted again"
-            will = "that settles it" if found.settles else "no run of this kind settles it"
-            lines.append(f"the nearest two of {names} differ there by {odds}: {will}")
+            if found.split:
+                sizes = [f"{name} ({math.sqrt(found.told[name]):.3g})" for name in found.split]
+                lines.append(
+                    f"it tells {found.effect} from {', '.join(sizes)}: by so many noises, once "
+                    "every number is fitted again"
+                )
+            stays = [name for name in found.told if name not in found.split]
+            if stays:
+                lines.append(f"no run of this kind tells it from {', '.join(stays)}")
+            else:
+                lines.append("that settles it")
         else:
             lines.append(
                 "nothing is open: it narrows what is known of all numbers together "

@@ -31,6 +31,8 @@ from sims.base import Array, Scenario
 
 SPLITS = 14.0
 """(1) from which a run settles it: odds of 1,000 to 1 for what is true."""
+ENOUGH = 4.0 * SPLITS
+"""(1) beyond which more of it is worth no more."""
 BEST = 8
 """Runs of the largest plain difference for which (1) is asked."""
 SIZES = (1.0, 2.0)
@@ -39,8 +41,10 @@ TRAVEL = 3.0
 """Times the range recorded so far that a channel may leave it, where nothing states its limits."""
 LITTLE = 1e-3
 """Of a channel's usual size, by which an initial state is moved for a derivative."""
-_HARDLY = 1e6
-"""Times that, an initial state is free."""
+WILD = 100.0
+"""Times that such a shift may grow on the way."""
+STEPS = 6
+"""Of a fit of a rival to a run that does not exist."""
 
 
 class Run(NamedTuple):
@@ -58,9 +62,10 @@ class Design:
     Attributes:
         says: the commands, in words.
         by: ``T`` where it tells models apart, ``D`` where it narrows numbers.
-        gain: (1), or by how much the volume of the intervals shrinks, a factor.
-        settles: whether that is enough.
-        between: effects that it tells apart; empty for ``D``.
+        gain: (2), the logarithm of the factor by which the volume of the intervals shrinks; of
+            ``T`` the least of `told`.
+        effect: what stands, if it is to be told from others.
+        told: (1) of each other effect that would explain the same; empty for ``D``.
         times: (T,) seconds.
         inputs: (T,) by name, each value held until the next.
         initial: states to begin from, by name.
@@ -69,11 +74,26 @@ class Design:
     says: str
     by: Literal["T", "D"]
     gain: float
-    settles: bool
-    between: tuple[str, ...]
+    effect: str
+    told: Mapping[str, float]
     times: Array
     inputs: Mapping[str, Array]
     initial: Mapping[str, float]
+
+    @property
+    def split(self) -> tuple[str, ...]:
+        """Other effects that would be told from what stands."""
+        return tuple(name for name, value in self.told.items() if value > SPLITS)
+
+    @property
+    def settles(self) -> bool:
+        """Whether nothing would be open afterwards."""
+        return len(self.split) == len(self.told)
+
+    @property
+    def worth(self) -> float:
+        """What it is chosen by: what it tells of each, more than enough counted once."""
+        return sum(min(value, ENOUGH) for value in self.told.values()) if self.told else self.gain
 
 
 def design(models: Models, model: Model, rivals: Sequence[Model], seconds: float) -> Design | None:
@@ -91,29 +111,31 @@ def design(models: Models, model: Model, rivals: Sequence[Model], seconds: float
         mine = _simulated(world, run, [model.fit.theta], [run.states])
         if mine is None or not _within(world, mine[0]):
             continue
+        if _wild(world, run, model.fit.theta, mine[0]):
+            continue
         ranked.append((_plain(models, run, mine[0], rivals), run, mine[0]))
     ranked.sort(key=lambda entry: -entry[0])
     found: list[Design] = []
     for _, run, mine in ranked[:BEST]:
         if rivals:
-            value = min(_told(models, run, mine, rival) for rival in rivals)
-            names = {name for m in (model, *rivals) for name in m.names}
-            shared = set(model.names).intersection(*(m.names for m in rivals))
-            found.append(_made(world, run, "T", value, tuple(sorted(names - shared))))
+            told = {_other(rival, model): _told(models, run, mine, rival) for rival in rivals}
+            found.append(_made(world, run, min(told.values()), _other(model, rivals[0]), told))
         else:
-            found.append(_made(world, run, "D", _narrowed(models, run, mine, model), ()))
-    return max(found, key=lambda one: one.gain, default=None)
+            found.append(_made(world, run, _narrowed(models, run, mine, model), "", {}))
+    return max(found, key=lambda one: one.worth, default=None)
 
 
-def _made(
-    world: World, run: Run, by: Literal["T", "D"], gain: float, between: tuple[str, ...]
-) -> Design:
+def _other(model: Model, than: Model) -> str:
+    """The effect that a model has and the other has not."""
+    return " and ".join(name for name in model.names if name not in than.names)
+
+
+def _made(world: World, run: Run, gain: float, effect: str, told: Mapping[str, float]) -> Design:
     times = run.scenario.times - run.scenario.times[0]
     initial = dict(zip(world.states, run.states.tolist(), strict=True))
-    settles = gain > SPLITS if by == "T" else gain > 1.0
-    return Design(
-        run.says, by, float(gain), bool(settles), between, times, dict(run.scenario.inputs), initial
-    )
+    by: Literal["T", "D"] = "T" if told else "D"
+    inputs = dict(run.scenario.inputs)
+    return Design(run.says, by, float(gain), effect, told, times, inputs, initial)
 
 
 def _runs(world: World, seconds: float) -> Iterator[Run]:
@@ -240,10 +262,19 @@ def _simulated(
     return np.asarray(result)
 
 
+def _wild(world: World, run: Run, theta: Array, simulated: Array) -> bool:
+    """Whether a run amplifies where it begins: nobody could say later where it went, or why."""
+    count = run.states.size
+    moved = run.states + LITTLE * np.eye(count)
+    runs = _simulated(world, run, [theta] * count, list(moved))
+    if runs is None or not np.isfinite(runs).all():
+        return True
+    sizes = np.array([channel.scale for channel in world.simulator.channels])
+    return bool((np.abs(runs - simulated) / sizes).max() > WILD * LITTLE)
+
+
 def _plain(models: Models, run: Run, mine: Array, rivals: Sequence[Model]) -> float:
-    """What a run shows before anything is fitted again: the least difference from a rival, or how
-    much it moves.
-    """
+    """What a run shows before any refit: how far rivals are, or how much it moves."""
     sigma = models.noise.sigma
     if not rivals:
         return float(np.square(np.std(mine, axis=0) / sigma).sum())
@@ -252,8 +283,8 @@ def _plain(models: Models, run: Run, mine: Array, rivals: Sequence[Model]) -> fl
         other = _simulated(models.world, run, [rival.fit.theta], [run.states])
         if other is None or not np.isfinite(other).all():
             return -np.inf
-        values.append(float(np.square((mine - other[0]) / sigma).sum()))
-    return min(values)
+        values.append(float(np.log1p(np.square((mine - other[0]) / sigma).sum())))
+    return sum(values)
 
 
 class _Slopes(NamedTuple):
@@ -265,12 +296,15 @@ class _Slopes(NamedTuple):
     states: Array
 
 
-def _slopes(models: Models, run: Run, model: Model, centre: Array) -> _Slopes | None:
+def _slopes(models: Models, run: Run, model: Model, at: Array, centre: Array) -> _Slopes | None:
+    """Derivatives about a parameter vector `at`, where the run is `centre`; None where there are
+    none.
+    """
     world, sigma = models.world, models.noise.sigma
     spread = _spread(models, model)
     thetas, states = [], []
     for place, size in zip(model.fit.free.tolist(), spread.tolist(), strict=True):
-        theta = model.fit.theta.copy()
+        theta = at.copy()
         theta[place] += size
         thetas.append(theta)
         states.append(run.states)
@@ -279,7 +313,7 @@ def _slopes(models: Models, run: Run, model: Model, centre: Array) -> _Slopes | 
         moved = run.states.copy()
         moved[place] += LITTLE
         little.append(LITTLE)
-        thetas.append(model.fit.theta)
+        thetas.append(at)
         states.append(moved)
     moved_runs = _simulated(world, run, thetas, states)
     if moved_runs is None or not np.isfinite(moved_runs).all():
@@ -299,28 +333,40 @@ def _spread(models: Models, model: Model) -> Array:
 
 
 def _told(models: Models, run: Run, mine: Array, rival: Model) -> float:
-    """(1)."""
-    other = _simulated(models.world, run, [rival.fit.theta], [run.states])
-    if other is None or not np.isfinite(other).all():
-        return 0.0
-    slopes = _slopes(models, run, rival, other[0])
-    if slopes is None:
-        return 0.0
-    apart = ((mine - other[0]) / models.noise.sigma).ravel()
+    """(1), by a few steps of Gauss and Newton: what the run shows of a rival may be far from it."""
     scale = 1.0 / _spread(models, rival)
     known = np.linalg.pinv(covariance(models, rival) * np.outer(scale, scale), hermitian=True)
-    q = known.shape[0]
-    columns = np.concatenate([slopes.numbers, slopes.states], axis=1)
-    normal = columns.T @ columns
-    normal[:q, :q] += known
-    normal += 1e-12 * np.diag(np.diagonal(normal)) + 1e-12 / _HARDLY * np.eye(len(normal))
-    moved = np.linalg.solve(normal, columns.T @ apart)
-    return float(max(apart @ apart - apart @ (columns @ moved), 0.0))
+    q, free = known.shape[0], rival.fit.free
+    at, states = rival.fit.theta.copy(), run.states.copy()
+    gone, least = np.zeros(q), np.inf
+    for _ in range(STEPS):
+        here = _simulated(models.world, run, [at], [states])
+        if here is None or not np.isfinite(here).all():
+            break
+        left = ((mine - here[0]) / models.noise.sigma).ravel()
+        cost = float(left @ left + gone @ known @ gone)
+        if not cost < least:
+            break
+        least = cost
+        placed = run._replace(states=states)
+        slopes = _slopes(models, placed, rival, at, here[0])
+        if slopes is None:
+            break
+        columns = np.concatenate([slopes.numbers, slopes.states], axis=1)
+        normal, pull = columns.T @ columns, columns.T @ left
+        normal[:q, :q] += known
+        pull[:q] -= known @ gone
+        normal += 1e-9 * np.diag(np.diagonal(normal)) + 1e-18 * np.eye(len(normal))
+        step = np.linalg.solve(normal, pull)
+        gone = gone + step[:q]
+        at, states = at.copy(), states + step[q:]
+        at[free] += step[:q] / scale
+    return least if np.isfinite(least) else 0.0
 
 
 def _narrowed(models: Models, run: Run, mine: Array, model: Model) -> float:
     """(2), as a factor."""
-    slopes = _slopes(models, run, model, mine)
+    slopes = _slopes(models, run, model, model.fit.theta, mine)
     if slopes is None:
         return 0.0
     basis, _ = np.linalg.qr(slopes.states)

@@ -104,6 +104,7 @@ def _pieces(run: Run, seconds: float, longest: float) -> list[Run]:
     length = max(length, FEWEST * float(np.median(np.diff(run.times))))
     count = max(int(seconds / length + 0.5), 1)
     span = _seconds(run) / count
+    length = min(length, span)
     change = _changes(run)
     pieces = []
     for number in range(count):

@@ -28,6 +28,8 @@ PUBLISHED = {
     "smartphone_fall/fall": "quadratic air drag, and an offset",
     "smartphone_fall/up_down": "quadratic air drag, and an offset that varies by run",
     "ball_drops/bowling_ball": "nothing measurable",
+    "emps/explained": "mass 95.1 kg, viscous 203.5 N·s/m, Coulomb 20.4 N, offset −3.2 N",
+    "so101/explained": "nothing",
 }
 HEAD = (
     "| recording | published | verdict | causes (what explains it as well) | held-out RMSE: base | "

@@ -75,12 +75,15 @@ def test_the_proposed_run_splits_the_set(tmp_path):
     assert {"input.lag", "input.delay"} <= ambiguous
     design = proposed.design
     assert design.by == "T"
-    assert design.settles
-    assert set(design.between) == ambiguous
+    assert {design.effect, *design.told} == ambiguous
+    assert design.split
     assert design.times[-1] <= 4.0
     after = write(tmp_path, "after", drawn(design), lag=0.04, seed=1)
     names = names_of(simgap.explain([before, after]))
     assert "input.lag" in names
+    # What it says it would split is split.
+    kept = "input.lag" in (design.effect, *design.split)
+    assert kept
     assert len(names) < len(ambiguous)
     assert "input.delay" not in names
 
@@ -92,7 +95,7 @@ def test_what_no_run_can_split_is_said(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "force.bias" in said
     assert "input.bias" in said
-    assert "no run of this kind settles it" in said
+    assert "no run of this kind tells it from" in said
 
 
 def test_what_is_known_is_narrowed(tmp_path, capsys):

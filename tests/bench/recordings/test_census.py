@@ -44,7 +44,7 @@ def followed(u, w, fine):
 
 def run_of(seed, name="1", stamp=lambda t, rng: t, late=lambda t: t, seconds=SECONDS):
     """A run with sensors read at `late(t)` where the log says t, and stamps that `stamp` makes."""
-    rng, fine = np.random.default_rng(seed), 2000.0
+    rng, fine = np.random.default_rng(seed), 1000.0
     t = stamp(np.arange(0.0, seconds, 1.0 / RATE), rng)
     whole = np.arange(0.0, seconds + 1.0, 1.0 / fine)
     channels, inputs = {}, {}
@@ -76,7 +76,7 @@ def changed(run, **signals):
     )
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_sound_log_has_no_finding(kind, seed):
     assert found(kind, run_of(seed)) == []
 
@@ -131,10 +131,10 @@ def test_an_interval_of_drift_holds():
     from bench.recordings.census import drift
 
     inside = 0
-    for seed in range(40):
+    for seed in range(24):
         (one,) = drift._estimate(run_of(seed, seconds=12.0), "u.m_hip", "q.hip")
         inside += abs(one.drift) < 2 * one.error
-    assert inside >= 34
+    assert inside >= 20
 
 
 def test_coarse_steps(kind):
