@@ -173,9 +173,11 @@ def _runs(world: World, seconds: float) -> Iterator[Run]:
 
 def _forms(step: float, seconds: float) -> Iterator[tuple[str, str]]:
     """Signals of size one, in words and as they are written."""
-    slow, fast = max(1.0 / seconds, 0.1), min(8.0, 0.1 / step)
+    slow = min(max(1.0 / seconds, 0.1), 0.5)
+    fast = max(min(8.0, 0.1 / step), 2.0 * slow)
     yield f"multisine of {slow:.3g} to 1 Hz", f"multisine:1:{slow:g}:1"
-    yield f"multisine of 1 to {fast:.3g} Hz", f"multisine:1:1:{fast:g}"
+    if fast > 1.0:
+        yield f"multisine of 1 to {fast:.3g} Hz", f"multisine:1:1:{fast:g}"
     yield f"chirp of {slow:.3g} to {fast:.3g} Hz", f"chirp:1:{slow:g}:{fast:g}"
     yield "steps of 0.5 s", "steps:1:0.5"
     yield "steps of 0.1 s", "steps:1:0.1"

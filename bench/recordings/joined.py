@@ -53,9 +53,10 @@ def load_all(
         for name, recording in zip(names, recordings, strict=True)
         for run in recording.runs
     ]
+    more = len(loaded) - 1
     joined = replace(
         first,
-        title=f"{first.title} and {len(loaded) - 1} more logs",
+        title=f"{first.title or first.path.stem} and {more} more log{'s' * (more > 1)}",
         constants=constants,
         noise=_noise(recordings),
         runs=tuple(runs),

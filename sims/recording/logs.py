@@ -263,7 +263,8 @@ def _archive(path: Path) -> Log:
     columns: dict[str, Array] = {}
     texts = []
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        # Opened here: what is no archive would be left open by its reader.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             for name in arrays.files:
                 values = arrays[name]
                 if values.dtype.kind not in "fiub" or not 1 <= values.ndim <= 2:

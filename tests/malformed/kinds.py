@@ -236,5 +236,5 @@ def made(strategy, count, act):
 
 def share(kind: str, of: int | None = None) -> int:
     """How many cases of a kind: its share of so many, of $MALFORMED, or of what CI makes."""
-    total = of or int(os.environ.get("MALFORMED", "2000"))
+    total = of or int(os.environ.get("MALFORMED", "1500"))
     return max(SHARES[kind] * total // sum(SHARES.values()), 1)
