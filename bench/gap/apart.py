@@ -34,11 +34,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.gap.measure import Z95, derived
-from bench.gap.model.arrow import held
+from bench.gap.measure import Z95, curved
 from bench.gap.model.fit import prior_of
 from bench.gap.model.models import Model, Models
-from bench.gap.model.noise import Noise, whitened
+from bench.gap.model.noise import whitened
 from bench.gap.model.world import World
 from sims.base import Array
 from sims.recording.recording import Run
@@ -166,29 +165,17 @@ def _groupings(runs: Sequence[Run]) -> Iterator[_Grouping]:
 
 def _by_run(models: Models, model: Model) -> tuple[Array, Array]:
     """(R, q, q) and (R, q) of (1)."""
-    world = models.world
-    fit = derived(models, model.fit)
+    world, fit = models.world, model.fit
     q = fit.free.size
-    noise = Noise(np.maximum(model.likelihood.sigma, 1e-300), model.likelihood.phi)
-    jacobian = whitened(np.where(models.seen[..., None], fit.jacobian, 0.0), models.seen, noise)
-    residual = whitened(models.residual(fit), models.seen, noise)
-    runs, *_, size = jacobian.shape
-    j, e = jacobian.reshape(runs, -1, size), residual.reshape(runs, -1)
-    normal = np.matmul(j.transpose(0, 2, 1), j)
-    pull = np.einsum("rnk,rn->rk", j, e)
-    precision = prior_of(world) ** -2.0
-    pull[:, q:] += precision * (world.guess - fit.states)
-    powers = np.einsum("rii->ri", normal[:, q:, q:])
-    ridge = 1e-12 * powers[:, :, None] * np.eye(powers.shape[1])
-    inner, cross = held(
-        normal[:, q:, q:] + np.diag(precision) + ridge, normal[:, :q, q:], world.known
-    )
+    found = curved(models, model)
+    residual = whitened(models.residual(fit), models.seen, found.noise)
+    pull = np.einsum("rnk,rn->rk", found.jacobian, residual.reshape(len(residual), -1))
+    pull[:, q:] += prior_of(world) ** -2.0 * (world.guess - fit.states)
     pull[:, q:] *= ~world.known
-    solved = np.linalg.solve(
-        inner, np.concatenate([cross.transpose(0, 2, 1), pull[:, q:, None]], 2)
-    )
-    curvatures = normal[:, :q, :q] - np.matmul(cross, solved[..., :-1])
-    gradients = pull[:, :q] - np.matmul(cross, solved[..., -1:])[..., 0]  # (1)
+    right = np.concatenate([found.cross.transpose(0, 2, 1), pull[:, q:, None]], 2)
+    solved = np.linalg.solve(found.inner, right)
+    curvatures = found.own - np.matmul(found.cross, solved[..., :-1])
+    gradients = pull[:, :q] - np.matmul(found.cross, solved[..., -1:])[..., 0]  # (1)
     return curvatures, gradients
 
 

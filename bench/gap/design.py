@@ -116,13 +116,33 @@ def design(models: Models, model: Model, rivals: Sequence[Model], seconds: float
         ranked.append((_plain(models, run, mine[0], rivals), run, mine[0]))
     ranked.sort(key=lambda entry: -entry[0])
     found: list[Design] = []
+    # Once for all runs: what the old ones know does not hang on the new one.
+    known = [_known(models, one) for one in (rivals or [model])]
     for _, run, mine in ranked[:BEST]:
         if rivals:
-            told = {_other(rival, model): _told(models, run, mine, rival) for rival in rivals}
+            told = {_other(one.model, model): _told(models, run, mine, one) for one in known}
             found.append(_made(world, run, min(told.values()), _other(model, rivals[0]), told))
         else:
-            found.append(_made(world, run, _narrowed(models, run, mine, model), "", {}))
+            found.append(_made(world, run, _narrowed(models, run, mine, known[0]), "", {}))
     return max(found, key=lambda one: one.worth, default=None)
+
+
+class _Known(NamedTuple):
+    """What the old runs know of a model's numbers: their covariance, and a size of each, 1 sigma
+    but no more than a tenth of its bounds.
+    """
+
+    model: Model
+    covariance: Array
+    spread: Array
+
+
+def _known(models: Models, model: Model) -> _Known:
+    own = covariance(models, model)
+    bounds = np.array([models.world.parameters[i].bounds for i in model.fit.free]).reshape(-1, 2)
+    widest = 0.1 * (bounds[:, 1] - bounds[:, 0])
+    sizes = np.sqrt(np.maximum(np.diagonal(own), 1e-300))
+    return _Known(model, own, np.minimum(sizes, widest))
 
 
 def _other(model: Model, than: Model) -> str:
@@ -298,14 +318,14 @@ class _Slopes(NamedTuple):
     states: Array
 
 
-def _slopes(models: Models, run: Run, model: Model, at: Array, centre: Array) -> _Slopes | None:
+def _slopes(models: Models, run: Run, known: _Known, at: Array, centre: Array) -> _Slopes | None:
     """Derivatives about a parameter vector `at`, where the run is `centre`; None where there are
     none.
     """
     world, sigma = models.world, models.noise.sigma
-    spread = _spread(models, model)
+    spread = known.spread
     thetas, states = [], []
-    for place, size in zip(model.fit.free.tolist(), spread.tolist(), strict=True):
+    for place, size in zip(known.model.fit.free.tolist(), spread.tolist(), strict=True):
         theta = at.copy()
         theta[place] += size
         thetas.append(theta)
@@ -325,21 +345,12 @@ def _slopes(models: Models, run: Run, model: Model, at: Array, centre: Array) ->
     return _Slopes(columns[:, :q], columns[:, q:] / np.array(little))
 
 
-def _spread(models: Models, model: Model) -> Array:
-    """(q,) 1 sigma of each number, no more than a tenth of its bounds."""
-    variances = np.diagonal(covariance(models, model))
-    bounds = np.array([models.world.parameters[i].bounds for i in model.fit.free]).reshape(-1, 2)
-    widest = 0.1 * (bounds[:, 1] - bounds[:, 0])
-    spread: Array = np.minimum(np.sqrt(np.maximum(variances, 1e-300)), widest)
-    return spread
-
-
-def _told(models: Models, run: Run, mine: Array, rival: Model) -> float:
+def _told(models: Models, run: Run, mine: Array, rival: _Known) -> float:
     """(1), by a few steps of Gauss and Newton: what the run shows of a rival may be far from it."""
-    scale = 1.0 / _spread(models, rival)
-    known = np.linalg.pinv(covariance(models, rival) * np.outer(scale, scale), hermitian=True)
-    q, free = known.shape[0], rival.fit.free
-    at, states = rival.fit.theta.copy(), run.states.copy()
+    fit, scale = rival.model.fit, 1.0 / rival.spread
+    known = np.linalg.pinv(rival.covariance * np.outer(scale, scale), hermitian=True)
+    q, free = known.shape[0], fit.free
+    at, states = fit.theta.copy(), run.states.copy()
     gone, least = np.zeros(q), np.inf
     for _ in range(STEPS):
         here = _simulated(models.world, run, [at], [states])
@@ -366,14 +377,14 @@ def _told(models: Models, run: Run, mine: Array, rival: Model) -> float:
     return least if np.isfinite(least) else 0.0
 
 
-def _narrowed(models: Models, run: Run, mine: Array, model: Model) -> float:
+def _narrowed(models: Models, run: Run, mine: Array, known: _Known) -> float:
     """(2), as a factor."""
-    slopes = _slopes(models, run, model, model.fit.theta, mine)
+    slopes = _slopes(models, run, known, known.model.fit.theta, mine)
     if slopes is None:
         return 0.0
     basis, _ = np.linalg.qr(slopes.states)
     own = slopes.numbers - basis @ (basis.T @ slopes.numbers)
-    scale = 1.0 / _spread(models, model)
-    known = covariance(models, model) * np.outer(scale, scale)
-    _, value = np.linalg.slogdet(np.eye(len(known)) + known @ (own.T @ own))
+    scale = 1.0 / known.spread
+    scaled = known.covariance * np.outer(scale, scale)
+    _, value = np.linalg.slogdet(np.eye(len(scaled)) + scaled @ (own.T @ own))
     return float(0.5 * value)

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -226,6 +227,33 @@ def covariance(models: Models, model: Model) -> Array:
 
 def _curvatures(models: Models, model: Model) -> tuple[Array, Array]:
     """(q, q) the first sum of (2), and both together, which (2) inverts."""
+    found = curved(models, model)
+    own = found.own.sum(axis=0)
+    # The theorem by which a step of the fit is solved eliminates them here, too.
+    left, _ = schur_complement(own, found.cross, found.inner)
+    return own, left
+
+
+class Curved(NamedTuple):
+    """The pieces of (2), run by run.
+
+    Attributes:
+        noise: by which they are whitened: what the model leaves.
+        jacobian: (R, n, q + s) whitened derivatives by parameters and by initial states.
+        own: (R, q, q) A' A.
+        cross: (R, q, s) A' B, zero where an initial state is known.
+        inner: (R, s, s) B' B with what was known beforehand.
+    """
+
+    noise: Noise
+    jacobian: Array
+    own: Array
+    cross: Array
+    inner: Array
+
+
+def curved(models: Models, model: Model) -> Curved:
+    """The curvature of the sum of squares about a fitted model, run by run."""
     world = models.world
     q = model.fit.free.size
     fit = derived(models, model.fit)
@@ -237,7 +265,6 @@ def _curvatures(models: Models, model: Model) -> tuple[Array, Array]:
     runs, *_, size = jacobian.shape
     j = jacobian.reshape(runs, -1, size)
     normal = np.matmul(j.transpose(0, 2, 1), j)
-    own = normal[:, :q, :q].sum(axis=0)
     precision = 1.0 / prior_of(world) ** 2
     # In an unstable motion all initial states may show alike.
     powers = np.einsum("rii->ri", normal[:, q:, q:])
@@ -248,9 +275,7 @@ def _curvatures(models: Models, model: Model) -> tuple[Array, Array]:
         normal[:, :q, q:],
         world.known,
     )
-    # The theorem by which a step of the fit is solved eliminates them here, too.
-    left, _ = schur_complement(own, cross, inner)
-    return own, left
+    return Curved(noise, j, normal[:, :q, :q], cross, inner)
 
 
 def intervals(models: Models, model: Model) -> dict[int, tuple[float, float, float]]:
