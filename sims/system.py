@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from types import MappingProxyType
 from typing import ClassVar, Literal, Protocol
@@ -97,6 +97,21 @@ class Moment:
         return load
 
     @property
+    def error(self) -> Array:
+        """(L, 1) of the servo: how far its set point is from where it is."""
+        error: Array = self.inputs[self.system.servo] - self.primary
+        return error
+
+    def aimed(self, shift: Array) -> Array:
+        """(L, D) what the drive would exert more if its servo's set point were moved by `shift`
+        (L, 1).
+        """
+        name = self.system.servo
+        moved = replace(self, inputs={**self.inputs, name: self.inputs[name] + shift})
+        more: Array = self.system.drive(moved) - self.system.drive(self)
+        return more
+
+    @property
     def primary(self) -> Array:
         """(L, 1) the coordinate that biases, springs and ripples act on."""
         return self.x[:, self.system.primary, None]
@@ -148,6 +163,7 @@ class System(ABC):
         bounces: whether its last coordinate strikes ground at `floor`.
         sensed: channels that sensor effects may act on, in order of preference.
         primary: index of the coordinate that biases and springs act on.
+        servo: input that is the set point of a servo's primary coordinate; empty where none is.
         uniform: whether its own force is the same everywhere and always, so that it moves along
             parabolas.
         has_model: whether it comes from a model file, whose numbers may be wrong.
@@ -166,6 +182,7 @@ class System(ABC):
     states: ClassVar[Mapping[str, float]]
     sensed: ClassVar[tuple[str, ...]]
     primary: ClassVar[int] = 0
+    servo: ClassVar[str] = ""
     bounces: ClassVar[bool] = False
     uniform: ClassVar[bool] = False
     has_model: ClassVar[bool] = False
@@ -175,6 +192,11 @@ class System(ABC):
     def reading(cls, observed: Sequence[str]) -> str:
         """The channel among those `observed` whose value sensor effects act on."""
         return next((name for name in cls.sensed if name in observed), observed[0])
+
+    @classmethod
+    def gear(cls, coordinate: int) -> float:  # noqa: ARG003
+        """By how much its servo turns for each unit of a coordinate."""
+        return 1.0
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
@@ -262,7 +284,8 @@ class Coefficient:
             exist there.
         plausible: the range one would expect, in the same order.
         of: whose unit it has where `units` are only the usual ones: ``input`` the first input's,
-            ``reading`` that of the channel it acts on, ``reading/s`` the same per second;
+            ``reading`` that of the channel it acts on, ``input/s`` and ``reading/s`` the same per
+            second;
             ``drive`` is a limit of the drive's force, with units of its own.
         least: what a fit may not go below, where that is not a matter of plausibility.
     """
@@ -270,7 +293,7 @@ class Coefficient:
     name: str
     units: tuple[str | None, str | None, str | None]
     plausible: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-    of: Literal["", "input", "reading", "reading/s", "drive"] = ""
+    of: Literal["", "input", "input/s", "reading", "reading/s", "drive"] = ""
     least: float | None = None
 
     def unit(self, kind: Kind) -> str | None:
@@ -283,8 +306,8 @@ class Coefficient:
         """
         if system.has_model:
             return self.unit(system.kind)
-        if self.of == "input" and system.inputs:
-            return system.inputs[0].unit
+        if self.of.startswith("input") and system.inputs:
+            return self.of.replace("input", system.inputs[0].unit)
         if self.of.startswith("reading"):
             units = {channel.name: channel.unit for channel in system.channels}
             return self.of.replace("reading", units[system.reading(observed or tuple(units))])
@@ -310,8 +333,9 @@ class Effect(ABC):
             a kind of system does not have come last and stay zero there; a kind that lacks the
             first lacks the effect.
         needs: what the system must have: ``input``; ``ground`` to strike; ``guide``, which a body
-            that flies freely lacks; ``gravity``; ``push``, a say in what horizontal acceleration
-            does to it; ``space`` of three dimensions; ``model``, a file that states its numbers;
+            that flies freely lacks; ``servo``, an input that is a set point; ``gravity``; ``push``,
+            a say in what horizontal acceleration does to it; ``space`` of three dimensions;
+            ``model``, a file that states its numbers;
             or empty.
         contains: simpler effects that it turns into where some of its coefficients are zero.
         hook: which of the engine's hooks it uses; set by the hook classes.
@@ -359,6 +383,7 @@ class Effect(ABC):
             "ground": "" if system.bounces else "it meets no ground",
             # What bounces flies freely: dry friction and springs have nothing to hold on to.
             "guide": "it flies freely" if system.bounces else "",
+            "servo": "" if declared.servo else "it has no servo that follows a set point",
             "gravity": "" if heavy else "it states no gravity",
             "push": "" if says_push else "it does not say what horizontal acceleration does",
             "space": "" if in_space else "it does not move in three dimensions",

@@ -304,22 +304,34 @@ class _Explainer:
         # Loaded where there is a robot alone.
         from bench.gap.model.numerics import finer
 
-        fine = finer(self.fitting, self.noise)
-        if fine is None:
-            return base
         coarse = self.kind, self.fitting, self.measuring
-        value = self._value(base)
-        self._enter(fine.kind)
-        other = fit_base(self.fitting, self.noise, self._given())
-        gain = self._value(other) - value
-        if gain < SWITCH:
-            # What the robot does is no nearer to its fine motion: the file's own step stands.
-            self._return(*coarse)
-            return base
-        self.say(f"stepped more finely: {fine.numerics.integrator}, {fine.numerics.timestep:g} s")
-        self.coarse = Coarse(fine, gain)
-        self.assessor = replace(self.assessor, before=self._before(base, coarse[2]))
-        return other
+        value, left = self._value(base), self._left(base)
+        for fine in finer(self.fitting, self.noise):
+            # A finer step leaves less: one that is too coarse for what is left is not tried.
+            if not fine.suits(left):
+                continue
+            self._enter(fine.kind)
+            other = fit_base(self.fitting, self.noise, self._given())
+            left = self._left(other)
+            gain = self._value(other) - value
+            if gain < SWITCH:
+                # What the robot does is no nearer to its fine motion: the file's own step stands.
+                if fine.suits(0.0):
+                    break
+                left = 0.0
+            elif fine.suits(left):
+                numerics = fine.numerics
+                self.say(f"stepped more finely: {numerics.integrator}, {numerics.timestep:g} s")
+                self.coarse = Coarse(fine, gain)
+                self.assessor = replace(self.assessor, before=self._before(base, coarse[2]))
+                return other
+        self._return(*coarse)
+        return base
+
+    def _left(self, base: Base) -> float:
+        """What a base model leaves, RMS in units of the noise."""
+        scaled = (self.fitting.observed - base.fit.simulated) / self.noise.sigma
+        return float(np.sqrt(np.square(scaled[np.isfinite(self.fitting.observed)]).mean()))
 
     def _before(self, base: Base, measuring: World | None) -> Array | None:
         """What the file's own step makes of the held-out runs; None where there are none."""

@@ -11,6 +11,7 @@ With u the command, w what the plant feels and c the coefficient:
 * (5) dead band: w = u - clip(u, -c, c)
 * (6) saturation: w = clip(u, -c, c)
 * (7) backlash: w stays while |u - w| <= c / 2, else it is pushed along by the nearer flank
+* (8) rate: dw/dt = clip((u - w) / h, -c, c) over a step h, from the first command on
 
 A negative delay leads; a negative lag, width or limit is none.
 """
@@ -37,6 +38,10 @@ _WIDTH = ((0, 2), (0, 2), (0, 0.2))
 """Plausible widths of dead band and play, in the units of `_USUAL`."""
 _LIMIT = ((0, 10), (0, 10), (0, 2))
 """Plausible limits, in the units of `_USUAL`."""
+_PER_SECOND = ("m/s^3", "N/s", "N*m/s")
+"""Units of `_USUAL`, per second."""
+_SLEW = ((0, 50), (0, 50), (0, 10))
+"""Plausible limits of the rate, in the units of `_PER_SECOND`."""
 _DELAY = (-0.05, 0.2)
 """Plausible delays, s: stamps may be late by a sample or two, so that a command seems to lead."""
 _FEEDBACK = "K. J. Astrom, R. M. Murray, Feedback Systems (2008)"
@@ -161,6 +166,21 @@ class Backlash(Input):
         return np.where(c[0] > 0, played, signal.values)
 
 
+class Rate(Input):
+    """The input follows no faster than c a second; a limit of zero is none."""
+
+    name = "input.rate"
+    noun = "a limit of the input's rate"
+    says = "the input follows commands no faster than a limit"
+    source = _NONLINEAR
+    coefficients = (Coefficient("coefficient", _PER_SECOND, _SLEW, of="input/s"),)
+
+    def feel(self, c: Array, signal: Signal) -> Array:
+        """The mean over each step of what is reached at the limit."""
+        limit = np.where(c[0] > 0, c[0], np.inf)
+        return np.where(c[0] > 0, _slewed(signal, limit), signal.values)
+
+
 def _lagged(signal: Signal, lag: Array) -> Array:
     """Means (L, S) over each step of (4), `lag` (L, 1) in seconds."""
     # the command is constant over a step, so (2) of sims.effects.lag leads from end to end
@@ -182,3 +202,25 @@ def _pushed(signal: Signal, half: Array) -> Array:
         np.maximum(state, below, out=below)
         state = np.minimum(below, above, out=below)
     return low.T
+
+
+def _slewed(signal: Signal, limit: Array) -> Array:
+    """Means (L, S) over each step of (8), `limit` (L, 1) of the rate, endless where there is
+    none.
+    """
+    wanted = np.ascontiguousarray(signal.values.T)
+    # An endless limit over a step of no length is none.
+    reach = np.where(signal.steps > 0, limit * np.where(signal.steps > 0, signal.steps, 1.0), 0.0).T
+    back = -reach
+    moved = np.empty_like(wanted)
+    ends = np.empty_like(wanted)
+    state: Array = signal.start[:, 0]
+    for row, up, down, move, end in zip(wanted, reach, back, moved, ends, strict=True):
+        np.subtract(row, state, out=move)
+        np.minimum(move, up, out=move)
+        np.maximum(move, down, out=move)
+        state = np.add(state, move, out=end)
+    # It rises for as long as the limit asks, and stays for the rest of the step.
+    rising = np.abs(moved) / np.where(reach > 0, reach, np.inf)
+    means = ends - 0.5 * rising * moved
+    return np.where(np.isfinite(reach), means, wanted).T

@@ -7,7 +7,12 @@ sticks. With v the velocity, limits are
 * (2) Stribeck: coulomb + extra exp(-(v / speed)^2)
 * (3) load: c |drive - load|, each counted as it pushes the joint
 
-A negative limit is none.
+A negative limit is none. And one that is no limit but a force, since it vanishes at rest:
+
+* (4) direction: -viscous+ v where v > 0, -viscous- v where v < 0
+
+Dry friction that differs by direction needs no law of its own: with limits d+ and d- it is, at rest
+as in motion, Coulomb friction of (d+ + d-) / 2 and a constant force of -(d+ - d-) / 2.
 """
 
 from __future__ import annotations
@@ -15,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from sims.base import Array
-from sims.system import Coefficient, Friction, Moment
+from sims.system import Coefficient, Force, Friction, Moment
 
 _SURVEY = (
     "B. Armstrong-Helouvry et al., Automatica 30(7), 1083 (1994), doi:10.1016/0005-1098(94)90209-7"
@@ -24,6 +29,10 @@ _SMALLEST = 1e-9
 """m/s or rad/s; the Stribeck speed that stands for zero, so that 0 / 0 never comes up."""
 _USUAL = ("m/s^2", "N", "N*m")
 """Units of a force on the three kinds of system."""
+_VISCOUS = (None, "N*s/m", "N*m*s/rad")
+"""Units of a viscous friction, where motion has two ways."""
+_DAMPED = ((0, 0), (0, 5), (0, 0.05))
+"""Plausible ones, in the units of `_VISCOUS`."""
 
 
 class Coulomb(Friction):
@@ -74,6 +83,22 @@ class Load(Friction):
     def limit(self, c: Array, moment: Moment) -> Array:
         """In proportion to the load."""
         return np.maximum(c[0], 0.0) * moment.load  # (3)
+
+
+class Direction(Force):
+    """Viscous friction that differs by the way of the motion."""
+
+    name = "friction.direction"
+    noun = "friction that differs by direction"
+    says = "motion is resisted more one way than the other"
+    source = "A. Janot, M. Gautier, M. Brunot, Nonlinear System Identification Benchmarks (2019)"
+    needs, contains = "guide", ("drag.linear",)
+    coefficients = tuple(Coefficient(f"viscous{way}", _VISCOUS, _DAMPED) for way in "+-")
+
+    def force(self, c: Array, moment: Moment) -> Array:
+        """In proportion to speed, by that of the way in which it moves."""
+        ahead, back = np.maximum(moment.v, 0.0), np.minimum(moment.v, 0.0)
+        return -c[0] * ahead - c[1] * back  # (4)
 
 
 def _falling(speed: Array, scale: Array) -> Array:

@@ -8,9 +8,10 @@ With y what there is, r what is recorded, t the time stamp and c the coefficient
 * (4) lag: c dr/dt = y - r (`sims.effects.lag`)
 * (5) drift: r(t) = y(t) + c t
 * (6) clock: r(t) = y((1 + c) t)
+* (7) eccentricity: r = y + a sin y + b cos y, y an angle
 
-Gain, bias and drift act on one channel, the system's first observed; a delay, a lag and a skewed
-clock on all. A negative delay leads; a negative lag is none.
+Gain, bias, drift and eccentricity act on one channel, the system's first observed; a delay, a lag
+and a skewed clock on all. A negative delay leads; a negative lag is none.
 """
 
 from __future__ import annotations
@@ -37,6 +38,10 @@ _DRIFT = ((-0.2, 0.2), (-0.05, 0.05), (-0.1, 0.1))
 """Plausible drifts, in the units of `_SPEED`."""
 _SLOW = ((-0.05, 0.05), (-0.05, 0.05), (-0.05, 0.05))
 """Plausible errors of a clock, seconds a second."""
+_ANGLE = (None, None, "rad")
+"""Of what an encoder of angles shows."""
+_OFF_AXIS = ((0, 0), (0, 0), (-0.1, 0.1))
+"""Plausible errors of an encoder that is off its axis, in the units of `_ANGLE`."""
 _VOCABULARY = "International Vocabulary of Metrology, JCGM 200:2012"
 
 
@@ -110,6 +115,22 @@ class Drift(Sensor):
     def read(self, c: Array, signal: Signal) -> Array:
         """Further off as time goes on."""
         return signal.values + c[0] * signal.times  # (5)
+
+
+class Eccentricity(Sensor):
+    """An encoder's disc or magnet that is off its axis: an error that comes once a turn."""
+
+    name = "sensor.eccentricity"
+    noun = "an eccentric encoder"
+    says = "the encoder is off its axis, so that its error comes once a turn"
+    source = "X.-D. Lu et al., CIRP Annals 59(1), 529 (2010), introduction"
+    needs = "guide"
+    coefficients = tuple(Coefficient(of, _ANGLE, _OFF_AXIS) for of in ("sine", "cosine"))
+
+    def read(self, c: Array, signal: Signal) -> Array:
+        """As far off as the angle says."""
+        y = signal.values
+        return y + c[0] * np.sin(y) + c[1] * np.cos(y)  # (7)
 
 
 class Skew(Sensor):

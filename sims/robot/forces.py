@@ -20,13 +20,22 @@ OVER_TIME = frozenset({"force.bias", "force.periodic"})
 
 
 def moment_of(
-    system: RobotSystem, t: Array, x: Array, v: Array, inputs: Mapping[str, Array], carried: Array
+    system: RobotSystem,
+    t: Array,
+    x: Array,
+    v: Array,
+    inputs: Mapping[str, Array],
+    carried: Array,
+    stiffness: Array | None = None,
 ) -> RobotMoment:
-    """The instant of lanes; t (L, 1), all others (L, D)."""
+    """The instant of lanes; t (L, 1), all others (L, D); without `stiffness` no servo is at
+    work.
+    """
     theta = np.zeros((len(x), 0))
-    return RobotMoment(
-        system, theta, {}, t, x, v, inputs, carried, system.alone, dict(system.drives)
-    )
+    stiff = np.zeros((0, 0)) if stiffness is None else stiffness
+    drives, servos = dict(system.drives), dict(system.servos)
+    joints = system.alone, drives, servos, stiff
+    return RobotMoment(system, theta, {}, t, x, v, inputs, carried, *joints)
 
 
 def over_time(system: RobotSystem, acting: Acting, t: Array, size: int, lanes: int) -> Array:
@@ -58,12 +67,19 @@ class Forces:
         acting: effects at one place each.
         count: how many lanes.
         addresses: of the joints.
+        stiffness: (L, D) of their position servos.
     """
 
     def __init__(
-        self, system: RobotSystem, acting: Acting, count: int, addresses: Addresses
+        self,
+        system: RobotSystem,
+        acting: Acting,
+        count: int,
+        addresses: Addresses,
+        stiffness: Array | None = None,
     ) -> None:
         self._system = system
+        self._stiffness = stiffness
         self._count = count
         self.addresses = addresses
         asked = [(e, c) for e, c in acting if e.hook == "force" and e.of not in OVER_TIME]
@@ -80,7 +96,7 @@ class Forces:
     ) -> tuple[Array, Array]:
         """Forces and limits of dry friction (L, D) each, at an instant."""
         now = np.full((len(x), 1), t)
-        moment = moment_of(self._system, now, x, v, inputs, carried)
+        moment = moment_of(self._system, now, x, v, inputs, carried, self._stiffness)
         force = np.zeros_like(x)
         for effect, c in self._forces:
             force += effect.force(c, moment)

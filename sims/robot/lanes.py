@@ -283,6 +283,20 @@ class Bench:
         self._fails(n)
         return result
 
+    def stiffness(self, places: Addresses) -> Array:
+        """(LANES, D) what position servos exert for each unit of their errors, as the lanes are
+        loaded; zero of joints without one.
+        """
+        robot = self.robot
+        result = np.zeros((self.count, len(places.velocities)))
+        columns = {int(place): i for i, place in enumerate(places.velocities)}
+        for actuator in robot.actuators:
+            if actuator.kind == "position" and actuator.joint is not None:
+                gear = float(robot.compiled.actuator_gear[actuator.id, 0])
+                gain = self.fields["actuator_gainprm"][:, actuator.id, 0]
+                result[:, columns[robot.joint(actuator.joint).velocity]] += gear * gain
+        return result
+
     def rub(self, n: int, dof: int, limit: Array) -> None:
         """Let dry friction of at most `limit` (n,) besides act on the first n lanes of a joint."""
         loss = self.fields["dof_frictionloss"]

@@ -49,14 +49,29 @@ class JointMoment(Moment):
 
     Attributes:
         carried: (L, 1) what its transmission carries, with its sign.
+        goal: (L, 1) set point of its position servo; NaN without one.
+        stiffness: (L, 1) what that exerts for each unit of its error.
+        gear: by how much it turns for each unit of the joint's position.
     """
 
     carried: Array = field(default_factory=lambda: np.zeros((0, 1)))
+    goal: Array = field(default_factory=lambda: np.zeros((0, 1)))
+    stiffness: Array = field(default_factory=lambda: np.zeros((0, 1)))
+    gear: float = 1.0
 
     @property
     def load(self) -> Array:
         """(L, 1) what the transmission carries, whichever way."""
         return np.abs(self.carried)
+
+    @property
+    def error(self) -> Array:
+        """See `Moment`."""
+        return self.goal - self.gear * self.x
+
+    def aimed(self, shift: Array) -> Array:
+        """See `Moment`; a limit of the actuator's force is not in it."""
+        return self.stiffness * shift
 
 
 @dataclass
@@ -68,11 +83,15 @@ class RobotMoment(Moment):
             and what comes of the motion of the other bodies from the other.
         alone: (D,) each joint as a system of its own.
         drives: by coordinate, the inputs of its actuators.
+        servos: by coordinate, the input that is the set point of its position servo.
+        stiffness: (L, D) what position servos exert for each unit of their errors; zero without.
     """
 
     carried: Array = field(default_factory=lambda: np.zeros((0, 0)))
     alone: tuple[System, ...] = ()
     drives: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    servos: dict[int, str] = field(default_factory=dict)
+    stiffness: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def of_joint(self, joint: int) -> JointMoment:
         """The instant as one joint sees it."""
@@ -80,6 +99,8 @@ class RobotMoment(Moment):
         inputs = {
             name: self.inputs[name] for name in self.drives.get(joint, ()) if name in self.inputs
         }
+        servo = self.servos.get(joint)
+        followed = servo is not None and servo in self.inputs and self.stiffness.size
         return JointMoment(
             self.alone[joint],
             self.theta,
@@ -89,4 +110,7 @@ class RobotMoment(Moment):
             self.v[:, one],
             inputs,
             self.carried[:, one],
+            self.inputs[servo] if followed and servo else np.full_like(self.t, np.nan),
+            self.stiffness[:, one] if followed else np.zeros_like(self.t),
+            self.system.gear(joint),
         )

@@ -33,7 +33,15 @@ from sims.system import (
 
 SHARED = frozenset({"input.delay", "input.hold", "input.lag", "sensor.delay", "sensor.lag"})
 """Families of one coefficient for all places: what is late is late everywhere."""
-ALONE = frozenset({"force.periodic", "force.ripple", "friction.stribeck"})
+ALONE = frozenset(
+    {
+        "force.periodic",
+        "force.ripple",
+        "friction.direction",
+        "friction.stribeck",
+        "sensor.eccentricity",
+    }
+)
 """Effects without a family: what shapes them differs from place to place."""
 TYPICAL = {"hinge": 0.5, "slide": 5.0}
 """A force for which the plausible ranges of the library are meant: N m on a hinge, N on a slide."""
@@ -67,6 +75,7 @@ class Spot(NamedTuple):
         inertia: about it, kg or kg m^2.
         stated: what the file states, by name of the effect that changes it.
         words: how a sentence calls it.
+        servo: whether it is an actuator that follows a set point of its position.
     """
 
     name: str
@@ -78,6 +87,7 @@ class Spot(NamedTuple):
     inertia: float
     stated: Mapping[str, float]
     words: str
+    servo: bool = False
 
 
 def at_world(effect: type[Effect]) -> type[Effect]:
@@ -184,8 +194,8 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
     i = 2 if spot.kind == "hinge" else 1
     unit, (low, high) = c.units[i], c.plausible[i]
     least = c.least
-    if c.of == "input":
-        unit = spot.unit
+    if c.of.startswith("input"):
+        unit = c.of.replace("input", spot.unit)
     elif c.of.startswith("reading"):
         unit = c.of.replace("reading", spot.unit)
     # What the library calls plausible is meant for small joints: a force here may be larger.
@@ -243,6 +253,7 @@ def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[S
                 unit=unit,
                 stated=_gains(robot, actuator.id),
                 words=f"actuator {actuator.name}",
+                servo=actuator.kind == "position",
             )
         )
     for body in robot.bodies:
@@ -312,7 +323,7 @@ def _for_one(effect: type[Effect]) -> bool:
     if issubclass(effect, Input | Sensor):
         return True
     # A force that asks for more than its own joint has no meaning at one of several.
-    alone = effect.needs in ("", "guide", "input")
+    alone = effect.needs in ("", "guide", "input", "servo")
     return alone and issubclass(effect, Force | Friction)
 
 
@@ -322,6 +333,13 @@ def _acts_at(effect: type[Effect], spot: Spot, found: Mapping[str, Sequence[Spot
         return False
     if effect.at == "joint" and effect.needs == "input":
         return any(actuator.coordinate == spot.coordinate for actuator in found["actuator"])
+    if effect.needs == "servo" and not spot.servo:
+        return False
+    # What is an angle to an encoder is none to what else is recorded.
+    if effect.at == "channel" and not effect.coefficients[0].of:
+        unit = effect.coefficients[0].unit(_KINDS[spot.kind])
+        if unit is None or (unit == "rad" and spot.unit != "rad"):
+            return False
     if issubclass(effect, Value) and effect.at == "actuator":
         return spot.stated.get(effect.name, 1.0) != 0.0
     return True

@@ -255,7 +255,8 @@ class RobotSimulator(Simulated):
             record.append("sensordata")
         record = list(dict.fromkeys(record))
         if asked:
-            asking = Forces(self.robotic, start.acting, n, self.addresses)
+            stiffness = bench.stiffness(self.addresses)[:n]
+            asking = Forces(self.robotic, start.acting, n, self.addresses, stiffness)
             done = bench.ask(given.controls, given.forces, given.felt, asking, self.step, record)
         else:
             done = bench.run(given.controls, given.forces, record)

@@ -25,6 +25,7 @@ class RobotSystem(System):
         spots: its places by kind.
         alone: (D,) each joint as a system of its own.
         drives: by coordinate, the inputs of its actuators.
+        servos: by coordinate, the input that is the set point of its position servo.
     """
 
     name = "robot"
@@ -42,9 +43,18 @@ class RobotSystem(System):
     spots: ClassVar[Mapping[str, Sequence[places.Spot]]]
     alone: ClassVar[tuple[System, ...]]
     drives: ClassVar[Mapping[int, tuple[str, ...]]]
+    servos: ClassVar[Mapping[int, str]]
     freed: ClassVar[frozenset[str]] = frozenset()
     freed_effects: ClassVar[tuple[type[Effect], ...]] = ()
     _placed: ClassVar[dict[str, tuple[type[Effect], ...]]]
+
+    @classmethod
+    def gear(cls, coordinate: int) -> float:
+        """See `System`."""
+        name = cls.servos[coordinate].partition(".")[2] if coordinate in cls.servos else ""
+        if not name:
+            return 1.0
+        return float(cls.robot.compiled.actuator_gear[cls.robot.actuator(name).id, 0])
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
@@ -155,8 +165,14 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
     states = {f"q.{j.name}": float(model.qpos0[j.position]) for j in joints}
     states |= {f"qd.{j.name}": 0.0 for j in joints}
     drives: dict[int, tuple[str, ...]] = {}
+    servos: dict[int, str] = {}
     for number, joint in enumerate(joints):
-        drives[number] = tuple(f"u.{a.name}" for a in robot.actuators if a.joint == joint.name)
+        own = [a for a in robot.actuators if a.joint == joint.name]
+        drives[number] = tuple(f"u.{a.name}" for a in own)
+        follows = [f"u.{a.name}" for a in own if a.kind == "position"]
+        # Of several which one is off would not show in the joint's motion.
+        if len(follows) == 1:
+            servos[number] = follows[0]
     declared: dict[str, Any] = {
         "name": robot.name,
         "says": f"the robot of {robot.path.name}",
@@ -172,6 +188,7 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
         "spots": places.spots(robot, [(c.name, c.unit) for c in channels]),
         "alone": tuple(OneJoint() if j.kind == "hinge" else Slide() for j in joints),
         "drives": drives,
+        "servos": servos,
         "_placed": {},
     }
     system: type[RobotSystem] = type("RobotSystemOfFile", (RobotSystem,), declared)

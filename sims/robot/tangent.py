@@ -153,6 +153,8 @@ class Tangent:
             bench.batch.bind(name)
         self.looks = 0
         self._asked = [(e, c) for e, c in acting if is_asked(e)]
+        bench.load(_repeated(acting, bench.count))
+        self._stiffness = bench.stiffness(places)[:1]
         bench.batch.reset(stage=0)
         self._fresh = bench.batch.state.copy()
         self._base, self._read = self._advanced({}, acting)
@@ -249,7 +251,7 @@ class Tangent:
         v = bind("qvel")[:n, places.velocities]
         inputs = {name: u[at][:, None] for name, u in motion.inputs.items()}
         t: Array = motion.step * at[:, None].astype(np.float64)
-        moment = moment_of(self._system, t, x, v, inputs, motion.carried[at])
+        moment = moment_of(self._system, t, x, v, inputs, motion.carried[at], self._stiff(n))
         for effect, c in self._asked:
             own = np.repeat(c, n, axis=1)
             if isinstance(effect, Friction):
@@ -258,6 +260,10 @@ class Tangent:
                 self._bench.rub(n, int(places.velocities[effect.coordinate]), limit)
             elif isinstance(effect, Force):
                 bind("qfrc_applied")[:n, places.velocities] += effect.force(own, moment)
+
+    def _stiff(self, count: int) -> Array:
+        """(count, D) of the servos, at so many instants."""
+        return np.repeat(self._stiffness, count, axis=0)
 
     def _quotients(self) -> Quotients:
         size = self._motion.x.shape[1]
@@ -338,7 +344,7 @@ class Tangent:
         inputs = {name: u[:, None] for name, u in motion.inputs.items()}
         x = 0.5 * (motion.x[:-1] + motion.x[1:])[:steps]
         v = 0.5 * (motion.v[:-1] + motion.v[1:])[:steps]
-        return moment_of(self._system, t[:, None], x, v, inputs, motion.carried)
+        return moment_of(self._system, t[:, None], x, v, inputs, motion.carried, self._stiff(steps))
 
     @cached_property
     def accelerations(self) -> Array:

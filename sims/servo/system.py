@@ -83,6 +83,7 @@ class ServoSystem(System):
     rates = ("qd",)
     states: ClassVar[Mapping[str, float]] = MappingProxyType({"q": 0.0, "qd": 0.0})
     sensed = ("q",)
+    servo = "goal"
     usual_recording = UsualRecording(
         initial={"q": (-0.5, 0.5)},
         inputs={"goal": "steps:1:1", "torque_enable": "1"},

@@ -30,6 +30,7 @@ APART = 1.0
 # Noises that the simpler form of an effect must leave, or else it is the right answer.
 TELLING = 0.4
 SIMPLER = {
+    "friction.direction": ("drag.linear",),
     "friction.stribeck": ("friction.coulomb",),
     "wind": (
         "drag.linear",

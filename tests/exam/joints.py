@@ -20,6 +20,7 @@ TOLERANCES = {"rtol": 1e-8, "atol": 1e-10}
 SHORT = 0.011  # seconds: up to here a method of fifth order is cheaper than one of eighth
 # Share of its half width over which a region's borders are soft: the solver keeps its order.
 EDGE = 0.05
+SLEWED = 2e-3  # seconds in which an input that rises steadily is held
 STRAIGHT = 10  # parts of an interval in which a command that goes straight is held
 
 Law = Callable[[float, float, float], float]
@@ -56,12 +57,14 @@ def felt(scenario, effects, until) -> list[Piece]:
     if "input.hold" in effects:
         levels, edges = _straight(levels, edges, effects["input.hold"][0])
     for name, c in effects.items():
-        if name in ("input.deadband", "input.saturation", "backlash") and lag:
+        if name in ("input.deadband", "input.saturation", "backlash", "input.rate") and lag:
             raise NotImplementedError(f"{name} behind input.lag")
         if name == "input.delay":
             edges = edges + c[0]
         elif name == "input.lag":
             lag = c[0]
+        elif name == "input.rate":
+            levels, edges = _slewed(levels, edges, c[0])
         elif name in STEPWISE:
             levels = STEPWISE[name](levels, c[0])
     changes = np.flatnonzero(np.diff(levels)) + 1
@@ -82,6 +85,27 @@ def _straight(levels, edges, share):
     fine = levels[:-1, None] + share * np.diff(levels)[:, None] * parts
     begins = edges[:-1, None] + np.diff(edges)[:, None] * np.arange(STRAIGHT) / STRAIGHT
     return np.append(fine.ravel(), levels[-1]), np.append(begins.ravel(), edges[-1])
+
+
+def _slewed(levels, edges, most):
+    """Levels in short parts of time that follow no faster than `most` a second."""
+    ends = [*edges[1:].tolist(), edges[-1] + 1.0]
+    values, begins, state = [], [], float(levels[0])
+    for level, begin, end in zip(levels.tolist(), edges.tolist(), ends, strict=True):
+        while begin < end and state != level:
+            last = min(begin + SLEWED, end)
+            away = level - state
+            lasting = min(abs(away) / most, last - begin)
+            after = level if lasting >= abs(away) / most else state + copysign(most * lasting, away)
+            # the mean over the part, whose rise may end within it
+            values.append(0.5 * (state + after) * lasting / (last - begin))
+            values[-1] += after * (1 - lasting / (last - begin))
+            begins.append(begin)
+            state, begin = after, last
+        if begin < end:
+            values.append(level)
+            begins.append(begin)
+    return np.array(values), np.array(begins)
 
 
 def _play(levels, width):
@@ -156,6 +180,7 @@ def _wave(c, cycles):
 FORCES: dict[str, Callable[[Joint, list[float]], Law]] = {
     "drag.linear": lambda j, c: lambda t, x, v: -c[0] * v,
     "drag.quadratic": lambda j, c: lambda t, x, v: -c[0] * abs(v) * v,
+    "friction.direction": lambda j, c: lambda t, x, v: -c[0] * max(v, 0.0) - c[1] * min(v, 0.0),
     "wind": lambda j, c: lambda t, x, v: -c[0] * abs(v - c[1]) * (v - c[1]),
     "gravity.scale": lambda j, c: lambda t, x, v: c[0] * j.weight(x),
     "gravity.tilt": lambda j, c: lambda t, x, v: c[0] * j.gravity * j.sideways(x),

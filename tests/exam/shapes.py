@@ -90,7 +90,23 @@ def _saturation(far, setting, rng):
     return lambda s: (float(peak * (1 - s)),)
 
 
+def _one_way(far, setting, rng):
+    """Several times as much one way as the other."""
+    shares = [1.0, float(rng.uniform(0.0, 0.3))]
+    rng.shuffle(shares)
+    return lambda s: (far * shares[0] * s, far * shares[1] * s)
+
+
+def _rate(far, setting, rng):
+    """A jump of the input's peak takes from no time at all to most of a second."""
+    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    return lambda s: (float(peak / (0.8 * s)),)
+
+
 SHAPES = {
+    "friction.direction": _one_way,
+    "input.rate": _rate,
+    "sensor.eccentricity": _direction,
     "gravity.tilt": _level,
     "lift.magnus": _direction,
     "force.ripple": _ripple,

@@ -88,6 +88,9 @@ def solved(world, scenario, channels, number=0):
             observed[:, reads] += c[0]
         elif name == "sensor.drift":
             observed[:, reads] += c[0] * grid
+        elif name == "sensor.eccentricity":
+            angle = observed[:, reads].copy()
+            observed[:, reads] += c[0] * np.sin(angle) + c[1] * np.cos(angle)
         elif name == "sensor.lag":
             observed = _lagged(observed, grid, c[0])
     return observed[rows]

@@ -8,17 +8,17 @@ import numpy as np
 
 JOINT = (
     "friction.coulomb", "friction.stribeck", "drag.linear", "drag.quadratic", "spring.linear",
-    "inertia.armature", "force.bias", "force.ripple",
+    "inertia.armature", "force.bias", "force.ripple", "friction.direction",
 )  # fmt: skip
 BODY = ("mass.scale", "mass.offset", "inertia.scale")
-BOTH = ("input.gain", "input.bias", "input.delay", "input.lag")
+BOTH = ("input.gain", "input.bias", "input.delay", "input.lag", "input.rate")
 MOTOR = ("input.deadband", "input.saturation")
-SERVO = ("actuator.stiffness", "actuator.damping")
-CHANNEL = ("sensor.bias", "sensor.gain", "sensor.delay")
+SERVO = ("actuator.stiffness", "actuator.damping", "servo.deadband", "servo.derivative")
+CHANNEL = ("sensor.bias", "sensor.gain", "sensor.delay", "sensor.eccentricity")
 WORLD = ("gravity.tilt", "gravity.scale", "clock.skew")
 FOREIGN = ("elastic", "binding", "slip")
 FAMILIES = ("friction.coulomb", "drag.linear")
-SIMPLER = {"friction.stribeck": "friction.coulomb"}
+SIMPLER = {"friction.stribeck": "friction.coulomb", "friction.direction": "drag.linear"}
 SIGNED = (
     "force.bias", "mass.scale", "inertia.scale", "input.gain", "input.bias", "sensor.bias",
     "sensor.gain", "clock.skew", "gravity.scale", "actuator.stiffness", "actuator.damping",
@@ -27,7 +27,7 @@ FAR = {  # of effects that need no scale of the motion
     "mass.scale": 0.5, "inertia.scale": 0.9, "input.gain": 0.4, "input.delay": 0.1,
     "input.lag": 0.2, "sensor.bias": 0.2, "sensor.gain": 0.3, "sensor.delay": 0.1,
     "clock.skew": 0.06, "gravity.scale": 0.3, "actuator.stiffness": 0.5, "actuator.damping": 0.8,
-    "gravity.tilt": 0.2, "mass.offset": 0.1,
+    "gravity.tilt": 0.2, "mass.offset": 0.1, "servo.derivative": 0.1,
 }  # fmt: skip
 
 
@@ -43,6 +43,8 @@ def places(machine, effect):
         return list(machine.joints)
     if effect in BODY:
         return list(machine.bodies)
+    if effect == "sensor.eccentricity":
+        return [f"q.{joint}" for joint in machine.joints if machine.unit(joint) == "rad"]
     if effect in CHANNEL:
         return [f"q.{joint}" for joint in machine.joints]
     return [""] if effect in WORLD else [drive.name for drive in machine.drives]
@@ -88,6 +90,7 @@ SCALES = {
     "force.bias": _per_force(lambda typical: 1.0),
     "inertia.armature": lambda place, setting: 2.0 * _at(setting, place)["inertia"],
     "input.bias": lambda place, setting: float(np.ptp(_command(setting, place))) / 2,
+    "servo.deadband": lambda place, setting: float(np.ptp(_command(setting, place))) / 8,
     "input.deadband": lambda place, setting: float(np.abs(_command(setting, place)).max()) / 2,
 }
 
@@ -123,7 +126,30 @@ def _saturation(place, setting, rng):
     return lambda s: (peak * (1 - s),)
 
 
+def _rate(place, setting, rng):
+    """A jump over the command's range takes from no time at all to a second."""
+    range_ = float(np.ptp(_command(setting, place)))
+    return lambda s: (range_ / s,)
+
+
+def _direction(place, setting, rng):
+    """Several times as much one way as the other."""
+    far = SCALES["drag.linear"](place, setting)
+    shares = [1.0, float(rng.uniform(0.0, 0.3))]
+    rng.shuffle(shares)
+    return lambda s: (far * shares[0] * s, far * shares[1] * s)
+
+
+def _eccentric(place, setting, rng):
+    angle = rng.uniform(0, 2 * np.pi)
+    sine, cosine = 0.3 * float(np.sin(angle)), 0.3 * float(np.cos(angle))
+    return lambda s: (sine * s, cosine * s)
+
+
 SHAPES = {
+    "friction.direction": _direction,
+    "input.rate": _rate,
+    "sensor.eccentricity": _eccentric,
     "friction.stribeck": _stribeck,
     "force.ripple": _ripple,
     "gravity.tilt": _tilt,

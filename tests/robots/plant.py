@@ -50,6 +50,7 @@ class Plant:
         model, data: of Pinocchio.
         damping, quadratic, spring, bias: by joint, (N,).
         coulomb, extra, speed: dry friction `coulomb + extra exp(-(v / speed)^2)`, (N,).
+        ahead, back: damping of motion the one way and the other, (N,).
         ripples: (joint, sine, cosine, period).
         binding, elastic: see there; None where there is none.
     """
@@ -63,6 +64,8 @@ class Plant:
     bias: np.ndarray
     extra: np.ndarray
     speed: np.ndarray
+    ahead: np.ndarray
+    back: np.ndarray
     ripples: list = field(default_factory=list)
     binding: Binding | None = None
     elastic: Elastic | None = None
@@ -85,6 +88,10 @@ class Plant:
     @cached_property
     def drags(self):
         return bool(self.quadratic.any())
+
+    @cached_property
+    def lopsided(self):
+        return bool((self.ahead != self.back).any())
 
     @cached_property
     def stribeck(self):
@@ -115,6 +122,8 @@ class Plant:
             force -= self.spring * q
         if self.drags:
             force -= self.quadratic * np.abs(v) * v
+        if self.lopsided:
+            force -= self.ahead * np.maximum(v, 0.0) + self.back * np.minimum(v, 0.0)
         for joint, sine, cosine, period in self.ripples:
             angle = 2 * np.pi * q[joint] / period
             force[joint] += sine * np.sin(angle) + cosine * np.cos(angle)
@@ -163,7 +172,7 @@ def plant(machine: Machine, effects=None, foreign=None):
     count = model.nv
     damping, coulomb = (np.array(values) for values in zip(*machine.stated(), strict=True))
     made = Plant(
-        model, None, damping, coulomb, *np.zeros((3, count)), np.zeros(count), np.ones(count)
+        model, None, damping, coulomb, *np.zeros((4, count)), np.ones(count), *np.zeros((2, count))
     )  # fmt: skip
     for name, c in (effects or {}).items():
         effect, _, place = name.partition("@")
@@ -201,12 +210,18 @@ def _stribeck(plant, joint, c):
     plant.speed[joint] = c[2]
 
 
+def _direction(plant, joint, c):
+    plant.ahead[joint] += c[0]
+    plant.back[joint] += c[1]
+
+
 def _ripple(plant, joint, c):
     plant.ripples.append((joint, *c))
 
 
 FORCES = {
     "friction.coulomb": _adds("coulomb"),
+    "friction.direction": _direction,
     "friction.stribeck": _stribeck,
     "drag.linear": _adds("damping"),
     "drag.quadratic": _adds("quadratic"),

@@ -34,5 +34,7 @@ def observed(world, run, channels, slips=()):
                 column = column + jump * (run.times >= instant)
         gain = world.effects.get(f"sensor.gain@{name}", (0.0,))[0]
         bias = world.effects.get(f"sensor.bias@{name}", (0.0,))[0]
+        sine, cosine = world.effects.get(f"sensor.eccentricity@{name}", (0.0, 0.0))
+        column = column + sine * np.sin(column) + cosine * np.cos(column)
         columns.append(column * (1 + gain) + bias)
     return np.column_stack(columns)

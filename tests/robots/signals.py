@@ -6,13 +6,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+SIGNALS = (
+    "input.gain", "input.bias", "input.deadband", "input.saturation", "input.delay", "input.lag",
+    "input.rate", "servo.derivative",
+)  # fmt: skip
+
 
 @dataclass
 class Felt:
     """A command on its way to an actuator.
 
-    It passes gain, bias, dead band, saturation, delay and lag, in this order; it is constant from
-    one stamp to the next, and before the first it has the first value.
+    It passes gain, bias, dead band, saturation, a limit of its rate, delay, a servo's D term and
+    lag, in this order; it is constant from one stamp to the next, and before the first it has the
+    first value.
     """
 
     times: np.ndarray
@@ -23,6 +29,8 @@ class Felt:
     saturation: float = 0.0
     delay: float = 0.0
     lag: float = 0.0
+    rate: float = 0.0
+    derivative: float = 0.0
     values: np.ndarray = field(init=False)
     begins: np.ndarray = field(init=False)
 
@@ -31,12 +39,37 @@ class Felt:
         values = np.sign(values) * np.maximum(np.abs(values) - self.deadband, 0.0)
         if self.saturation:
             values = np.clip(values, -self.saturation, self.saturation)
-        self.values, self.begins = values, self.times + self.delay
+        begins = self.times
+        if self.rate:
+            values, begins = _slewed(values, begins, self.rate)
+        begins = begins + self.delay
+        if self.derivative:
+            # what a D term makes of a jump lasts as long as its rate is taken over
+            both = np.unique(np.concatenate([begins, begins + self.derivative]))
+            now, before = (_held(begins, values, both - late) for late in (0.0, self.derivative))
+            values, begins = 2 * now - before, both
+        self.values, self.begins = values, begins
 
     def at(self, t):
         """What arrives at t, before the lag; a value holds from its stamp on."""
         place = np.searchsorted(self.begins, t + 1e-9, side="right") - 1
         return self.values[max(place, 0)]
+
+
+def _held(begins, values, t):
+    """What holds at instants; before the first stamp the first value."""
+    return values[np.maximum(np.searchsorted(begins, t + 1e-9, side="right") - 1, 0)]
+
+
+def _slewed(values, times, most):
+    """What follows no faster than `most` a second, held over a millisecond each."""
+    fine = np.arange(times[0], times[-1] + 1e-3, 1e-3)
+    wanted, state, risen = _held(times, values, fine), values[0], []
+    for level in wanted.tolist():
+        moved = min(max(level - state, -most * 1e-3), most * 1e-3)
+        risen.append(state + moved - 0.5 * abs(moved) / (most * 1e-3) * moved)
+        state += moved
+    return np.array(risen), fine
 
 
 def felt(machine, times, commands, effects):
@@ -46,26 +79,29 @@ def felt(machine, times, commands, effects):
         numbers = {}
         for name, c in effects.items():
             effect, _, place = name.partition("@")
-            if effect.startswith("input.") and place == drive.name:
-                numbers[effect.removeprefix("input.")] = c[0]
+            if effect in SIGNALS and place == drive.name:
+                numbers[effect.partition(".")[2]] = c[0]
         signals[drive.name] = Felt(times, commands[drive.name], **numbers)
     return signals
 
 
 @dataclass
 class Drives:
-    """Forces of all actuators: clip(gain u - kp q - kv v, within +-limit) by joint, (N,)."""
+    """Forces of all actuators: clip(gain u - kp q - kv v, within +-limit) by joint, (N,); a servo
+    does nothing about an error u - q that is below `dead`.
+    """
 
     gain: np.ndarray
     kp: np.ndarray
     kv: np.ndarray
     limit: np.ndarray
+    dead: np.ndarray
 
     @classmethod
     def of(cls, machine, effects=None):
         """Of a machine, with what is hidden in its servos."""
         count = len(machine.joints)
-        gain, kp, kv, limit = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
+        gain, kp, kv, limit, dead = np.zeros((5, count))
         for joint, drive in zip(machine.driven, machine.drives, strict=True):
             change = {
                 name.partition("@")[0]: c[0]
@@ -79,9 +115,12 @@ class Drives:
             kp[joint] = drive.kp * (1 + change.get("actuator.stiffness", 0.0))
             kv[joint] = drive.kv * (1 + change.get("actuator.damping", 0.0))
             gain[joint] = kp[joint]
-        return cls(gain, kp, kv, limit)
+            dead[joint] = change.get("servo.deadband", 0.0)
+        return cls(gain, kp, kv, limit, dead)
 
     def forces(self, u, q, v):
         """For commands u by joint."""
         wanted = self.gain * u - self.kp * q - self.kv * v
+        if self.dead.any():
+            wanted -= self.kp * np.clip(u - q, -self.dead, self.dead)
         return np.minimum(np.maximum(wanted, -self.limit), self.limit)  # np.clip takes three times

@@ -24,15 +24,20 @@ import numpy as np
 from bench.gap.model.bounds import CYCLES
 from bench.gap.model.noise import Mask
 from bench.gap.model.problem import Fit, Start
+from bench.gap.model.tracks import Track
 from bench.gap.model.world import World
 from sims.base import Array, Parameter
 from sims.simulated import effect_parameters
-from sims.system import FAMILY
+from sims.system import FAMILY, Effect
 
 SMALL = 1e-4
 """Share of a plausible range at which a direction is first taken."""
 LEVELS = (0.15, 0.35, 0.6, 0.85, 0.95, 0.99)
 """Shares of the largest input at which limits, dead bands and plays are tried besides."""
+LIMITED = ("drive", "input/s")
+"""What a coefficient limits of which every small size takes all away."""
+RATES = (0.015, 0.05, 0.12, 0.3, 0.6, 0.9)
+"""The same of the largest rate: that of a jump is of no length, and what limits it may be long."""
 NOTHING = 1e-11
 """Share of the largest observation below which a change is rounding."""
 SHAPES = 12
@@ -116,8 +121,8 @@ def _first(world: World, name: str) -> Iterator[Probe]:
     leading = world.effects[name].coefficients[0]
     # Coefficients that scale at one point of the grid act together: a sine with its cosine.
     for point in product(*grids):
-        # Of a limit of force every small size takes all of it away.
-        for place in scaling if leading.of != "drive" else ():
+        # Of a limit of force or of a rate every small size takes all of it away.
+        for place in scaling if leading.of not in LIMITED else ():
             low, high = parameters[place].bounds
             c = np.zeros(count)
             c[shaping] = point
@@ -132,7 +137,7 @@ def _first(world: World, name: str) -> Iterator[Probe]:
         group += 1
     least, _ = parameters[0].bounds
     # Of a limit no small size is like a large one: it is tried where the input reaches it.
-    if leading.of == "drive" or (leading.of == "input" and least == 0):
+    if leading.of in LIMITED or (leading.of == "input" and least == 0):
         yield from _limits(world, name, group)
 
 
@@ -141,7 +146,8 @@ def _limits(world: World, name: str, group: int) -> Iterator[Probe]:
     largest = _reach(world, name)
     if not largest.any():
         return
-    for number, level in enumerate(LEVELS, start=group):
+    levels = RATES if world.effects[name].coefficients[0].of == "input/s" else LEVELS
+    for number, level in enumerate(levels, start=group):
         yield Probe(
             effect=name,
             group=number,
@@ -159,16 +165,41 @@ def _reach(world: World, name: str) -> Array:
     if effect.coefficients[0].of == "drive":
         # How large a force gets is not recorded: what is plausible has to do.
         return np.array([p.bounds[1] for p in _parameters(world, name)])
-    return np.array([max(_largest_input(world, member.signal)) for member in members])
+    most = {"input/s": _fastest}.get(effect.coefficients[0].of, _largest)
+    if effect.needs == "servo":
+        most = _farthest
+    return np.array([max(most(world, t, one) for t in world.tracks) for one in members])
 
 
-def _largest_input(world: World, name: str) -> Iterator[float]:
-    """Of each run, of the input of that name; of its first one without a name."""
-    for track in world.tracks:
-        signals = track.scenario.inputs
-        first = next(iter(signals.values()), np.zeros(1))
-        signal = signals.get(name, np.zeros(1)) if name else first
-        yield float(np.abs(signal).max())
+def _command(track: Track, effect: Effect) -> Array:
+    """(T,) the input that an effect acts on; the first one where it names none."""
+    signals = track.scenario.inputs
+    nothing = np.zeros(track.scenario.times.size)
+    first = next(iter(signals.values()), nothing)
+    return signals.get(effect.signal, nothing) if effect.signal else first
+
+
+def _largest(world: World, track: Track, effect: Effect) -> float:  # noqa: ARG001
+    """Of a run, of the input."""
+    return float(np.abs(_command(track, effect)).max())
+
+
+def _fastest(world: World, track: Track, effect: Effect) -> float:  # noqa: ARG001
+    """Of a run, from sample to sample of the input, a second."""
+    risen = np.abs(np.diff(_command(track, effect)))
+    return float((risen / np.diff(track.scenario.times)).max(initial=0.0))
+
+
+def _farthest(world: World, track: Track, effect: Effect) -> float:
+    """Of a run, by which a servo is off its set point; zero where that is not recorded."""
+    system = world.simulator.system
+    place = system.primary if effect.coordinate is None else effect.coordinate
+    name = system.coordinates[place]
+    if name not in world.channels:
+        return 0.0
+    turned = system.gear(place) * track.observed[:, world.channels.index(name)]
+    apart = _command(track, effect) - turned
+    return float(np.nanmax(np.abs(apart), initial=0.0))
 
 
 def _parameters(world: World, name: str) -> Sequence[Parameter]:

@@ -43,7 +43,8 @@ class Moves(Scored):
             theta = model.fit.theta.copy()
             theta[self.world.slots[name]] = 0.0
             rest = tuple(n for n in model.names if n != name)
-            starts.append(Start(rest, theta, model.fit.states))
+            known = model.fit.known().without(self.world.places(name))
+            starts.append(Start(rest, theta, model.fit.states, known))
         self.refit(starts)
 
     def drop(self, model: Model) -> Model:

@@ -5,6 +5,7 @@ their scores say.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from bench.gap.model.base_fit import HORIZONS
 from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.models import Model, Names
 from bench.gap.model.noise import Noise
-from bench.gap.model.problem import Start
+from bench.gap.model.problem import Known, Start
 from bench.gap.model.world import World
 from sims.base import Array
 
@@ -27,6 +28,8 @@ PROMISING = 0.25
 """Candidates are refitted that promise at least this share of the best one's score."""
 CLOSE = 0.6
 """The same where the scores are to first order exact."""
+PATIENT = 20
+"""So many of them at most, with patience."""
 SHARES = (1.0, 0.25)
 """Of the size that a score says; the score is linear, so less of it is tried too."""
 REACHES = (0.2, 0.7, 1.5)
@@ -48,23 +51,28 @@ def nominated(
     numbered = []
     # Where scores are those of the simulator's own derivatives, few can be better than they seem.
     share = CLOSE if world.linear else PROMISING
-    for i in _promising(scores, most, patient, share):
+    if patient and world.linear:
+        most, share = PATIENT, 0.0
+    # Where scores mean less they order what is tried with patience, and leave nothing out.
+    everything = patient and not world.linear
+    for i in _promising(scores, most, share, everything):
         name = scores.effects[i]
         # The peaks of an effect are fitted apart: each may end in a minimum of its own.
         for peak, (group, scored) in enumerate(scores.peaks[i]):
+            known = _known(world, model, found, group, name)
             for c in _sizes(world, found, group, scored, name):
-                start = _with(world, model, name, c)
+                start = replace(_with(world, model, name, c), known=known)
                 numbered.append((peak, start))
     # In patience the fit begins with the first part of the runs, so the nearest is asked there.
     share = HORIZONS[0].share if patient else 1.0
     return _nearest(world, noise, numbered, share)
 
 
-def _promising(scores: Scores, most: int, patient: bool, share: float) -> list[int]:
+def _promising(scores: Scores, most: int, share: float, everything: bool) -> list[int]:
     """Places of the candidates to refit, the most promising first."""
     promise = scores.score - scores.chance
     order: list[int] = np.argsort(-promise, kind="stable").tolist()
-    if patient:
+    if everything:
         return order
     good = [i for i in order if promise[i] >= share * promise[order[0]]]
     good = good[:most]
@@ -83,6 +91,25 @@ def _with(world: World, model: Model, name: str, c: Array) -> Start:
         theta[world.slots[part]] = 0.0
     rest = [n for n in model.names if n not in contained]
     return Start((*rest, name), theta, model.fit.states)
+
+
+def _known(world: World, model: Model, found: Directions, group: Group, name: str) -> Known | None:
+    """The derivatives of the model with one more effect where it acts a little, from the model's
+    own and from the directions; None where these say nothing of a coefficient.
+    """
+    if not world.linear:
+        return None
+    columns = {found.probes[i].place: i for i in group.columns if not found.probes[i].fixed}
+    places = world.places(name)
+    shaping = [i for i in range(len(places)) if world.parameters[places[i]].bounds[0] > 0]
+    if not columns or shaping:
+        return None
+    jacobian = np.zeros((*found.values.shape[:3], len(places)))
+    for place, column in columns.items():
+        jacobian[..., place] = found.values[..., column]
+    contained = [world.places(n) for n in world.effects[name].contains if n in model.names]
+    gone = {place for span in contained for place in span}
+    return model.fit.known().without(gone).beside(places, jacobian)
 
 
 def _sizes(

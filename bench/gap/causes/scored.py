@@ -107,6 +107,7 @@ class Scored(Models):
         calls, keys = [], []
         for model in models:
             self._look(model)
+            model = self.exact(model)
             key = frozenset(model.names)
             residual, stream = self.residual(model.fit), self.drawing("library", model.names)
             former = self.former.pop(key, None)

@@ -10,6 +10,7 @@ Regression, 2nd ed., 2002, doi:10.1201/9781420035933, chapter 3).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -166,7 +167,7 @@ class Search(Moves):
 
     def from_pieces(self, size: int) -> None:
         """Refit the models of so many effects that explain short pieces of the runs best."""
-        if size > SKETCHED:
+        if size > SKETCHED or self._forgets:
             return
         cut = pieces(self.world)
         if cut is None:
@@ -179,6 +180,16 @@ class Search(Moves):
         sketch.extend(beam(sketch, size - 1), NOMINATED)
         best = of_size(sketch, size)[:TRANSFERRED]
         self.refit([whole(self.world, model.fit) for model in best])
+
+    @cached_property
+    def _forgets(self) -> bool:
+        """Whether pieces of the runs are no easier to follow than the whole of them."""
+        if not self.world.linear:
+            return False
+        # loaded where there is a robot alone
+        from bench.gap.model.tangents import forgets
+
+        return forgets(self.world, self.noise)
 
     def _simpler(self, single: Model) -> Model:
         """The effect that the single one contains, where structure is left to which the rest of it

@@ -138,6 +138,7 @@ def remains(models: Models, model: Model) -> Remains:
     if not any(probe.name in world.slots for probe in (Hat, JointHat)):
         return quick
     world.watch.look("a force of any shape")
+    model = models.exact(model)
     directions = hats(world, model)
     if not directions.probes:
         return quick

@@ -121,15 +121,15 @@ class Fitter:
         # the samples that count, (R, T, C)
         seen = self.world.counted(self.share)
         if not leg.first:
-            begun = self._points([(p, p.point.start) for p in problems], seen)
-            for problem, point in zip(problems, begun, strict=True):
-                self._take(problem, point)
+            self._begin(problems, seen)
         for iteration in range(leg.first, leg.last):
             # in its first steps even the right model may be far behind
             if race and iteration >= RACED:
                 give_up(problems, reached)
-            self._renew(problems, seen)
+            self._renew(problems, seen, waiting=not race or iteration >= RACED)
             trials = list(self._trials(problems, seen))
+            if not trials and any(p.waits and not p.done for p in problems):
+                continue
             # what comes after it sees that this was left off
             if not trials or self.world.watch.leaves(iteration / leg.all):
                 break
@@ -138,9 +138,33 @@ class Fitter:
                 self._judge(problem, point)
         return list(problems)
 
-    def _renew(self, problems: Sequence[Problem], seen: Mask) -> None:
-        """Take the derivatives anew of problems whose own are not good enough."""
-        stale = [p for p in problems if p.stale and not p.done]
+    def _begin(self, problems: Sequence[Problem], seen: Mask) -> None:
+        """Where they begin, with derivatives; those that are known nearby do to begin with."""
+        nearby = [p for p in problems if self._knows(p)]
+        others = [p for p in problems if not self._knows(p)]
+        if others:
+            begun = self._points([(p, p.point.start) for p in others], seen)
+            for problem, point in zip(others, begun, strict=True):
+                self._take(problem, point)
+        if nearby:
+            begun = self._plain_points([(p, p.point.start) for p in nearby], seen)
+            for problem, point in zip(nearby, begun, strict=True):
+                assert point.start.known is not None
+                own = self._begun(point.start, point.simulated.shape[1])
+                known = point.start.known.jacobian[:, : point.simulated.shape[1]]
+                self._take(problem, replace(point, jacobian=np.concatenate([known, own], axis=3)))
+                problem.here = False
+
+    def _knows(self, problem: Problem) -> bool:
+        """Whether derivatives are known near a start, by all that is fitted."""
+        known = problem.point.start.known
+        return self.world.linear and known is not None and np.array_equal(known.free, problem.free)
+
+    def _renew(self, problems: Sequence[Problem], seen: Mask, waiting: bool) -> None:
+        """Take the derivatives anew of problems whose own are not good enough; of those that can
+        wait only where `waiting` says so.
+        """
+        stale = [p for p in problems if p.stale and not p.done and (waiting or not p.waits)]
         if not stale:
             return
         points = self._points([(p, p.point.start) for p in stale], seen)
@@ -170,7 +194,7 @@ class Fitter:
         # a start may be the size that a score asks for, or come from wider bounds
         theta = start.theta.copy()
         theta[free] = np.clip(theta[free], low, high)
-        begun = Start(start.effects, theta, start.states.copy())
+        begun = Start(start.effects, theta, start.states.copy(), start.known)
         return Problem(
             point=Point(begun, np.empty(0), np.empty(0), np.inf),
             free=np.array(free, dtype=np.intp),
@@ -274,7 +298,7 @@ class Fitter:
     def _take(self, problem: Problem, point: Point) -> None:
         """Go on from a point, with differences that suit what it responds to."""
         problem.point = point
-        problem.here, problem.stale = True, False
+        problem.here, problem.stale, problem.waits = True, False, False
         problem.steps = difference_steps(point.jacobian, self.noise, problem.widths)
 
     def _residual(self, simulated: Array, seen: Mask) -> Array:
@@ -300,7 +324,7 @@ class Fitter:
     def _trials(self, problems: Sequence[Problem], seen: Mask) -> Iterator[_Trial]:
         """Where each problem that is not done goes next; one whose step promises nothing is."""
         for problem in problems:
-            if problem.done:
+            if problem.done or problem.waits:
                 continue
             trial = self._trial(problem, seen)
             if trial is not None:
@@ -337,7 +361,7 @@ class Fitter:
             or step.promised < ENOUGH + SHARE * at.cost
             or problem.damping > LARGEST_DAMPING
         ):
-            problem.done = True
+            problem.finish()
             return None
 
         # a copy: where the trial is refused, the old point stands
@@ -351,7 +375,8 @@ class Fitter:
         gained = problem.point.cost - point.cost
         if point.cost < problem.point.cost:
             if self.world.linear:
-                problem.point, problem.here = point, not problem.free.size
+                problem.point = replace(point, jacobian=problem.learnt(point))
+                problem.here = not problem.free.size
             else:
                 self._take(problem, point)
             problem.taken(gained, point.cost)

@@ -13,7 +13,7 @@ coefficients have paid of that already.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -164,6 +164,22 @@ class Models:
             self.enter(fit)
         # One that was left off is kept, and not judged.
         self.world.watch.check()
+
+    def exact(self, model: Model) -> Model:
+        """The model with derivatives of its own, where its fit has ended with those of a point
+        nearby; they are found once.
+        """
+        if model.fit.own or not np.isfinite(model.fit.cost):
+            return model
+        known = self.models.get(frozenset(model.names))
+        if known is not None and known.fit.own and known.fit.theta is model.fit.theta:
+            return known
+        fitter = Fitter(self.world, self.noise, self.frozen)
+        (fit,) = fitter.fit([model.fit.start()], iterations=0)
+        result = replace(model, fit=replace(model.fit, jacobian=fit.jacobian, own=True))
+        if known is model:
+            self.models[frozenset(model.names)] = result
+        return result
 
     def _sifted(self, starts: Sequence[Start], noise: Noise) -> list[Start]:
         """Where the best stand after all horizons but the last, which is the whole of the runs."""

@@ -27,6 +27,14 @@ MATTERS = 0.2
 """RMS error in units of the noise from which the step is asked about."""
 MENDED = 0.1
 """RMS error below which a setting is taken to mend it."""
+ROUGH = 0.7
+"""The same where far more is left to explain; what remains of it is taken out when that is done
+(`bench.gap.model.tangents`).
+"""
+LESS = 4.0
+"""And this many times smaller than that of the file's own step."""
+WITHIN = 0.05
+"""But no larger than this share of what the model leaves."""
 TRUSTED = 0.03
 """RMS change by halving the step below which a scheme is a reference."""
 FINEST = 10
@@ -45,17 +53,25 @@ class Finer(NamedTuple):
         own: step and integrator of the file.
         numerics: those that mend it.
         error: RMS error of the file's own numerics in units of the noise.
+        rest: the same of those that mend it.
     """
 
     kind: type[RobotSimulator]
     own: Numerics
     numerics: Numerics
     error: float
+    rest: float
+
+    def suits(self, left: float) -> bool:
+        """Whether its step is fine enough for a model that leaves so much, RMS in units of the
+        noise.
+        """
+        return self.rest < max(MENDED, WITHIN * left)
 
 
-def finer(world: World, noise: Noise) -> Finer | None:
-    """The cheapest step and integrator that follow the robot's own fine motion, where the file's do
-    not; None where they do, or none is found.
+def finer(world: World, noise: Noise) -> Iterator[Finer]:
+    """Steps and integrators that follow the robot's own fine motion, the cheapest first, where the
+    file's do not; none where they do.
 
     Args:
         world: the runs, of a robot.
@@ -67,14 +83,14 @@ def finer(world: World, noise: Noise) -> Finer | None:
     own = kind.numerics
     reference = motions.reference(own)
     if reference is None:
-        return None
+        return
     error = motions.apart(motions.of(own), reference)
     if not error > MATTERS:
-        return None
+        return
     for numerics in _settings(own):
-        if motions.apart(motions.of(numerics), reference) < MENDED:
-            return Finer(kind.stepped_by(numerics), own, numerics, error)
-    return None
+        rest = motions.apart(motions.of(numerics), reference)
+        if rest < max(MENDED, min(ROUGH, error / LESS)):
+            yield Finer(kind.stepped_by(numerics), own, numerics, error, rest)
 
 
 def _settings(own: Numerics) -> Iterator[Numerics]:

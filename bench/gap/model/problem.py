@@ -10,14 +10,22 @@ method, IMM-REP-1999-05), here quicker in both directions: his least factor is 1
     λ ← λ max(0.1, 1 - (2ρ - 1)³),   ν ← 2        where F' < F, and the step is taken            (2)
     λ ← 2ν λ,                        ν ← 2ν       where it is not                                (3)
 
-Derivatives that cost much may serve for several steps (the chord method; C. T. Kelley, Iterative
-Methods for Linear and Nonlinear Equations, 1995, section 5.4.1): as long as steps keep their
-promises, so that ρ is near 1.
+Derivatives J that cost much may serve for several steps. What a step δ changed beside what was
+expected is put into them, along the step alone, with D the scales of the unknowns (C. G. Broyden,
+Math. Comp. 19, 577, 1965, doi:10.1090/S0025-5718-1965-0198670-6; in this method: K. Madsen, H. B.
+Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems, 2004, section 3.3),
+
+    J ← J + (y(x + δ) - y(x) - J δ) δᵀ D⁻² / (δᵀ D⁻² δ)                                          (4)
+
+and they are taken anew where steps no longer keep their promises: where ρ is far from 1, or F has
+grown.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,17 +50,39 @@ GROWTH = 2.0
 """Where the ν of (3) begins, and by what it grows."""
 LEAST_FACTOR = 0.1
 """The least factor of (2)."""
-KEPT = 0.2
+KEPT = 0.5
 """Derivatives serve for another step while ρ is no farther from 1."""
+
+
+class Known(NamedTuple):
+    """Derivatives (R, T, C, q) of the runs by some of the parameters, (q,) of theta, about a point
+    nearby.
+    """
+
+    free: Indices
+    jacobian: Array
+
+    def without(self, places: Collection[int]) -> Known:
+        """Those by the others alone."""
+        kept = [j for j, place in enumerate(self.free.tolist()) if place not in places]
+        return Known(self.free[kept], self.jacobian[..., kept])
+
+    def beside(self, places: Sequence[int], jacobian: Array) -> Known:
+        """With those by further parameters (R, T, C, k)."""
+        free = np.concatenate([self.free, np.array(places, dtype=np.intp)])
+        return Known(free, np.concatenate([self.jacobian, jacobian], axis=3))
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit begins: the effects that act, parameters (P,), initial states (R, s)."""
+    """Where a fit begins: the effects that act, parameters (P,), initial states (R, s); and what is
+    known of its derivatives already, if anything.
+    """
 
     effects: tuple[str, ...]
     theta: Array
     states: Array
+    known: Known | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +97,7 @@ class Fit:
         simulated: (R, T, C).
         jacobian: (R, T, C, q + s) its derivatives, initial states last.
         cost: sum of squares of the whitened residual.
+        own: whether the derivatives are those of this very point.
     """
 
     effects: tuple[str, ...]
@@ -76,6 +107,11 @@ class Fit:
     simulated: Array
     jacobian: Array
     cost: float
+    own: bool = True
+
+    def known(self) -> Known:
+        """Its derivatives by parameters, for what begins nearby."""
+        return Known(self.free, self.jacobian[..., : self.free.size])
 
     def start(self) -> Start:
         """To go on from here."""
@@ -106,8 +142,9 @@ class Problem:
         growth: ν.
         promised: decrease of the cost that the last step promised.
         done: whether it has converged, or is given up.
-        here: whether the point's derivatives are its own, and not those of an earlier one.
+        here: whether the point's derivatives are its own, and not those of another one.
         stale: whether they have to be taken anew before it goes on.
+        waits: whether that can wait until it is known that it is not far behind.
     """
 
     point: Point
@@ -122,6 +159,7 @@ class Problem:
     done: bool = False
     here: bool = True
     stale: bool = False
+    waits: bool = False
 
     def fit(self) -> Fit:
         """What has been fitted by now."""
@@ -134,6 +172,7 @@ class Problem:
             at.simulated,
             at.jacobian,
             at.cost,
+            self.here,
         )
 
     def inward(self, theta: Array) -> Array:
@@ -143,6 +182,33 @@ class Problem:
         own[theta[self.free] + own > self.high] *= -1.0
         return steps
 
+    def learnt(self, reached: Point) -> Array:
+        """(R, T, C, q + s) derivatives at a point that a step has reached, by what it has shown
+        beside those that it began with: (4), run by run.
+        """
+        at = self.point
+        # What nobody simulates, behind the end of a shorter run, has not changed.
+        shown = np.nan_to_num(reached.simulated - at.simulated)
+        shared = (reached.start.theta - at.start.theta)[self.free]
+        own = reached.start.states - at.start.states
+        moved = np.concatenate([np.broadcast_to(shared, (len(own), shared.size)), own], axis=1)
+        weighed = moved / np.square(self.steps)
+        length = np.sum(weighed * moved, axis=1)
+        # A run of which nothing was moved shows nothing.
+        along = weighed / np.where(length > 0, length, np.inf)[:, None]
+        missed = shown - np.einsum("rtcq,rq->rtc", at.jacobian, moved)
+        learnt: Array = at.jacobian + missed[..., None] * along[:, None, None, :]  # (4)
+        return learnt
+
+    def finish(self) -> None:
+        """It has converged, as far as its derivatives tell: those of another point have to be taken
+        anew before it is believed.
+        """
+        if self.here:
+            self.done = True
+        else:
+            self.stale = self.waits = True
+
     def taken(self, gained: float, cost: float) -> None:
         """After a step that brought the cost down to this."""
         self.stale = not self.here and abs(gained / max(self.promised, 1e-300) - 1.0) > KEPT
@@ -150,7 +216,9 @@ class Problem:
         factor = max(LEAST_FACTOR, 1.0 - (2.0 * ratio - 1.0) ** 3)
         self.damping = max(self.damping * factor, LEAST_DAMPING)  # (2)
         self.growth = GROWTH
-        self.done = gained < ENOUGH + SHARE * cost  # converged
+        # With derivatives of its own it has converged; with others it may have.
+        if gained < ENOUGH + SHARE * cost:
+            self.finish()
 
     def refused(self) -> None:
         """After a step that did not, (3), unless its derivatives were to blame."""

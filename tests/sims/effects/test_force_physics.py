@@ -264,3 +264,54 @@ def test_periodic_force_shakes_with_its_amplitude():
     omega = 2 * np.pi * f
     expected = (a * (1 - np.cos(omega * times)) + b * np.sin(omega * times)) / (mass * omega)
     assert v == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize(("way", "rate"), [(1.0, 0.8), (-1.0, 3.0)])
+def test_friction_by_direction_decays_at_the_rate_of_its_way(way, rate):
+    times = np.arange(100) * 0.01
+    x, v = slide(times, {"friction.direction": (0.8, 3.0)}, 2.0, v=3.0 * way)
+    assert v == pytest.approx(3.0 * way * np.exp(-rate / 2.0 * times), rel=1e-6)
+    assert x == pytest.approx(3.0 * way * 2.0 / rate * -np.expm1(-rate / 2.0 * times), abs=1e-6)
+
+
+def test_what_rubs_one_way_alone_lets_a_spring_swing_back_freely():
+    """Half of each swing is damped, half keeps its energy: the amplitude falls once a period."""
+    times, stiffness, damping = np.arange(0, 8, 0.005), 20.0, 1.0
+    fixed = {"friction.direction": (damping, 0.0), "spring.linear": stiffness}
+    x, v = slide(times, fixed, 1.0, x=-1.0)
+    energy = 0.5 * v**2 + 0.5 * stiffness * x**2
+    assert np.diff(energy[v < -0.01]).max() < 1e-4
+    back = (v[1:] < 0) & (v[:-1] < 0)
+    assert np.abs(np.diff(energy)[back]).max() < 1e-6
+    damped = np.sqrt(stiffness - damping**2 / 4)
+    (peaks,) = np.nonzero((v[:-1] > 0) & (v[1:] <= 0))
+    # from rest at -1 through half a damped swing
+    assert x[peaks[0]] == pytest.approx(np.exp(-damping / 2 * np.pi / damped), rel=1e-4)
+
+
+def turn(times, fixed, goal, constants=None, theta=(0.5, 4.0, 2e-3), **initial):
+    """The angle of a servo, (T,)."""
+    inputs = {"goal": np.broadcast_to(goal, times.shape), "torque_enable": np.ones(times.size)}
+    return run("servo", times, fixed, list(theta), inputs, constants, **initial)[:, 0]
+
+
+@pytest.mark.parametrize("begin", [0.95, 1.04, 1.3, 0.2])
+def test_a_servo_with_a_dead_zone_rests_where_it_first_comes_within_it(begin):
+    times = np.arange(0, 6, 0.01)
+    q = turn(times, {"servo.deadband": 0.06}, 1.0, FREE, q=begin)
+    if abs(begin - 1.0) < 0.06:
+        assert q == pytest.approx(begin, abs=1e-12)
+    else:
+        # at its edge it is pushed no more, and damped by its own voltage
+        assert abs(q[-1] - 1.0) <= 0.06 + 1e-3
+        assert abs(turn(times, {}, 1.0, FREE, q=begin)[-1] - 1.0) < 1e-3
+
+
+def test_gravity_pulls_a_servo_by_the_dead_zone_further_down():
+    times, width = np.arange(0, 8, 0.01), 0.05
+    fixed = {"servo.deadband": width}
+    plain, dead = (turn(times, f, 1.0, q=0.9)[-1] for f in ({}, fixed))
+    kp, voltage, kt, resistance = 200.0 * 0.00287738, 7.4, 0.5, 4.0
+    stiffness = kt * kp * voltage / resistance
+    for q, error in ((plain, 1.0 - plain), (dead, 1.0 - dead - width)):
+        assert stiffness * error == pytest.approx(0.49 * 9.81 * 0.1 * np.sin(q), rel=1e-5)

@@ -90,15 +90,20 @@ def test_what_fits_what():
     impact, flight = {"restitution.speed", "contact.friction"}, {"lift.magnus"}
     guided = {
         "friction.coulomb",
+        "friction.direction",
         "friction.stribeck",
+        "sensor.eccentricity",
         "spring.linear",
         "spring.cubic",
         "force.ripple",
     }
     inputs = {name for name in NAMES if name.startswith("input.")} | {"backlash", "friction.load"}
-    assert there["ball"] == set(NAMES) - guided - inputs
-    assert there["slider"] == set(NAMES) - impact - flight - {"gravity.scale"}
-    assert there["pendulum"] == there["servo"] == set(NAMES) - impact - flight - {"wind"}
+    servo = {"servo.deadband", "servo.derivative"}
+    joint = set(NAMES) - impact - flight
+    assert there["ball"] == set(NAMES) - guided - inputs - servo
+    assert there["slider"] == joint - {"gravity.scale", "sensor.eccentricity"} - servo
+    assert there["pendulum"] == joint - {"wind"} - servo
+    assert there["servo"] == joint - {"wind"}
 
 
 @pytest.mark.parametrize(
@@ -109,6 +114,8 @@ def test_what_fits_what():
         ("contact.friction", "pendulum", "no ground"),
         ("gravity.scale", "slider", "no gravity"),
         ("friction.coulomb", "ball", "flies freely"),
+        ("servo.deadband", "slider", "no servo"),
+        ("sensor.eccentricity", "slider", "not defined for a linear system"),
         ("wind", "pendulum", "not defined for a rotary system"),
     ],
 )

@@ -38,6 +38,12 @@ RAMP = np.array([-2.0, -1.0, 0.0, 0.5, 1.0, 2.0])
         ("input.deadband", -0.75, RAMP),
         ("backlash", -0.75, RAMP),
         ("input.lag", -0.1, RAMP),
+        ("input.rate", -0.1, RAMP),
+        ("servo.derivative", -0.1, RAMP),
+        # a value that is held arrives twice for as long as the rate is taken over
+        ("servo.derivative", 0.1, [-4.0, 0.0, 1.0, 1.0, 1.5, 3.0]),
+        ("servo.derivative", 0.2, [-4.0, -2.0, 2.0, 2.0, 2.0, 3.5]),
+        ("servo.derivative", 0.05, [-3.0, -0.5, 0.5, 0.75, 1.25, 2.5]),
         ("sensor.lag", -0.1, RAMP),
     ],
 )
@@ -126,3 +132,18 @@ def test_lanes_that_are_off_keep_every_bit_beside_lanes_that_are_on(name):
     felt = change(np.array([[[0.0], [0.3], [0.0]]]), given)
     assert np.array_equal(felt[::2], given.values[::2])
     assert np.abs(felt[1] - given.values[1]).max() > 0.1
+
+
+@pytest.mark.parametrize("lead", [0.004, 0.05, 0.3])
+def test_a_d_term_on_the_error_leads_a_ramp_by_its_time(lead):
+    ramp = 3.0 * 0.01 * np.arange(100) + 0.5 * 3.0 * 0.01
+    led = through("servo.derivative", lead, ramp, step=0.01, start=0.0)
+    begun = 0.01 * np.arange(100) > lead
+    assert led[begun] == pytest.approx((ramp + 3.0 * lead)[begun], abs=1e-9)
+
+
+def test_a_limit_of_the_rate_rises_straight_and_stays():
+    # at 5 a second a step of 0.1 s rises by half: from -0.5 on, its means are those of a ramp
+    assert through("input.rate", 5.0, [0.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.9]) == pytest.approx(
+        [0.0, 0.25, 0.75, 1.25, 1.75, 2.0, 1.91]
+    )

@@ -145,3 +145,31 @@ def test_a_skewed_clock_stretches_the_record():
     stretched = run("pendulum", TIMES * 1.04, q=0.8)
     assert skewed == pytest.approx(stretched, abs=1e-7)
     assert np.abs(skewed - run("pendulum", TIMES, q=0.8)).max() > 0.1
+
+
+def test_a_limit_of_the_rate_makes_a_ramp_of_a_step():
+    """2 N at 4 N/s take half a second; the impulse is that of the ramp, to rounding."""
+    _, v = slide({"input.rate": 4.0}, STEP)
+    since = np.maximum(TIMES - 0.5, 0.0)
+    rising = np.minimum(since, 0.5)
+    impulse = 2.0 * rising**2 + 2.0 * (since - rising)
+    assert 2.0 * v == pytest.approx(impulse, abs=1e-9)
+
+
+def test_what_is_slower_than_the_limit_of_the_rate_passes_as_it_is():
+    wave = np.sin(3 * TIMES)
+    slow, fast = felt({"input.rate": 200.0}, wave), felt({}, wave)
+    assert slow == pytest.approx(fast, abs=5e-3)
+    assert slow != pytest.approx(felt({"input.rate": 2.0}, wave), abs=0.1)
+
+
+def test_an_eccentric_encoder_is_off_by_a_sine_of_the_angle():
+    times = np.arange(0, 2, 0.01)
+    initial = {"q": 0.3, "qd": 25.0}
+    inputs = {"u": np.zeros(times.size)}
+    fixed = {"sensor.eccentricity": (0.03, -0.02)}
+    true, rate = run("pendulum", times, {}, [3.3e-3], inputs, **initial).T
+    seen, other = run("pendulum", times, fixed, [3.3e-3], inputs, **initial).T
+    assert np.ptp(true) > np.pi
+    assert seen == pytest.approx(true + 0.03 * np.sin(true) - 0.02 * np.cos(true), abs=1e-12)
+    assert np.array_equal(other, rate)

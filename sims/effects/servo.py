@@ -1,0 +1,87 @@
+"""The law of a servo, where it is not the proportional one of its set point.
+
+With u the set point, q the position, e = u - q, K the servo's stiffness and c the coefficient, the
+drive exerts besides
+
+* (1) dead zone: K (dz(e) - e), dz(e) = e - clip(e, -c, c); what limits the drive limits this, too
+* (2) derivative: K (u(t) - u(t - c)): the servo's D term acts on the rate of the error, not of q
+  alone; c is the D gain over the P gain, and the rate is taken over as long, so that of a jump
+  the servo feels a kick of its height and not an impulse
+
+A negative width is none.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.base import Array
+from sims.system import Coefficient, Force, Input, Moment, Signal
+
+_USUAL = ("m/s^2", "m", "rad")
+"""Units of a set point; point systems have no servo."""
+_WIDTH = ((0, 1), (0, 0.05), (0, 0.2))
+"""Plausible half widths of a dead zone, in the units of `_USUAL`."""
+_TIME = ("s", "s", "s")
+"""Seconds, on every kind of system."""
+
+
+class Deadband(Force):
+    """No drive while the servo is within c of its set point, that of the excess beyond."""
+
+    name = "servo.deadband"
+    noun = "a dead zone of the servo"
+    says = "the servo does nothing about small errors"
+    source = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
+    at = "actuator"
+    needs = "servo"
+    coefficients = (Coefficient("coefficient", _USUAL, _WIDTH, of="input"),)
+
+    def force(self, c: Array, moment: Moment) -> Array:
+        """What the drive lacks of the proportional law."""
+        width = np.maximum(c[0], 0.0)
+        return moment.aimed(-np.clip(moment.error, -width, width))  # (1)
+
+
+class Derivative(Input):
+    """The set point leads by its own rate times c, as where a D term acts on the error."""
+
+    name = "servo.derivative"
+    noun = "a D term on the error"
+    says = "the servo's D term acts on the error, so that it also follows the set point's rate"
+    source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), section 10.5"
+    needs = "servo"
+    coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
+
+    def feel(self, c: Array, signal: Signal) -> Array:
+        """What has come in the last c seconds is felt twice."""
+        lead = np.maximum(c[0], 0.0)
+        return np.where(
+            lead > 0, 2.0 * signal.values - _earlier(signal, lead), signal.values
+        )  # (2)
+
+
+def _earlier(signal: Signal, late: Array) -> Array:
+    """Means (L, S) over each step of the signal `late` (L, 1) seconds before; before the run what
+    it began with.
+    """
+    ends = signal.times
+    begins = ends - signal.steps
+    gained = np.cumsum(signal.values * signal.steps, axis=1)
+    result = signal.values.copy()
+    for lane in np.flatnonzero(late[:, 0] > 0):
+        # the integral of the signal, from long before the run
+        knots = np.concatenate([[begins[lane, 0] - 1.0, begins[lane, 0]], ends[lane]])
+        whole = np.concatenate([[-signal.start[lane, 0], 0.0], gained[lane]])
+        first, last = (_integral(knots, whole, t[lane] - late[lane]) for t in (begins, ends))
+        steps = signal.steps[lane]
+        long = steps > 0
+        result[lane, long] = (last - first)[long] / steps[long]
+    return result
+
+
+def _integral(knots: Array, whole: Array, t: Array) -> Array:
+    """The integral at instants, straight on before the first of them."""
+    inside: Array = np.interp(t, knots, whole)
+    slope = (whole[1] - whole[0]) / (knots[1] - knots[0])
+    return inside + slope * np.minimum(t - knots[0], 0.0)

@@ -1,0 +1,72 @@
+"""The law of a servo in a robot: a dead zone, a D term on the error, a limited rate."""
+
+import numpy as np
+import pytest
+
+from sims.base import Scenario
+from tests.sims.robot.test_motion import kind_of
+
+MASS, LENGTH, KP, KV = 0.8, 0.3, 20.0, 2.0
+ARM = f"""
+<mujoco>
+  <option timestep="0.001" integrator="implicitfast"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="hinge" axis="0 1 0"/>
+      <inertial pos="0 0 -{LENGTH}" mass="{MASS}" diaginertia="0.001 0.001 0.001"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="m" joint="hinge" kp="{KP}" kv="{KV}" gear="2"/>
+  </actuator>
+</mujoco>
+"""
+FREE = ARM.replace("<option ", '<option gravity="0 0 0" ')
+TIMES = np.arange(0, 3, 0.01)
+
+
+def seen(effects, command, text=ARM, **initial):
+    """The joint's angle, (T,), by coefficients of effects."""
+    kind = kind_of(text)
+    placed = [kind.system.effect(name) for name in effects]
+    simulator = kind(observe=["q.hinge"], effects=placed)
+    theta = np.concatenate([np.ravel(c) for c in effects.values()])[None]
+    given = {c.name: np.zeros(TIMES.size) for c in simulator.inputs}
+    given["u.m"] = np.broadcast_to(command, TIMES.shape)
+    begin = {f"{key}.hinge": value for key, value in initial.items()}
+    return simulator.simulate(theta, Scenario(TIMES, begin, given))[0][:, 0]
+
+
+@pytest.mark.parametrize("begin", [0.0, 0.03, -0.049])
+def test_within_its_dead_zone_a_servo_leaves_the_joint_where_it_is(begin):
+    # the control is that of the geared length: q is half of it
+    q = seen({"servo.deadband@m": 0.1}, 0.0, FREE, q=begin)
+    assert q == pytest.approx(begin, abs=1e-9)
+    assert seen({"servo.deadband@m": 0.0}, 0.0, FREE, q=begin)[-1] == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("stiffer", [0.0, 0.6])
+def test_an_arm_hangs_lower_by_the_dead_zone_with_the_gain_that_the_servo_has(stiffer):
+    width = 0.06
+    effects = {"servo.deadband@m": width, "actuator.stiffness@m": stiffer}
+    q = seen(effects, 1.6, q=0.7)[-1]
+    pulled = 2 * KP * (1 + stiffer) * (1.6 - 2 * q - width)
+    assert pulled == pytest.approx(MASS * 9.81 * LENGTH * np.sin(q), rel=1e-3)
+
+
+def test_a_d_term_on_the_error_takes_the_lag_of_a_ramp_away():
+    """A servo lags a ramp by kv / kp of its time; the lead makes up for it."""
+    ramp = 0.5 * TIMES
+    plain, led = (seen({"servo.derivative@m": c}, ramp, FREE)[-50:] for c in (0.0, KV / KP))
+    # what is held from sample to sample is late by half of one
+    held = 0.25 * 0.005
+    assert ramp[-50:] / 2 - plain == pytest.approx(0.25 * KV / KP + held, rel=1e-2)
+    assert ramp[-50:] / 2 - led == pytest.approx(held, abs=2e-4)
+
+
+def test_a_limit_of_the_rate_makes_the_servo_follow_a_ramp():
+    step = np.where(TIMES >= 0.5, 1.0, 0.0)
+    ramp = np.clip(TIMES - 0.5, 0.0, 0.5) * 2.0
+    limited = seen({"input.rate@m": 2.0}, step, FREE)
+    # the command of the ramp is held from sample to sample: late by half of one
+    assert limited == pytest.approx(seen({"input.delay@m": -0.005}, ramp, FREE), abs=2e-4)
