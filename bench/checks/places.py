@@ -189,7 +189,8 @@ def _pushed(effect: Force | Friction, c: Array, kind: type) -> tuple[object, ...
     system = kind.system()  # type: ignore[attr-defined]
     x = np.array([[0.3, -0.4], [0.8, 0.2]])
     inputs = {c.name: np.full((2, 1), 0.3) for c in system.inputs}
-    moment = moment_of(system, np.full((2, 1), 0.4), x, 1.0 - x, inputs, 0.5 + x)
+    stiffness = np.ones_like(x)
+    moment = moment_of(system, np.full((2, 1), 0.4), x, 1.0 - x, inputs, 0.5 + x, stiffness)
     if isinstance(effect, Friction):
         return (effect.coordinate,) if np.any(effect.limit(c, moment)) else ()
     force = effect.force(c, moment)
