@@ -14,6 +14,7 @@ from bench.commands.options import (
     add_model,
     add_plugin,
     add_trust,
+    cluster_pool,
     names,
     natural,
     place,
@@ -204,18 +205,9 @@ def _begun(options: argparse.Namespace) -> list[Study]:
         return begin_all(chosen, options.plugin, options.out, options.jobs, options.salt)
 
 
-def _cluster(address: str | None) -> Pool | None:
-    if not address:
-        return None
-    from bench.runs.cluster import ClusterPool
-
-    with said_as("--cluster", address):
-        return ClusterPool(address)
-
-
 def _compare(options: argparse.Namespace) -> int:
     # First of all: a scheduler that does not answer leaves no folder behind.
-    pool = _cluster(options.cluster)
+    pool = cluster_pool(options.cluster)
     studies = _begun(options)
     codes = []
     for study in studies:

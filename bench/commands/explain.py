@@ -7,7 +7,16 @@ import json
 from pathlib import Path
 
 from bench.commands.interrupts import INTERRUPTED, Interrupts
-from bench.commands.options import add_force, add_model, add_plugin, names, place, positive, seconds
+from bench.commands.options import (
+    add_force,
+    add_model,
+    add_plugin,
+    cluster_pool,
+    names,
+    place,
+    positive,
+    seconds,
+)
 
 _PICTURED = (".html", ".png", ".pdf")
 """Endings of what is for the eye: the report names the pictures."""
@@ -80,6 +89,17 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
         help="cut runs into pieces of S seconds, each with an initial state of its own: for motion "
         "that drifts or is unstable",
     )
+    parser.add_argument(
+        "--each",
+        action="store_true",
+        help="explain every recording by itself, --jobs of them at once: a folder for each and one "
+        "table of all; what --out holds of an earlier call is not made again",
+    )
+    parser.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="with --each: on the Dask cluster with this scheduler, which must see the same files",
+    )
     add_plugin(parser, "systems")
     add_force(parser)
     parser.set_defaults(command=_explain)
@@ -114,9 +134,14 @@ def _explain(options: argparse.Namespace) -> int:
     from bench.commands.progress import Look
     from bench.gap.report.account import account
     from bench.registry import load_plugins
+    from sims.base import InputError
     from sims.files import refuse_full, stamped
 
+    if options.cluster and not options.each:
+        raise InputError("--cluster: expected --each beside it, as it is for many recordings")
     load_plugins(options.plugin)
+    if options.each:
+        return _explain_each(options)
     # Before the work, which may take minutes.
     if options.out is not None:
         refuse_full(options.out)
@@ -150,6 +175,43 @@ def _explain(options: argparse.Namespace) -> int:
             print(f"{path.stem:7} {path}")
     cut = explanation.answer.cut
     return INTERRUPTED if cut is not None and cut.by == "interrupt" else 0
+
+
+def _explain_each(options: argparse.Namespace) -> int:
+    """Explain every recording by itself, as the rows come in, and print what they say together."""
+    from bench.gap.each import TABLE, Row, explain_each, logs_of, told
+    from bench.gap.model.crew import cores
+    from bench.runs.pools import pool_of
+    from bench.runs.survey import Plugin
+    from sims.files import stamped
+
+    settings = {
+        name: getattr(options, name)
+        for name in (
+            "system", "model", "engine", "tuner", "seed", "force", "budget", "whole", "pieces"
+        )
+    } | {"free": tuple(names(options.free))}  # fmt: skip
+    out = options.out or stamped(Path("results"), "explain-each")
+    logs = logs_of(options.recordings, out, settings)
+
+    def done(row: Row) -> None:
+        causes = [" or ".join([c["effect"], *c["alternatives"]]) for c in row.causes]
+        seconds = "" if row.seconds is None else f" ({row.seconds:.0f} s)"
+        print(f"{row.log}: {row.error or row.verdict} {'; '.join(causes)}".rstrip() + seconds)
+
+    with Interrupts() as interrupts:
+        pool = cluster_pool(options.cluster) or pool_of(min(options.jobs or cores(), len(logs)))
+        with pool:
+            pool.load([Plugin(str(path)) for path in options.plugin])
+            rows = explain_each(logs, out, settings, pool, done, interrupts.asked)
+    print("")
+    for line in told(rows):
+        print(line)
+    print(f"\ntable   {out / TABLE}")
+    if len(rows) < len(logs):
+        print(f"{len(logs) - len(rows)} of {len(logs)} left: the same command goes on with them")
+        return INTERRUPTED
+    return int(any(row.error for row in rows))
 
 
 def _score(options: argparse.Namespace) -> int:

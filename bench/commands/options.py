@@ -6,6 +6,10 @@ import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from bench.runs.pools import Pool
 
 
 def add_plugin(parser: argparse.ArgumentParser, more: str) -> None:
@@ -128,3 +132,17 @@ def said_as(option: str, value: object) -> Iterator[None]:
         if value is None or not str(error).startswith(f"{value}:"):
             raise
         raise InputError(f"{option} {error}") from None
+
+
+def cluster_pool(address: str | None) -> Pool | None:
+    """The Dask cluster with this scheduler; None without one.
+
+    Raises:
+        InputError: nobody answers there, or its workers have other code.
+    """
+    if not address:
+        return None
+    from bench.runs.cluster import ClusterPool
+
+    with said_as("--cluster", address):
+        return ClusterPool(address)

@@ -34,7 +34,7 @@ def load_all(
     for recording, other in loaded[1:]:
         _refuse_other(first, kind, recording, other)
     recordings = [recording for recording, _ in loaded]
-    names = _names([recording.path for recording in recordings])
+    names = names_of([recording.path for recording in recordings])
     constants = {
         key: value
         for key, value in first.constants.items()
@@ -95,7 +95,7 @@ def _refuse_other(
             )
 
 
-def _names(paths: Sequence[Path]) -> list[str]:
+def names_of(paths: Sequence[Path]) -> list[str]:
     """A short name for each log: its stem, with its folder where stems are alike."""
     stems = [path.stem for path in paths]
     if len(set(stems)) == len(stems):

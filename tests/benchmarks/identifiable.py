@@ -131,9 +131,7 @@ def answered(problem, rng):
             continue
         place = places[number.name]
         truth = problem.truth[number.name]
-        if number.word == "identifiable":
-            rows.append((number.word, abs(fit.theta[place] - truth) < number.half))
-        elif number.word == "weak":
+        if number.word == "identifiable" or number.word == "weak":
             rows.append((number.word, abs(fit.theta[place] - truth) < number.half))
         else:
             rows.append((number.word, is_fixed(problem, number, rng)))
