@@ -18,6 +18,10 @@ NOMINATED = 7
 """Candidates of the best scores that are refitted about one model."""
 MOVES = 2
 """Exchanges of one effect tried in a row, at most."""
+NEARER = 0.95
+"""A richer law stands where it brings a model to less than this share of the excess over the noise
+that its simpler form leaves.
+"""
 BETTER = 1e-6
 """A merit must grow by more than this for an exchange to count; less is rounding."""
 
@@ -61,6 +65,40 @@ class Moves(Scored):
             if smaller.merit >= model.merit:
                 return self.drop(smaller)
         return model
+
+    def plainer(self, model: Model) -> Model:
+        """The model with simpler laws in the place of richer ones that contain them, where these
+        come no nearer to the data.
+        """
+        for name in model.names:
+            for part in self._parts(name):
+                other = self._with_part(model, name, part)
+                enough = self.excess(model) > NEARER * self.excess(other) > 0.0
+                if other.merit >= model.merit or enough:
+                    return self.plainer(other)
+        return model
+
+    def _parts(self, name: str) -> list[str]:
+        """The simpler laws at the same place that an effect contains."""
+        effects = self.world.effects
+        own = effects[name]
+        return [
+            part for part in own.contains if part in effects and effects[part].place == own.place
+        ]
+
+    def _with_part(self, model: Model, name: str, part: str) -> Model:
+        """The model with a simpler law in the place of a richer one."""
+        names = tuple(dict.fromkeys(part if n == name else n for n in model.names))
+        key = frozenset(names)
+        if key not in self.models:
+            theta = model.fit.theta.copy()
+            slot, richer = self.world.slots[part], self.world.slots[name]
+            # What scales a law comes first in the law that it is part of.
+            count = slot.stop - slot.start
+            theta[slot] = theta[richer][:count]
+            theta[richer] = 0.0
+            self.refit([Start(names, theta, model.fit.states)], race=False)
+        return self.models[key]
 
     def swap(self, model: Model) -> Model:
         """The best model that has one effect replaced."""

@@ -140,7 +140,7 @@ class Search(Moves):
         if size == 1:
             return self._simpler(larger)
         # An idle effect goes before the exchange, which else puts another idle one in its place.
-        return conservative(self, best, self.drop(self.swap(self.drop(larger))))
+        return self.plainer(conservative(self, best, self.drop(self.swap(self.drop(larger)))))
 
     def _grown(self, size: int) -> Model | None:
         """The best model of so many effects: from the best smaller one, then from its rivals, or
