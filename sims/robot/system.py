@@ -209,6 +209,8 @@ def freed_effects(system: type[RobotSystem], free: Sequence[str]) -> list[type[E
 
 WIDER = 4.0
 """Bounds of a freed number reach so many times as far as its plausible range."""
+GUESSED = 9.0
+"""Those of a servo's gain, as a share of what is stated."""
 
 
 def _parameters(effect: type[Effect]) -> list[Parameter]:
@@ -217,9 +219,11 @@ def _parameters(effect: type[Effect]) -> list[Parameter]:
     for c in effect.coefficients:
         low, high = c.plausible[0]
         least = WIDER * low if c.least is None else max(WIDER * low, c.least)
+        # A gain that is free is a guess: it may be several times as large.
+        reach = GUESSED if effect.at == "actuator" and c.least is not None else WIDER * high
         name = effect.name if len(effect.coefficients) == 1 else f"{effect.name}.{c.name}"
         unit = c.units[0] or "1"
-        bounds = (least, WIDER * high)
+        bounds = (least, reach)
         result.append(Parameter(name, unit, 0.0, bounds, (low, high), says=effect.says))
     return result
 

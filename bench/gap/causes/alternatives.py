@@ -121,15 +121,13 @@ class Alternatives:
         return self._without_richer(rivals)
 
     def _without_richer(self, rivals: list[tuple[float, str]]) -> list[tuple[float, str]]:
-        """The rivals without those at a place that contain another one: a family of which one
-        member does as well, a richer law of which the plain one does.
+        """The rivals without those that contain another one: a family of which one member does as
+        well, a richer law of which the plain one does.
         """
         effects = self.search.world.effects
         names = {name for _, name in rivals}
         return [
-            (behind, name)
-            for behind, name in rivals
-            if not effects[name].place or not names & set(effects[name].contains)
+            (behind, name) for behind, name in rivals if not names & set(effects[name].contains)
         ]
 
     def _behind(self, model: Model, other: Model) -> float:

@@ -7,12 +7,15 @@ Regression, 2nd ed., 2002, doi:10.1201/9781420035933, chapter 3).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from bench.gap.causes.scored import Scored
 from bench.gap.model.models import Model
 from bench.gap.model.problem import Start
+from sims.base import Array
 
 NOMINATED = 7
 """Candidates of the best scores that are refitted about one model."""
@@ -67,36 +70,46 @@ class Moves(Scored):
         return model
 
     def plainer(self, model: Model) -> Model:
-        """The model with simpler laws in the place of richer ones that contain them, where these
-        come no nearer to the data.
+        """The model with simpler laws in the place of richer ones that contain them, and with the
+        one place that acts most in the place of all, where these come no nearer to the data.
         """
         for name in model.names:
-            for part in self._parts(name):
-                other = self._with_part(model, name, part)
+            for part, c in self._parts(model, name):
+                other = self._with_part(model, name, part, c)
                 enough = self.excess(model) > NEARER * self.excess(other) > 0.0
                 if other.merit >= model.merit or enough:
                     return self.plainer(other)
         return model
 
-    def _parts(self, name: str) -> list[str]:
-        """The simpler laws at the same place that an effect contains."""
-        effects = self.world.effects
-        own = effects[name]
-        return [
-            part for part in own.contains if part in effects and effects[part].place == own.place
-        ]
+    def _parts(self, model: Model, name: str) -> Iterator[tuple[str, Array]]:
+        """The simpler laws at the same place that an effect contains, and of a family the member
+        that changes most; each with coefficients to begin with.
+        """
+        effects, slots = self.world.effects, self.world.slots
+        own = model.fit.theta[slots[name]]
+        for part in effects[name].contains:
+            if part in effects and effects[part].place == effects[name].place:
+                # What scales a law comes first in the law that it is part of.
+                yield part, own[: slots[part].stop - slots[part].start]
+        members = getattr(effects[name], "members", ())
+        each = len(members[0].coefficients) if members else 0
+        # One coefficient for all places says nothing of one of them.
+        if len(members) > 1 and own.size == each * len(members):
+            free = model.fit.free.tolist()
+            columns = [free.index(place) for place in self.world.places(name)]
+            responses = np.sqrt(np.square(model.fit.jacobian[..., columns]).sum(axis=(0, 1, 2)))
+            sizes = (np.abs(own) * responses).reshape(len(members), each).max(axis=1)
+            most = int(np.argmax(sizes))
+            yield members[most].name, own[each * most : each * (most + 1)]
 
-    def _with_part(self, model: Model, name: str, part: str) -> Model:
-        """The model with a simpler law in the place of a richer one."""
+    def _with_part(self, model: Model, name: str, part: str, c: Array) -> Model:
+        """The model with a simpler effect in the place of a richer one."""
         names = tuple(dict.fromkeys(part if n == name else n for n in model.names))
         key = frozenset(names)
         if key not in self.models:
             theta = model.fit.theta.copy()
-            slot, richer = self.world.slots[part], self.world.slots[name]
-            # What scales a law comes first in the law that it is part of.
-            count = slot.stop - slot.start
-            theta[slot] = theta[richer][:count]
-            theta[richer] = 0.0
+            theta[self.world.slots[name]] = 0.0
+            theta[self.world.slots[part]] = c
             self.refit([Start(names, theta, model.fit.states)], race=False)
         return self.models[key]
 

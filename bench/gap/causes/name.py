@@ -105,7 +105,7 @@ class _Inquiry:
         self._watch.begin("search")
         self._model = sought(search)
         self._watch.begin("rivals")
-        self._model = settle(search, self._model)
+        self._model = search.plainer(settle(search, self._model))
         self._try()
         self._watch.begin("structure")
         left = remains(search, self._model)
@@ -134,7 +134,8 @@ class _Inquiry:
         # Initial states that were left off would speak against their model.
         self._watch.check()
         self._trial = trial
-        self._model = trial.without_idle(self._search, self._model)
+        # What is left where an idle effect was may have a simpler form, too.
+        self._model = self._search.plainer(trial.without_idle(self._search, self._model))
 
     def so_far(self) -> Finding:
         """The finding where the search had to end: never more than what was answered supports."""
