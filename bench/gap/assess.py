@@ -140,12 +140,15 @@ class Assessor:
         return _heldout(result, self.fitting.simulator.channels[counted[0]].unit)
 
     def _candidates(self, search: Search, finding: Finding) -> tuple[Candidate, ...]:
-        """The whole library with its evidence about the base model, the strongest first."""
+        """The whole library with its evidence about the base model, the strongest first; a score is
+        less what numbers beyond the first cost, so that a law comes before those that contain it.
+        """
         scanned = search.scanned.get(frozenset())
         if scanned is None:
             return ()
         scores = scanned.scores
         base = search.base.likelihood.value
+        price = float(np.log(max(int(search.seen.sum()), 2)))
         rows = []
         for i, effect in enumerate(scores.effects):
             score = float(scores.score[i])
@@ -156,6 +159,8 @@ class Assessor:
             beyond_chance = np.array([score - scores.chance[i]])
             p_value = float(np.clip(tail(scores.by_chance, beyond_chance), 0.0, 1.0))
             share = self._share(finding, (effect,))
+            slot = search.world.slots[effect]
+            score -= price * (slot.stop - slot.start - 1)
             rows.append(Candidate(effect, max(score, 0.0), p_value, share))
         return tuple(sorted(rows, key=lambda row: -row.score))
 

@@ -107,7 +107,8 @@ class Candidate:
 
     Attributes:
         effect: its name.
-        score: twice the gain in log likelihood by it alone.
+        score: twice the gain in log likelihood by it alone, less log n for each of its numbers
+            beyond the first, of n samples.
         p_value: chance of the best score of a library being as high with nothing missing.
         heldout_gain: share of the gap on held-out runs that it closes alone; None if not measured.
     """
