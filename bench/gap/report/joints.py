@@ -108,6 +108,8 @@ def joints_figure(story: Story, shot: Shot) -> Figure:
     axes[0, 0].set_title("measured and simulated", fontsize=9.5, loc="left")
     for panel in axes[-1]:
         panel.set_xlabel("time [s]")
+        # The narrower column has no room for more; a late run has long numbers.
+        panel.locator_params(axis="x", nbins=4)
     _finish(figure, axes, story, shot, rows)
     return figure
 
