@@ -22,7 +22,7 @@ from bench.gap.model.watch import Watch
 from bench.recordings.joined import names_of
 from bench.runs.pools import Pool
 from sims.base import InputError
-from sims.files import first_line, write
+from sims.files import first_line, refuse_full, write
 from sims.recording.description import description_of
 
 STATE = "logs.json"
@@ -165,6 +165,7 @@ def _known(out: Path, logs: Sequence[Log]) -> dict[str, Row]:
     """What an earlier call has found about the same files with the same settings."""
     path = out / STATE
     if not path.exists():
+        refuse_full(out)
         return {}
     try:
         stored = [Row(**row) for row in json.loads(path.read_text())]

@@ -94,6 +94,10 @@ def test_what_is_none_of_its_own_is_left_alone(logs, tmp_path, capsys):
     assert explain(logs[:1], out) == 2
     assert "name another folder" in capsys.readouterr().err
     assert (out / "logs.json").read_text() == '{"mine": 1}'
+    (out / "logs.json").rename(out / "mine.json")
+    assert explain(logs[:1], out) == 2
+    assert "not empty" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["mine.json"]
 
 
 def test_a_cluster_needs_many_logs(logs, tmp_path, capsys):
