@@ -246,7 +246,8 @@ def scores_panel(axis: Axes, story: Story, shown: Sequence[Candidate]) -> None:
     longest = max(*sizes, *every, 1e-9)
     axis.set_xlim(0, (1.5 if placed else 1.35) * longest)
     axis.set_xlabel(
-        "score: evidence that the simulation lacks it\n(twice the gain in log likelihood, further numbers paid)"
+        "score: evidence that the simulation lacks it\n"
+        "(twice the gain in log likelihood, further numbers paid)"
     )
 
 
