@@ -284,8 +284,8 @@ class Coefficient:
             exist there.
         plausible: the range one would expect, in the same order.
         of: whose unit it has where `units` are only the usual ones: ``input`` the first input's,
-            ``reading`` that of the channel it acts on, ``input/s`` and ``reading/s`` the same per
-            second;
+            ``error`` the same, where it is compared with a servo's error, ``reading`` that of the
+            channel it acts on, ``input/s`` and ``reading/s`` the same per second;
             ``drive`` is a limit of the drive's force, with units of its own.
         least: what a fit may not go below, where that is not a matter of plausibility.
     """
@@ -293,7 +293,7 @@ class Coefficient:
     name: str
     units: tuple[str | None, str | None, str | None]
     plausible: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-    of: Literal["", "input", "input/s", "reading", "reading/s", "drive"] = ""
+    of: Literal["", "input", "input/s", "error", "reading", "reading/s", "drive"] = ""
     least: float | None = None
 
     def unit(self, kind: Kind) -> str | None:
@@ -306,8 +306,8 @@ class Coefficient:
         """
         if system.has_model:
             return self.unit(system.kind)
-        if self.of.startswith("input") and system.inputs:
-            return self.of.replace("input", system.inputs[0].unit)
+        if self.of.startswith(("input", "error")) and system.inputs:
+            return self.of.replace("error", "input").replace("input", system.inputs[0].unit)
         if self.of.startswith("reading"):
             units = {channel.name: channel.unit for channel in system.channels}
             return self.of.replace("reading", units[system.reading(observed or tuple(units))])

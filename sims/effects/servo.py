@@ -35,7 +35,7 @@ class Deadband(Force):
     source = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
     at = "actuator"
     needs = "servo"
-    coefficients = (Coefficient("coefficient", _USUAL, _WIDTH, of="input"),)
+    coefficients = (Coefficient("coefficient", _USUAL, _WIDTH, of="error"),)
 
     def force(self, c: Array, moment: Moment) -> Array:
         """What the drive lacks of the proportional law."""

@@ -194,8 +194,8 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
     i = 2 if spot.kind == "hinge" else 1
     unit, (low, high) = c.units[i], c.plausible[i]
     least = c.least
-    if c.of.startswith("input"):
-        unit = c.of.replace("input", spot.unit)
+    if c.of.startswith(("input", "error")):
+        unit = c.of.replace("error", "input").replace("input", spot.unit)
     elif c.of.startswith("reading"):
         unit = c.of.replace("reading", spot.unit)
     # What the library calls plausible is meant for small joints: a force here may be larger.

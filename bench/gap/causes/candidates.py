@@ -37,7 +37,7 @@ LEVELS = (0.15, 0.35, 0.6, 0.85, 0.95, 0.99)
 LIMITED = ("drive", "input/s")
 """What a coefficient limits of which every small size takes all away."""
 RATES = (0.015, 0.05, 0.12, 0.3, 0.6, 0.9)
-"""The same of the largest rate: that of a jump is of no length, and what limits it may be long."""
+"""The same of what is largest for a moment alone: the rate of a command, the error of a servo."""
 NOTHING = 1e-11
 """Share of the largest observation below which a change is rounding."""
 SHAPES = 12
@@ -137,7 +137,7 @@ def _first(world: World, name: str) -> Iterator[Probe]:
         group += 1
     least, _ = parameters[0].bounds
     # Of a limit no small size is like a large one: it is tried where the input reaches it.
-    if leading.of in LIMITED or (leading.of == "input" and least == 0):
+    if leading.of in LIMITED or (leading.of in ("input", "error") and least == 0):
         yield from _limits(world, name, group)
 
 
@@ -146,7 +146,9 @@ def _limits(world: World, name: str, group: int) -> Iterator[Probe]:
     largest = _reach(world, name)
     if not largest.any():
         return
-    levels = RATES if world.effects[name].coefficients[0].of == "input/s" else LEVELS
+    # A servo's error is largest for a moment after a jump, as a command's rate is.
+    seldom = world.effects[name].coefficients[0].of in ("input/s", "error")
+    levels = RATES if seldom else LEVELS
     for number, level in enumerate(levels, start=group):
         yield Probe(
             effect=name,
@@ -165,9 +167,8 @@ def _reach(world: World, name: str) -> Array:
     if effect.coefficients[0].of == "drive":
         # How large a force gets is not recorded: what is plausible has to do.
         return np.array([p.bounds[1] for p in _parameters(world, name)])
-    most = {"input/s": _fastest}.get(effect.coefficients[0].of, _largest)
-    if effect.needs == "servo":
-        most = _farthest
+    found = {"input/s": _fastest, "error": _farthest}
+    most = found.get(effect.coefficients[0].of, _largest)
     return np.array([max(most(world, t, one) for t in world.tracks) for one in members])
 
 
