@@ -148,7 +148,6 @@ class Assessor:
             return ()
         scores = scanned.scores
         base = search.base.likelihood.value
-        price = float(np.log(max(int(search.seen.sum()), 2)))
         rows = []
         for i, effect in enumerate(scores.effects):
             score = float(scores.score[i])
@@ -160,7 +159,7 @@ class Assessor:
             p_value = float(np.clip(tail(scores.by_chance, beyond_chance), 0.0, 1.0))
             share = self._share(finding, (effect,))
             slot = search.world.slots[effect]
-            score -= price * (slot.stop - slot.start - 1)
+            score -= search.price * (slot.stop - slot.start - 1)
             rows.append(Candidate(effect, max(score, 0.0), p_value, share))
         return tuple(sorted(rows, key=lambda row: -row.score))
 

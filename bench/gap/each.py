@@ -6,9 +6,7 @@ explained is a row with its reason, and costs no other one.
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -18,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from bench.gap.explain import explain
+from bench.gap.explanation import csv_text
 from bench.gap.model.watch import Watch
 from bench.recordings.joined import names_of
 from bench.runs.pools import Pool
@@ -191,23 +190,16 @@ def _write(out: Path, rows: Sequence[Row]) -> None:
 
 def table(rows: Sequence[Row]) -> str:
     """The table of all logs as CSV, a row for each number of each cause."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(HEAD)
+    lines: list[tuple[object, ...]] = []
     for row in rows:
-        last = row.gap_closed, row.seconds, row.error
         cells: list[tuple[object, ...]] = []
         for cause in row.causes:
             for name, number in cause["coefficients"].items():
                 what = cause["effect"], " or ".join(cause["alternatives"]), name
                 cells.append((*what, *(number[key] for key in ("value", "low", "high", "unit"))))
-        for cell in cells or [("",) * 7]:
-            # What begins like a formula is one to a spreadsheet; names are from files.
-            line = [row.log, row.verdict, *cell, *last]
-            writer.writerow(
-                [f"'{c}" if isinstance(c, str) and c[:1] in "=+-@" and c else c for c in line]
-            )
-    return text.getvalue()
+        last = row.gap_closed, row.seconds, row.error
+        lines += [(row.log, row.verdict, *cell, *last) for cell in cells or [("",) * 7]]
+    return csv_text(HEAD, lines)
 
 
 def told(rows: Sequence[Row]) -> list[str]:

@@ -305,15 +305,15 @@ class _Explainer:
         from bench.gap.model.numerics import finer
 
         coarse = self.kind, self.fitting, self.measuring
-        value, left = self._value(base), self._left(base)
+        value, left = self._judged(base)
         for fine in finer(self.fitting, self.noise):
             # A finer step leaves less: one that is too coarse for what is left is not tried.
             if not fine.suits(left):
                 continue
             self._enter(fine.kind)
             other = fit_base(self.fitting, self.noise, self._given())
-            left = self._left(other)
-            gain = self._value(other) - value
+            reached, left = self._judged(other)
+            gain = reached - value
             if gain < SWITCH:
                 # What the robot does is no nearer to its fine motion: the file's own step stands.
                 if fine.suits(0.0):
@@ -328,11 +328,6 @@ class _Explainer:
         self._return(*coarse)
         return base
 
-    def _left(self, base: Base) -> float:
-        """What a base model leaves, RMS in units of the noise."""
-        scaled = (self.fitting.observed - base.fit.simulated) / self.noise.sigma
-        return float(np.sqrt(np.square(scaled[np.isfinite(self.fitting.observed)]).mean()))
-
     def _before(self, base: Base, measuring: World | None) -> Array | None:
         """What the file's own step makes of the held-out runs; None where there are none."""
         if measuring is None:
@@ -344,9 +339,12 @@ class _Explainer:
         self.kind, self.fitting, self.measuring = kind, fitting, measuring
         self.assessor = Assessor(self.recording, fitting, measuring, self.floor, self.engine)
 
-    def _value(self, base: Base) -> float:
-        """Twice the log likelihood of a base model."""
-        return float(self._search(base, self._rng()).base.likelihood.value)
+    def _judged(self, base: Base) -> tuple[float, float]:
+        """Twice the log likelihood of a base model, and what it leaves, RMS in units of the
+        noise.
+        """
+        found = self._search(base, self._rng())
+        return float(found.base.likelihood.value), 1.0 + found.excess(found.base)
 
     def _rng(self) -> np.random.Generator:
         return rng_for("explain", self.recording.system, self.seed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -94,7 +94,7 @@ class Explanation:
             folder / "extended.toml": extending.written(self.extended, folder),
         }
         if apart := rows(self.story):
-            contents[folder / "apart.csv"] = _csv(apart)
+            contents[folder / "apart.csv"] = csv_text(HEAD, apart)
         contents |= {folder / name: text for name, text in self._robot_files.contents.items()}
         for name, figure in figures.items():
             contents[folder / f"{name}.png"] = figure.png
@@ -155,18 +155,18 @@ class Explanation:
         return framed(self._page(pictures.printed(self.story), for_print=False))
 
 
-def _csv(found: Sequence[tuple[object, ...]]) -> str:
-    """A table with the columns of `agreement.HEAD`."""
+def csv_text(head: Sequence[str], found: Iterable[Sequence[object]]) -> str:
+    """A table with these columns."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(HEAD)
+    writer.writerow(head)
     # What begins like a formula is one to a spreadsheet; names are from files.
     writer.writerows([_plain(cell) for cell in row] for row in found)
     return text.getvalue()
 
 
 def _plain(cell: object) -> object:
-    return f"'{cell}" if isinstance(cell, str) and cell[:1] in "=+-@" else cell
+    return f"'{cell}" if isinstance(cell, str) and cell.startswith(("=", "+", "-", "@")) else cell
 
 
 def _in_words(cause: Cause) -> str:

@@ -26,6 +26,7 @@ class RobotSystem(System):
         alone: (D,) each joint as a system of its own.
         drives: by coordinate, the inputs of its actuators.
         servos: by coordinate, the input that is the set point of its position servo.
+        gears: and by how much that turns for each unit of the coordinate.
     """
 
     name = "robot"
@@ -44,6 +45,7 @@ class RobotSystem(System):
     alone: ClassVar[tuple[System, ...]]
     drives: ClassVar[Mapping[int, tuple[str, ...]]]
     servos: ClassVar[Mapping[int, str]]
+    gears: ClassVar[Mapping[int, float]]
     freed: ClassVar[frozenset[str]] = frozenset()
     freed_effects: ClassVar[tuple[type[Effect], ...]] = ()
     _placed: ClassVar[dict[str, tuple[type[Effect], ...]]]
@@ -51,10 +53,7 @@ class RobotSystem(System):
     @classmethod
     def gear(cls, coordinate: int) -> float:
         """See `System`."""
-        name = cls.servos[coordinate].partition(".")[2] if coordinate in cls.servos else ""
-        if not name:
-            return 1.0
-        return float(cls.robot.compiled.actuator_gear[cls.robot.actuator(name).id, 0])
+        return cls.gears.get(coordinate, 1.0)
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
@@ -166,13 +165,15 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
     states |= {f"qd.{j.name}": 0.0 for j in joints}
     drives: dict[int, tuple[str, ...]] = {}
     servos: dict[int, str] = {}
+    gears: dict[int, float] = {}
     for number, joint in enumerate(joints):
         own = [a for a in robot.actuators if a.joint == joint.name]
         drives[number] = tuple(f"u.{a.name}" for a in own)
-        follows = [f"u.{a.name}" for a in own if a.kind == "position"]
+        follows = [a for a in own if a.kind == "position"]
         # Of several which one is off would not show in the joint's motion.
         if len(follows) == 1:
-            servos[number] = follows[0]
+            servos[number] = f"u.{follows[0].name}"
+            gears[number] = float(model.actuator_gear[follows[0].id, 0])
     declared: dict[str, Any] = {
         "name": robot.name,
         "says": f"the robot of {robot.path.name}",
@@ -189,6 +190,7 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
         "alone": tuple(OneJoint() if j.kind == "hinge" else Slide() for j in joints),
         "drives": drives,
         "servos": servos,
+        "gears": gears,
         "_placed": {},
     }
     system: type[RobotSystem] = type("RobotSystemOfFile", (RobotSystem,), declared)

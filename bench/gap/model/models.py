@@ -111,7 +111,7 @@ class Models:
         if np.isfinite(fit.cost):
             found = likelihood(self.residual(fit), self.seen, free)
         chance = sum(self.chance_of(name) for name in fit.effects)
-        merit = found.value - free * self._price - chance  # (1)
+        merit = found.value - free * self.price - chance  # (1)
 
         # the order in which effects were added makes no difference
         key = frozenset(fit.effects)
@@ -124,7 +124,7 @@ class Models:
         """Called when a model has taken the place of another."""
 
     @property
-    def _price(self) -> float:
+    def price(self) -> float:
         """What each number that the data fix costs a model, the log n of (1)."""
         count = int(self.seen.sum())
         return float(np.log(max(count, FEWEST)))
@@ -133,7 +133,7 @@ class Models:
         """What an effect costs beside that, its part of the last term of (1)."""
         slot = self.world.slots[name]
         # few shapes gain less by chance than their coefficients pay
-        paid = (slot.stop - slot.start) * self._price
+        paid = (slot.stop - slot.start) * self.price
         return float(max(self.chances.get(name, 0.0) - paid, 0.0))
 
     def refit(
