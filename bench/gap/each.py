@@ -6,7 +6,6 @@ explained is a row with its reason, and costs no other one.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -18,11 +17,11 @@ import numpy as np
 from bench.gap.explain import explain
 from bench.gap.explanation import csv_text
 from bench.gap.model.watch import Watch
+from bench.recordings.digest import content_of, digest_of
 from bench.recordings.joined import names_of
 from bench.runs.pools import Pool
 from sims.base import InputError
 from sims.files import first_line, refuse_full, write
-from sims.recording.description import description_of
 
 STATE = "logs.json"
 """What is known of the logs: it is written again whenever one is done."""
@@ -42,7 +41,8 @@ class Log:
         name: short, and no other log's.
         path: of its table or description.
         folder: for verdict, extended simulator, figures and report.
-        digest: of its files and of what it is asked with.
+        digest: of its files, those that its description maps among them, and of what it is asked
+            with.
     """
 
     name: str
@@ -86,20 +86,12 @@ def logs_of(paths: Sequence[Path], out: Path, settings: Mapping[str, Any]) -> li
         InputError: a file is not there.
     """
     told = repr(sorted((key, str(value)) for key, value in settings.items()))
+    if settings.get("model") is not None:
+        told += content_of(Path(settings["model"])).hex()
     return [
-        Log(name, path.absolute(), out.absolute() / name.replace("/", "_"), _digest(path, told))
+        Log(name, path.absolute(), out.absolute() / name.replace("/", "_"), digest_of(path, told))
         for name, path in zip(names_of(paths), paths, strict=True)
     ]
-
-
-def _digest(path: Path, told: str) -> str:
-    digest = hashlib.sha256(told.encode())
-    for file in dict.fromkeys([path, description_of(path)]):
-        try:
-            digest.update(file.read_bytes())
-        except OSError as error:
-            raise InputError(f"{file}: cannot be read ({error.strerror})") from None
-    return digest.hexdigest()
 
 
 def explain_each(

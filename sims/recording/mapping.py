@@ -16,7 +16,7 @@ from sims.limits import BRIEFEST, LATEST, NAME
 from sims.recording.logs import Log, read_log
 from sims.recording.table import TableRun
 from sims.recording.units import scale
-from sims.user_toml import finite, known, table, text
+from sims.user_toml import finite, known, read_toml, table, text
 
 TIME = ("offset", "column", "unit")
 """What may stand in `[time]`."""
@@ -91,6 +91,33 @@ def read_sources(
         folders,
         bool(said or folders or {"column", "unit"} & time.keys()),
     )
+
+
+def mapped(description: Path) -> list[Path]:
+    """Files that a description leads to beside its table: logs and bags that it maps, its model.
+
+    Whatever is malformed leads nowhere: it is refused when the recording is read.
+    """
+    try:
+        meta = read_toml(description)
+    except InputError:
+        return []
+    signals = [_named(meta.get(kind), "file") for kind in ("channels", "inputs")]
+    folders = _named(meta.get("runs"), "folder") or [""]
+    # A signal without a file is in the table of the description's name in each folder.
+    usual = description.with_suffix(".csv").name
+    files = dict.fromkeys([usual, *(name for names in signals for name in names)])
+    paths = [description.parent / folder / file for folder in folders for file in files]
+    model = [name for name in (meta.get("model"),) if isinstance(name, str)]
+    return [*paths, *(description.parent / name for name in model)]
+
+
+def _named(tables: Any, word: str) -> list[str]:
+    """What a word says in any of some tables, however deep they stand in each other."""
+    if not isinstance(tables, dict):
+        return []
+    own = [tables[word]] if isinstance(tables.get(word), str) else []
+    return own + [name for inner in tables.values() for name in _named(inner, word)]
 
 
 def read_logs(

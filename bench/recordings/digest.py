@@ -1,0 +1,77 @@
+"""What a recording stands in, in one number: any of its files changed, another number."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from functools import lru_cache
+from pathlib import Path
+
+from sims.base import InputError
+from sims.recording.bags import bag_of
+from sims.recording.description import description_of
+from sims.recording.mapping import mapped
+
+PIECE = 1 << 20
+"""Bytes read at once: a bag may be larger than the memory."""
+_INCLUDE = re.compile(rb"<include\s+file\s*=\s*[\"']([^\"']+)[\"']")
+
+
+def digest_of(path: Path, told: str = "") -> str:
+    """Of a recording: its table, its description, the logs and bags that this maps, and its model.
+
+    Args:
+        path: of its table or description.
+        told: what else makes it another one.
+
+    Raises:
+        InputError: the table or the description cannot be read.
+    """
+    digest = hashlib.sha256(told.encode())
+    description = description_of(path)
+    for file in dict.fromkeys([path, description]):
+        try:
+            digest.update(file.read_bytes())
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read ({error.strerror})") from None
+    for file in mapped(description):
+        digest.update(content_of(file))
+    return digest.hexdigest()
+
+
+def content_of(path: Path) -> bytes:
+    """What stands for a file and for what it includes, or for the bag that a path leads into.
+
+    Nothing where there is none: whoever reads it will say so.
+    """
+    bag = bag_of(path)
+    whole = path if bag is None else bag[0]
+    files = sorted(whole.rglob("*")) if bag is not None and whole.is_dir() else [whole]
+    content = hashlib.sha256()
+    for file in files if whole.suffix.lower() != ".xml" else _with_included(whole):
+        if file.is_file():
+            about = file.stat()
+            content.update(_hashed(file, about.st_mtime_ns, about.st_size))
+    return content.digest()
+
+
+def _with_included(model: Path) -> list[Path]:
+    """A model file, and those that it includes, which MuJoCo looks for beside it."""
+    files, found = [model], 0
+    while found < len(files):
+        inner = files[found]
+        names = _INCLUDE.findall(inner.read_bytes()) if inner.is_file() else []
+        beside = [model.parent / name.decode(errors="replace") for name in names]
+        files += [file for file in dict.fromkeys(beside) if file not in files]
+        found += 1
+    return files
+
+
+@lru_cache(maxsize=256)
+def _hashed(path: Path, _changed: int, _size: int) -> bytes:
+    """Of a file, which many logs may name; one changed since is another one."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while piece := file.read(PIECE):
+            digest.update(piece)
+    return digest.digest()
