@@ -60,6 +60,7 @@ _WHERE = {
         "Force",
         "Friction",
         "Input",
+        "Level",
         "Moment",
         "Sensor",
         "Signal",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import weakref
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -20,8 +20,9 @@ from sims.base import Array, Channel, InputError, Parameter
 from sims.bullet import engine
 from sims.limits import cut, is_number
 from sims.own_engine import OwnEngine
+from sims.own_levels import at_levels, named
 from sims.simulated import Simulated
-from sims.system import Contact, Effect, Engine, Force, Friction, Kind, Moment, System
+from sims.system import Contact, Effect, Engine, Force, Friction, Kind, Level, Moment, System
 
 
 class OwnSystem(System):
@@ -39,12 +40,26 @@ class OwnSystem(System):
     simulator: ClassVar[type[OwnSimulator]]
 
     @classmethod
+    def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
+        """An effect on levels at each of them, any other as it is."""
+        if issubclass(effect, Level) and not effect.misses(cls):
+            return at_levels(effect, cls)
+        return super().placed(effect)
+
+    @classmethod
+    def effect(cls, name: str) -> type[Effect] | None:
+        """The effect of a name such as ``state.overflow@upper``."""
+        return named(name, cls)
+
+    @classmethod
     def refuses(cls, effect: type[Effect]) -> str:
         """A force needs the simulator's hook; dry friction its inertia besides; an impact is out of
         reach.
         """
         if issubclass(effect, Contact):
             return "an own simulator does not say when it strikes something"
+        if issubclass(effect, Level) and cls.simulator.put is OwnSimulator.put:
+            return "its levels cannot be set (it has no method put)"
         if not issubclass(effect, Force | Friction):
             return ""
         if cls.simulator.apply_force is OwnSimulator.apply_force:
@@ -109,6 +124,8 @@ class OwnSimulator(Simulated):
         kind: how its forces count: ``linear`` in N, ``rotary`` in N m, ``point`` per unit mass.
         coordinates: states that are its generalised position, for effects that are forces.
         rates: states that are their rates, in the same order.
+        levels: states that are stores, such as a tank's level, which may spill over; each is a
+            channel, too.
 
     Raises:
         InputError: the declaration contradicts itself.
@@ -120,6 +137,7 @@ class OwnSimulator(Simulated):
     kind: ClassVar[Kind] = "linear"
     coordinates: ClassVar[tuple[str, ...]] = ()
     rates: ClassVar[tuple[str, ...]] = ()
+    levels: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         _check(cls)
@@ -134,6 +152,7 @@ class OwnSimulator(Simulated):
             "kind": cls.kind,
             "coordinates": cls.coordinates,
             "rates": (*cls.rates, *others),
+            "levels": cls.levels,
             "sensed": tuple(c.name for c in cls.channels),
             "simulator": cls,
         }
@@ -183,6 +202,10 @@ class OwnSimulator(Simulated):
         """
         raise NotImplementedError
 
+    def put(self, levels: Mapping[str, float]) -> None:
+        """Optional: give these levels these values and go on from there; the others stay."""
+        raise NotImplementedError
+
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
         if name is not None:
             raise InputError(f"simulator {self.name} steps itself; it has no engine '{name}'")
@@ -218,6 +241,10 @@ def _check(cls: type[OwnSimulator]) -> None:
         if name not in cls.states:
             known = ", ".join(cls.states) or "(none)"
             raise InputError(f"simulator {cls.name}: {name} is not among its states {known}")
+    shown = [c.name for c in cls.channels]
+    for name in cls.levels:
+        if name not in cls.states or name not in shown:
+            raise InputError(f"simulator {cls.name}: level {name} must be a state and a channel")
 
 
 class BulletWorld:

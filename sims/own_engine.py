@@ -18,7 +18,7 @@ import numpy as np
 
 from sims.base import Array, InputError
 from sims.engines.external import evened
-from sims.system import Force, Friction, Lanes, Moment, Motion, System
+from sims.system import Force, Friction, Lanes, Level, Moment, Motion, System
 
 
 class Stepping(Protocol):
@@ -47,6 +47,8 @@ class Stepping(Protocol):
     def apply_force(self, force: Array) -> None: ...
 
     def inertia(self) -> float: ...
+
+    def put(self, levels: Mapping[str, float]) -> None: ...
 
 
 class OwnEngine:
@@ -95,6 +97,8 @@ class OwnEngine:
             return None
         world.reset(theta, constants, initial)
         forces = _Forces(lanes, lane, world)
+        rims = _Rims(lanes, lane, world)
+        rims.keep()
         steps = lanes.steps[lane].copy()
         # Steps of no length, in which the lane waits for others, are no steps of the simulator.
         moving = steps > 0
@@ -109,6 +113,7 @@ class OwnEngine:
                 if forces.any:
                     world.apply_force(forces.at(t, inputs, seconds))
                 world.step(inputs, seconds)
+                rims.keep()
                 t = t + seconds
                 moved = True
             # Nothing has changed where nothing has moved: the row before is the row now.
@@ -131,6 +136,29 @@ def _seen(world: Stepping, seen: Mapping[str, float], name: str) -> float:
     return float(seen[name])
 
 
+class _Rims:
+    """What bounds the levels of one lane."""
+
+    def __init__(self, lanes: Lanes, lane: int, world: Stepping) -> None:
+        self.acting = []
+        for effect, c in lanes.effects:
+            own = c[:, lane : lane + 1]
+            if isinstance(effect, Level) and own.any():
+                self.acting.append((effect, own, effect.place or lanes.system.levels[0]))
+        self.world = world
+
+    def keep(self) -> None:
+        """Take from the levels what is too much."""
+        if not self.acting:
+            return
+        seen = self.world.observe()
+        for effect, c, name in self.acting:
+            level = np.array([[_seen(self.world, seen, name)]])
+            kept = float(effect.keep(c, level)[0, 0])
+            if kept != level[0, 0]:
+                self.world.put({name: kept})
+
+
 class _Forces:
     """The effects' forces on one lane."""
 
@@ -139,7 +167,7 @@ class _Forces:
         acting = [(effect, c) for effect, c in here if c.any()]
         self.forces = [(effect, c) for effect, c in acting if isinstance(effect, Force)]
         self.frictions = [(effect, c) for effect, c in acting if isinstance(effect, Friction)]
-        self.any = bool(acting)
+        self.any = bool(self.forces or self.frictions)
         self.world = world
         self.system = lanes.system
         self.theta = lanes.theta[lane : lane + 1]

@@ -22,6 +22,7 @@ from sims.system import (
     Friction,
     Input,
     Lanes,
+    Level,
     Motion,
     Sensor,
     Signal,
@@ -170,7 +171,7 @@ class Simulated(Simulator):
             every = 1 if filtered else plan.every
             own = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
             constants, x, v = self._known(scenarios, initial)
-            forces = _of(acting, (Force, Friction, Contact))
+            forces = _of(acting, (Force, Friction, Contact, Level))
             lanes = Lanes(self._declared, own, constants, x, v, plan.steps, inputs, forces, every)
             observations = self._read(self.engine.integrate(lanes), lanes, plan, sensors)
         # A shorter run has waited at its end; what it showed there was no sample.

@@ -32,8 +32,8 @@ Kind = Literal["point", "linear", "rotary"]
 """How a system counts force: `point` per unit mass (m/s^2), `linear` in N, `rotary` in N*m."""
 KINDS: tuple[Kind, ...] = ("point", "linear", "rotary")
 """All kinds, in the order of a coefficient's units and ranges."""
-PlaceKind = Literal["joint", "actuator", "body", "channel", "world"]
-"""Kinds of places in a robot."""
+PlaceKind = Literal["joint", "actuator", "body", "channel", "world", "level"]
+"""Kinds of places in a robot, and of an own simulator the levels."""
 FAMILY = "*"
 """The place of an effect that acts at all places of its kind."""
 STANDARD_GRAVITY = 9.80665
@@ -167,6 +167,7 @@ class System(ABC):
         uniform: whether its own force is the same everywhere and always, so that it moves along
             parabolas.
         has_model: whether it comes from a model file, whose numbers may be wrong.
+        levels: states that are stores, such as a tank's level: they may spill over.
         usual_recording: what its simulated recordings show where the user does not say.
     """
 
@@ -186,6 +187,7 @@ class System(ABC):
     bounces: ClassVar[bool] = False
     uniform: ClassVar[bool] = False
     has_model: ClassVar[bool] = False
+    levels: ClassVar[tuple[str, ...]] = ()
     usual_recording: ClassVar[UsualRecording] = UsualRecording()
 
     @classmethod
@@ -285,7 +287,8 @@ class Coefficient:
         plausible: the range one would expect, in the same order.
         of: whose unit it has where `units` are only the usual ones: ``input`` the first input's,
             ``error`` the same, where it is compared with a servo's error, ``reading`` that of the
-            channel it acts on, ``input/s`` and ``reading/s`` the same per second;
+            channel it acts on, ``input/s`` and ``reading/s`` the same per second; ``level`` that
+            of what is stored;
             ``drive`` is a limit of the drive's force, with units of its own.
         least: what a fit may not go below, where that is not a matter of plausibility.
     """
@@ -293,7 +296,7 @@ class Coefficient:
     name: str
     units: tuple[str | None, str | None, str | None]
     plausible: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-    of: Literal["", "input", "input/s", "error", "reading", "reading/s", "drive"] = ""
+    of: Literal["", "input", "input/s", "error", "reading", "reading/s", "drive", "level"] = ""
     least: float | None = None
 
     def unit(self, kind: Kind) -> str | None:
@@ -335,7 +338,7 @@ class Effect(ABC):
         needs: what the system must have: ``input``; ``ground`` to strike; ``guide``, which a body
             that flies freely lacks; ``servo``, an input that is a set point; ``gravity``; ``push``,
             a say in what horizontal acceleration does to it; ``space`` of three dimensions;
-            ``model``, a file that states its numbers;
+            ``model``, a file that states its numbers; ``level``, something that it stores;
             or empty.
         contains: simpler effects that it turns into where some of its coefficients are zero.
         hook: which of the engine's hooks it uses; set by the hook classes.
@@ -390,6 +393,7 @@ class Effect(ABC):
             "model": ""
             if declared.has_model
             else "it has no model file whose numbers may be wrong",
+            "level": "" if declared.levels else "it names no level that could spill over",
         }[cls.needs]
         undefined = "" if cls.on(system) else f"it is not defined for a {system.kind} system"
         return lacks or undefined or system.refuses(cls)
@@ -434,6 +438,20 @@ class Value(Effect):
 
     hook = "value"
     needs = "model"
+
+
+class Level(Effect):
+    """A bound of what a system stores, such as the level of a tank; an own simulator takes it after
+    each of its steps.
+    """
+
+    hook = "level"
+    at: ClassVar[PlaceKind] = "level"
+    needs = "level"
+
+    @abstractmethod
+    def keep(self, c: Array, level: Array) -> Array:
+        """(L, 1) what remains of a level (L, 1)."""
 
 
 class Contact(Effect):

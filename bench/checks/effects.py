@@ -13,12 +13,24 @@ import numpy as np
 from bench.checks.arm import placed
 from bench.checks.base import CheckError, NotApplicable, require, same_bits
 from bench.checks.places import PLACE_CHECKS
+from bench.checks.tub import Tub
 from bench.registry import SkippedError, simulators
 from sims import effects
 from sims.base import Array, InputError, Scenario
 from sims.own import OwnSimulator
 from sims.simulated import Simulated
-from sims.system import Contact, Effect, Force, Friction, Input, Moment, Sensor, Signal, System
+from sims.system import (
+    Contact,
+    Effect,
+    Force,
+    Friction,
+    Input,
+    Level,
+    Moment,
+    Sensor,
+    Signal,
+    System,
+)
 
 _NAME = re.compile(r"[a-z]+(\.[a-z_]+)?$")
 _SAMPLES = 60
@@ -38,7 +50,8 @@ def _declared() -> Iterator[type[Simulated]]:
 
 def _hosts(effect: type[Effect]) -> Iterator[type[Simulated]]:
     """Those that can have the effect."""
-    return (kind for kind in _declared() if not effect.misses(kind.system))
+    kinds: tuple[type[Simulated], ...] = (*_declared(), Tub)
+    return (kind for kind in kinds if not effect.misses(kind.system))
 
 
 def _made(host: type[Simulated], effect: type[Effect]) -> Simulated:
@@ -62,6 +75,7 @@ def _engine(host: type[Simulated]) -> str | None:
 def _scenario(system: type[System]) -> Scenario:
     """A run in which everything moves: speed in every direction, an input that changes."""
     times = np.arange(_SAMPLES) / _RATE
+    # What is no coordinate and no rate, as a level, has its place among the rates.
     initial = dict.fromkeys(system.rates, 0.7) | dict.fromkeys(system.coordinates, 0.4)
     if system.bounces:
         initial[system.coordinates[-1]] = 2.0
@@ -142,6 +156,8 @@ def _contributions(
         return [(acting.times(c, times), times), (acting.feel(c, signal), values)]
     if isinstance(acting, Sensor):
         return [(acting.times(c, times), times), (acting.read(c, signal), values)]
+    if isinstance(acting, Level):
+        return [(acting.keep(c, e), e)]
     raise CheckError(
         f"expected one of the hook classes; found {type(acting).__mro__}; see sims.system"
     )

@@ -172,6 +172,7 @@ def test_faulty_declarations_are_one_line():
         ({"channels": ()}, "at least one parameter and one channel"),
         ({"rates": ()}, r"expected a rate for each of \('x',\), found \(\)"),
         ({"coordinates": ("y",)}, "y is not among its states charge, x, v"),
+        ({"levels": ("y",)}, "level y must be a state and a channel"),
     ]:
         with pytest.raises(InputError, match=message):
             declared(**changes)
@@ -195,7 +196,7 @@ def test_examples_are_short():
         assert len(path.read_text().splitlines()) <= 40, path
 
 
-@pytest.mark.parametrize(("name", "kind"), [("puck", "Puck"), ("bob", "Bob")])
+@pytest.mark.parametrize(("name", "kind"), [("puck", "Puck"), ("bob", "Bob"), ("tanks", "Tanks")])
 def test_examples_conform(name, kind):
     for check in SIMULATOR_CHECKS:
         check(example(name, kind))

@@ -34,7 +34,7 @@ SMALL = 1e-4
 """Share of a plausible range at which a direction is first taken."""
 LEVELS = (0.15, 0.35, 0.6, 0.85, 0.95, 0.99)
 """Shares of the largest input at which limits, dead bands and plays are tried besides."""
-LIMITED = ("drive", "input/s")
+LIMITED = ("drive", "input/s", "level")
 """What a coefficient limits of which every small size takes all away."""
 RATES = (0.015, 0.05, 0.12, 0.3, 0.6, 0.9)
 """The same of what is largest for a moment alone: the rate of a command, the error of a servo."""
@@ -164,11 +164,12 @@ def _reach(world: World, name: str) -> Array:
     """(k,) of each place where an effect limits something, what is reached there."""
     effect = world.effects[name]
     members = getattr(effect, "members", ()) or (effect,)
-    if effect.coefficients[0].of == "drive":
+    of = effect.coefficients[0].of
+    if of == "drive" or (of == "level" and not _recorded(world, effect)):
         # How large a force gets is not recorded: what is plausible has to do.
         return np.array([p.bounds[1] for p in _parameters(world, name)])
-    found = {"input/s": _fastest, "error": _farthest}
-    most = found.get(effect.coefficients[0].of, _largest)
+    found = {"input/s": _fastest, "error": _farthest, "level": _fullest}
+    most = found.get(of, _largest)
     return np.array([max(most(world, t, one) for t in world.tracks) for one in members])
 
 
@@ -189,6 +190,18 @@ def _fastest(world: World, track: Track, effect: Effect) -> float:  # noqa: ARG0
     """Of a run, from sample to sample of the input, a second."""
     risen = np.abs(np.diff(_command(track, effect)))
     return float((risen / np.diff(track.scenario.times)).max(initial=0.0))
+
+
+def _recorded(world: World, effect: Effect) -> str:
+    """The channel that shows the level an effect acts on; empty where that is not recorded."""
+    name = effect.place or world.simulator.system.levels[0]
+    return name if name in world.channels else ""
+
+
+def _fullest(world: World, track: Track, effect: Effect) -> float:
+    """Of a run, of the level."""
+    shown = track.observed[:, world.channels.index(_recorded(world, effect))]
+    return float(np.nanmax(shown, initial=0.0))
 
 
 def _farthest(world: World, track: Track, effect: Effect) -> float:

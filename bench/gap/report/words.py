@@ -26,6 +26,7 @@ _AT = {
     "actuator": ("at", "actuators"),
     "body": ("of", "bodies"),
     "channel": ("in", "channels"),
+    "level": ("of", "levels"),
 }
 """How a sentence leads to a place of each kind, and how it calls several."""
 NUMERICS = {

@@ -46,7 +46,8 @@ def contradictions(recording: Recording, kind: type[Simulator]) -> Iterator[Find
     if not issubclass(kind, Simulated):
         return
     system = kind.system
-    for position, rate in zip(system.coordinates, system.rates, strict=True):
+    # not strict: behind the coordinates' rates, an own system may have other states
+    for position, rate in zip(system.coordinates, system.rates, strict=False):
         runs = [run for run in recording.runs if {position, rate} <= run.channels.keys()]
         if runs:
             yield from _pair(runs, position, rate)

@@ -14,10 +14,16 @@ from sims import effects
 from sims.base import InputError
 from sims.effects.table import table
 from sims.simulated import effect_parameters
-from sims.system import KINDS, Contact, Force, Friction, Input, Sensor, Signal
+from sims.system import KINDS, Contact, Force, Friction, Input, Level, Sensor, Signal
 from tests.sims.effects.worlds import NAMES, PAIRS, SIMULATORS, SYSTEMS, lanes, moment, run
 
-HOOKS = {"force": (Force, Friction), "contact": (Contact,), "input": (Input,), "sensor": (Sensor,)}
+HOOKS = {
+    "force": (Force, Friction),
+    "contact": (Contact,),
+    "input": (Input,),
+    "sensor": (Sensor,),
+    "level": (Level,),
+}
 UNITS = pint.UnitRegistry()
 
 
@@ -99,8 +105,9 @@ def test_what_fits_what():
     }
     inputs = {name for name in NAMES if name.startswith("input.")} | {"backlash", "friction.load"}
     servo = {"servo.deadband", "servo.derivative"}
-    joint = set(NAMES) - impact - flight
-    assert there["ball"] == set(NAMES) - guided - inputs - servo
+    mechanical = set(NAMES) - {"state.overflow"}
+    joint = mechanical - impact - flight
+    assert there["ball"] == mechanical - guided - inputs - servo
     assert there["slider"] == joint - {"gravity.scale", "sensor.eccentricity"} - servo
     assert there["pendulum"] == joint - {"wind"} - servo
     assert there["servo"] == joint - {"wind"}
@@ -115,6 +122,7 @@ def test_what_fits_what():
         ("gravity.scale", "slider", "no gravity"),
         ("friction.coulomb", "ball", "flies freely"),
         ("servo.deadband", "slider", "no servo"),
+        ("state.overflow", "slider", "no level"),
         ("sensor.eccentricity", "slider", "not defined for a linear system"),
         ("wind", "pendulum", "not defined for a rotary system"),
     ],

@@ -56,6 +56,7 @@ NAMES = [
     "servo.deadband",
     "servo.derivative",
     "clock.skew",
+    "state.overflow",
 ]
 PAIRS = [
     (name, system)

@@ -1,0 +1,66 @@
+"""Effects at what an own simulator stores: a registered effect on levels becomes a class for each
+level, named ``effect@level`` where there are several, with the level's unit and a range about its
+typical size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+from sims.base import InputError, unknown
+from sims.effects import registry
+from sims.registry import SkippedError
+from sims.system import Coefficient, Effect, Level, System
+
+
+@lru_cache(maxsize=64)
+def at_levels(effect: type[Level], system: type[System]) -> tuple[type[Effect], ...]:
+    """The effect at each level of a system; empty where that has none."""
+    levels = [channel for channel in system.channels if channel.name in system.levels]
+    made = []
+    for channel in levels:
+        several = len(levels) > 1
+        body = {
+            "name": f"{effect.name}@{channel.name}" if several else effect.name,
+            "of": effect.name,
+            "place": channel.name if several else "",
+            "coefficients": [_sized(c, channel.unit, channel.scale) for c in effect.coefficients],
+            "__module__": __name__,
+            "__doc__": effect.__doc__,
+        }
+        made.append(type(f"{effect.__name__}At", (effect,), body))
+    return tuple(made)
+
+
+def _sized(c: Coefficient, unit: str, scale: float) -> Coefficient:
+    """In the unit of a level, and in its size."""
+    low, high = c.plausible[0]
+    return replace(c, units=(unit,) * 3, plausible=((low * scale, high * scale),) * 3)
+
+
+def named(name: str, system: type[System]) -> type[Effect] | None:
+    """The effect of a name such as ``state.overflow@upper``; None for one that is not on levels.
+
+    Raises:
+        InputError: it cannot be on this system, or not at this place; the message says why, or
+            where it is.
+    """
+    base, at, place = name.partition("@")
+    try:
+        effect = registry.get(base)
+    except SkippedError:
+        return None
+    if not issubclass(effect, Level) or not system.levels:
+        return None
+    if reason := effect.misses(system):
+        raise InputError(f"system {system.name} cannot have effect {name}: {reason}")
+    known = {one.name: one for one in at_levels(effect, system)}
+    if name in known:
+        return known[name]
+    places: Sequence[str] = [one.place for one in known.values()]
+    if not at:
+        where = ", ".join(f"{base}@{there}" for there in places)
+        raise InputError(f"effect {base} of simulator {system.name} needs a place: {where}")
+    raise unknown(f"place of effect {base} in simulator {system.name}", place, list(system.levels))
