@@ -97,6 +97,14 @@ class Moment:
         return load
 
     @property
+    def sides(self) -> tuple[Array, Array]:
+        """(L, 1) each, of the primary coordinate: the force of the drive, and what it works
+        against; both press on the transmission where they have one sign.
+        """
+        place = slice(self.system.primary, self.system.primary + 1)
+        return self.system.drive(self)[:, place], self.system.passive(self)[:, place]
+
+    @property
     def error(self) -> Array:
         """(L, 1) of the servo: how far its set point is from where it is."""
         error: Array = self.inputs[self.system.servo] - self.primary

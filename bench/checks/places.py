@@ -190,7 +190,8 @@ def _pushed(effect: Force | Friction, c: Array, kind: type) -> tuple[object, ...
     x = np.array([[0.3, -0.4], [0.8, 0.2]])
     inputs = {c.name: np.full((2, 1), 0.3) for c in system.inputs}
     stiffness = np.ones_like(x)
-    moment = moment_of(system, np.full((2, 1), 0.4), x, 1.0 - x, inputs, 0.5 + x, stiffness)
+    carried = np.stack([0.5 + x, 0.4 + x])
+    moment = moment_of(system, np.full((2, 1), 0.4), x, 1.0 - x, inputs, carried, stiffness)
     if isinstance(effect, Friction):
         return (effect.coordinate,) if np.any(effect.limit(c, moment)) else ()
     force = effect.force(c, moment)

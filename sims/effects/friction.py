@@ -6,16 +6,23 @@ sticks. With v the velocity, limits are
 * (1) Coulomb: c
 * (2) Stribeck: coulomb + extra exp(-(v / speed)^2)
 * (3) load: c |drive - load|, each counted as it pushes the joint
+* (4) load, by direction: |motor drive - external load|
+* (5) load, quadratic: c |drive - load| + quadratic through^2, where `through` is the smaller of
+  drive and load as far as they pull against each other: what goes through the gears
+* (6) position: coulomb + sine sin(2 pi x / period) + cosine cos(2 pi x / period)
+* (7) warming: (dry + viscous |v|) exp(-t / time), t since the start of the run
 
 A negative limit is none. And one that is no limit but a force, since it vanishes at rest:
 
-* (4) direction: -viscous+ v where v > 0, -viscous- v where v < 0
+* (8) direction: -viscous+ v where v > 0, -viscous- v where v < 0
 
 Dry friction that differs by direction needs no law of its own: with limits d+ and d- it is, at rest
 as in motion, Coulomb friction of (d+ + d-) / 2 and a constant force of -(d+ - d-) / 2.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,14 +32,45 @@ from sims.system import Coefficient, Force, Friction, Moment
 _SURVEY = (
     "B. Armstrong-Helouvry et al., Automatica 30(7), 1083 (1994), doi:10.1016/0005-1098(94)90209-7"
 )
+_SERVOS = "M. Duclusaud et al. (2024), arXiv:2410.08650, model "
+_WARM = (
+    "A. C. Bittencourt, S. Gunnarsson, J. Dyn. Sys. Meas. Control 134(5), 051013 (2012); time as in"
+    " L. Simoni et al., Robotica 36 (2018), doi:10.1017/S0263574717000509"
+)
+_PLACE = (
+    "M. R. Popovic, A. A. Goldenberg, IEEE Trans. Robot. Autom. 14(1), 114 (1998); B. Armstrong,"
+    " Proc. IEEE ICRA, 1422 (1988)"
+)
 _SMALLEST = 1e-9
-"""m/s or rad/s; the Stribeck speed that stands for zero, so that 0 / 0 never comes up."""
+"""What stands for a speed, a period or a time of zero, so that 0 / 0 never comes up."""
 _USUAL = ("m/s^2", "N", "N*m")
 """Units of a force on the three kinds of system."""
 _VISCOUS = (None, "N*s/m", "N*m*s/rad")
 """Units of a viscous friction, where motion has two ways."""
 _DAMPED = ((0, 0), (0, 5), (0, 0.05))
 """Plausible ones, in the units of `_VISCOUS`."""
+_LOAD = Coefficient("coefficient", (None, "1", "1"), ((0, 0), (0, 0.5), (0, 0.5)))
+"""Friction by load: a share of it."""
+_DRY = ((0, 5), (0, 5), (0, 0.5))
+"""Plausible limits, in the units of `_USUAL`."""
+_WAVE = ((-5, 5), (-5, 5), (-0.5, 0.5))
+"""Plausible amplitudes over the joint, in the units of `_USUAL`."""
+_PERIOD = ((0.2, 5), (0.2, 5), (0.5, 6.2832))
+"""Plausible periods, m or rad: once a turn, and a few times."""
+_OVER = (
+    Coefficient("sine", _USUAL, _WAVE),
+    Coefficient("cosine", _USUAL, _WAVE),
+    Coefficient("period", ("m", "m", "rad"), _PERIOD),
+)
+"""A wave over position."""
+_SQUARE = ((None, "1/N", "1/(N*m)"), ((0, 0), (0, 0.1), (0, 1)))
+"""Unit and plausible size of friction per square of a force."""
+_COLD = (
+    Coefficient("dry", _USUAL, _DRY),
+    Coefficient("viscous", _VISCOUS, _DAMPED),
+    Coefficient("time", ("s", "s", "s"), ((0.5, 500), (0.5, 500), (0.5, 500))),
+)
+"""Of warming."""
 
 
 class Coulomb(Friction):
@@ -43,7 +81,7 @@ class Coulomb(Friction):
     says = "a constant friction opposes motion, and holds still what pulls less"
     source = _SURVEY
     needs = "guide"
-    coefficients = (Coefficient("coefficient", _USUAL, ((0, 5), (0, 5), (0, 0.5))),)
+    coefficients = (Coefficient("coefficient", _USUAL, _DRY),)
 
     def limit(self, c: Array, moment: Moment) -> Array:  # noqa: ARG002
         """The coefficient."""
@@ -58,8 +96,8 @@ class Stribeck(Friction):
     says = "friction is greatest at rest and falls as motion picks up"
     needs, contains, source = "guide", ("friction.coulomb",), _SURVEY
     coefficients = (
-        Coefficient("coulomb", _USUAL, ((0, 5), (0, 5), (0, 0.5))),
-        Coefficient("extra", _USUAL, ((0, 5), (0, 5), (0, 0.5))),
+        Coefficient("coulomb", _USUAL, _DRY),
+        Coefficient("extra", _USUAL, _DRY),
         Coefficient("speed", ("m/s", "m/s", "rad/s"), ((0.005, 0.5), (0.005, 0.5), (0.02, 2))),
     )
 
@@ -76,13 +114,73 @@ class Load(Friction):
     name = "friction.load"
     noun = "load-dependent friction"
     says = "friction grows with the load that the drive carries"
-    source = "M. Duclusaud et al. (2024), arXiv:2410.08650, model M3"
+    source = _SERVOS + "M3"
     needs = "input"
-    coefficients = (Coefficient("coefficient", (None, "1", "1"), ((0, 0), (0, 0.5), (0, 0.5))),)
+    coefficients = (_LOAD,)
 
     def limit(self, c: Array, moment: Moment) -> Array:
         """In proportion to the load."""
         return np.maximum(c[0], 0.0) * moment.load  # (3)
+
+
+class LoadDirection(Friction):
+    """The same, each side by a coefficient of its own: |motor drive - external load|."""
+
+    name = "friction.load_direction"
+    noun = "load-dependent friction by direction"
+    says = "friction differs by whether the motor drives the load or the load drives the motor"
+    needs, contains, source = "input", ("friction.load",), _SERVOS + "M5"
+    coefficients = (replace(_LOAD, name="motor"), replace(_LOAD, name="external"))
+
+    def limit(self, c: Array, moment: Moment) -> Array:
+        """What one side presses on the gears less the other."""
+        drive, against = moment.sides
+        return np.abs(np.maximum(c[0], 0.0) * drive + np.maximum(c[1], 0.0) * against)  # (4)
+
+
+class LoadQuadratic(Friction):
+    """The same with a part that grows with the square of what the gears transmit."""
+
+    name = "friction.load_quadratic"
+    noun = "friction that grows with load and its square"
+    says = "friction grows with the load that the drive carries, the more the larger it is"
+    needs, contains, source = "input", ("friction.load",), _SERVOS + "M6"
+    coefficients = (_LOAD, Coefficient("quadratic", *_SQUARE))
+
+    def limit(self, c: Array, moment: Moment) -> Array:
+        """In proportion to the load, and to the square of what goes through."""
+        through = _transmitted(*moment.sides)
+        return np.maximum(c[0] * moment.load + c[1] * through**2, 0.0)  # (5)
+
+
+class Position(Friction):
+    """Dry friction of gears and bearings that are not round: a mean and a wave."""
+
+    name = "friction.position"
+    noun = "friction that varies over the joint"
+    says = "friction is greater in some positions than in others, and repeats with position"
+    needs, contains, source = "guide", ("friction.coulomb",), _PLACE
+    coefficients = (Coefficient("coulomb", _USUAL, _DRY), *_OVER)
+
+    def limit(self, c: Array, moment: Moment) -> Array:
+        """Periodic in the primary coordinate."""
+        angle = 2 * np.pi * moment.primary / np.maximum(c[3], _SMALLEST)
+        return np.maximum(c[0] + c[1] * np.sin(angle) + c[2] * np.cos(angle), 0.0)  # (6)
+
+
+class Warming(Friction):
+    """Dry and viscous friction that a cold joint has beyond its own, and loses as it warms."""
+
+    name = "friction.warming"
+    noun = "friction that falls as the joint warms"
+    says = "a joint that is cold at the start of a run rubs more, and less and less as it warms"
+    needs, contains, source = "guide", ("friction.coulomb", "drag.linear"), _WARM
+    coefficients = _COLD
+
+    def limit(self, c: Array, moment: Moment) -> Array:
+        """What is left of both; the viscous part is none at rest."""
+        left = np.exp(-moment.t / np.maximum(c[2], _SMALLEST))
+        return (np.maximum(c[0], 0.0) + np.maximum(c[1], 0.0) * moment.speed) * left  # (7)
 
 
 class Direction(Force):
@@ -98,7 +196,13 @@ class Direction(Force):
     def force(self, c: Array, moment: Moment) -> Array:
         """In proportion to speed, by that of the way in which it moves."""
         ahead, back = np.maximum(moment.v, 0.0), np.minimum(moment.v, 0.0)
-        return -c[0] * ahead - c[1] * back  # (4)
+        return -c[0] * ahead - c[1] * back  # (8)
+
+
+def _transmitted(drive: Array, against: Array) -> Array:
+    """(L, 1) the smaller of two forces that press from either side; zero where they do not."""
+    low, high = np.minimum(drive, against), np.maximum(drive, against)
+    return np.maximum(low, 0.0) - np.minimum(high, 0.0)
 
 
 def _falling(speed: Array, scale: Array) -> Array:

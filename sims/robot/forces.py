@@ -28,8 +28,8 @@ def moment_of(
     carried: Array,
     stiffness: Array | None = None,
 ) -> RobotMoment:
-    """The instant of lanes; t (L, 1), all others (L, D); without `stiffness` no servo is at
-    work.
+    """The instant of lanes; t (L, 1), `carried` (2, L, D), all others (L, D); without `stiffness`
+    no servo is at work.
     """
     theta = np.zeros((len(x), 0))
     stiff = np.zeros((0, 0)) if stiffness is None else stiffness
@@ -46,7 +46,7 @@ def over_time(system: RobotSystem, acting: Acting, t: Array, size: int, lanes: i
     half = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
     nothing = np.zeros((t.size, size))
     # The force in the middle of a step gives the momentum that the force over it does.
-    moment = moment_of(system, (t + half)[:, None], nothing, nothing, {}, nothing)
+    moment = moment_of(system, (t + half)[:, None], nothing, nothing, {}, np.stack([nothing] * 2))
     for effect, c in acting:
         if effect.of not in OVER_TIME or not isinstance(effect, Force):
             continue

@@ -270,7 +270,7 @@ class Bench:
             x = qpos[:n, asking.addresses.positions]
             v = qvel[:n, dofs]
             inputs = {name: u[:, k, None] for name, u in felt.items()}
-            carried = (drive[:n] + bias[:n])[:, dofs]
+            carried = np.stack([drive[:n, dofs], bias[:n, dofs]])
             force, limit = asking.at(k * step, x, v, inputs, carried)
             ctrl[:n] = controls[:, k]
             applied[:n] = forces[:, k]

@@ -68,7 +68,8 @@ class Linear:
         more = ("qfrc_actuator", "qfrc_bias", "act")
         made = simulator.stepped(self._work, given, more)
         dofs = simulator.addresses.velocities
-        carried = (made.fields["qfrc_actuator"] + made.fields["qfrc_bias"])[0][:, dofs]
+        sides = ("qfrc_actuator", "qfrc_bias")
+        carried = np.stack([made.fields[name][0][:, dofs] for name in sides])
         act = made.fields["act"][0]
         first = made.begun[0][None]
         data = made.fields["sensordata"][0] if self._names else np.zeros((steps, 0))

@@ -48,13 +48,14 @@ class JointMoment(Moment):
     """One instant of one joint.
 
     Attributes:
-        carried: (L, 1) what its transmission carries, with its sign.
+        carried: (2, L, 1) what its transmission carries, the drive's force and what it works
+            against.
         goal: (L, 1) set point of its position servo; NaN without one.
         stiffness: (L, 1) what that exerts for each unit of its error.
         gear: by how much it turns for each unit of the joint's position.
     """
 
-    carried: Array = field(default_factory=lambda: np.zeros((0, 1)))
+    carried: Array = field(default_factory=lambda: np.zeros((2, 0, 1)))
     goal: Array = field(default_factory=lambda: np.zeros((0, 1)))
     stiffness: Array = field(default_factory=lambda: np.zeros((0, 1)))
     gear: float = 1.0
@@ -62,7 +63,13 @@ class JointMoment(Moment):
     @property
     def load(self) -> Array:
         """(L, 1) what the transmission carries, whichever way."""
-        return np.abs(self.carried)
+        load: Array = np.abs(self.carried[0] + self.carried[1])
+        return load
+
+    @property
+    def sides(self) -> tuple[Array, Array]:
+        """See `Moment`."""
+        return self.carried[0], self.carried[1]
 
     @property
     def error(self) -> Array:
@@ -79,15 +86,15 @@ class RobotMoment(Moment):
     """One instant of every lane of a robot.
 
     Attributes:
-        carried: (L, D) what each joint's transmission carries: the drive from one side, and gravity
-            and what comes of the motion of the other bodies from the other.
+        carried: (2, L, D) what each joint's transmission carries: the drive from one side, and
+            gravity and what comes of the motion of the other bodies from the other.
         alone: (D,) each joint as a system of its own.
         drives: by coordinate, the inputs of its actuators.
         servos: by coordinate, the input that is the set point of its position servo.
         stiffness: (L, D) what position servos exert for each unit of their errors; zero without.
     """
 
-    carried: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    carried: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
     alone: tuple[System, ...] = ()
     drives: dict[int, tuple[str, ...]] = field(default_factory=dict)
     servos: dict[int, str] = field(default_factory=dict)
@@ -109,7 +116,7 @@ class RobotMoment(Moment):
             self.x[:, one],
             self.v[:, one],
             inputs,
-            self.carried[:, one],
+            self.carried[:, :, one],
             self.inputs[servo] if followed and servo else np.full_like(self.t, np.nan),
             self.stiffness[:, one] if followed else np.zeros_like(self.t),
             self.system.gear(joint),

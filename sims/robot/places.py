@@ -38,7 +38,11 @@ ALONE = frozenset(
         "force.periodic",
         "force.ripple",
         "friction.direction",
+        "friction.load_direction",
+        "friction.load_quadratic",
+        "friction.position",
         "friction.stribeck",
+        "friction.warming",
         "sensor.eccentricity",
     }
 )
@@ -201,9 +205,11 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
     # What the library calls plausible is meant for small joints: a force here may be larger.
     if unit is None:
         unit = "1"
+    share = spot.size / TYPICAL[spot.kind]
     if unit.startswith("N"):
-        share = spot.size / TYPICAL[spot.kind]
         low, high = share * low, share * high
+    elif unit.startswith("1/"):
+        low, high = low / share, high / share
     if effect.name == "inertia.armature":
         high = 3.0 * spot.inertia
     stated = spot.stated.get(effect.name) if effect.at == "joint" else None

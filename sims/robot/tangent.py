@@ -57,7 +57,7 @@ class Motion:
         instant: (S, nu) the same when each step begins.
         forces: (S, nv) generalised, known beforehand.
         inputs: (S,) what is felt of each input, by name.
-        carried: (S, D) what transmissions carry.
+        carried: (2, S, D) what transmissions carry, from either side.
         step: seconds.
     """
 
@@ -251,7 +251,7 @@ class Tangent:
         v = bind("qvel")[:n, places.velocities]
         inputs = {name: u[at][:, None] for name, u in motion.inputs.items()}
         t: Array = motion.step * at[:, None].astype(np.float64)
-        moment = moment_of(self._system, t, x, v, inputs, motion.carried[at], self._stiff(n))
+        moment = moment_of(self._system, t, x, v, inputs, motion.carried[:, at], self._stiff(n))
         for effect, c in self._asked:
             own = np.repeat(c, n, axis=1)
             if isinstance(effect, Friction):

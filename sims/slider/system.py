@@ -9,7 +9,10 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.base import Array, Channel, Parameter
-from sims.system import Kind, Moment, System, UsualRecording
+from sims.system import Effect, Kind, Moment, System, UsualRecording
+
+LOADED = ("friction.load_direction", "friction.load_quadratic")
+"""Effects that tell the drive from what it works against."""
 
 
 class SliderSystem(System):
@@ -29,6 +32,11 @@ class SliderSystem(System):
     states: ClassVar[Mapping[str, float]] = MappingProxyType({"x": 0.0, "v": 0.0})
     sensed = ("x", "v")
     usual_recording = UsualRecording(inputs={"u": "steps:2:0.5"})
+
+    @classmethod
+    def refuses(cls, effect: type[Effect]) -> str:
+        """See `System`; with nothing to work against they would be `friction.load` itself."""
+        return "nothing works against its drive" if effect.name in LOADED else ""
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """(L, 1) kg."""

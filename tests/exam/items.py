@@ -31,7 +31,11 @@ APART = 1.0
 TELLING = 0.4
 SIMPLER = {
     "friction.direction": ("drag.linear",),
+    "friction.load_direction": ("friction.load",),
+    "friction.load_quadratic": ("friction.load",),
+    "friction.position": ("friction.coulomb",),
     "friction.stribeck": ("friction.coulomb",),
+    "friction.warming": ("friction.coulomb", "drag.linear"),
     "wind": (
         "drag.linear",
         "drag.quadratic",

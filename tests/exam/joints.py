@@ -156,7 +156,7 @@ class Joint:
             self.forces.append(
                 lambda t, x, v: push if begin <= self.middle < begin + lasting else 0.0
             )
-        self.restless = "force.periodic" in acting or "input.lag" in acting
+        self.restless = bool({"force.periodic", "input.lag", "friction.warming"} & set(acting))
 
     def enter(self, piece):
         self.piece, self.middle = piece, 0.5 * (piece.begin + piece.end)
@@ -198,11 +198,27 @@ LIMITS: dict[str, Callable[[Joint, list[float]], Law]] = {
     "friction.coulomb": lambda j, c: lambda t, x, v: c[0],
     "friction.stribeck": lambda j, c: lambda t, x, v: c[0] + c[1] * exp(-((v / c[2]) ** 2)),
     "friction.load": lambda j, c: lambda t, x, v: c[0] * abs(j.piece.at(t) - j.weight(x)),
+    "friction.load_direction": lambda j, c: (
+        lambda t, x, v: abs(c[0] * j.piece.at(t) - c[1] * j.weight(x))
+    ),
+    "friction.load_quadratic": lambda j, c: (
+        lambda t, x, v: (
+            c[0] * abs(j.piece.at(t) - j.weight(x))
+            + c[1] * through(j.piece.at(t), -j.weight(x)) ** 2
+        )
+    ),
+    "friction.position": lambda j, c: lambda t, x, v: max(c[0] + _wave(c[1:], x / c[3]), 0.0),
+    "friction.warming": lambda j, c: lambda t, x, v: (c[0] + c[1] * abs(v)) * exp(-t / c[2]),
     "patch": lambda j, c: (
         lambda t, x, v: c[0] * inside(x, c[1], c[2])
     ),  # foreign: rough from c1 - c2 to c1 + c2
 }
 FOREIGN = ("patch", "gust", "ageing", "stop")
+
+
+def through(drive, against):
+    """What gears transmit from one side to the other; nothing where both pull the same way."""
+    return min(abs(drive), abs(against)) if drive * against > 0 else 0.0
 
 
 def inside(x, centre, half):

@@ -15,6 +15,8 @@ STARTS = 3  # shapes from which one effect is refitted
 SHAPES = {  # first guesses of what shapes an effect rather than scales it, in the library's units
     "force.periodic": [(f,) for f in (0.2, 0.4, 0.7, 1.2, 2.0, 3.5)],
     "force.ripple": [(p,) for p in (0.1, 0.2, 0.4, 0.8, 1.6, 3.0, 6.0)],
+    "friction.position": [(p,) for p in (0.3, 0.6, 1.2, 2.5, 5.0)],
+    "friction.warming": [(s,) for s in (0.7, 2.0, 6.0)],
     "friction.stribeck": [(s,) for s in (0.05, 0.2, 1.0)],
     "wind": [(u, v) for u in (-4.0, 0.0, 4.0) for v in (-4.0, 0.0, 4.0)],
 }

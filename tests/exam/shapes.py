@@ -103,8 +103,36 @@ def _rate(far, setting, rng):
     return lambda s: (float(peak / (0.8 * s)),)
 
 
+def _quadratic(far, setting, rng):
+    """At the forces that act the square makes as much as the load itself, or more."""
+    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    square = float(far * rng.uniform(2.0, 6.0) / peak)
+    return lambda s: (0.5 * far * s, square * s)
+
+
+def _uneven(far, setting, rng):
+    """A wave of most of the mean, that the motion passes once to four times."""
+    travel = float(np.median(_ranges(setting)))
+    low, high = (0.2, 5.0) if setting.system == "slider" else (0.5, 6.2832)
+    period = float(np.clip(travel / rng.uniform(1.0, 4.0), low, high))
+    angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 0.95)
+    sine, cosine = far * share * float(np.sin(angle)), far * share * float(np.cos(angle))
+    return lambda s: (far * s, sine * s, cosine * s, period)
+
+
+def _warming(far, setting, rng):
+    """It is gone by the end of a run, or half of it is; the rest is viscous."""
+    time = float(setting.seconds * rng.uniform(0.2, 0.8))
+    viscous = float(far * rng.uniform(0.0, 1.0) / np.median(np.abs(_speeds(setting))))
+    return lambda s: (far * s, viscous * s, max(time, 0.5))
+
+
 SHAPES = {
     "friction.direction": _one_way,
+    "friction.load_direction": _one_way,
+    "friction.load_quadratic": _quadratic,
+    "friction.position": _uneven,
+    "friction.warming": _warming,
     "input.rate": _rate,
     "sensor.eccentricity": _direction,
     "gravity.tilt": _level,

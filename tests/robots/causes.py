@@ -9,6 +9,7 @@ import numpy as np
 JOINT = (
     "friction.coulomb", "friction.stribeck", "drag.linear", "drag.quadratic", "spring.linear",
     "inertia.armature", "force.bias", "force.ripple", "friction.direction",
+    "friction.position", "friction.warming",
 )  # fmt: skip
 BODY = ("mass.scale", "mass.offset", "inertia.scale")
 BOTH = ("input.gain", "input.bias", "input.delay", "input.lag", "input.rate")
@@ -18,7 +19,10 @@ CHANNEL = ("sensor.bias", "sensor.gain", "sensor.delay", "sensor.eccentricity")
 WORLD = ("gravity.tilt", "gravity.scale", "clock.skew")
 FOREIGN = ("elastic", "binding", "slip")
 FAMILIES = ("friction.coulomb", "drag.linear")
-SIMPLER = {"friction.stribeck": "friction.coulomb", "friction.direction": "drag.linear"}
+SIMPLER = {
+    "friction.stribeck": "friction.coulomb", "friction.direction": "drag.linear",
+    "friction.position": "friction.coulomb", "friction.warming": "friction.coulomb",
+}  # fmt: skip
 SIGNED = (
     "force.bias", "mass.scale", "inertia.scale", "input.gain", "input.bias", "sensor.bias",
     "sensor.gain", "clock.skew", "gravity.scale", "actuator.stiffness", "actuator.damping",
@@ -140,6 +144,23 @@ def _direction(place, setting, rng):
     return lambda s: (far * shares[0] * s, far * shares[1] * s)
 
 
+def _uneven(place, setting, rng):
+    """A wave of most of the mean, that the motion passes once to four times."""
+    typical, angle = _at(setting, place), rng.uniform(0, 2 * np.pi)
+    period = float(np.clip(typical["travel"] / rng.uniform(1.0, 4.0), 0.5, 6.28))
+    far, share = typical["force"], float(rng.uniform(0.5, 0.95))
+    sine, cosine = far * share * float(np.sin(angle)), far * share * float(np.cos(angle))
+    return lambda s: (far * s, sine * s, cosine * s, period)
+
+
+def _warming(place, setting, rng):
+    """Most of it, or half, is gone by the end of a run."""
+    typical, lasting = _at(setting, place), float(setting.fitted[0].times[-1])
+    time = max(lasting * float(rng.uniform(0.2, 0.8)), 0.5)
+    viscous = float(rng.uniform(0.0, 1.0)) * typical["force"] / typical["speed"]
+    return lambda s: (typical["force"] * s, viscous * s, time)
+
+
 def _eccentric(place, setting, rng):
     angle = rng.uniform(0, 2 * np.pi)
     sine, cosine = 0.3 * float(np.sin(angle)), 0.3 * float(np.cos(angle))
@@ -148,6 +169,8 @@ def _eccentric(place, setting, rng):
 
 SHAPES = {
     "friction.direction": _direction,
+    "friction.position": _uneven,
+    "friction.warming": _warming,
     "input.rate": _rate,
     "sensor.eccentricity": _eccentric,
     "friction.stribeck": _stribeck,

@@ -100,5 +100,8 @@ class Rivals:
         return sizing.rms(self.unseen - np.concatenate(self.held.change(effects)))
 
 
-FREE = {"force.ripple": 2, "gravity.tilt": 2, "mass.offset": 3, "friction.stribeck": 2}
+FREE = {
+    "force.ripple": 2, "gravity.tilt": 2, "mass.offset": 3, "friction.stribeck": 2,
+    "friction.position": 3, "friction.warming": 2,
+}  # fmt: skip
 """Numbers that are fitted; those behind them shape the effect."""

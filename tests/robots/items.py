@@ -137,7 +137,7 @@ def _single(item, setting, effect, rng):
     if effect in causes.SIMPLER:
         (name, c), gauge = *hidden.items(), gauge_of(item.name)
         simpler = causes.SIMPLER[effect] + "@" + name.partition("@")[2]
-        tried = [gauge.change({simpler: (share * (c[0] + c[1]),)}) for share in (0.3, 0.6)]
+        tried = [gauge.change({simpler: (share * (c[0] + abs(c[1])),)}) for share in (0.3, 0.6)]
         beyond = sizing.left(_joined(gauge.change(hidden)), [_joined(t) for t in tried])
         if beyond < TELLING:
             return None

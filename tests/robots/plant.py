@@ -52,6 +52,8 @@ class Plant:
         coulomb, extra, speed: dry friction `coulomb + extra exp(-(v / speed)^2)`, (N,).
         ahead, back: damping of motion the one way and the other, (N,).
         ripples: (joint, sine, cosine, period).
+        uneven: (joint, mean, sine, cosine, period) of dry friction over the joint.
+        cold: (joint, dry, viscous, time) of friction that dies away.
         binding, elastic: see there; None where there is none.
     """
 
@@ -67,6 +69,8 @@ class Plant:
     ahead: np.ndarray
     back: np.ndarray
     ripples: list = field(default_factory=list)
+    uneven: list = field(default_factory=list)
+    cold: list = field(default_factory=list)
     binding: Binding | None = None
     elastic: Elastic | None = None
 
@@ -103,9 +107,11 @@ class Plant:
         rubs = (self.coulomb > 0) | (self.extra > 0)
         if self.binding:
             rubs[self.binding.joint] = True
+        for joint, *_ in self.uneven + self.cold:
+            rubs[joint] = True
         return rubs
 
-    def limit(self, q, v):
+    def limit(self, t, q, v):
         """Largest dry friction of every joint, (N,)."""
         limit = self.coulomb
         if self.stribeck:
@@ -113,6 +119,13 @@ class Plant:
         if self.binding:
             limit = limit.copy()
             limit[self.binding.joint] += self.binding.limit(q)
+        if self.uneven or self.cold:
+            limit = limit.copy()
+        for joint, mean, sine, cosine, period in self.uneven:
+            angle = 2 * np.pi * q[joint] / period
+            limit[joint] += max(mean + sine * np.sin(angle) + cosine * np.cos(angle), 0.0)
+        for joint, dry, viscous, time in self.cold:
+            limit[joint] += (dry + viscous * abs(v[joint])) * np.exp(-t / time)
         return limit
 
     def passive(self, q, v):
@@ -219,8 +232,18 @@ def _ripple(plant, joint, c):
     plant.ripples.append((joint, *c))
 
 
+def _uneven(plant, joint, c):
+    plant.uneven.append((joint, *c))
+
+
+def _cold(plant, joint, c):
+    plant.cold.append((joint, *c))
+
+
 FORCES = {
     "friction.coulomb": _adds("coulomb"),
+    "friction.position": _uneven,
+    "friction.warming": _cold,
     "friction.direction": _direction,
     "friction.stribeck": _stribeck,
     "drag.linear": _adds("damping"),

@@ -58,6 +58,30 @@ def test_a_joint_with_dry_friction_stops_where_and_when_theory_says():
     np.testing.assert_allclose(motion.q[moving, 0], expected[moving], atol=1e-12)
 
 
+def test_friction_over_the_joint_takes_its_work():
+    mean, sine, cosine, period, inertia = 0.5, 0.2, -0.3, 1.3, 0.4
+    world = World(roller(), {"friction.position@axle": (mean, sine, cosine, period)})
+    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.5]))
+    motion = world.move(start, STAMPS)
+    q, v = motion.q[:, 0], motion.v[:, 0]
+    angle = 2 * np.pi * q / period
+    wave = period / (2 * np.pi) * (sine * (1 - np.cos(angle)) + cosine * np.sin(angle))
+    taken = 0.5 * inertia * (2.5**2 - v**2)
+    np.testing.assert_allclose(taken, mean * q + wave, atol=1e-9)
+
+
+def test_a_joint_that_warms_loses_its_friction():
+    dry, viscous, time, inertia = 0.3, 0.2, 0.9, 0.4
+    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([3.0]))
+    cold = -np.expm1(-STAMPS / time) * time / inertia
+    for c, expected in (
+        ((dry, 0.0, time), 3.0 - dry * cold),
+        ((0.0, viscous, time), 3.0 * np.exp(-viscous * cold)),
+    ):
+        motion = World(roller(), {"friction.warming@axle": c}).move(start, STAMPS)
+        np.testing.assert_allclose(motion.v[:, 0], expected, atol=1e-9)
+
+
 def test_friction_holds_exactly_below_its_limit_and_breaks_loose_above_it():
     pull = np.where(STAMPS < 2.0, 0.4999, 0.75)
     world = World(roller(), {"friction.coulomb@axle": (0.5,)})

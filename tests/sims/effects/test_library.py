@@ -97,18 +97,22 @@ def test_what_fits_what():
     guided = {
         "friction.coulomb",
         "friction.direction",
+        "friction.position",
         "friction.stribeck",
+        "friction.warming",
         "sensor.eccentricity",
         "spring.linear",
         "spring.cubic",
         "force.ripple",
     }
-    inputs = {name for name in NAMES if name.startswith("input.")} | {"backlash", "friction.load"}
+    begins = ("input.", "friction.load")
+    inputs = {name for name in NAMES if name.startswith(begins)} | {"backlash"}
     servo = {"servo.deadband", "servo.derivative"}
     mechanical = set(NAMES) - {"state.overflow"}
     joint = mechanical - impact - flight
     assert there["ball"] == mechanical - guided - inputs - servo
-    assert there["slider"] == joint - {"gravity.scale", "sensor.eccentricity"} - servo
+    level = {"gravity.scale", "friction.load_direction", "friction.load_quadratic"}
+    assert there["slider"] == joint - {"sensor.eccentricity"} - level - servo
     assert there["pendulum"] == joint - {"wind"} - servo
     assert there["servo"] == joint - {"wind"}
 
@@ -120,6 +124,7 @@ def test_what_fits_what():
         ("input.delay", "ball", "no input"),
         ("contact.friction", "pendulum", "no ground"),
         ("gravity.scale", "slider", "no gravity"),
+        ("friction.load_direction", "slider", "nothing works against its drive"),
         ("friction.coulomb", "ball", "flies freely"),
         ("servo.deadband", "slider", "no servo"),
         ("state.overflow", "slider", "no level"),

@@ -70,6 +70,8 @@ def test_names_are_those_of_the_model(arm):
         "input.delay": ("m_shoulder", "m_elbow", "m_spin", "*"),
         "friction.load": (*joints, "*"),
         "friction.direction": joints,
+        "friction.load_direction": joints,
+        "friction.position": joints,
         "input.rate": ("m_shoulder", "m_elbow", "m_spin", "*"),
         "sensor.eccentricity": ("q.shoulder", "q.elbow", "q.spin"),
         "servo.deadband": ("m_shoulder",),
@@ -179,11 +181,12 @@ def test_scales_are_what_gravity_pulls_with_and_what_turns(rail):
 def test_an_effect_sees_its_joint_alone(rail):
     x, v = np.array([[0.1, 0.2], [0.3, 0.4]]), np.array([[1.0, -2.0], [-3.0, 4.0]])
     inputs = {"u.push": np.full((2, 1), 7.0), "u.hold": np.full((2, 1), 0.5)}
-    moment = moment_of(rail(), np.full((2, 1), 0.25), x, v, inputs, -x)
+    moment = moment_of(rail(), np.full((2, 1), 0.25), x, v, inputs, np.stack([-3 * x, 2 * x]))
     hinge = moment.of_joint(1)
     np.testing.assert_array_equal(hinge.primary, [[0.2], [0.4]])
     np.testing.assert_array_equal(hinge.speed, [[2.0], [4.0]])
-    np.testing.assert_array_equal(hinge.load, [[0.2], [0.4]])
+    np.testing.assert_allclose(hinge.load, [[0.2], [0.4]])
+    np.testing.assert_allclose(hinge.sides, [[[-0.6], [-1.2]], [[0.4], [0.8]]])
     assert set(hinge.inputs) == {"u.hold"}
     assert (hinge.system.kind, moment.of_joint(0).system.kind) == ("rotary", "linear")
     np.testing.assert_array_equal(hinge.along_primary(np.array([[5.0], [6.0]])), [[5.0], [6.0]])
@@ -191,7 +194,7 @@ def test_an_effect_sees_its_joint_alone(rail):
 
 def test_a_force_at_a_joint_pushes_that_joint(rail):
     moment = moment_of(rail(), np.zeros((1, 1)), np.array([[0.1, 0.2]]), np.ones((1, 2)), {},
-                       np.zeros((1, 2)))  # fmt: skip
+                       np.zeros((2, 1, 2)))  # fmt: skip
     ripple = rail.effect("force.ripple@hinge")()
     c = np.array([0.0, 0.7, 0.5])[:, None, None]
     expected = [[0.0, 0.7 * np.cos(2 * np.pi * 0.2 / 0.5)]]

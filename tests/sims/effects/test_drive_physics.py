@@ -1,0 +1,100 @@
+"""What drives do beside the simplest laws, through the batch engine, against closed forms."""
+
+import numpy as np
+import pytest
+
+from tests.sims.effects.test_force_laws import limit
+from tests.sims.effects.worlds import moment, run
+
+MASS, LENGTH, GRAVITY = 0.2, 0.5, 10.0  # of a pendulum that weighs sin q
+HEAVY = {"mass": MASS, "length": LENGTH, "gravity": GRAVITY}
+
+
+def slide(times, fixed, mass=1.0, u=0.0, **initial):
+    """x and v, each (T,)."""
+    return run("slider", times, fixed, [mass], {"u": np.broadcast_to(u, times.shape)}, **initial).T
+
+
+def moved(fixed, u, q=0.5):
+    """By how much a pendulum that weighs 1 N m moves in a fifth of a second from rest, rad."""
+    times = np.arange(21) * 0.01
+    inputs = {"u": np.full(times.size, u)}
+    return run("pendulum", times, fixed, [0.06], inputs, HEAVY, q=q)[-1, 0] - q
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_friction_over_the_joint_takes_its_work(way):
+    coulomb, sine, cosine, period, mass = 0.6, 0.3, -0.4, 0.7, 1.5
+    times = np.arange(0, 2, 0.01)
+    fixed = {"friction.position": (coulomb, sine, cosine, period)}
+    x, v = slide(times, fixed, mass, x=0.2, v=1.5 * way)
+
+    def work(at):
+        angle = 2 * np.pi * at / period
+        wave = -sine * np.cos(angle) + cosine * np.sin(angle)
+        return coulomb * at + period / (2 * np.pi) * wave
+
+    taken = way * (work(x) - work(0.2))
+    assert 0.5 * mass * v**2 == pytest.approx(0.5 * mass * 1.5**2 - taken, abs=2e-5)
+    assert np.ptp(x) > 1.5 * period
+
+
+def test_friction_over_the_joint_is_none_where_its_wave_is_below_zero():
+    at = [limit("friction.position", moment("slider", [[x]], [[0.0]]), 0.2, 0.5, 0.0, 1.0)
+          for x in (0.0, 0.25, 0.75)]  # fmt: skip
+    assert at == pytest.approx([0.2, 0.7, 0.0])
+    assert limit("friction.position", moment("slider", [[0.3]], [[0.0]]), 0.4, 0.0, 0.0, 0.0) == 0.4
+
+
+WEIGHT = float(np.sin(0.5))
+
+
+@pytest.mark.parametrize(
+    ("fixed", "lifts", "sinks"),
+    [
+        # up at u (1 - motor) > w (1 + external), down at u (1 + motor) < w (1 - external)
+        ({"friction.load_direction": (0.3, 0.1)}, 1.1 / 0.7, 0.9 / 1.3),
+        ({"friction.load_direction": (0.0, 0.4)}, 1.4, 0.6),
+        ({"friction.load": 0.2}, 1.2 / 0.8, 0.8 / 1.2),
+        ({"friction.load_direction": (0.2, 0.2)}, 1.2 / 0.8, 0.8 / 1.2),
+        # up at u - w > c (u + w) + d w^2; down at w - u > c (u + w) + d u^2, here for c = 0
+        (
+            {"friction.load_quadratic": (0.0, 0.5)},
+            1 + 0.5 * WEIGHT,
+            (np.sqrt(1 + 2 * WEIGHT) - 1) / WEIGHT,
+        ),
+        ({"friction.load_quadratic": (0.2, 0.5)}, (1.2 + 0.5 * WEIGHT) / 0.8, None),
+    ],
+)
+def test_a_loaded_gear_lifts_and_sinks_beyond_its_drive_and_back_drive_lines(fixed, lifts, sinks):
+    assert moved(fixed, 1.01 * lifts * WEIGHT) > 5e-4
+    assert moved(fixed, 0.99 * lifts * WEIGHT) == 0.0
+    if sinks:
+        assert moved(fixed, 1.01 * sinks * WEIGHT) == 0.0
+        assert moved(fixed, 0.99 * sinks * WEIGHT) < -5e-4
+
+
+def test_what_helps_the_drive_is_not_transmitted():
+    helped = moment("pendulum", [[0.5]], [[0.0]], inputs=[-WEIGHT], **HEAVY)
+    assert limit("friction.load_quadratic", helped, 0.0, 0.5) == 0.0
+    assert limit("friction.load_direction", helped, 0.3, 0.1) == pytest.approx(0.2 * WEIGHT)
+
+
+def test_a_joint_that_warms_lets_go_of_what_it_rubbed():
+    times, mass, time = np.arange(0, 4, 0.01), 1.5, 0.8
+    cold = -np.expm1(-times / time)
+    _, v = slide(times, {"friction.warming": (0.9, 0.0, time)}, mass, v=2.0)
+    assert v == pytest.approx(2.0 - 0.9 * time / mass * cold, abs=1e-6)
+    _, v = slide(times, {"friction.warming": (0.0, 0.7, time)}, mass, v=2.0)
+    assert v == pytest.approx(2.0 * np.exp(-0.7 * time / mass * cold), abs=1e-6)
+
+
+def test_what_a_cold_joint_holds_it_lets_go_when_it_is_warm():
+    times, time = np.arange(0, 4, 0.01), 1.0
+    x, _ = slide(times, {"friction.warming": (2.0, 0.0, time)}, 1.0, u=1.0)
+    begins = time * np.log(2.0)  # when what is left of 2 N is less than 1 N
+    assert not x[times < begins - 0.02].any()
+    # v = (t - t0) - 2 (exp(-t0) - exp(-t))
+    late = times[-1] - begins
+    expected = late**2 / 2 - late + (1 - np.exp(-late))
+    assert x[-1] == pytest.approx(expected, abs=2e-3)
