@@ -23,11 +23,13 @@ from os.path import abspath, dirname, realpath
 _WHERE = {
     "bench": ("__version__",),
     "bench.api.compare": ("Compared", "compare", "sweep"),
+    "bench.api.datasheet": ("datasheet",),
     "bench.api.design": ("NextRecording", "design"),
     "bench.api.explain": ("explain", "score"),
     "bench.api.recordings": ("import_logs", "read_recording", "simulate"),
     "bench.checks": ("parametrize",),
     "bench.gap.explanation": ("Explanation",),
+    "bench.gap.sheet.sheet": ("DataSheet",),
     "bench.problem.experiment": ("Experiment",),
     "bench.registry": ("effects", "load_plugins", "simulators", "tuners"),
     "methods.base": (

@@ -3,11 +3,13 @@ from collections.abc import Sequence
 
 from bench import __version__
 from bench.api.compare import Compared, compare, sweep
+from bench.api.datasheet import datasheet
 from bench.api.design import NextRecording, design
 from bench.api.explain import explain, score
 from bench.api.recordings import import_logs, read_recording, simulate
 from bench.checks import parametrize
 from bench.gap.explanation import Explanation
+from bench.gap.sheet.sheet import DataSheet
 from bench.problem.experiment import Experiment
 from bench.registry import effects, load_plugins, simulators, tuners
 from methods.base import (
@@ -57,6 +59,7 @@ __all__ = [
     "Compared",
     "Constant",
     "Contact",
+    "DataSheet",
     "Effect",
     "Evaluation",
     "Experiment",
@@ -85,6 +88,7 @@ __all__ = [
     "Tuner",
     "__version__",
     "compare",
+    "datasheet",
     "design",
     "effects",
     "explain",

@@ -14,6 +14,7 @@ from typing import NoReturn
 from bench import __version__
 from bench.commands.check import add_check
 from bench.commands.compare import add_compare, add_plot, add_status, add_verify
+from bench.commands.datasheet import add_datasheet
 from bench.commands.design import add_design
 from bench.commands.explain import add_explain, add_score
 from bench.commands.film import add_film, add_track
@@ -35,6 +36,7 @@ COMMANDS = (
     ("inspect", add_inspect, "summarise and draw a recording"),
     ("explain", add_explain, "show what a simulation gets wrong on a recording, and why"),
     ("design", add_design, "design the next recording, by which what is open would be settled"),
+    ("datasheet", add_datasheet, "make the data sheet of a joint or actuator from its logs"),
     ("score", add_score, "error of an extended simulator on another recording"),
     ("film", add_film, "render a recorded ball as a video"),
     ("track", add_track, "track a ball in a video; write a recording"),

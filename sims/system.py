@@ -18,7 +18,7 @@ less dry friction, which is added up over its effects and opposes the motion as 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from types import MappingProxyType
@@ -155,6 +155,23 @@ class UsualRecording:
         object.__setattr__(self, "inputs", MappingProxyType(dict(self.inputs)))
 
 
+@dataclass(frozen=True)
+class Derived:
+    """A number that follows from a system's parameters and constants, and that people ask for.
+
+    Attributes:
+        name: what it is called.
+        unit: of it.
+        says: what it is, in a few words.
+        of: of parameters and constants by name.
+    """
+
+    name: str
+    unit: str
+    says: str
+    of: Callable[[Mapping[str, float]], float]
+
+
 class System(ABC):
     """A physical system, declared once for every engine.
 
@@ -177,6 +194,7 @@ class System(ABC):
         has_model: whether it comes from a model file, whose numbers may be wrong.
         levels: states that are stores, such as a tank's level: they may spill over.
         usual_recording: what its simulated recordings show where the user does not say.
+        derived: numbers that follow from others, for a data sheet.
     """
 
     name: ClassVar[str]
@@ -197,6 +215,7 @@ class System(ABC):
     has_model: ClassVar[bool] = False
     levels: ClassVar[tuple[str, ...]] = ()
     usual_recording: ClassVar[UsualRecording] = UsualRecording()
+    derived: ClassVar[tuple[Derived, ...]] = ()
 
     @classmethod
     def reading(cls, observed: Sequence[str]) -> str:

@@ -63,12 +63,13 @@ WORST = -9.0
 
 @dataclass(frozen=True)
 class Measured:
-    """Runs simulated with parameters that others gave: (R, T, C), and their merit, which counts
-    initial states.
+    """Runs simulated with parameters that others gave: (R, T, C), their merit, which counts initial
+    states, and these (R, s).
     """
 
     simulated: Array
     merit: float
+    states: Array
 
 
 class HeldOutRuns:
@@ -119,7 +120,7 @@ class HeldOutRuns:
     def _measured(self, fit: Fit) -> Measured:
         if not np.isfinite(fit.cost):
             nothing = np.full_like(self.world.observed, np.nan)
-            return Measured(nothing, -np.inf)
+            return Measured(nothing, -np.inf, fit.states)
         left = self.world.observed - fit.simulated
         residual = np.where(self.seen, left, 0.0)
         # Only initial states were fitted here, so they alone cost merit.
@@ -128,7 +129,7 @@ class HeldOutRuns:
         price = float(np.log(max(count, 2)))
         likeliest = likelihood(residual, self.seen, free)
         merit = likeliest.value - free * price  # (3)
-        return Measured(fit.simulated, merit)
+        return Measured(fit.simulated, merit, fit.states)
 
 
 def central(world: World, fit: Fit, noise: Noise) -> Fit:
@@ -208,7 +209,17 @@ def _bounds_around(world: World, fit: Fit) -> Array:
 
 def covariance(models: Models, model: Model) -> Array:
     """(q, q) of the fitted parameters, (2), with the noise's own correlation."""
-    own, left = _curvatures(models, model)
+    found = curved(models, model)
+    own = found.own.sum(axis=0)
+    # The theorem by which a step of the fit is solved eliminates them here, too.
+    left, _ = schur_complement(own, found.cross, found.inner)
+    return inverted(own, left)
+
+
+def inverted(own: Array, left: Array) -> Array:
+    """The inverse of the second of two (q, q) matrices, scaled by the first: the first sum of (2),
+    and both together.
+    """
     # Parameters of any unit on one scale, so that the cut-off below means the same for each.
     powers = np.diagonal(own)
     scale = np.sqrt(np.maximum(powers, UNTOUCHED))
@@ -223,15 +234,6 @@ def covariance(models: Models, model: Model) -> Array:
         inverse = inverse + (free * 1e12) @ free.T
     result: Array = inverse / units  # (2)
     return result
-
-
-def _curvatures(models: Models, model: Model) -> tuple[Array, Array]:
-    """(q, q) the first sum of (2), and both together, which (2) inverts."""
-    found = curved(models, model)
-    own = found.own.sum(axis=0)
-    # The theorem by which a step of the fit is solved eliminates them here, too.
-    left, _ = schur_complement(own, found.cross, found.inner)
-    return own, left
 
 
 class Curved(NamedTuple):
@@ -254,14 +256,17 @@ class Curved(NamedTuple):
 
 def curved(models: Models, model: Model) -> Curved:
     """The curvature of the sum of squares about a fitted model, run by run."""
-    world = models.world
-    q = model.fit.free.size
     fit = derived(models, model.fit)
     # What the model leaves is the noise, whatever the recording states of it.
     sigma = np.maximum(model.likelihood.sigma, 1e-300)
     noise = Noise(sigma, model.likelihood.phi)
-    jacobian = np.where(models.seen[..., None], fit.jacobian, 0.0)
-    jacobian = whitened(jacobian, models.seen, noise)
+    return curvature(models.world, fit.jacobian, model.fit.free.size, noise)
+
+
+def curvature(world: World, jacobian: Array, q: int, noise: Noise) -> Curved:
+    """The same of derivatives (R, T, C, q + s) by any q numbers, initial states last."""
+    seen = np.isfinite(world.observed)
+    jacobian = whitened(np.where(seen[..., None], jacobian, 0.0), seen, noise)
     runs, *_, size = jacobian.shape
     j = jacobian.reshape(runs, -1, size)
     normal = np.matmul(j.transpose(0, 2, 1), j)

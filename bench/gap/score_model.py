@@ -119,7 +119,7 @@ def _check_channels(recording: Path, extended: Extended, recorded: list[str]) ->
             raise unknown(f"channel of {recording}", channel, recorded)
 
 
-def _theta(world: World, extended: Extended) -> Array:
+def theta_of(world: World, extended: Extended) -> Array:
     """(P,) the numbers of an extended simulator, nominal where it has none."""
     # Parameters that the file does not state are nominal, coefficients that it does not are off.
     theta = world.nominal()
@@ -141,7 +141,7 @@ def _simulated(world: World, extended: Extended, sigma: Array) -> Array:
     """(R, T, C) the runs with the model's numbers, from initial states that are fitted to them."""
     white = np.zeros(len(sigma))
     runs = HeldOutRuns(world, Noise(sigma, white))
-    (measured,) = runs.measure([_theta(world, extended)])
+    (measured,) = runs.measure([theta_of(world, extended)])
     return measured.simulated
 
 

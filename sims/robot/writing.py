@@ -62,6 +62,8 @@ def written(robot: Robot, causes: Causes, recording: str = "") -> Written:
     try:
         if robot.format != "mjcf":
             raise UnfitError("it is a URDF")
+        if robot.actuator_tables:
+            raise UnfitError("its actuators are the recording's")
         text = Edit(robot, applied, recording, robot.path.read_bytes()).stated()
     except UnfitError as unfit:
         if robot.format == "mjcf":

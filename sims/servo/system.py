@@ -10,7 +10,7 @@ import numpy as np
 
 from sims.base import Array, Channel, Constant, Parameter
 from sims.limits import GAIN, GRAVITY, LENGTH, MASS, VOLTAGE
-from sims.system import Kind, Moment, System, UsualRecording
+from sims.system import Derived, Kind, Moment, System, UsualRecording
 
 _KT = slice(0, 1)
 """Column of the torque constant among the parameters."""
@@ -84,6 +84,32 @@ class ServoSystem(System):
     states: ClassVar[Mapping[str, float]] = MappingProxyType({"q": 0.0, "qd": 0.0})
     sensed = ("q",)
     servo = "goal"
+    derived = (
+        Derived(
+            "torque constant over resistance",
+            "N*m/V",
+            "stall torque for each volt",
+            lambda k: k["torque_constant"] / k["resistance"],
+        ),
+        Derived(
+            "back-EMF damping",
+            "N*m*s/rad",
+            "what the driven motor's own voltage takes off its torque",
+            lambda k: k["torque_constant"] ** 2 / k["resistance"],
+        ),
+        Derived(
+            "stall torque",
+            "N*m",
+            "at the whole supply, at rest",
+            lambda k: k["torque_constant"] * k["voltage"] / k["resistance"],
+        ),
+        Derived(
+            "free speed",
+            "rad/s",
+            "at the whole supply, without friction",
+            lambda k: k["voltage"] / k["torque_constant"],
+        ),
+    )
     usual_recording = UsualRecording(
         initial={"q": (-0.5, 0.5)},
         inputs={"goal": "steps:1:1", "torque_enable": "1"},

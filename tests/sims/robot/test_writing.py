@@ -316,3 +316,19 @@ def test_a_lag_settled_at_its_first_command_is_that_of_the_simulator(tmp_path: P
     effect = abs(shown[-1, place] - direct[-1, place])
     assert effect > 0.1
     assert abs(data.qpos[1] - shown[-1, place]) < 0.02 * effect
+
+
+def test_actuators_of_a_recording_are_written_into_the_file(tmp_path: Path) -> None:
+    """The author's text has no element for them, so MuJoCo writes the model."""
+    path = tmp_path / "leg.xml"
+    actuator = NAMELESS[NAMELESS.index("  <actuator>") : NAMELESS.index("</mujoco>")]
+    path.write_text(NAMELESS.replace(actuator, ""))
+    added = {"m_hip": {"joint": "hip", "kind": "position", "kp": 4.0, "kv": 0.5}}
+    leg = read(path, actuators=added)
+    causes: Causes = {"actuator.stiffness@m_hip": one(0.5)}
+    done = written(leg, causes)
+    check(leg, causes, done)
+    assert done.xml is not None
+    model = mujoco.MjModel.from_xml_string(done.xml)
+    assert model.actuator_gainprm[0, 0] == pytest.approx(6.0)
+    assert any("its actuators are the recording's" in line for line in done.said)

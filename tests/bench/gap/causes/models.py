@@ -39,6 +39,7 @@ def held_out(left):
         seen=np.ones((1, 4, 1), dtype=bool),
     )
     measured = {
-        names: Measured(np.full((1, 4, 1), float(rms)), -100.0 * rms) for names, rms in left.items()
+        names: Measured(np.full((1, 4, 1), float(rms)), -100.0 * rms, np.zeros((1, 1)))
+        for names, rms in left.items()
     }
     return runs, measured

@@ -1,0 +1,121 @@
+"""`simgap.datasheet`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from bench.api.explain import Source, explain, sources_of
+from bench.gap.explanation import Explanation
+from bench.gap.sheet.sheet import DataSheet, sheet
+from bench.gap.sheet.subject import subject_of
+from bench.gap.verdict import Verdict
+from bench.recordings.joined import load_all
+from bench.registry import simulators
+from sims.base import InputError
+from sims.extended import Extended, opened
+from sims.simulated import Simulated
+
+
+def datasheet(
+    recording: Source | Sequence[Source],
+    *,
+    joint: str | None = None,
+    name: str | None = None,
+    explained: str | Path | Explanation | None = None,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+    force: bool = False,
+    budget: float | None = None,
+    jobs: int | None = None,
+    say: Callable[[str], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[float, str], None] | None = None,
+) -> DataSheet:
+    """Make the data sheet of a joint or actuator.
+
+    Args:
+        recording: the logs, as for `explain`.
+        joint: which, of a robot of several.
+        name: on the sheet; None for the joint's or the system's.
+        explained: what `explain` has found in these logs, or the folder that it was written to;
+            None to explain them now.
+        system: as for `explain`, and so what follows.
+        model: see there.
+        free: see there.
+        force: see there.
+        budget: see there.
+        jobs: see there.
+        say: see there.
+        stop: see there.
+        progress: see there.
+
+    Raises:
+        InputError: as `explain`; or there is no such joint, or the folder is not one that explain
+            has written, or of other logs.
+    """
+    sources = sources_of(recording)
+    if explained is None:
+        refuse_joint(sources, joint, system, model, free)
+        explained = explain(
+            sources,
+            system=system,
+            model=model,
+            free=free,
+            force=force,
+            budget=budget,
+            jobs=jobs,
+            say=say,
+            stop=stop,
+            progress=progress,
+        )
+    if isinstance(explained, Explanation):
+        extended, verdict = explained.extended, explained.answer
+    else:
+        extended, verdict = _read(Path(explained))
+    free = extended.robot.free if extended.robot is not None else ()
+    loaded, kind = load_all(sources, system, model, free)
+    if extended.kind is None or kind.name != extended.kind.name:
+        raise InputError(
+            f"{loaded.path}: expected a recording of {extended.system}, as what was explained; "
+            f"found one of {kind.name}"
+        )
+    say("asking what these data would have shown")
+    return sheet(loaded, extended, verdict, joint, name)
+
+
+def refuse_joint(
+    recording: Source | Sequence[Source],
+    joint: str | None,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+) -> None:
+    """Refuse a joint that the recording's robot does not have, before anything is explained.
+
+    Raises:
+        InputError: it has none of that name, or several and none is named.
+    """
+    loaded, kind = load_all(sources_of(recording), system, model, free)
+    if not issubclass(kind, Simulated):
+        raise InputError(f"{loaded.path}: simulator {loaded.system} takes no effects")
+    subject_of(kind, joint)
+
+
+def _read(folder: Path) -> tuple[Extended, Verdict]:
+    """What explain has written to a folder."""
+    path = folder / "verdict.json"
+    try:
+        verdict = Verdict.of(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        remedy = "name a folder that simgap explain has written"
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(
+            f"{path}: expected a verdict of simgap explain, found other text"
+        ) from None
+    extended, kind, _ = opened(folder / "extended.toml", simulators.get)
+    return replace(extended, kind=kind), verdict

@@ -1,0 +1,103 @@
+"""The command `simgap datasheet`."""
+
+from __future__ import annotations
+
+import argparse
+
+from bench.commands.interrupts import Interrupts
+from bench.commands.options import (
+    add_force,
+    add_model,
+    add_plugin,
+    names,
+    place,
+    positive,
+    seconds,
+)
+
+
+def add_datasheet(parser: argparse.ArgumentParser) -> None:
+    """The options of `simgap datasheet`."""
+    parser.add_argument(
+        "recordings",
+        metavar="RECORDING.csv",
+        type=place,
+        nargs="+",
+        help="the logs, as for `simgap explain`",
+    )
+    parser.add_argument(
+        "--joint", metavar="NAME", help="of a robot of several joints: the one that the sheet is of"
+    )
+    parser.add_argument(
+        "--name", metavar="TEXT", help="on the sheet (default: the joint's, or the system's)"
+    )
+    parser.add_argument(
+        "--from",
+        dest="explained",
+        metavar="FOLDER",
+        type=place,
+        help="what `simgap explain` has written about these logs (default: they are explained now, "
+        "into the folder explained in --out)",
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", type=place, required=True, help="folder to write, a new one"
+    )
+    parser.add_argument(
+        "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
+    )
+    add_model(parser)
+    parser.add_argument("--free", metavar="A,B,...", default="", help="as for `simgap explain`")
+    parser.add_argument(
+        "--budget", type=seconds, metavar="S", help="seconds, as for `simgap explain`"
+    )
+    parser.add_argument("--jobs", type=positive, metavar="N", help="processes that work at once")
+    add_plugin(parser, "systems")
+    add_force(parser)
+    parser.set_defaults(command=_datasheet)
+
+
+def _datasheet(options: argparse.Namespace) -> int:
+    """Make a sheet, and the explanation that it is from where there is none."""
+    from bench.api.datasheet import datasheet, refuse_joint
+    from bench.api.explain import explain
+    from bench.commands.progress import Look
+    from bench.registry import load_plugins
+    from sims.files import refuse_full
+
+    load_plugins(options.plugin)
+    # Before the work, which may take minutes.
+    refuse_full(options.out)
+    logs, free, source = options.recordings, names(options.free), options.explained
+    with Look() as look, Interrupts() as interrupts:
+        if source is None:
+            refuse_joint(logs, options.joint, options.system, options.model, free)
+            source = explain(
+                logs,
+                system=options.system,
+                model=options.model,
+                free=free,
+                force=options.force,
+                budget=options.budget,
+                jobs=options.jobs,
+                say=look.say,
+                stop=interrupts.asked,
+                progress=look.show,
+            )
+            # What took minutes is kept, whatever comes of the sheet.
+            source.write(options.out / "explained")
+        made = datasheet(
+            logs,
+            joint=options.joint,
+            name=options.name,
+            explained=source,
+            system=options.system,
+            model=options.model,
+            say=look.say,
+        )
+    paths = made.write(options.out)
+    for line in made.lines():
+        print(line)
+    print("")
+    for path in paths:
+        print(f"{path.suffix[1:]:7} {path}")
+    return 0

@@ -1,0 +1,221 @@
+"""The rows of a data sheet: each number of a joint or actuator, found, fitted or not shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from bench.gap.measure import Z95
+from bench.gap.report.words import name_of
+from bench.gap.sheet.reach import Reach, Shown
+from bench.gap.sheet.subject import Stated, Subject
+from bench.gap.verdict import Cause, Verdict
+from sims import effects as library
+from sims.extended import Extended, Number
+
+State = Literal["found", "fitted", "derived", "not shown"]
+STEP = 1e-6
+"""Share of a number by which it is moved to see what follows from it."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One number of the sheet.
+
+    Attributes:
+        name: of an effect here, with its coefficient where it has several; of a parameter.
+        says: what it is, in words.
+        part: ``joint``, ``actuator``, ``channel``, or ``system`` for a parameter of one.
+        state: whether it is a cause that was found, a parameter that was fitted, follows from
+            others, or is not shown.
+        number: with its 95 % interval; None where it is not shown.
+        stated: what the model file says of it; None where it says nothing.
+        reach: how small a one these data would have shown, or could not: of what is not shown.
+        p_value: chance of a gain like that of the cause if it were not there.
+        share: of the gap on held-out runs that the cause closes alone; None if not measured.
+        instead: effects that would explain the same share as well.
+    """
+
+    name: str
+    says: str
+    part: str
+    state: State
+    unit: str
+    number: Number | None = None
+    stated: float | None = None
+    reach: Reach | None = None
+    p_value: float | None = None
+    share: float | None = None
+    instead: tuple[str, ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        """As TOML, which has no null."""
+        row: dict[str, Any] = {"state": self.state, "says": self.says, "unit": self.unit}
+        row["part"] = self.part
+        if self.number is not None:
+            row |= self.number.table()
+        if self.stated is not None:
+            row["stated"] = self.stated
+        if self.reach is not None:
+            row |= _reached(self.reach)
+        if self.p_value is not None:
+            row["p_value"] = self.p_value
+        if self.share is not None:
+            row["heldout_gain"] = self.share
+        if self.instead:
+            row["alternatives"] = list(self.instead)
+        return row
+
+
+def _reached(reach: Reach) -> dict[str, Any]:
+    row: dict[str, Any] = {}
+    if np.isfinite(reach.size):
+        row[{"": "resolved", "above": "none_above", "below": "none_below"}[reach.limit]] = (
+            reach.size
+        )
+        if reach.leans:
+            row["leans_to"] = reach.leaning
+    if reach.mixed:
+        row["mixed_with"] = list(reach.mixed)
+    return row
+
+
+def quantities(
+    subject: Subject, extended: Extended, verdict: Verdict, shown: Shown
+) -> tuple[Quantity, ...]:
+    """The rows of a sheet: what follows from parameters, these, causes, then what is not shown."""
+    rows = _Rows(subject, extended, verdict, shown)
+    return (*rows.derived(), *rows.parameters(), *rows.causes(), *rows.absent())
+
+
+@dataclass(frozen=True)
+class _Rows:
+    subject: Subject
+    extended: Extended
+    verdict: Verdict
+    shown: Shown
+
+    def derived(self) -> Iterator[Quantity]:
+        """What follows from the system's parameters, by error propagation."""
+        parameters = self.extended.parameters
+        values = {name: number.value for name, number in parameters.items()}
+        known = {**self.extended.constants, **values}
+        free = [name for name in self.shown.free if name in values]
+        places = [self.shown.free.index(name) for name in free]
+        covariance = self.shown.covariance[np.ix_(places, places)]
+        for derived in self.subject.kind.system.derived:
+            try:
+                value = derived.of(known)
+            except KeyError:
+                # A constant that differs between runs has no one value.
+                continue
+            slopes = []
+            for name in free:
+                step = STEP * abs(known[name])
+                slopes.append((derived.of({**known, name: known[name] + step}) - value) / step)
+            spread = np.array(slopes)
+            half = Z95 * float(np.sqrt(max(spread @ covariance @ spread, 0.0)))
+            number = Number(value, derived.unit, value - half, value + half)
+            yield Quantity(derived.name, derived.says, "system", "derived", derived.unit, number)
+
+    def parameters(self) -> Iterator[Quantity]:
+        """Parameters of the system, or free numbers of the robot's file here."""
+        if not self.subject.joint:
+            for parameter in self.subject.kind.parameters:
+                number = self.extended.parameters[parameter.name]
+                says = parameter.says or parameter.name
+                yield _row(parameter.name, says, "system", "fitted", number, None)
+            return
+        for name, number in self.extended.parameters.items():
+            # An effect's coefficient, with its name behind a point where it has several.
+            effect, _, place = name.partition("@")
+            there = next(
+                (p for p in self.subject.places if place in (p, f"{p}.{_tail(place)}")), ""
+            )
+            if there:
+                yield self._of_effect(f"{effect}@{there}", name, number, "fitted")
+
+    def causes(self) -> Iterator[Quantity]:
+        """What was found, and of a family also what is nothing here."""
+        for name, numbers in self.extended.effects.items():
+            own = list(self.subject.own(name, numbers))
+            for effect, coefficient, number in own:
+                if number.value == 0:
+                    # As good as not there: it is asked about like any other.
+                    continue
+                several = sum(other == effect for other, _, _ in own) > 1
+                label = f"{effect} {coefficient}" if several else effect
+                row = self._of_effect(effect, label, number, "found", self._cause(name))
+                yield self._nothing(row, effect, number) if _is_nothing(number) else row
+
+    def _nothing(self, row: Quantity, effect: str, number: Number) -> Quantity:
+        """A number of a cause that stands elsewhere, and is not shown here."""
+        reach = _of_number(number, self.subject.stated(effect))
+        return Quantity(
+            row.name, row.says, row.part, "not shown", row.unit, stated=row.stated, reach=reach
+        )
+
+    def absent(self) -> Iterator[Quantity]:
+        """What the model has not."""
+        for (effect, coefficient), reach in self.shown.reaches.items():
+            several = len({c for e, c in self.shown.reaches if e == effect}) > 1
+            label = f"{effect} {coefficient}" if several else effect
+            placed = library.find(effect, self.subject.kind.system)
+            c = next(c for c in placed.coefficients if c.name == coefficient)
+            unit = c.unit_on(self.subject.kind.system, self.extended.observe) or "1"
+            yield self._absent(effect, label, unit, reach)
+
+    def _absent(self, effect: str, label: str, unit: str, reach: Reach) -> Quantity:
+        stated = self.subject.stated(effect)
+        value = None
+        if stated is not None:
+            unit, value = stated.unit, stated.value
+            reach = replace(reach, size=stated.half(reach.size), leaning=stated.half(reach.leaning))
+        instead = tuple(c.effect for c in self.verdict.causes if effect in c.alternatives)
+        says = name_of(effect.partition("@")[0])
+        part = library.find(effect, self.subject.kind.system).at
+        return Quantity(
+            label, says, part, "not shown", unit, stated=value, reach=reach, instead=instead
+        )
+
+    def _of_effect(
+        self, effect: str, label: str, number: Number, state: State, cause: Cause | None = None
+    ) -> Quantity:
+        placed = library.find(effect, self.subject.kind.system)
+        stated = self.subject.stated(effect)
+        if stated is not None:
+            number = stated.total(number)
+        row = _row(label, name_of(effect.partition("@")[0]), placed.at, state, number, stated)
+        if cause is None:
+            return row
+        gains = [c.heldout_gain for c in self.verdict.candidates if c.effect == cause.effect]
+        share = next(iter(gains), None)
+        return replace(row, p_value=cause.p_value, share=share, instead=cause.alternatives)
+
+    def _cause(self, name: str) -> Cause | None:
+        return next((c for c in self.verdict.causes if c.effect == name), None)
+
+
+def _row(name: str, says: str, part: str, state: State, number: Number, stated: Any) -> Quantity:
+    value = None if stated is None else stated.value
+    return Quantity(name, says, part, state, number.unit, number, value)
+
+
+def _tail(place: str) -> str:
+    return place.rpartition(".")[2]
+
+
+def _is_nothing(number: Number) -> bool:
+    """Whether a coefficient of a cause that stands elsewhere may be zero here."""
+    if number.low is None or number.high is None:
+        return False
+    return number.low <= 0 <= number.high
+
+
+def _of_number(number: Number, stated: Stated | None) -> Reach:
+    low, high = number.low or 0.0, number.high or 0.0
+    size = max(abs(low), abs(high))
+    return Reach(size if stated is None else stated.half(size))

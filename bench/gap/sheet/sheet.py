@@ -1,0 +1,111 @@
+"""`simgap datasheet`: an explanation and its logs in, one page of a joint or actuator out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+from bench.gap.model.world import World
+from bench.gap.sheet.facts import Facts
+from bench.gap.sheet.page import page
+from bench.gap.sheet.quantity import quantities
+from bench.gap.sheet.reach import shown
+from bench.gap.sheet.subject import Subject, subject_of
+from bench.gap.verdict import Verdict
+from bench.recordings.pieces import cut
+from sims.base import InputError, unknown
+from sims.extended import Extended
+from sims.files import Content, write_all
+from sims.recording.recording import Recording
+from sims.system import FAMILY
+
+
+class DataSheet(Facts):
+    """The data sheet of a joint or actuator."""
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write sheet.toml and sheet.html: all or none. The folder is made where it is missing.
+
+        Raises:
+            InputError: the folder cannot be made or written to.
+        """
+        import tomli_w
+
+        folder = Path(folder)
+        contents: dict[Path, Content] = {
+            folder / "sheet.toml": tomli_w.dumps(self.document()),
+            folder / "sheet.html": page(self),
+        }
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_all(contents)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
+        return list(contents)
+
+
+def sheet(
+    recording: Recording,
+    extended: Extended,
+    verdict: Verdict,
+    joint: str | None = None,
+    name: str | None = None,
+) -> DataSheet:
+    """The data sheet of a joint or actuator.
+
+    Args:
+        recording: the logs, as they were explained.
+        extended: what was found in them; its class is known.
+        verdict: the same, with its evidence.
+        joint: which, of a robot.
+        name: on the sheet; None for the joint's or the system's.
+
+    Raises:
+        InputError: there is no such joint, or the logs are not of the system.
+    """
+    kind = extended.kind
+    assert kind is not None
+    subject = subject_of(kind, joint)
+    for channel in extended.observe:
+        there = list(recording.runs[0].channels)
+        if channel not in there:
+            raise unknown(f"channel of {recording.path}", channel, there)
+    recording = replace(recording, constants={**extended.constants, **recording.constants})
+    recording, _ = cut(recording, kind)
+    asked = tuple(absent(subject, extended))
+    candidates = [*extended.effects, *asked]
+    engine = None if kind.own_engine else extended.engine
+    world = World(kind, recording, recording.training(), engine, candidates=candidates)
+    with closing(world):
+        # An effect on a channel that nobody recorded shows nowhere.
+        there = [
+            effect for effect in asked if not world.effects[effect].signal or _seen(world, effect)
+        ]
+        rows = quantities(subject, extended, verdict, shown(world, extended, there))
+    return DataSheet(
+        name or subject.joint or kind.name, subject, recording, verdict, extended, rows
+    )
+
+
+def absent(subject: Subject, extended: Extended) -> Iterator[str]:
+    """Effects that the model does not have here, without simpler forms of those that it has."""
+    own = [
+        effect
+        for name, numbers in extended.effects.items()
+        for effect, _, number in subject.own(name, numbers)
+        if number.value != 0
+    ]
+    has = {*own, *extended.effects}
+    effects = {effect.name: effect for effect in subject.effects()}
+    simpler = {other for name in own for other in getattr(effects.get(name), "contains", ())}
+    for name in effects:
+        if name not in has | simpler and name.partition("@")[2] != FAMILY:
+            yield name
+
+
+def _seen(world: World, effect: str) -> bool:
+    """Whether the signal that an effect acts on was recorded."""
+    run = world.runs[0]
+    return world.effects[effect].signal in {*run.channels, *run.inputs}

@@ -1,0 +1,69 @@
+"""A servo that carries a pendulum, with dry friction, stepped by no code under test."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+TRUTH = {"torque_constant": 0.4, "resistance": 5.0, "armature": 0.002}
+FRICTION = 0.06
+"""N m."""
+CONSTANTS = {
+    "mass": 0.4,
+    "length": 0.1,
+    "gravity": 9.81,
+    "voltage": 7.4,
+    "error_gain": 0.003,
+    "kp": 200.0,
+}
+NOISE = 0.004
+"""rad."""
+STEP = 1e-4
+EVERY = 100
+"""Steps from sample to sample."""
+SAMPLES = 300
+HELD = 5000
+"""Steps for which each command holds."""
+
+
+def swings(rng: np.random.Generator) -> list[tuple[float, float, float]]:
+    """Time, command and noisy angle of one run, by the equations of a direct-current motor."""
+    k, c = TRUTH, CONSTANTS
+    inertia = k["armature"] + c["mass"] * c["length"] ** 2
+    goals = rng.uniform(-1.5, 1.5, 1 + EVERY * SAMPLES // HELD)
+    angle = rate = 0.0
+    rows = []
+    for step in range(EVERY * SAMPLES):
+        goal = goals[step // HELD]
+        if step % EVERY == 0:
+            rows.append((step * STEP, goal, angle + rng.normal(0.0, NOISE)))
+        duty = np.clip(c["kp"] * c["error_gain"] * (goal - angle), -1.0, 1.0)
+        current = (duty * c["voltage"] - k["torque_constant"] * rate) / k["resistance"]
+        weight = c["mass"] * c["gravity"] * c["length"] * np.sin(angle)
+        pull = k["torque_constant"] * current - weight
+        if rate == 0.0 and abs(pull) <= FRICTION:
+            continue
+        way = np.sign(rate) if rate else np.sign(pull)
+        faster = rate + STEP * (pull - FRICTION * way) / inertia
+        # Friction stops a motion, and does not turn it round.
+        rate = 0.0 if faster * rate < 0 else float(faster)
+        angle += STEP * rate
+    return rows
+
+
+def written(folder: Path, runs: int = 2, seed: int = 0) -> Path:
+    """A recording of it."""
+    rng = np.random.default_rng(seed)
+    lines = ["run,t,goal,torque_enable,q"]
+    for run in range(runs):
+        lines += [f"{run},{t:.4f},{goal:.9g},1,{q:.6f}" for t, goal, q in swings(rng)]
+    path = folder / "log.csv"
+    path.write_text("\n".join(lines) + "\n")
+    constants = "".join(f"{name} = {value}\n" for name, value in CONSTANTS.items())
+    path.with_suffix(".toml").write_text(
+        f'system = "servo"\ntitle = "a <b>servo</b>"\n[constants]\n{constants}'
+        f'[channels.q]\nunit = "rad"\nnoise = {NOISE}\n'
+        '[inputs.goal]\nunit = "rad"\n[inputs.torque_enable]\nunit = "1"\n'
+    )
+    return path

@@ -1,0 +1,149 @@
+"""The sheet of a servo whose numbers are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomllib
+
+from bench.api.datasheet import datasheet
+from bench.cli import main
+from bench.gap.explanation import Explanation
+from bench.gap.sheet.quantity import Quantity
+from bench.gap.sheet.sheet import DataSheet
+from sims.base import InputError
+from tests.bench.gap.sheet.drives import CONSTANTS, FRICTION, NOISE, SAMPLES, TRUTH
+
+
+def row(sheet: DataSheet, name: str) -> Quantity:
+    return next(row for row in sheet.rows if row.name == name)
+
+
+def test_what_was_put_in_lies_within_the_intervals(sheet: DataSheet) -> None:
+    stall = TRUTH["torque_constant"] / TRUTH["resistance"]
+    truth = {
+        **TRUTH,
+        "friction.coulomb": FRICTION,
+        "torque constant over resistance": stall,
+        "back-EMF damping": stall * TRUTH["torque_constant"],
+        "stall torque": stall * CONSTANTS["voltage"],
+        "free speed": CONSTANTS["voltage"] / TRUTH["torque_constant"],
+    }
+    assert sheet.verdict.verdict == "named"
+    shown = {row.name: row.number for row in sheet.rows if row.number is not None}
+    assert set(shown) == set(truth)
+    for name, value in truth.items():
+        number = shown[name]
+        assert number.low is not None
+        assert number.high is not None
+        assert number.low <= value <= number.high, name
+        # An interval that holds everything would hold the truth, too.
+        assert number.high - number.low < 0.1 * abs(value), name
+
+
+def test_a_ratio_is_known_better_than_its_parts(sheet: DataSheet) -> None:
+    def width(name: str) -> float:
+        number = row(sheet, name).number
+        assert number is not None
+        assert number.low is not None
+        assert number.high is not None
+        return (number.high - number.low) / number.value
+
+    # What shows is the torque for each volt: errors of its two parts go together.
+    assert width("torque constant over resistance") < 0.5 * width("resistance")
+
+
+def test_what_is_not_there_is_not_shown_within_what_these_data_resolve(sheet: DataSheet) -> None:
+    absent = [row for row in sheet.rows if row.number is None]
+    names = {row.name for row in absent}
+    assert {"drag.linear", "servo.deadband", "input.delay", "sensor.bias", "backlash"} <= names
+    # The plain friction of a richer law is that which was found: it is told once.
+    assert "friction.stribeck coulomb" not in names
+    leaning = [row.name for row in absent if row.reach and row.reach.leans]
+    # One in twenty of what is not there leans by more than its interval.
+    assert len(leaning) <= 0.2 * len(absent)
+
+
+def test_what_the_data_resolve_is_what_least_squares_says(sheet: DataSheet) -> None:
+    """An offset of the sensor, in a motion that gravity bends little: its interval is no narrower
+    than that of a mean, and not much wider than that of the pose that gravity tells.
+    """
+    reach = row(sheet, "sensor.bias").reach
+    assert reach is not None
+    mean = 1.96 * NOISE / np.sqrt(2 * SAMPLES)
+    assert mean < reach.size < 30 * mean
+
+
+def test_drag_cannot_be_told_from_the_motors_own(sheet: DataSheet) -> None:
+    """With any drag c, kt and R may be such that kt / R and kt^2 / R + c stay as they are."""
+    reach = row(sheet, "drag.linear").reach
+    assert reach is not None
+    assert {"torque_constant", "resistance"} <= set(reach.mixed)
+    assert reach.size > 0.05
+
+
+def test_a_gap_smaller_than_the_error_cannot_show(sheet: DataSheet) -> None:
+    dead = row(sheet, "servo.deadband").reach
+    slow = row(sheet, "input.rate").reach
+    assert dead is not None
+    assert dead.limit == "above"
+    assert 0 < dead.size < 0.2
+    # Commands jump: any limit of their rate would show.
+    assert slow is not None
+    assert slow.limit == "below"
+    assert slow.size > 10
+
+
+def test_the_files_say_the_same_and_are_safe(sheet: DataSheet, tmp_path: Path) -> None:
+    sheet.write(tmp_path)
+    stated = tomllib.loads((tmp_path / "sheet.toml").read_text())
+    friction = stated["quantities"]["friction.coulomb"]
+    assert friction["state"] == "found"
+    assert friction["unit"] == "N*m"
+    assert friction["low"] <= FRICTION <= friction["high"]
+    assert friction["p_value"] < 1e-6
+    load = stated["quantities"]["friction.load"]
+    assert load["state"] == "not shown"
+    assert 0 < load["resolved"] < 0.2
+    assert "value" not in load
+    html = (tmp_path / "sheet.html").read_text()
+    assert "<b>servo" not in html
+    assert "<i>one" not in html
+    assert "&lt;b&gt;servo" in html
+
+
+def test_a_folder_of_explain_gives_the_same_sheet(
+    log: Path,
+    explained: Explanation,
+    sheet: DataSheet,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    explained.write(tmp_path / "explained")
+    out = tmp_path / "sheet"
+    given = ["--from", str(tmp_path / "explained"), "--out", str(out), "--name", sheet.name]
+    assert main(["datasheet", str(log), *given]) == 0
+    assert "not shown by these data: drag.linear" in capsys.readouterr().out
+    again = tomllib.loads((out / "sheet.toml").read_text())
+    assert again == sheet.document()
+
+
+def test_faults_are_one_line(log: Path, explained: Explanation, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="name a folder that simgap explain has written"):
+        datasheet(log, explained=tmp_path)
+    (tmp_path / "verdict.json").write_text("[]")
+    with pytest.raises(InputError, match="expected a verdict of simgap explain"):
+        datasheet(log, explained=tmp_path)
+    with pytest.raises(InputError, match="expected none, as servo is no robot; found elbow"):
+        datasheet(log, explained=explained, joint="elbow")
+
+
+def test_a_joint_that_is_none_is_refused_before_the_search(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "sheet"
+    assert main(["datasheet", str(log), "--joint", "elbow", "--out", str(out)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not out.exists()
