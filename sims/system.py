@@ -164,12 +164,14 @@ class Derived:
         unit: of it.
         says: what it is, in a few words.
         of: of parameters and constants by name.
+        strongest: whether it is the force of the drive at its limit, at rest.
     """
 
     name: str
     unit: str
     says: str
     of: Callable[[Mapping[str, float]], float]
+    strongest: bool = False
 
 
 class System(ABC):

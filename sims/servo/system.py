@@ -102,6 +102,7 @@ class ServoSystem(System):
             "N*m",
             "at the whole supply, at rest",
             lambda k: k["torque_constant"] * k["voltage"] / k["resistance"],
+            strongest=True,
         ),
         Derived(
             "free speed",

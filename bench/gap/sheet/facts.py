@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from bench.gap.report.words import clean, estimated, joined
+from bench.gap.sheet.diagram import Diagram, diagram
 from bench.gap.sheet.quantity import Quantity
 from bench.gap.sheet.subject import Subject
 from bench.gap.verdict import Verdict
@@ -51,7 +53,14 @@ class Facts:
             "verdict": self.verdict.verdict,
             "elsewhere": list(self.elsewhere()),
             "quantities": named,
+            "diagram": self.diagram.document(),
         }
+
+    @cached_property
+    def diagram(self) -> Diagram:
+        """Where the joint moves, holds and slips."""
+        strongest = [row.number.value for row in self.rows if row.strongest and row.number]
+        return diagram(self.subject, self.extended, next(iter(strongest), None))
 
     def elsewhere(self) -> Iterator[str]:
         """Causes that the model has at other places, or in the world."""

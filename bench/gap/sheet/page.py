@@ -5,23 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from bench.gap.report.elements import code, heading, paragraph, safe, table
+from bench.gap.report.elements import code, figure, heading, paragraph, safe, table
 from bench.gap.report.words import (
     estimated,
     joined,
     number,
-    percent,
-    probability,
     sentence,
     with_unit,
 )
+from bench.gap.sheet.diagram import Diagram
 from bench.gap.sheet.facts import Facts
 from bench.gap.sheet.quantity import Quantity
-from bench.gap.sheet.subject import PARTS
+from bench.gap.sheet.words import TITLES, beside, called, evidence, reached
 
 _STYLE = Path(__file__).parents[1] / "report" / "page.css"
-_TITLES = {"system": "Motor", **PARTS}
-"""Of the parts of the table."""
 _REACH = (
     "How small a number these data would have shown: within the 95 % interval given it would not "
     "stand out beside the others, the noise being what the model leaves. What says 'not named' "
@@ -30,9 +27,10 @@ _REACH = (
 )
 
 
-def page(sheet: Facts) -> str:
-    """The page as HTML."""
-    return "\n".join([*_head(sheet), *_found(sheet), *_absent(sheet), *_foot(sheet)])
+def page(sheet: Facts, diagram: Diagram, drawn: bytes) -> str:
+    """The page as HTML, with the diagram as it is drawn (PNG)."""
+    parts = [*_head(sheet), *_found(sheet), *_diagram(diagram, drawn), *_absent(sheet)]
+    return "\n".join([*parts, *_foot(sheet)])
 
 
 def _head(sheet: Facts) -> Iterator[str]:
@@ -54,8 +52,8 @@ def _found(sheet: Facts) -> Iterator[str]:
             continue
         rows.append(
             [
-                _TITLES[row.part],
-                f"{safe(row.says, 80)}<br>{code(safe(row.name, 80))}",
+                TITLES[row.part],
+                f"{safe(called(row), 80)}<br>{code(safe(row.name, 80))}",
                 safe(estimated(row.number), 120),
                 _stated(row),
                 safe(evidence(row), 400),
@@ -65,11 +63,28 @@ def _found(sheet: Facts) -> Iterator[str]:
     yield table(["", "quantity", "-value (95 %)", "-the file says", "evidence"], rows, marks)
 
 
+def _diagram(diagram: Diagram, drawn: bytes) -> Iterator[str]:
+    yield heading("Drive and back-drive")
+    starts = with_unit(number(diagram.breakaway), diagram.unit)
+    said = f"At rest it starts without a load at {starts}; "
+    if diagram.backdrive < float("inf"):
+        said += f"without power {with_unit(number(diagram.backdrive), diagram.unit)} turn it back."
+    else:
+        said += "without power no load turns it."
+    laws = joined([code(safe(law, 60)) for law in diagram.laws]) or "no friction at rest"
+    caption = (
+        f"By the force of the motor and what it works against, where the joint moves, holds and "
+        f"slips: {laws}, at position 0 and at the start of a run. The dotted line is balance."
+    )
+    yield paragraph(safe(said))
+    yield f'<div style="max-width:34rem">{figure(drawn, safe(said), caption)}</div>'
+
+
 def _absent(sheet: Facts) -> Iterator[str]:
     rows = [
         [
-            _TITLES[row.part],
-            f"{safe(row.says, 80)}<br>{code(safe(row.name, 80))}",
+            TITLES[row.part],
+            f"{safe(called(row), 80)}<br>{code(safe(row.name, 80))}",
             safe(reached(row), 120),
             _stated(row),
             safe(beside(row), 400),
@@ -80,41 +95,6 @@ def _absent(sheet: Facts) -> Iterator[str]:
     yield heading("Not shown by these data")
     yield paragraph(_REACH, "soft")
     yield table(["", "quantity", "-these data resolve", "-the file says", "mixed up with"], rows)
-
-
-def evidence(row: Quantity) -> str:
-    """Why a number stands on the sheet."""
-    if row.state == "derived":
-        return "follows from those below"
-    if row.state == "fitted":
-        return "fitted" if row.number and row.number.low is not None else "not fixed by these data"
-    said = [probability(row.p_value)]
-    if row.share is not None:
-        said.append(f"alone it closes {percent(row.share)} of the held-out gap")
-    if row.instead:
-        said.append(f"{joined(row.instead, 'or')} would do as well")
-    return "; ".join(said)
-
-
-def reached(row: Quantity) -> str:
-    """How small a number these data would have shown."""
-    reach = row.reach
-    if reach is None or reach.size == float("inf"):
-        return "nothing" if reach is not None and reach.mixed else "nothing: not touched"
-    size = with_unit(number(reach.size, 2), row.unit)
-    if reach.limit:
-        return f"none {reach.limit} {size}"
-    if reach.leans:
-        return f"{with_unit(number(reach.leaning, 2), row.unit)} ± {size}, not named"
-    return f"0 ± {size}"
-
-
-def beside(row: Quantity) -> str:
-    """What it is mixed up with, and what it might stand in place of."""
-    said = list(row.reach.mixed) if row.reach else []
-    if row.instead:
-        said.append(f"may be there instead of {joined(row.instead, 'or')}")
-    return ", ".join(said)
 
 
 def _stated(row: Quantity) -> str:

@@ -37,6 +37,7 @@ class Quantity:
         p_value: chance of a gain like that of the cause if it were not there.
         share: of the gap on held-out runs that the cause closes alone; None if not measured.
         instead: effects that would explain the same share as well.
+        strongest: whether it is the force of the drive at its limit, at rest.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Quantity:
     p_value: float | None = None
     share: float | None = None
     instead: tuple[str, ...] = ()
+    strongest: bool = False
 
     def document(self) -> dict[str, Any]:
         """As TOML, which has no null."""
@@ -119,7 +121,8 @@ class _Rows:
             spread = np.array(slopes)
             half = Z95 * float(np.sqrt(max(spread @ covariance @ spread, 0.0)))
             number = Number(value, derived.unit, value - half, value + half)
-            yield Quantity(derived.name, derived.says, "system", "derived", derived.unit, number)
+            row = Quantity(derived.name, derived.says, "system", "derived", derived.unit, number)
+            yield replace(row, strongest=derived.strongest)
 
     def parameters(self) -> Iterator[Quantity]:
         """Parameters of the system, or free numbers of the robot's file here."""

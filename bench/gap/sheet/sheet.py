@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bench.gap.model.world import World
+from bench.gap.sheet.drawn import picture, printed
 from bench.gap.sheet.facts import Facts
 from bench.gap.sheet.page import page
 from bench.gap.sheet.quantity import quantities
@@ -26,7 +27,7 @@ class DataSheet(Facts):
     """The data sheet of a joint or actuator."""
 
     def write(self, folder: str | Path) -> list[Path]:
-        """Write sheet.toml and sheet.html: all or none. The folder is made where it is missing.
+        """Write sheet.toml, .html and .pdf: all or none. The folder is made where it is missing.
 
         Raises:
             InputError: the folder cannot be made or written to.
@@ -36,7 +37,8 @@ class DataSheet(Facts):
         folder = Path(folder)
         contents: dict[Path, Content] = {
             folder / "sheet.toml": tomli_w.dumps(self.document()),
-            folder / "sheet.html": page(self),
+            folder / "sheet.html": page(self, self.diagram, picture(self.diagram)),
+            folder / "sheet.pdf": printed(self, self.diagram),
         }
         try:
             folder.mkdir(parents=True, exist_ok=True)

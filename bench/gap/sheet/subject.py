@@ -61,6 +61,14 @@ class Subject:
         """Names of those that drive the joint."""
         return tuple(spot.name for spot in self._spots().get("actuator", ()) if self._on(spot))
 
+    @property
+    def linear(self) -> bool:
+        """Whether it slides, and does not turn."""
+        if not self.joint:
+            return self.kind.system.kind != "rotary"
+        (joint,) = (s for s in self._spots()["joint"] if s.name == self.joint)
+        return bool(joint.kind == "slide")
+
     def has(self, effect: Effect | type[Effect]) -> bool:
         """Whether an effect acts here, and at no more than one place."""
         if effect.at not in PARTS or effect.place == FAMILY:

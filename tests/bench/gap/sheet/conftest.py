@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from bench.api.datasheet import datasheet
 from bench.api.explain import explain
+from bench.cli import main
 from bench.gap.explanation import Explanation
 from bench.gap.sheet.sheet import DataSheet
+from sims import extended
 from tests.bench.gap.sheet.drives import written
+
+NAME = "servo <i>one</i>"
 
 
 @pytest.fixture(scope="session")
@@ -25,4 +30,16 @@ def explained(log: Path) -> Explanation:
 
 @pytest.fixture(scope="session")
 def sheet(log: Path, explained: Explanation) -> DataSheet:
-    return datasheet(log, explained=explained, name="servo <i>one</i>")
+    return datasheet(log, explained=explained, name=NAME)
+
+
+@pytest.fixture(scope="session")
+def files(log: Path, explained: Explanation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command writes, from what explain has written."""
+    folder = tmp_path_factory.mktemp("made")
+    # The two of its files that are read again; to draw its figures takes seconds.
+    (folder / "verdict.json").write_text(json.dumps(explained.answer.document()))
+    extended.write(explained.extended, folder / "extended.toml")
+    given = ["--from", str(folder), "--name", NAME, "--out", str(folder / "sheet")]
+    assert main(["datasheet", str(log), *given]) == 0
+    return folder / "sheet"

@@ -1,0 +1,53 @@
+"""How a data sheet says its numbers, on the page and in print."""
+
+from __future__ import annotations
+
+from bench.gap.report.words import joined, number, percent, probability, with_unit
+from bench.gap.sheet.quantity import Quantity
+from bench.gap.sheet.subject import PARTS
+
+TITLES = {"system": "Motor", **PARTS}
+"""Of the parts of the table."""
+
+
+def called(row: Quantity) -> str:
+    """What a person calls it."""
+    return row.name.replace("_", " ") if row.part == "system" else row.says
+
+
+def evidence(row: Quantity, short: bool = False) -> str:
+    """Why a number stands on the sheet."""
+    if row.state == "derived":
+        return "follows from those below"
+    if row.state == "fitted":
+        return "fitted" if row.number and row.number.low is not None else "not fixed by these data"
+    said = [probability(row.p_value)]
+    if row.share is not None:
+        closed = percent(row.share)
+        said.append(
+            f"{closed} held out" if short else f"alone it closes {closed} of the held-out gap"
+        )
+    if row.instead:
+        said.append(f"{joined(row.instead, 'or')} would do as well")
+    return "; ".join(said)
+
+
+def reached(row: Quantity) -> str:
+    """How small a number these data would have shown."""
+    reach = row.reach
+    if reach is None or reach.size == float("inf"):
+        return "nothing" if reach is not None and reach.mixed else "nothing: not touched"
+    size = number(reach.size, 2)
+    if reach.limit:
+        return with_unit(f"none {reach.limit} {size}", row.unit)
+    if reach.leans:
+        return with_unit(f"{number(reach.leaning, 2)} ± {size}", row.unit) + ", not named"
+    return with_unit(f"0 ± {size}", row.unit)
+
+
+def beside(row: Quantity) -> str:
+    """What it is mixed up with, and what it might stand in place of."""
+    said = list(row.reach.mixed) if row.reach else []
+    if row.instead:
+        said.append(f"may be there instead of {joined(row.instead, 'or')}")
+    return ", ".join(said)
