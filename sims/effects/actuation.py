@@ -11,7 +11,8 @@ With u the command, w what the plant feels and c the coefficient:
 * (5) dead band: w = u - clip(u, -c, c)
 * (6) saturation: w = clip(u, -c, c)
 * (7) backlash: w stays while |u - w| <= c / 2, else it is pushed along by the nearer flank
-* (8) rate: dw/dt = clip((u - w) / h, -c, c) over a step h, from the first command on
+* (8) power: w = (1 + gain) sign(u) |u|^(1 + power), |u| in the input's unit
+* (9) rate: dw/dt = clip((u - w) / h, -c, c) over a step h, from the first command on
 
 A negative delay leads; a negative lag, width or limit is none.
 """
@@ -32,6 +33,12 @@ _PURE = ("1", "1", "1")
 """A pure number, on every kind of system."""
 _SHARE = ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
 """Plausible gains: half as much more or less."""
+_SCALE = ((-0.9, 9), (-0.9, 9), (-0.9, 9))
+"""Plausible gains beside a power: at inputs far from one unit its scale is another."""
+_EXPONENT = ((-0.5, 2), (-0.5, 2), (-0.5, 2))
+"""Plausible powers beyond the first."""
+_LEAST = 0.01
+"""The least power: of none the sign alone would act."""
 _OFFSET = ((-2, 2), (-2, 2), (-0.2, 0.2))
 """Plausible biases, in the units of `_USUAL`."""
 _WIDTH = ((0, 2), (0, 2), (0, 0.2))
@@ -166,6 +173,23 @@ class Backlash(Input):
         return np.where(c[0] > 0, played, signal.values)
 
 
+class Power(Input):
+    """The input to a power, as a propeller's thrust goes with the square of its speed."""
+
+    name = "input.power"
+    noun = "a power of the input"
+    says = "what acts goes with a power of the input, as a propeller's thrust with its square"
+    source = "R. Mahony, V. Kumar, P. Corke, IEEE Robot. Autom. Mag. 19(3), 20 (2012), equation 6"
+    needs, contains = "input", ("input.gain",)
+    coefficients = (Coefficient("gain", _PURE, _SCALE), Coefficient("power", _PURE, _EXPONENT))
+
+    def feel(self, c: Array, signal: Signal) -> Array:
+        """In proportion to the power of its size; an input of one unit stays, but for the gain."""
+        size = np.abs(signal.values)
+        bent = np.sign(signal.values) * size ** np.maximum(1.0 + c[1], _LEAST)
+        return (1.0 + c[0]) * np.where(c[1] != 0, bent, signal.values)  # (8)
+
+
 class Rate(Input):
     """The input follows no faster than c a second; a limit of zero is none."""
 
@@ -205,7 +229,7 @@ def _pushed(signal: Signal, half: Array) -> Array:
 
 
 def _slewed(signal: Signal, limit: Array) -> Array:
-    """Means (L, S) over each step of (8), `limit` (L, 1) of the rate, endless where there is
+    """Means (L, S) over each step of (9), `limit` (L, 1) of the rate, endless where there is
     none.
     """
     wanted = np.ascontiguousarray(signal.values.T)

@@ -18,6 +18,11 @@ from sims.system import Acting, Force, Friction
 OVER_TIME = frozenset({"force.bias", "force.periodic"})
 """Effects whose force hangs on nothing but time."""
 
+LOADED = frozenset(
+    {"friction.load", "friction.load_direction", "friction.load_quadratic", "supply.sag"}
+)
+"""Effects that look at what transmissions carry."""
+
 
 def moment_of(
     system: RobotSystem,

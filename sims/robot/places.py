@@ -37,6 +37,7 @@ ALONE = frozenset(
     {
         "force.periodic",
         "force.ripple",
+        "input.power",
         "friction.direction",
         "friction.load_direction",
         "friction.load_quadratic",
@@ -208,7 +209,7 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
     share = spot.size / TYPICAL[spot.kind]
     if unit.startswith("N"):
         low, high = share * low, share * high
-    elif unit.startswith("1/"):
+    elif unit.startswith(("1/N", "1/(N")):
         low, high = low / share, high / share
     if effect.name == "inertia.armature":
         high = 3.0 * spot.inertia
@@ -340,6 +341,9 @@ def _acts_at(effect: type[Effect], spot: Spot, found: Mapping[str, Sequence[Spot
     if effect.at == "joint" and effect.needs == "input":
         return any(actuator.coordinate == spot.coordinate for actuator in found["actuator"])
     if effect.needs == "servo" and not spot.servo:
+        return False
+    # A set point has no power.
+    if effect.name == "input.power" and not spot.unit.startswith(("N", "1")):
         return False
     # What is an angle to an encoder is none to what else is recorded.
     if effect.at == "channel" and not effect.coefficients[0].of:

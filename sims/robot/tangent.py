@@ -29,7 +29,7 @@ import numpy as np
 
 from sims.base import Array
 from sims.robot.acting import is_asked, natives
-from sims.robot.forces import moment_of
+from sims.robot.forces import LOADED, moment_of
 from sims.robot.lanes import Addresses, Bench, Places
 from sims.robot.moment import RobotMoment
 from sims.robot.system import RobotSystem
@@ -42,6 +42,8 @@ POSITION, VELOCITY, CONTROL, SHARE = 1e-6, 1e-5, 1e-5, 1e-3
 size."""
 SLOW = 1e-3
 """rad/s or m/s over which dry friction turns its sign along the motion."""
+SIDES = ("qfrc_actuator", "qfrc_bias")
+"""What presses on a joint's transmission from either side, in MuJoCo's data."""
 TOGETHER = 128
 """Changes that go through time side by side."""
 
@@ -149,7 +151,7 @@ class Tangent:
         self._share: Array = (numbers - looks[of]) / every
         self._earlier, self._later = _neighbours(looks, every)[:, of]
         # What is bound after a call is not there before the next one.
-        for name in ("qacc", *dict(outputs)):
+        for name in ("qacc", *SIDES, *dict(outputs)):
             bench.batch.bind(name)
         self.looks = 0
         self._asked = [(e, c) for e, c in acting if is_asked(e)]
@@ -251,7 +253,12 @@ class Tangent:
         v = bind("qvel")[:n, places.velocities]
         inputs = {name: u[at][:, None] for name, u in motion.inputs.items()}
         t: Array = motion.step * at[:, None].astype(np.float64)
-        moment = moment_of(self._system, t, x, v, inputs, motion.carried[:, at], self._stiff(n))
+        carried = motion.carried[:, at]
+        if any(effect.of in LOADED for effect, _ in self._asked):
+            # A servo's drive moves with the state as it does in the simulation.
+            self._bench.batch.forward(None if n == self._bench.count else np.arange(n))
+            carried = np.stack([bind(name)[:n, places.velocities] for name in SIDES])
+        moment = moment_of(self._system, t, x, v, inputs, carried, self._stiff(n))
         for effect, c in self._asked:
             own = np.repeat(c, n, axis=1)
             if isinstance(effect, Friction):

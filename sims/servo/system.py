@@ -10,7 +10,7 @@ import numpy as np
 
 from sims.base import Array, Channel, Constant, Parameter
 from sims.limits import GAIN, GRAVITY, LENGTH, MASS, VOLTAGE
-from sims.system import Derived, Kind, Moment, System, UsualRecording
+from sims.system import Derived, Effect, Kind, Moment, System, UsualRecording
 
 _KT = slice(0, 1)
 """Column of the torque constant among the parameters."""
@@ -115,6 +115,11 @@ class ServoSystem(System):
         initial={"q": (-0.5, 0.5)},
         inputs={"goal": "steps:1:1", "torque_enable": "1"},
     )
+
+    @classmethod
+    def refuses(cls, effect: type[Effect]) -> str:
+        """See `System`."""
+        return "its input is a set point, not a force" if effect.name == "input.power" else ""
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """(L, 1) kg m^2 about the joint."""

@@ -35,6 +35,7 @@ SIMPLER = {
     "friction.load_quadratic": ("friction.load",),
     "friction.position": ("friction.coulomb",),
     "friction.stribeck": ("friction.coulomb",),
+    "input.power": ("input.gain",),
     "friction.warming": ("friction.coulomb", "drag.linear"),
     "wind": (
         "drag.linear",

@@ -23,6 +23,8 @@ EDGE = 0.05
 SLEWED = 2e-3  # seconds in which an input that rises steadily is held
 STRAIGHT = 10  # parts of an interval in which a command that goes straight is held
 
+NOT_LINEAR = ("input.deadband", "input.saturation", "backlash", "input.rate", "input.power")
+
 Law = Callable[[float, float, float], float]
 
 
@@ -57,7 +59,7 @@ def felt(scenario, effects, until) -> list[Piece]:
     if "input.hold" in effects:
         levels, edges = _straight(levels, edges, effects["input.hold"][0])
     for name, c in effects.items():
-        if name in ("input.deadband", "input.saturation", "backlash", "input.rate") and lag:
+        if name in NOT_LINEAR and lag:
             raise NotImplementedError(f"{name} behind input.lag")
         if name == "input.delay":
             edges = edges + c[0]
@@ -66,7 +68,7 @@ def felt(scenario, effects, until) -> list[Piece]:
         elif name == "input.rate":
             levels, edges = _slewed(levels, edges, c[0])
         elif name in STEPWISE:
-            levels = STEPWISE[name](levels, c[0])
+            levels = STEPWISE[name](levels, *c)
     changes = np.flatnonzero(np.diff(levels)) + 1
     begins, targets = [0.0, *edges[changes]], [levels[0], *levels[changes]]
     pieces, state = [], levels[0]
@@ -122,6 +124,7 @@ STEPWISE = {
     "input.bias": lambda u, c: u + c,
     "input.deadband": lambda u, c: np.sign(u) * np.maximum(np.abs(u) - c, 0.0),
     "input.saturation": lambda u, c: np.minimum(np.maximum(u, -c), c),
+    "input.power": lambda u, gain, power: (1 + gain) * np.sign(u) * np.abs(u) ** (1 + power),
     "backlash": _play,
 }
 
@@ -184,6 +187,9 @@ FORCES: dict[str, Callable[[Joint, list[float]], Law]] = {
     "wind": lambda j, c: lambda t, x, v: -c[0] * abs(v - c[1]) * (v - c[1]),
     "gravity.scale": lambda j, c: lambda t, x, v: c[0] * j.weight(x),
     "gravity.tilt": lambda j, c: lambda t, x, v: c[0] * j.gravity * j.sideways(x),
+    "supply.sag": lambda j, c: (
+        lambda t, x, v: j.piece.at(t) * (1 / (1 + c[0] * abs(j.piece.at(t))) - 1)
+    ),
     "spring.linear": lambda j, c: lambda t, x, v: -c[0] * x,
     "spring.cubic": lambda j, c: lambda t, x, v: -c[0] * x**3,
     "force.bias": lambda j, c: lambda t, x, v: c[0],

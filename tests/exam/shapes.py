@@ -97,6 +97,12 @@ def _one_way(far, setting, rng):
     return lambda s: (far * shares[0] * s, far * shares[1] * s)
 
 
+def _power(far, setting, rng):
+    """Up to the square and beyond; at the input's peak it does what the input alone would."""
+    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    return lambda s: (float(peak**-s - 1), s)
+
+
 def _rate(far, setting, rng):
     """A jump of the input's peak takes from no time at all to most of a second."""
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
@@ -133,6 +139,7 @@ SHAPES = {
     "friction.load_quadratic": _quadratic,
     "friction.position": _uneven,
     "friction.warming": _warming,
+    "input.power": _power,
     "input.rate": _rate,
     "sensor.eccentricity": _direction,
     "gravity.tilt": _level,

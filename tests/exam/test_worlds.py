@@ -38,10 +38,12 @@ SOMEWHERE = {
         "gravity.scale": (0.1,), "gravity.tilt": (0.05,), "input.bias": (0.03,),
         "input.deadband": (0.02,),
         "input.delay": (0.033,), "input.gain": (0.1,), "input.hold": (1.0,),
-        "input.lag": (0.05,), "input.rate": (0.4,), "input.saturation": (0.05,),
+        "input.lag": (0.05,), "input.power": (2.0, 0.5),
+        "input.rate": (0.4,), "input.saturation": (0.05,),
         "sensor.bias": (0.1,), "sensor.delay": (0.033,), "sensor.drift": (0.05,),
         "sensor.eccentricity": (0.05, 0.04), "sensor.gain": (0.05,),
         "sensor.lag": (0.05,), "spring.cubic": (0.02,), "spring.linear": (0.05,),
+        "supply.sag": (4.0,),
     },
     "slider": {
         "backlash": (0.5,), "clock.skew": (0.02,), "drag.linear": (0.5,), "drag.quadratic": (0.5,),
@@ -52,11 +54,12 @@ SOMEWHERE = {
         "gravity.tilt": (0.05,), "input.bias": (0.3,), "input.deadband": (0.3,),
         "input.delay": (0.033,),
         "input.gain": (0.1,), "input.hold": (1.0,), "input.lag": (0.05,),
+        "input.power": (-0.3, 0.5),
         "input.rate": (8.0,), "input.saturation": (0.5,),
         "sensor.bias": (0.1,),
         "sensor.delay": (0.033,), "sensor.drift": (0.05,), "sensor.gain": (0.05,),
         "sensor.lag": (0.05,),
-        "spring.cubic": (2.0,), "spring.linear": (2.0,), "wind": (0.5, 2.0),
+        "spring.cubic": (2.0,), "spring.linear": (2.0,), "supply.sag": (0.1,), "wind": (0.5, 2.0),
     },
 }  # fmt: skip
 TOGETHER = [

@@ -12,8 +12,8 @@ JOINT = (
     "friction.position", "friction.warming",
 )  # fmt: skip
 BODY = ("mass.scale", "mass.offset", "inertia.scale")
-BOTH = ("input.gain", "input.bias", "input.delay", "input.lag", "input.rate")
-MOTOR = ("input.deadband", "input.saturation")
+BOTH = ("input.gain", "input.bias", "input.delay", "input.lag", "input.rate", "supply.sag")
+MOTOR = ("input.deadband", "input.saturation", "input.power")
 SERVO = ("actuator.stiffness", "actuator.damping", "servo.deadband", "servo.derivative")
 CHANNEL = ("sensor.bias", "sensor.gain", "sensor.delay", "sensor.eccentricity")
 WORLD = ("gravity.tilt", "gravity.scale", "clock.skew")
@@ -21,6 +21,7 @@ FOREIGN = ("elastic", "binding", "slip")
 FAMILIES = ("friction.coulomb", "drag.linear")
 SIMPLER = {
     "friction.stribeck": "friction.coulomb", "friction.direction": "drag.linear",
+    "input.power": "input.gain",
     "friction.position": "friction.coulomb", "friction.warming": "friction.coulomb",
 }  # fmt: skip
 SIGNED = (
@@ -92,6 +93,7 @@ SCALES = {
     "drag.quadratic": _per_force(lambda typical: typical["speed"] ** 2),
     "spring.linear": _per_force(lambda typical: typical["position"] + 0.05),
     "force.bias": _per_force(lambda typical: 1.0),
+    "supply.sag": lambda place, setting: 1.0 / _at(setting, place)["force"],
     "inertia.armature": lambda place, setting: 2.0 * _at(setting, place)["inertia"],
     "input.bias": lambda place, setting: float(np.ptp(_command(setting, place))) / 2,
     "servo.deadband": lambda place, setting: float(np.ptp(_command(setting, place))) / 8,
@@ -136,6 +138,12 @@ def _rate(place, setting, rng):
     return lambda s: (range_ / s,)
 
 
+def _power(place, setting, rng):
+    """Up to the square and beyond; at the command's peak it does what the command alone would."""
+    peak = float(np.abs(_command(setting, place)).max())
+    return lambda s: (peak ** (-2 * s) - 1, 2.0 * s)
+
+
 def _direction(place, setting, rng):
     """Several times as much one way as the other."""
     far = SCALES["drag.linear"](place, setting)
@@ -172,6 +180,7 @@ SHAPES = {
     "friction.position": _uneven,
     "friction.warming": _warming,
     "input.rate": _rate,
+    "input.power": _power,
     "sensor.eccentricity": _eccentric,
     "friction.stribeck": _stribeck,
     "force.ripple": _ripple,

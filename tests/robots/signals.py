@@ -8,7 +8,7 @@ import numpy as np
 
 SIGNALS = (
     "input.gain", "input.bias", "input.deadband", "input.saturation", "input.delay", "input.lag",
-    "input.rate", "servo.derivative",
+    "input.rate", "servo.derivative", "input.power",
 )  # fmt: skip
 
 
@@ -16,9 +16,9 @@ SIGNALS = (
 class Felt:
     """A command on its way to an actuator.
 
-    It passes gain, bias, dead band, saturation, a limit of its rate, delay, a servo's D term and
-    lag, in this order; it is constant from one stamp to the next, and before the first it has the
-    first value.
+    It passes gain, power, bias, dead band, saturation, a limit of its rate, delay, a servo's D term
+    and lag, in this order; it is constant from one stamp to the next, and before the first it has
+    the first value.
     """
 
     times: np.ndarray
@@ -31,11 +31,14 @@ class Felt:
     lag: float = 0.0
     rate: float = 0.0
     derivative: float = 0.0
+    power: tuple = (0.0, 0.0)
     values: np.ndarray = field(init=False)
     begins: np.ndarray = field(init=False)
 
     def __post_init__(self):
-        values = self.command * (1 + self.gain) + self.bias
+        values = self.command * (1 + self.gain)
+        scale, more = self.power
+        values = (1 + scale) * np.sign(values) * np.abs(values) ** (1 + more) + self.bias
         values = np.sign(values) * np.maximum(np.abs(values) - self.deadband, 0.0)
         if self.saturation:
             values = np.clip(values, -self.saturation, self.saturation)
@@ -80,7 +83,7 @@ def felt(machine, times, commands, effects):
         for name, c in effects.items():
             effect, _, place = name.partition("@")
             if effect in SIGNALS and place == drive.name:
-                numbers[effect.partition(".")[2]] = c[0]
+                numbers[effect.partition(".")[2]] = c[0] if len(c) == 1 else c
         signals[drive.name] = Felt(times, commands[drive.name], **numbers)
     return signals
 
@@ -88,7 +91,8 @@ def felt(machine, times, commands, effects):
 @dataclass
 class Drives:
     """Forces of all actuators: clip(gain u - kp q - kv v, within +-limit) by joint, (N,); a servo
-    does nothing about an error u - q that is below `dead`.
+    does nothing about an error u - q that is below `dead`; of a force U a supply leaves
+    U / (1 + sag |U|).
     """
 
     gain: np.ndarray
@@ -96,12 +100,13 @@ class Drives:
     kv: np.ndarray
     limit: np.ndarray
     dead: np.ndarray
+    sag: np.ndarray
 
     @classmethod
     def of(cls, machine, effects=None):
         """Of a machine, with what is hidden in its servos."""
         count = len(machine.joints)
-        gain, kp, kv, limit, dead = np.zeros((5, count))
+        gain, kp, kv, limit, dead, sag = np.zeros((6, count))
         for joint, drive in zip(machine.driven, machine.drives, strict=True):
             change = {
                 name.partition("@")[0]: c[0]
@@ -109,6 +114,7 @@ class Drives:
                 if name.partition("@")[2] == drive.name
             }
             limit[joint] = drive.force
+            sag[joint] = change.get("supply.sag", 0.0)
             if drive.kind == "motor":
                 gain[joint] = 1.0
                 continue
@@ -116,11 +122,12 @@ class Drives:
             kv[joint] = drive.kv * (1 + change.get("actuator.damping", 0.0))
             gain[joint] = kp[joint]
             dead[joint] = change.get("servo.deadband", 0.0)
-        return cls(gain, kp, kv, limit, dead)
+        return cls(gain, kp, kv, limit, dead, sag)
 
     def forces(self, u, q, v):
         """For commands u by joint."""
         wanted = self.gain * u - self.kp * q - self.kv * v
         if self.dead.any():
             wanted -= self.kp * np.clip(u - q, -self.dead, self.dead)
-        return np.minimum(np.maximum(wanted, -self.limit), self.limit)  # np.clip takes three times
+        force = np.minimum(np.maximum(wanted, -self.limit), self.limit)  # np.clip takes three times
+        return force / (1 + self.sag * np.abs(force)) if self.sag.any() else force

@@ -48,6 +48,7 @@ COEFFICIENTS = {
     "input.gain": (None, 0.1, 0.1),
     "input.hold": (None, 1.0, 1.0),
     "input.lag": (None, 0.04, 0.04),
+    "input.power": (None, (-0.3, 0.5), (2.0, 0.5)),
     "input.rate": (None, 8.0, 0.4),
     "input.saturation": (None, 1.5, 0.05),
     "lift.magnus": ((0.3, 0.1), None, None),
@@ -62,6 +63,7 @@ COEFFICIENTS = {
     "servo.derivative": (None, None, 0.02),
     "spring.cubic": (None, 2.0, 0.05),
     "spring.linear": (None, 3.0, 0.1),
+    "supply.sag": (None, 0.1, 1.0),
     "wind": ((0.05, 3.0, -2.0), (0.3, 2.0), None),
 }
 

@@ -98,3 +98,29 @@ def test_what_a_cold_joint_holds_it_lets_go_when_it_is_warm():
     late = times[-1] - begins
     expected = late**2 / 2 - late + (1 - np.exp(-late))
     assert x[-1] == pytest.approx(expected, abs=2e-3)
+
+
+@pytest.mark.parametrize("u", [0.5, -3.0, 40.0])
+def test_a_supply_that_sags_gives_what_its_voltage_leaves(u):
+    """F = U (1 - c |F|), and never as much as 1 / c."""
+    times, c, mass = np.arange(0, 1, 0.01), 0.1, 2.0
+    _, v = slide(times, {"supply.sag": c}, mass, u)
+    force = mass * v[-1] / times[-1]
+    assert force == pytest.approx(u * (1 - c * abs(force)), rel=1e-9)
+    assert abs(force) < min(abs(u), 1 / c)
+
+
+def test_a_servo_whose_supply_sags_hangs_lower():
+    times, c = np.arange(0, 8, 0.01), 0.5
+    inputs = {"goal": np.full(times.size, 1.0), "torque_enable": np.ones(times.size)}
+    q = run("servo", times, {"supply.sag": c}, [0.5, 4.0, 2e-3], inputs, q=0.9)[-1, 0]
+    stiffness = 0.5 * 200.0 * 0.00287738 * 7.4 / 4.0
+    wanted = stiffness * (1.0 - q)
+    assert wanted / (1 + c * wanted) == pytest.approx(0.49 * 9.81 * 0.1 * np.sin(q), rel=1e-5)
+
+
+@pytest.mark.parametrize(("u", "force"), [(2.0, 6.0), (-2.0, -6.0), (1.0, 1.5), (0.0, 0.0)])
+def test_a_propeller_pulls_with_the_square_of_its_input(u, force):
+    times = np.arange(0, 1, 0.01)
+    x, _ = slide(times, {"input.power": (0.5, 1.0)}, 2.0, u)
+    assert x == pytest.approx(force / 2.0 * times**2 / 2, abs=1e-9)

@@ -106,7 +106,7 @@ def test_what_fits_what():
         "force.ripple",
     }
     begins = ("input.", "friction.load")
-    inputs = {name for name in NAMES if name.startswith(begins)} | {"backlash"}
+    inputs = {name for name in NAMES if name.startswith(begins)} | {"backlash", "supply.sag"}
     servo = {"servo.deadband", "servo.derivative"}
     mechanical = set(NAMES) - {"state.overflow"}
     joint = mechanical - impact - flight
@@ -114,7 +114,7 @@ def test_what_fits_what():
     level = {"gravity.scale", "friction.load_direction", "friction.load_quadratic"}
     assert there["slider"] == joint - {"sensor.eccentricity"} - level - servo
     assert there["pendulum"] == joint - {"wind"} - servo
-    assert there["servo"] == joint - {"wind"}
+    assert there["servo"] == joint - {"wind", "input.power"}
 
 
 @pytest.mark.parametrize(
@@ -128,6 +128,7 @@ def test_what_fits_what():
         ("friction.coulomb", "ball", "flies freely"),
         ("servo.deadband", "slider", "no servo"),
         ("state.overflow", "slider", "no level"),
+        ("input.power", "servo", "a set point, not a force"),
         ("sensor.eccentricity", "slider", "not defined for a linear system"),
         ("wind", "pendulum", "not defined for a rotary system"),
     ],

@@ -72,6 +72,8 @@ def test_names_are_those_of_the_model(arm):
         "friction.direction": joints,
         "friction.load_direction": joints,
         "friction.position": joints,
+        "supply.sag": ("m_shoulder", "m_elbow", "m_spin", "*"),
+        "input.power": ("m_elbow",),
         "input.rate": ("m_shoulder", "m_elbow", "m_spin", "*"),
         "sensor.eccentricity": ("q.shoulder", "q.elbow", "q.spin"),
         "servo.deadband": ("m_shoulder",),

@@ -30,7 +30,7 @@ def seen(effects, command, text=ARM, **initial):
     kind = kind_of(text)
     placed = [kind.system.effect(name) for name in effects]
     simulator = kind(observe=["q.hinge"], effects=placed)
-    theta = np.concatenate([np.ravel(c) for c in effects.values()])[None]
+    theta = np.concatenate([[], *(np.ravel(c) for c in effects.values())])[None]
     given = {c.name: np.zeros(TIMES.size) for c in simulator.inputs}
     given["u.m"] = np.broadcast_to(command, TIMES.shape)
     begin = {f"{key}.hinge": value for key, value in initial.items()}
@@ -70,3 +70,57 @@ def test_a_limit_of_the_rate_makes_the_servo_follow_a_ramp():
     limited = seen({"input.rate@m": 2.0}, step, FREE)
     # the command of the ramp is held from sample to sample: late by half of one
     assert limited == pytest.approx(seen({"input.delay@m": -0.005}, ramp, FREE), abs=2e-4)
+
+
+WAVE = 0.9 * np.sin(2.5 * TIMES)
+PUSHED = ARM.replace(f'<position name="m" joint="hinge" kp="{KP}" kv="{KV}" gear="2"/>',
+                     '<motor name="m" joint="hinge" gear="2"/>')  # fmt: skip
+TENTH, FIFTH = 1.1, 1.1**2 - 1
+
+
+@pytest.mark.parametrize(
+    ("text", "other", "effects"),
+    [
+        # a gear ratio that is a tenth larger: of a motor, and of a servo whose set point is geared
+        (PUSHED.replace('gear="2"', 'gear="2.2"'), PUSHED, {"input.gain@m": 0.1}),
+        (
+            ARM.replace('gear="2"', 'gear="2.2"'),
+            ARM,
+            {
+                "input.gain@m": 1 / TENTH - 1,
+                "actuator.stiffness@m": FIFTH,
+                "actuator.damping@m": FIFTH,
+            },
+        ),
+        # a proportional law that droops, and a D term on the velocity
+        (ARM.replace(f'kp="{KP}"', f'kp="{0.8 * KP}"'), ARM, {"actuator.stiffness@m": -0.2}),
+        (ARM.replace(f'kv="{KV}"', f'kv="{1.5 * KV}"'), ARM, {"actuator.damping@m": 0.5}),
+        (ARM.replace(f'kv="{KV}"', f'kv="{1.5 * KV}"'), ARM, {"drag.linear@hinge": 0.5 * KV * 4}),
+        # a current that is limited
+        (ARM.replace("gear=", 'forcerange="-0.2 0.2" gear='), ARM, {"actuator.limit@m": 0.2}),
+    ],
+)
+def test_what_needs_no_effect_of_its_own(text, other, effects):
+    wanted, plain = seen({}, WAVE, text), seen({}, WAVE, other)
+    np.testing.assert_allclose(seen(effects, WAVE, other), wanted, atol=1e-9)
+    assert np.abs(wanted - plain).max() > 1e-2
+
+
+def test_a_speed_limit_of_back_emf_is_a_limit_of_force_and_a_drag():
+    """Voltage clip(kp e, -V, V) less what motion induces: stall force S, no-load speed S / drag."""
+    from scipy.integrate import solve_ivp
+
+    stall, speed, inertia = 1.5, 2.0, 0.001 + MASS * LENGTH**2
+    text = FREE.replace(f' kv="{KV}" gear="2"', "")
+    command = np.where(TIMES >= 0.1, 3.0, 0.0)
+    found = seen({"actuator.limit@m": stall, "drag.linear@hinge": stall / speed}, command, text)
+
+    def rate(t, y):
+        duty = np.clip(KP * (3.0 - y[0]) / stall, -1.0, 1.0)
+        return y[1], stall * (duty - y[1] / speed) / inertia
+
+    late = TIMES[TIMES >= 0.1]
+    expected = solve_ivp(rate, (0.1, TIMES[-1]), (0.0, 0.0), t_eval=late, rtol=1e-9, atol=1e-9,
+                         max_step=1e-3)  # fmt: skip
+    np.testing.assert_allclose(found[TIMES >= 0.1], expected.y[0], atol=3e-3)
+    assert np.gradient(found, TIMES).max() == pytest.approx(speed, rel=1e-2)
