@@ -173,7 +173,9 @@ class Simulated(Simulator):
             constants, x, v = self._known(scenarios, initial)
             forces = _of(acting, (Force, Friction, Contact, Level))
             lanes = Lanes(self._declared, own, constants, x, v, plan.steps, inputs, forces, every)
-            observations = self._read(self.engine.integrate(lanes), lanes, plan, sensors)
+            clock = np.array([s.times[0] for s in runs.distinct])[runs.of, None]
+            motion = self.engine.integrate(lanes)
+            observations = self._read(motion, lanes, plan, sensors, clock)
         # A shorter run has waited at its end; what it showed there was no sample.
         sizes = np.array([s.times.size for s in runs.distinct])
         if sizes.min() < sizes.max():
@@ -218,8 +220,10 @@ class Simulated(Simulator):
         v = _stacked(states, self.system.rates, of.size)
         return constants, x, v
 
-    def _read(self, motion: Motion, lanes: Lanes, plan: Plan, sensors: Acting) -> Array:
-        """What the sensors record: (L, T, C)."""
+    def _read(
+        self, motion: Motion, lanes: Lanes, plan: Plan, sensors: Acting, clock: Array
+    ) -> Array:
+        """What the sensors record: (L, T, C); `clock` (L, 1) is the first stamp of each run."""
         channels = self._declared.observe(motion.x, motion.v, motion.a, lanes.constants)
         names = [c.name for c in self.channels]
         valued = self.system.reading(names)
@@ -233,7 +237,7 @@ class Simulated(Simulator):
             # A gain or bias is that of one channel.
             reading = tuple((e, c) for e, c in sensors if _filters(e) or name == valued)
             if reading:
-                values = sensed(reading, values, steps, times)
+                values = sensed(reading, values, steps, times, clock)
             observations[:, :, place] = _chosen(values, rows)
         observations += 0.0  # no zero is negative: whatever made it, it is the same zero
         return observations
@@ -244,22 +248,26 @@ def _filters(effect: Effect) -> bool:
     return isinstance(effect, Sensor) and effect.filters
 
 
-def sensed(sensors: Acting, values: Array, steps: Array, times: Array) -> Array:
+def sensed(
+    sensors: Acting, values: Array, steps: Array, times: Array, clock: Array | float = 0.0
+) -> Array:
     """(L, R) what sensors in a row make of a channel's values (L, R).
 
     Each reads what the one before gives, also at the start, in which the next begins.
     """
     values = values.copy()
     start = values[:, :1].copy()
+    clock = np.broadcast_to(clock, start.shape)
     for effect, c in sensors:
         assert isinstance(effect, Sensor)
         # Of hundreds of lanes an effect may act in a few: the others are not asked.
         lanes = np.flatnonzero(acts(c))
         own, begin = c[:, lanes], start[lanes]
         nothing = np.zeros_like(begin)
-        signal = Signal(values[lanes], steps[lanes], begin, times[lanes])
+        first = clock[lanes]
+        signal = Signal(values[lanes], steps[lanes], begin, times[lanes], first)
         values[lanes] = effect.read(own, signal)
-        start[lanes] = effect.read(own, Signal(begin, nothing, begin, nothing))
+        start[lanes] = effect.read(own, Signal(begin, nothing, begin, nothing, first))
     return values
 
 

@@ -510,12 +510,14 @@ class Signal:
         steps: (L, S) lengths of the steps, seconds; zero where a lane waits.
         start: (L, 1) value before the first step.
         times: (L, S) seconds since the start of the run, at the end of each step.
+        clock: (L, 1) what the recording's stamps say at the start of the run, seconds.
     """
 
     values: Array
     steps: Array
     start: Array
     times: Array
+    clock: Array | float = 0.0
 
 
 class Input(Effect):

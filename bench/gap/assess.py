@@ -12,6 +12,7 @@ from bench.gap.causes.name import Finding
 from bench.gap.causes.score_test import tail
 from bench.gap.causes.search import Search
 from bench.gap.measure import Gain, gain, intervals
+from bench.gap.model.bounds import is_instant
 from bench.gap.model.floor import Floor
 from bench.gap.model.models import Model, Names
 from bench.gap.model.world import World
@@ -91,6 +92,9 @@ class Assessor:
             # What the data do not touch stays nominal; effects that are off are zero.
             given = float(model.fit.theta[place]), np.nan, np.nan
             value, low, high = fitted.get(place, given)
+            if is_instant(parameter):
+                # Nobody knows when between two samples it was.
+                low, high = low - self.fitting.spacing / 2, high + self.fitting.spacing / 2
             # JSON has no number for what is not known.
             bounded = np.isfinite(low) and np.isfinite(high)
             interval = (low, high) if bounded else (None, None)

@@ -9,9 +9,13 @@ With y what there is, r what is recorded, t the time stamp and c the coefficient
 * (5) drift: r(t) = y(t) + c t
 * (6) clock: r(t) = y((1 + c) t)
 * (7) eccentricity: r = y + a sin y + b cos y, y an angle
+* (8) slip: r(t) = y(t) + c from an instant s on, on the clock of the stamps
 
-Gain, bias, drift and eccentricity act on one channel, the system's first observed; a delay, a lag
-and a skewed clock on all. A negative delay leads; a negative lag is none.
+Of a slip between two samples nobody knows when it was: over an interval h before a sample, (8) is
+straight from s = t - h / 2, where it has happened, to s = t + h / 2, where it has not.
+
+Gain, bias, drift, eccentricity and slip act on one channel, the system's first observed; a delay,
+a lag and a skewed clock on all. A negative delay leads; a negative lag is none.
 """
 
 from __future__ import annotations
@@ -32,6 +36,8 @@ _LENGTH = ("m", "m", "rad")
 """Units of a reading that is a position; it may be another."""
 _OFFSET = ((-1, 1), (-0.2, 0.2), (-0.2, 0.2))
 """Plausible biases, in the units of `_LENGTH`."""
+_OFF = Coefficient("coefficient", _LENGTH, _OFFSET, of="reading")
+"""By how much a reading is off."""
 _SPEED = ("m/s", "m/s", "rad/s")
 """Units of `_LENGTH`, per second."""
 _DRIFT = ((-0.2, 0.2), (-0.05, 0.05), (-0.1, 0.1))
@@ -42,6 +48,10 @@ _ANGLE = (None, None, "rad")
 """Of what an encoder of angles shows."""
 _OFF_AXIS = ((0, 0), (0, 0), (-0.1, 0.1))
 """Plausible errors of an encoder that is off its axis, in the units of `_ANGLE`."""
+_INSTANT = ((0.01, 10), (0.01, 10), (0.01, 10))
+"""Plausible instants on a recording's clock, seconds; a fit looks for them as long as runs are."""
+_SHORTEST = 1e-12
+"""Seconds; samples this close are one."""
 _VOCABULARY = "International Vocabulary of Metrology, JCGM 200:2012"
 
 
@@ -66,7 +76,7 @@ class Bias(Sensor):
     noun = "a sensor bias"
     says = "the sensor's zero is off"
     source = _VOCABULARY + ", 4.20"
-    coefficients = (Coefficient("coefficient", _LENGTH, _OFFSET, of="reading"),)
+    coefficients = (_OFF,)
 
     def read(self, c: Array, signal: Signal) -> Array:
         """Shifted."""
@@ -133,6 +143,22 @@ class Eccentricity(Sensor):
         return y + c[0] * np.sin(y) + c[1] * np.cos(y)  # (7)
 
 
+class Slip(Sensor):
+    """An encoder that slips once: the reading plus c from an instant on."""
+
+    name = "sensor.slip"
+    noun = "an encoder that slipped"
+    says = "the encoder slipped at an instant, and is off by the same amount from then on"
+    source = "M. Basseville, I. V. Nikiforov, Detection of Abrupt Changes (1993), chapter 2"
+    needs = "guide"
+    contains = ("sensor.bias",)
+    coefficients = (_OFF, Coefficient("instant", _TIME, _INSTANT))
+
+    def read(self, c: Array, signal: Signal) -> Array:
+        """As far off as it has slipped."""
+        return signal.values + c[0] * _since(c[1], signal.clock + signal.times)  # (8)
+
+
 class Skew(Sensor):
     """A recorder's clock that is slow by c: 1 + c seconds pass between stamps one second apart."""
 
@@ -146,6 +172,13 @@ class Skew(Sensor):
     def times(self, c: Array, t: Array) -> Array:
         """Instants on the true clock."""
         return t * (1.0 + c[0])  # (6)
+
+
+def _since(instant: Array, now: Array) -> Array:
+    """(L, S) of stamps `now`: 0 before an instant (L, 1), 1 after it, (8) about it."""
+    apart = np.maximum(np.diff(now, axis=1, prepend=now[:, :1]), _SHORTEST)
+    share: Array = np.clip((now - instant) / apart + 0.5, 0.0, 1.0)
+    return share
 
 
 def _lagged(signal: Signal, lag: Array) -> Array:

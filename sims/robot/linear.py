@@ -45,7 +45,8 @@ class Linear:
     ) -> None:
         assert isinstance(simulator, RobotSimulator), "a robot"
         self._simulator = simulator
-        self._times = scenario.times - scenario.times[0]
+        self._clock = float(scenario.times[0])
+        self._times = scenario.times - self._clock
         self._steps = simulator.steps_of(self._times)
         acting = simulator.acting(theta[None])
         commands = simulator.run_inputs(scenario)
@@ -220,7 +221,8 @@ class Linear:
                 place = self._names.index(channel.name)
                 values = self._readings[channel.name][:upto] + readings[:, :upto, place]
             acting = _on(channel.name, own, sensors)
-            columns.append(sampled(values, slopes, simulator.step, self._times, acting))
+            seen = sampled(values, slopes, simulator.step, self._times, acting, self._clock)
+            columns.append(seen)
         return np.stack(columns, axis=2)
 
 

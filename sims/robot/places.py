@@ -45,9 +45,12 @@ ALONE = frozenset(
         "friction.stribeck",
         "friction.warming",
         "sensor.eccentricity",
+        "sensor.slip",
     }
 )
 """Effects without a family: what shapes them differs from place to place."""
+ENCODERS = frozenset({"sensor.slip"})
+"""Effects on what counts a position, and on no other channel."""
 TYPICAL = {"hinge": 0.5, "slide": 5.0}
 """A force for which the plausible ranges of the library are meant: N m on a hinge, N on a slide."""
 _KINDS: Mapping[str, Kind] = {"hinge": "rotary", "slide": "linear"}
@@ -344,6 +347,8 @@ def _acts_at(effect: type[Effect], spot: Spot, found: Mapping[str, Sequence[Spot
         return False
     # A set point has no power.
     if effect.name == "input.power" and not spot.unit.startswith(("N", "1")):
+        return False
+    if effect.name in ENCODERS and not spot.name.startswith("q."):
         return False
     # What is an angle to an encoder is none to what else is recorded.
     if effect.at == "channel" and not effect.coefficients[0].of:

@@ -26,7 +26,12 @@ EXACT = 1e-6
 
 
 def sampled(
-    values: Array, slopes: Array | None, step: float, times: Array, sensors: Acting
+    values: Array,
+    slopes: Array | None,
+    step: float,
+    times: Array,
+    sensors: Acting,
+    clock: float = 0.0,
 ) -> Array:
     """Readings (L, T) at the instants `times` (T,) since the start.
 
@@ -36,6 +41,7 @@ def sampled(
         step: seconds.
         times: recorded stamps, seconds since the start.
         sensors: effects on this channel in the order in which a signal passes them.
+        clock: the first stamp, seconds.
     """
     lanes, count = values.shape
     ends = step * np.arange(count)
@@ -49,7 +55,7 @@ def sampled(
     for some, filters in _filtering(sensors):
         grid = np.broadcast_to(ends, (some.size, count))
         steps = np.diff(grid, axis=1, prepend=0.0)
-        filtered = sensed(filters, values[some], steps, grid)
+        filtered = sensed(filters, values[some], steps, grid, clock)
         # What a filter shows has a slope that nobody knows.
         result[some] = _at(filtered, None, step, instants[some])
     stamps = np.broadcast_to(times, (lanes, times.size))
@@ -58,7 +64,7 @@ def sampled(
         if effect.filters or type(effect).read is Sensor.read:
             continue
         on = np.flatnonzero(acts(c))
-        signal = Signal(result[on], np.zeros_like(result[on]), result[on, :1], stamps[on])
+        signal = Signal(result[on], np.zeros_like(result[on]), result[on, :1], stamps[on], clock)
         result[on] = effect.read(c[:, on], signal)
     return result
 

@@ -315,7 +315,8 @@ class RobotSimulator(Simulated):
                 for e, c in work.acting
                 if isinstance(e, Sensor) and e.signal in ("", channel.name)
             )
-            columns.append(sampled(values, slopes, self.step, times, sensors))
+            clock = float(work.scenario.times[0])
+            columns.append(sampled(values, slopes, self.step, times, sensors, clock))
         result = np.stack(columns, axis=2)
         result[made.failed] = np.nan
         return result

@@ -133,7 +133,14 @@ def _warming(far, setting, rng):
     return lambda s: (far * s, viscous * s, max(time, 0.5))
 
 
+def _slip(far, setting, rng):
+    """Once in every run, at an instant well within it."""
+    sign, instant = float(rng.choice([-1, 1])), float(rng.uniform(0.15, 0.85) * setting.seconds)
+    return lambda s: (sign * far * s, instant)
+
+
 SHAPES = {
+    "sensor.slip": _slip,
     "friction.direction": _one_way,
     "friction.load_direction": _one_way,
     "friction.load_quadratic": _quadratic,

@@ -11,6 +11,7 @@ from tests.exam.settings import wave
 from tests.exam.worlds import CHANNELS, SIMULATORS, World, constants_of, simulated, solved
 
 TIMES = np.arange(300) / 100
+SLIPPED = 0.705  # between two samples
 # What MuJoCo's second-order steps of 1 ms (sensor.lag: what they miss at a bounce) leave, in m,
 # rad, m/s, rad/s.
 TOLERANCE = {"ball": (5e-5,) * 3, "pendulum": (1e-4, 1e-3), "slider": (5e-6, 5e-6)}
@@ -42,8 +43,8 @@ SOMEWHERE = {
         "input.rate": (0.4,), "input.saturation": (0.05,),
         "sensor.bias": (0.1,), "sensor.delay": (0.033,), "sensor.drift": (0.05,),
         "sensor.eccentricity": (0.05, 0.04), "sensor.gain": (0.05,),
-        "sensor.lag": (0.05,), "spring.cubic": (0.02,), "spring.linear": (0.05,),
-        "supply.sag": (4.0,),
+        "sensor.lag": (0.05,), "sensor.slip": (0.05, SLIPPED),
+        "spring.cubic": (0.02,), "spring.linear": (0.05,), "supply.sag": (4.0,),
     },
     "slider": {
         "backlash": (0.5,), "clock.skew": (0.02,), "drag.linear": (0.5,), "drag.quadratic": (0.5,),
@@ -58,7 +59,7 @@ SOMEWHERE = {
         "input.rate": (8.0,), "input.saturation": (0.5,),
         "sensor.bias": (0.1,),
         "sensor.delay": (0.033,), "sensor.drift": (0.05,), "sensor.gain": (0.05,),
-        "sensor.lag": (0.05,),
+        "sensor.lag": (0.05,), "sensor.slip": (-0.05, SLIPPED),
         "spring.cubic": (2.0,), "spring.linear": (2.0,), "supply.sag": (0.1,), "wind": (0.5, 2.0),
     },
 }  # fmt: skip

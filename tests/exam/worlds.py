@@ -91,6 +91,8 @@ def solved(world, scenario, channels, number=0):
         elif name == "sensor.eccentricity":
             angle = observed[:, reads].copy()
             observed[:, reads] += c[0] * np.sin(angle) + c[1] * np.cos(angle)
+        elif name == "sensor.slip":
+            observed[:, reads] += np.where(scenario.times[0] + grid >= c[1], c[0], 0.0)
         elif name == "sensor.lag":
             observed = _lagged(observed, grid, c[0])
     return observed[rows]

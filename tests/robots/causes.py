@@ -15,7 +15,7 @@ BODY = ("mass.scale", "mass.offset", "inertia.scale")
 BOTH = ("input.gain", "input.bias", "input.delay", "input.lag", "input.rate", "supply.sag")
 MOTOR = ("input.deadband", "input.saturation", "input.power")
 SERVO = ("actuator.stiffness", "actuator.damping", "servo.deadband", "servo.derivative")
-CHANNEL = ("sensor.bias", "sensor.gain", "sensor.delay", "sensor.eccentricity")
+CHANNEL = ("sensor.bias", "sensor.gain", "sensor.delay", "sensor.eccentricity", "sensor.slip")
 WORLD = ("gravity.tilt", "gravity.scale", "clock.skew")
 FOREIGN = ("elastic", "binding", "slip")
 FAMILIES = ("friction.coulomb", "drag.linear")
@@ -175,7 +175,16 @@ def _eccentric(place, setting, rng):
     return lambda s: (sine * s, cosine * s)
 
 
+def _slip(place, setting, rng):
+    """Once in every run, at the same instant of the clock."""
+    times = setting.runs[0].times
+    instant = float(rng.uniform(0.15, 0.85) * times[-1])
+    sign = float(rng.choice([-1.0, 1.0]))
+    return lambda s: (sign * 0.1 * s, instant)
+
+
 SHAPES = {
+    "sensor.slip": _slip,
     "friction.direction": _direction,
     "friction.position": _uneven,
     "friction.warming": _warming,

@@ -36,5 +36,6 @@ def observed(world, run, channels, slips=()):
         bias = world.effects.get(f"sensor.bias@{name}", (0.0,))[0]
         sine, cosine = world.effects.get(f"sensor.eccentricity@{name}", (0.0, 0.0))
         column = column + sine * np.sin(column) + cosine * np.cos(column)
-        columns.append(column * (1 + gain) + bias)
+        jump, instant = world.effects.get(f"sensor.slip@{name}", (0.0, 0.0))
+        columns.append(column * (1 + gain) + bias + jump * (run.times >= instant))
     return np.column_stack(columns)

@@ -59,6 +59,7 @@ COEFFICIENTS = {
     "sensor.eccentricity": (None, None, (0.02, 0.03)),
     "sensor.gain": (0.02, 0.02, 0.02),
     "sensor.lag": (0.03, 0.03, 0.03),
+    "sensor.slip": (None, (0.05, 0.605), (0.05, 0.605)),
     "servo.deadband": (None, None, 0.05),
     "servo.derivative": (None, None, 0.02),
     "spring.cubic": (None, 2.0, 0.05),

@@ -21,7 +21,7 @@ from itertools import product
 
 import numpy as np
 
-from bench.gap.model.bounds import CYCLES
+from bench.gap.model.bounds import CYCLES, coefficient_bounds, is_instant
 from bench.gap.model.noise import Mask
 from bench.gap.model.problem import Fit, Start
 from bench.gap.model.tracks import Track
@@ -48,6 +48,12 @@ SPREAD = 1.5
 """How much closer slow frequencies lie than fast ones, as a power."""
 MODIFIED = (-0.7, -0.25, 0.0, 0.25, 0.7)
 """Shares of its plausible range at which a coefficient that modifies is tried."""
+INSTANTS = 24
+"""Instants tried of what happens once."""
+FINER = 16
+"""Stamps between two of them that are tried where a fit begins, at most."""
+LATER = (-8, -4, -2, -1, 1, 2, 4, 8)
+"""Samples by which what happens once is made later."""
 SHIFTS = (-1.0, -0.5, 0.5, 1.0)
 """Cycles over the longest run by which what repeats is made faster or slower."""
 
@@ -234,7 +240,28 @@ def _grid(world: World, parameter: Parameter, travel: float) -> Array:
     if _is_period(parameter, travel):
         frequencies = _frequencies(1.0 / high, 1.0 / low, travel)
         return 1.0 / frequencies
+    if is_instant(parameter):
+        first, last = world.clock
+        # At the ends there is nothing before or after.
+        return np.linspace(first, last, INSTANTS + 2)[1:-1]
     return np.geomspace(low, high, SHAPES)
+
+
+def instants_about(world: World, name: str, c: Array) -> Iterator[Array]:
+    """The coefficients (k,) of an effect that happens once, with its instant between any two
+    stamps that are as near as the next instants that are tried; nothing for other effects.
+    """
+    for i, parameter in enumerate(_parameters(world, name)):
+        if not is_instant(parameter):
+            continue
+        first, last = world.clock
+        stamps = np.unique(np.concatenate([track.scenario.times for track in world.tracks]))
+        between = (stamps[1:] + stamps[:-1]) / 2.0
+        near = between[np.abs(between - c[i]) <= (last - first) / (INSTANTS + 1)]
+        for instant in near[:: -(-near.size // FINER) or 1].tolist():
+            moved = c.copy()
+            moved[i] = instant
+            yield moved
 
 
 def _is_period(parameter: Parameter, travel: float) -> bool:
@@ -247,17 +274,23 @@ def neighbours(world: World, fit: Fit) -> Iterator[Start]:
     nearest such minimum.
     """
     for name in fit.effects:
-        for place in world.places(name):
+        bounds = coefficient_bounds(world, name)
+        for number, place in enumerate(world.places(name)):
             parameter = world.parameters[place]
             value = float(fit.theta[place])
             for moved in _shifted(world, parameter, value, world.travel_of(name)):
                 theta = fit.theta.copy()
-                theta[place] = np.clip(moved, *parameter.bounds)
+                theta[place] = np.clip(moved, *bounds[number])
                 yield Start(fit.effects, theta, fit.states)
 
 
 def _shifted(world: World, parameter: Parameter, value: float, travel: float) -> Iterator[float]:
-    """A frequency or a period, by parts of a cycle faster and slower; nothing else."""
+    """A frequency or a period, by parts of a cycle faster and slower; an instant by samples earlier
+    and later; nothing else.
+    """
+    if is_instant(parameter):
+        for samples in LATER:
+            yield value + samples * world.spacing
     for cycles in SHIFTS:
         if parameter.unit == "Hz":
             yield value + cycles / world.longest

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.gap.causes.candidates import Directions
+from bench.gap.causes.candidates import Directions, instants_about
 from bench.gap.causes.gains import Group
 from bench.gap.causes.score_test import Scores
 from bench.gap.model.base_fit import HORIZONS
@@ -130,6 +130,7 @@ def _sizes(
             place = found.probes[column].place
             c[place] = share * float(np.clip(size, *bounds[place]))
         yield c
+        yield from instants_about(world, name, c)
     # Of several coefficients the range says nothing about how they go together.
     if len(group.columns) > 1:
         return

@@ -27,12 +27,20 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
     """
     effect = world.effects[name]
     coefficients = effect_parameters(effect, world.simulator.system, world.channels)
-    return [_bounds(coefficient, effect, world.longest) for coefficient in coefficients]
+    return [_bounds(coefficient, effect, world) for coefficient in coefficients]
 
 
-def _bounds(coefficient: Parameter, effect: Effect, longest: float) -> tuple[float, float]:
-    """Of one coefficient, in runs of so many seconds at most."""
+def is_instant(coefficient: Parameter) -> bool:
+    """Whether it is an instant on the clock of a recording's stamps."""
+    return coefficient.name.endswith(".instant")
+
+
+def _bounds(coefficient: Parameter, effect: Effect, world: World) -> tuple[float, float]:
+    """Of one coefficient."""
     low, high = coefficient.bounds
+    longest = world.longest
+    if is_instant(coefficient):
+        return world.clock
     if coefficient.unit == "Hz":
         # no higher than half of the range, so that there is one left
         low = min(max(low, CYCLES / longest), high / 2.0)

@@ -76,6 +76,7 @@ class World:
         known: (R, s) initial states that are not to be estimated.
         guess: (R, s) initial states, stated or guessed.
         longest: duration of the longest run, seconds.
+        clock: the first and the last stamp of all runs, seconds.
         simulations: lanes simulated so far.
         watch: says when fits have to leave off; never, unless another is put here.
         correction: (R, T, C) what is added to all that is simulated, if anything is
@@ -140,6 +141,7 @@ class World:
         self.known: Mask = np.array([t.known for t in self.tracks])
         self.guess: Array = np.array([t.guess for t in self.tracks])
         self.longest = self._longest()
+        self.clock = self._clock()
         self._travels: dict[str, float] = {}
         self.derivatives: Array | None = None
         self.correction: Array | None = None
@@ -182,6 +184,17 @@ class World:
         """Seconds that the longest run takes."""
         # not zero: lengths of time are divided by it
         return max(track.seconds for track in self.tracks) or 1.0
+
+    def _clock(self) -> tuple[float, float]:
+        """The first and the last stamp."""
+        stamps = [track.scenario.times for track in self.tracks]
+        return min(float(t[0]) for t in stamps), max(float(t[-1]) for t in stamps)
+
+    @property
+    def spacing(self) -> float:
+        """Seconds from sample to sample, of the run that is sampled most often."""
+        gaps = [np.diff(track.scenario.times) for track in self.tracks]
+        return min((float(np.median(gap)) for gap in gaps if gap.size), default=0.0)
 
     @property
     def travel(self) -> float:
@@ -316,6 +329,7 @@ class World:
         )
         # what is periodic goes on from piece to piece, and what is found in one is found in all
         other.longest = self.longest
+        other.clock = self.clock
         # found now: of pieces it would be another
         for name in self.channels:
             self._range(name)

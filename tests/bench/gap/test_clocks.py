@@ -92,3 +92,28 @@ def test_the_census_says_what_the_clock_does(tmp_path, clock):
         (line,) = told
         assert ("vary by" in line) == ("jitter" in clock)
         assert ("are lost" in line) == ("rows" in clock)
+
+
+def test_a_slip_in_the_only_run_is_named_at_its_stamp_and_borne_out_by_what_follows(tmp_path):
+    """A pendulum by scipy, in a log whose stamps begin at 100 s; its last third is held out."""
+    times, mass, length, inertia = np.arange(0.0, 5.0, 0.02), 0.15, 0.1, 3.3e-3
+
+    def rate(_t, state):
+        return [state[1], -mass * 9.81 * length / inertia * np.sin(state[0])]
+
+    swung = solve_ivp(rate, (0.0, 5.0), [1.0, 0.0], t_eval=times, rtol=1e-9, atol=1e-11)
+    q = swung.y[0] + 0.003 * np.random.default_rng(0).standard_normal(times.size)
+    q[times > 1.611] += 0.02
+    rows = ["run,t,q", *(f"1,{100 + t:.6f},{a:.8f}" for t, a in zip(times, q, strict=True))]
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    (tmp_path / "log.toml").write_text(
+        'system = "pendulum"\n[channels.q]\nunit = "rad"\nnoise = 0.003\n'
+        f"[constants]\nmass = {mass}\nlength = {length}\ngravity = 9.81\n"
+    )
+    answer = explain(tmp_path / "log.csv").answer
+    (cause,) = answer.causes
+    assert (answer.verdict, cause.effect, cause.alternatives) == ("named", "sensor.slip", ())
+    jump, instant = cause.coefficients["coefficient"], cause.coefficients["instant"]
+    assert jump.low < 0.02 < jump.high < 0.025
+    assert instant.low < 101.611 < instant.high < instant.low + 0.06
+    assert answer.heldout.gap_closed > 0.9

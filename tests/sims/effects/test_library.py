@@ -101,6 +101,7 @@ def test_what_fits_what():
         "friction.stribeck",
         "friction.warming",
         "sensor.eccentricity",
+        "sensor.slip",
         "spring.linear",
         "spring.cubic",
         "force.ripple",

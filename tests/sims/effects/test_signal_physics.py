@@ -173,3 +173,27 @@ def test_an_eccentric_encoder_is_off_by_a_sine_of_the_angle():
     assert np.ptp(true) > np.pi
     assert seen == pytest.approx(true + 0.03 * np.sin(true) - 0.02 * np.cos(true), abs=1e-12)
     assert np.array_equal(other, rate)
+
+
+def test_an_encoder_that_slipped_is_off_from_an_instant_of_the_clock_on():
+    times, slip = 5.0 + np.arange(0, 2, 0.01), {"sensor.slip": (0.03, 5.705)}
+    inputs = {"u": np.zeros(times.size)}
+    true, rate = run("pendulum", times, {}, [3.3e-3], inputs, q=0.8).T
+    seen, other = run("pendulum", times, slip, [3.3e-3], inputs, q=0.8).T
+    assert seen == pytest.approx(true + np.where(times > 5.705, 0.03, 0.0), abs=1e-12)
+    assert np.array_equal(other, rate)
+    # what is put a quarter of a sample late or early shows in that sample alone
+    for late, share in ((0.0025, 0.75), (-0.0025, 0.25)):
+        moved = {"sensor.slip": (0.03, 5.705 + late)}
+        between = run("pendulum", times, moved, [3.3e-3], inputs, q=0.8)[:, 0] - true
+        sample = 71 if late > 0 else 70
+        assert between[sample] == pytest.approx(0.03 * share, abs=1e-9)
+        assert np.delete(between, sample) == pytest.approx(
+            np.delete(np.where(times > 5.705, 0.03, 0.0), sample), abs=1e-12
+        )
+
+
+def test_a_slip_before_the_run_is_a_bias():
+    times = np.arange(0, 1, 0.01)
+    slipped = run("pendulum", times + 7.0, {"sensor.slip": (0.03, 3.0)}, q=0.8)
+    assert slipped == pytest.approx(run("pendulum", times, {"sensor.bias": 0.03}, q=0.8), abs=1e-12)

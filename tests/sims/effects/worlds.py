@@ -59,6 +59,7 @@ NAMES = [
     "sensor.drift",
     "sensor.eccentricity",
     "supply.sag",
+    "sensor.slip",
     "servo.deadband",
     "servo.derivative",
     "clock.skew",

@@ -76,6 +76,7 @@ def test_names_are_those_of_the_model(arm):
         "input.power": ("m_elbow",),
         "input.rate": ("m_shoulder", "m_elbow", "m_spin", "*"),
         "sensor.eccentricity": ("q.shoulder", "q.elbow", "q.spin"),
+        "sensor.slip": ("q.shoulder", "q.elbow", "q.spin"),
         "servo.deadband": ("m_shoulder",),
         "servo.derivative": ("m_shoulder",),
         "gravity.tilt": ("",),
@@ -255,3 +256,15 @@ def test_sensors_follow_each_other_in_the_lanes_where_they_act(arm):
     np.testing.assert_allclose(seen[0], 1.5 * cubic(shifted), rtol=0, atol=1e-13)
     np.testing.assert_allclose(seen[1], 1.5 * cubic(times) + 2.0 * times, rtol=0, atol=1e-13)
     np.testing.assert_array_equal(seen[2], sampled(values, slopes, STEP, times, ())[2])
+
+
+def test_an_encoder_of_a_robot_slips_on_the_clock_of_the_stamps(arm):
+    slip = arm.effect("sensor.slip@q.elbow")()
+    times = STEP * np.arange(6)
+    lanes = np.array([[0.0, 0.2], [1.0, 1.0]])[:, :, None]
+    still = np.full((2, 6), 0.3)
+    seen = sampled(still, np.zeros((2, 6)), STEP, times, ((slip, lanes),), 1.0 - 2.5 * STEP)
+    np.testing.assert_allclose(seen[1], [0.3] * 3 + [0.5] * 3, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(seen[0], still[0])
+    with pytest.raises(InputError, match="place"):
+        arm.effect("sensor.slip@qd.elbow")

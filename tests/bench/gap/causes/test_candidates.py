@@ -1,7 +1,18 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from bench.gap.causes.candidates import FREQUENCIES, SHAPES, directions, simulate_with
+from bench.gap.causes.candidates import (
+    FINER,
+    FREQUENCIES,
+    INSTANTS,
+    SHAPES,
+    directions,
+    instants_about,
+    simulate_with,
+)
+from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.fit import Fitter
 from bench.gap.model.problem import Start
 from sims.base import Scenario
@@ -134,3 +145,32 @@ def test_an_effect_added_to_a_model_is_simulated_with_what_the_model_has(swing):
     np.testing.assert_allclose(changed[0][seen], fit.simulated[seen], atol=1e-4)
     q = there.channels.index("q")
     np.testing.assert_allclose((changed[1] - fit.simulated)[..., q], 0.25, atol=1e-4)
+
+
+def test_what_happens_once_is_looked_for_on_the_clock_of_the_stamps():
+    made = recording(runs=2, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"])
+    first, second = made.runs
+    later = replace(second, times=second.times + 5.0)
+    there = world(replace(made, runs=(first, later)))
+    end = float(later.times[-1])
+    found = directions(there, fitted(there), ["sensor.slip"])
+    columns = of(found, "sensor.slip")
+    instants = sorted(found.probes[i].c[1] for i in columns)
+    spaced = np.linspace(0.0, end, INSTANTS + 2)[1:-1]
+    np.testing.assert_allclose(instants, spaced, rtol=1e-12)
+    q = there.channels.index("q")
+    for i in columns:
+        instant = found.probes[i].c[1]
+        for r, track in enumerate(there.tracks):
+            stamps = track.scenario.times
+            whole = np.abs(stamps - instant) > 0.6 / 60
+            slipped = found.values[r, whole, q, i]
+            np.testing.assert_allclose(slipped, stamps[whole] > instant, atol=1e-6)
+    c = np.array([0.01, 5.5])
+    around = [moved[1] for moved in instants_about(there, "sensor.slip", c)]
+    assert 2 < len(around) <= FINER
+    assert max(abs(t - 5.5) for t in around) <= end / (INSTANTS + 1)
+    np.testing.assert_allclose(np.array(around) % (1 / 60), 0.5 / 60, atol=1e-9)
+    assert not list(instants_about(there, "sensor.bias", np.array([0.01])))
+    bounds = coefficient_bounds(there, "sensor.slip")
+    assert bounds[1] == (0.0, end)
