@@ -9,7 +9,8 @@ sticks. With v the velocity, limits are
 * (4) load, by direction: |motor drive - external load|
 * (5) load, quadratic: c |drive - load| + quadratic through^2, where `through` is the smaller of
   drive and load as far as they pull against each other: what goes through the gears
-* (6) position: coulomb + sine sin(2 pi x / period) + cosine cos(2 pi x / period)
+* (6) position: least + a + sine sin(2 pi x / period) + cosine cos(2 pi x / period), with a the
+  amplitude (sine^2 + cosine^2)^(1/2), so that friction is `least` where it is least
 * (7) warming: (dry + viscous |v|) exp(-t / time), t since the start of the run
 
 A negative limit is none. And one that is no limit but a force, since it vanishes at rest:
@@ -154,18 +155,19 @@ class LoadQuadratic(Friction):
 
 
 class Position(Friction):
-    """Dry friction of gears and bearings that are not round: a mean and a wave."""
+    """Dry friction of gears and bearings that are not round: a wave that never falls below zero."""
 
     name = "friction.position"
     noun = "friction that varies over the joint"
     says = "friction is greater in some positions than in others, and repeats with position"
     needs, contains, source = "guide", ("friction.coulomb",), _PLACE
-    coefficients = (Coefficient("coulomb", _USUAL, _DRY), *_OVER)
+    coefficients = (Coefficient("least", _USUAL, _DRY), *_OVER)
 
     def limit(self, c: Array, moment: Moment) -> Array:
         """Periodic in the primary coordinate."""
         angle = 2 * np.pi * moment.primary / np.maximum(c[3], _SMALLEST)
-        return np.maximum(c[0] + c[1] * np.sin(angle) + c[2] * np.cos(angle), 0.0)  # (6)
+        mean = c[0] + np.sqrt(c[1] ** 2 + c[2] ** 2)
+        return np.maximum(mean + c[1] * np.sin(angle) + c[2] * np.cos(angle), 0.0)  # (6)
 
 
 class Warming(Friction):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import copysign, cos, exp, inf, pi, sin, tanh
+from math import copysign, cos, exp, hypot, inf, pi, sin, tanh
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -213,7 +213,9 @@ LIMITS: dict[str, Callable[[Joint, list[float]], Law]] = {
             + c[1] * through(j.piece.at(t), -j.weight(x)) ** 2
         )
     ),
-    "friction.position": lambda j, c: lambda t, x, v: max(c[0] + _wave(c[1:], x / c[3]), 0.0),
+    "friction.position": lambda j, c: (
+        lambda t, x, v: c[0] + hypot(c[1], c[2]) + _wave(c[1:], x / c[3])
+    ),
     "friction.warming": lambda j, c: lambda t, x, v: (c[0] + c[1] * abs(v)) * exp(-t / c[2]),
     "patch": lambda j, c: (
         lambda t, x, v: c[0] * inside(x, c[1], c[2])

@@ -123,7 +123,7 @@ def _uneven(far, setting, rng):
     period = float(np.clip(travel / rng.uniform(1.0, 4.0), low, high))
     angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 0.95)
     sine, cosine = far * share * float(np.sin(angle)), far * share * float(np.cos(angle))
-    return lambda s: (far * s, sine * s, cosine * s, period)
+    return lambda s: (far * (1 - share) * s, sine * s, cosine * s, period)
 
 
 def _warming(far, setting, rng):

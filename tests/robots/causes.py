@@ -158,7 +158,7 @@ def _uneven(place, setting, rng):
     period = float(np.clip(typical["travel"] / rng.uniform(1.0, 4.0), 0.5, 6.28))
     far, share = typical["force"], float(rng.uniform(0.5, 0.95))
     sine, cosine = far * share * float(np.sin(angle)), far * share * float(np.cos(angle))
-    return lambda s: (far * s, sine * s, cosine * s, period)
+    return lambda s: (far * (1 - share) * s, sine * s, cosine * s, period)
 
 
 def _warming(place, setting, rng):

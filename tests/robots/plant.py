@@ -52,7 +52,7 @@ class Plant:
         coulomb, extra, speed: dry friction `coulomb + extra exp(-(v / speed)^2)`, (N,).
         ahead, back: damping of motion the one way and the other, (N,).
         ripples: (joint, sine, cosine, period).
-        uneven: (joint, mean, sine, cosine, period) of dry friction over the joint.
+        uneven: (joint, least, sine, cosine, period) of dry friction over the joint.
         cold: (joint, dry, viscous, time) of friction that dies away.
         binding, elastic: see there; None where there is none.
     """
@@ -121,9 +121,10 @@ class Plant:
             limit[self.binding.joint] += self.binding.limit(q)
         if self.uneven or self.cold:
             limit = limit.copy()
-        for joint, mean, sine, cosine, period in self.uneven:
+        for joint, least, sine, cosine, period in self.uneven:
             angle = 2 * np.pi * q[joint] / period
-            limit[joint] += max(mean + sine * np.sin(angle) + cosine * np.cos(angle), 0.0)
+            limit[joint] += least + np.hypot(sine, cosine)
+            limit[joint] += sine * np.sin(angle) + cosine * np.cos(angle)
         for joint, dry, viscous, time in self.cold:
             limit[joint] += (dry + viscous * abs(v[joint])) * np.exp(-t / time)
         return limit
