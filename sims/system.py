@@ -174,6 +174,25 @@ class Derived:
     strongest: bool = False
 
 
+@dataclass(frozen=True)
+class ModelFile:
+    """A system as a robot's model file.
+
+    Attributes:
+        text: MJCF.
+        joint: its joint.
+        actuator: what drives that.
+        signals: channels and inputs of the robot, by the system's.
+        said: what the file cannot say, a clause each.
+    """
+
+    text: str
+    joint: str
+    actuator: str
+    signals: Mapping[str, str]
+    said: tuple[str, ...] = ()
+
+
 class System(ABC):
     """A physical system, declared once for every engine.
 
@@ -223,6 +242,13 @@ class System(ABC):
     def reading(cls, observed: Sequence[str]) -> str:
         """The channel among those `observed` whose value sensor effects act on."""
         return next((name for name in cls.sensed if name in observed), observed[0])
+
+    @classmethod
+    def model_file(cls, numbers: Mapping[str, float]) -> ModelFile | None:  # noqa: ARG003
+        """The system as a robot's model file, with these parameters and constants by name; None
+        where it has no such form.
+        """
+        return None
 
     @classmethod
     def gear(cls, coordinate: int) -> float:  # noqa: ARG003

@@ -14,7 +14,7 @@ from sims.robot.stated import Element
 _TWICE = ("replicate", "attach", "composite", "flexcomp", "model")
 """Elements that stand for several, or for those of another file."""
 
-_FILES = ("mesh", "texture", "hfield", "skin")
+FILES = ("mesh", "texture", "hfield", "skin")
 """Elements that name a file."""
 
 _DIRECTORIES = ("assetdir", "meshdir", "texturedir")
@@ -112,7 +112,7 @@ class Document:
     def rooted(self, folder: Path) -> bool:
         """Let files be found from wherever the text is; whether it names any."""
         named = any(
-            tag.name in _FILES and any(key.startswith("file") for key in tag.attributes)
+            tag.name in FILES and any(key.startswith("file") for key in tag.attributes)
             for tag in self.walk()
         )
         if named:

@@ -25,7 +25,7 @@ from sims.robot.stated import (
 _ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
 """What says in another way what ``quat`` and ``diaginertia`` say."""
 
-_OWN = ("kp", "kv", "ki", "dampratio", "timeconst", "inheritrange")
+OWN = ("kp", "kv", "ki", "dampratio", "timeconst", "inheritrange")
 """Attributes of MuJoCo's shortcuts, which ``general`` has not."""
 
 _INPUTS = {"position": "pos", "velocity": "vel"}
@@ -71,7 +71,7 @@ class Writer:
             tag.new |= values
 
     def _option(self, statement: Statement, comments: Sequence[str]) -> None:
-        options, values = self.document.under("option"), _texts(statement.values)
+        options, values = self.document.under("option"), texts(statement.values)
         if options:
             _say(options[-1], comments)
             options[-1].new |= values
@@ -90,7 +90,7 @@ class Writer:
                 compiler.new["settotalmass"] = number(float(self.wanted["body_mass"].sum()))
 
     def _inertial(self, body: Tag, statement: Statement, comments: Sequence[str]) -> None:
-        values = _texts(statement.values)
+        values = texts(statement.values)
         for child in self.document.children(body):
             if child.name == "inertial":
                 _say(child, comments)
@@ -117,7 +117,7 @@ class Writer:
         return whole(self.model, element, fields(self.model))
 
     def _joint(self, tag: Tag, statement: Statement) -> dict[str, str]:
-        values = _texts(statement.values)
+        values = texts(statement.values)
         hinge = tag.says("type") in (None, "hinge")
         if "springref" in statement.values and hinge and self.degrees:
             values["springref"] = numbers((float(np.rad2deg(statement.values["springref"][0])),))
@@ -135,15 +135,15 @@ class Writer:
         if own is not None:
             if "kv" in own:
                 tag.removed.add("dampratio")
-            return _texts({k: v for k, v in changed.items() if k not in _SERVO}) | own
+            return texts({k: v for k, v in changed.items() if k not in _SERVO}) | own
         if tag.name != "general":
             tag.renamed = "general"
-            tag.removed |= set(_OWN)
+            tag.removed |= set(OWN)
             stated = whole(self.model, statement.element, self.wanted)
             changed = {k: v for k, v in stated.items() if k in changed or _needed(k, v)}
             if tag.name in _INPUTS and hasattr(self.model, "actuator_ctrlspec"):
                 tag.new["input"] = _INPUTS[tag.name]
-        return _texts(changed)
+        return texts(changed)
 
 
 def _needed(name: str, values: tuple[float, ...]) -> bool:
@@ -180,7 +180,8 @@ def _say(tag: Tag, comments: Sequence[str]) -> None:
     tag.before += [text for text in comments if text not in tag.before]
 
 
-def _texts(values: Mapping[str, Values]) -> dict[str, str]:
+def texts(values: Mapping[str, Values]) -> dict[str, str]:
+    """Values as attributes."""
     return {name: _text(name, stated) for name, stated in values.items()}
 
 

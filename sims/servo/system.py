@@ -10,7 +10,8 @@ import numpy as np
 
 from sims.base import Array, Channel, Constant, Parameter
 from sims.limits import GAIN, GRAVITY, LENGTH, MASS, VOLTAGE
-from sims.system import Derived, Effect, Kind, Moment, System, UsualRecording
+from sims.servo.mjcf import model_file
+from sims.system import Derived, Effect, Kind, ModelFile, Moment, System, UsualRecording
 
 _KT = slice(0, 1)
 """Column of the torque constant among the parameters."""
@@ -120,6 +121,13 @@ class ServoSystem(System):
     def refuses(cls, effect: type[Effect]) -> str:
         """See `System`."""
         return "its input is a set point, not a force" if effect.name == "input.power" else ""
+
+    @classmethod
+    def model_file(cls, numbers: Mapping[str, float]) -> ModelFile:
+        """See `System`; the duty is clipped before the motor's own voltage is taken off, which is
+        thus a damping of the joint, behind the limit of the servo's force.
+        """
+        return model_file(numbers)
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """(L, 1) kg m^2 about the joint."""

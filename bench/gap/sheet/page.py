@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from html import escape
 from pathlib import Path
 
-from bench.gap.report.elements import code, figure, heading, paragraph, safe, table
+from bench.gap.report.elements import code, figure, heading, listed, paragraph, safe, table
 from bench.gap.report.words import (
     estimated,
     joined,
@@ -15,6 +16,7 @@ from bench.gap.report.words import (
 )
 from bench.gap.sheet.diagram import Diagram
 from bench.gap.sheet.facts import Facts
+from bench.gap.sheet.mjcf import CLASS, Made
 from bench.gap.sheet.quantity import Quantity
 from bench.gap.sheet.words import TITLES, beside, called, evidence, reached
 
@@ -27,10 +29,10 @@ _REACH = (
 )
 
 
-def page(sheet: Facts, diagram: Diagram, drawn: bytes) -> str:
+def page(sheet: Facts, diagram: Diagram, drawn: bytes, made: Made) -> str:
     """The page as HTML, with the diagram as it is drawn (PNG)."""
     parts = [*_head(sheet), *_found(sheet), *_diagram(diagram, drawn), *_absent(sheet)]
-    return "\n".join([*parts, *_foot(sheet)])
+    return "\n".join([*parts, *_class(made), *_foot(sheet)])
 
 
 def _head(sheet: Facts) -> Iterator[str]:
@@ -99,6 +101,17 @@ def _absent(sheet: Facts) -> Iterator[str]:
 
 def _stated(row: Quantity) -> str:
     return "" if row.stated is None else safe(with_unit(number(row.stated), row.unit), 60)
+
+
+def _class(made: Made) -> Iterator[str]:
+    """The class, and what MJCF cannot say."""
+    if CLASS in made.contents:
+        yield heading("For MuJoCo")
+        said = f"{code(CLASS)} holds it as a default class: include the file, and give the joint "
+        yield paragraph(said + "and its actuator the class.")
+        yield f"<pre>{escape(made.contents[CLASS])}</pre>"
+    if made.said:
+        yield listed(safe(line) for line in made.said)
 
 
 def _foot(sheet: Facts) -> Iterator[str]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from bench.gap.model.world import World
 from bench.gap.sheet.drawn import picture, printed
 from bench.gap.sheet.facts import Facts
+from bench.gap.sheet.mjcf import mjcf
 from bench.gap.sheet.page import page
 from bench.gap.sheet.quantity import quantities
 from bench.gap.sheet.reach import shown
@@ -27,7 +28,8 @@ class DataSheet(Facts):
     """The data sheet of a joint or actuator."""
 
     def write(self, folder: str | Path) -> list[Path]:
-        """Write sheet.toml, .html and .pdf: all or none. The folder is made where it is missing.
+        """Write sheet.toml, .html and .pdf, class.xml and models that use it: all or none. The
+        folder is made where it is missing.
 
         Raises:
             InputError: the folder cannot be made or written to.
@@ -35,10 +37,12 @@ class DataSheet(Facts):
         import tomli_w
 
         folder = Path(folder)
+        made = mjcf(self, folder)
         contents: dict[Path, Content] = {
             folder / "sheet.toml": tomli_w.dumps(self.document()),
-            folder / "sheet.html": page(self, self.diagram, picture(self.diagram)),
+            folder / "sheet.html": page(self, self.diagram, picture(self.diagram), made),
             folder / "sheet.pdf": printed(self, self.diagram),
+            **{folder / name: text for name, text in made.contents.items()},
         }
         try:
             folder.mkdir(parents=True, exist_ok=True)

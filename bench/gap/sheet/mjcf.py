@@ -1,0 +1,270 @@
+"""A data sheet as a default class of MJCF, and a model that uses it to score it by.
+
+What MuJoCo cannot say is said in comments. Of a system, whose moments are known at every sample,
+dry friction that MuJoCo lacks a law for is stated as its mean over the runs, so that the class is
+the nearest that MJCF has.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from os.path import relpath
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.gap.robot_files import causes_of
+from bench.gap.sheet.facts import Facts
+from sims import effects as library
+from sims.base import Array
+from sims.extended import Number
+from sims.recording.description import description_of
+from sims.recording.recording import Run
+from sims.system import Friction, ModelFile, Moment
+from sims.user_toml import read_toml
+
+CLASS = "class.xml"
+"""The file of the classes."""
+DRIVEN = 0.5
+"""A motor is on where what switches it is above this."""
+
+
+class Made(NamedTuple):
+    """The files by name, and what they cannot say."""
+
+    contents: Mapping[str, str]
+    said: tuple[str, ...]
+
+
+class _Class(NamedTuple):
+    """A class, what it cannot say, and the model that uses it; empty where none does."""
+
+    text: str
+    said: Sequence[str]
+    model: str = ""
+
+
+def mjcf(facts: Facts, folder: Path) -> Made:
+    """The class and the models that use it.
+
+    Args:
+        facts: what is on the sheet.
+        folder: where the files will lie: from there the log is named.
+    """
+    if facts.subject.kind.has_model:
+        return _of_robot(facts)
+    return _of_system(facts, folder)
+
+
+def _of_robot(facts: Facts) -> Made:
+    kind: Any = facts.subject.kind
+    causes = causes_of(facts.extended)
+    actuator = next(iter(facts.subject.actuators), None)
+    made = _class(kind.robot, causes, facts.subject.joint, actuator, class_name(facts.name), facts)
+    files = {CLASS: _file(facts, [made])}
+    if made.model:
+        files["model.xml"] = made.model
+    return Made(files, tuple(made.said))
+
+
+def _of_system(facts: Facts, folder: Path) -> Made:
+    """A class, a model and a description of the log for each setting of the recording."""
+    from sims.robot.reading import read
+
+    made: list[_Class] = []
+    files: dict[str, str] = {}
+    for setting in settings(facts):
+        model = facts.subject.kind.system.model_file(setting.numbers)
+        if model is None:
+            return Made({}, (f"{facts.subject.kind.name} has no form in MJCF",))
+        name = class_name("_".join([facts.name, setting.name]) if setting.name else facts.name)
+        with tempfile.TemporaryDirectory() as place:
+            path = Path(place) / f"{facts.subject.kind.name}.xml"
+            path.write_text(model.text)
+            robot = read(path)
+        causes, said = _placed(facts, setting, model)
+        one = _class(robot, causes, model.joint, model.actuator, name, facts, (*model.said, *said))
+        made.append(one)
+        stem = f"model_{setting.name}" if setting.name else "model"
+        if one.model:
+            files[f"{stem}.xml"] = one.model
+            files |= _described(facts, setting, model, stem, folder)
+    lines = dict.fromkeys(line for one in made for line in one.said)
+    return Made({CLASS: _file(facts, made), **files}, tuple(lines))
+
+
+def _class(
+    robot: Any,
+    causes: Mapping[str, Mapping[str, Number]],
+    joint: str,
+    actuator: str | None,
+    name: str,
+    facts: Facts,
+    notes: Sequence[str] = (),
+) -> _Class:
+    """The class of a robot's joint."""
+    from sims.robot.changes import apply
+    from sims.robot.defaults import default_class, using
+    from sims.robot.markup import UnfitError
+
+    applied = apply(robot, causes, facts.extended.title)
+    own = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None
+    said = [*notes, *applied.said]
+    text = default_class(applied, *own, name, said)
+    try:
+        return _Class(text, said, using(robot, applied, *own, name, text))
+    except UnfitError as unfit:
+        return _Class(text, [*said, f"no model that uses the class is written: {unfit}"])
+
+
+def class_name(name: str) -> str:
+    """A name of a class that XML and MuJoCo take."""
+    plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_")
+    return plain or "drive"
+
+
+def _file(facts: Facts, made: Sequence[_Class]) -> str:
+    """The classes as a file that MuJoCo loads, and that others include."""
+    title = facts.recording.title or facts.recording.path.stem
+    heading = f"{class_name(facts.name)}: data sheet from {title}; written by simgap datasheet"
+    safe = re.sub(r"-(?=-)", "- ", heading)
+    inner = "\n".join(one.text for one in made).replace("\n", "\n    ")
+    return f"<mujoco>\n  <!-- {safe} -->\n  <default>\n    {inner}\n  </default>\n</mujoco>\n"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Runs of a recording that share their constants.
+
+    Attributes:
+        name: short, of the constants that differ; empty where none does.
+        numbers: parameters and constants.
+        runs: of the recording.
+    """
+
+    name: str
+    numbers: Mapping[str, float]
+    runs: tuple[Run, ...]
+
+
+def settings(facts: Facts) -> list[Setting]:
+    """The runs by the constants that differ between them, in the order of the recording."""
+    by_constants: dict[tuple[tuple[str, float], ...], list[Run]] = {}
+    for run in facts.recording.runs:
+        by_constants.setdefault(tuple(sorted(run.constants.items())), []).append(run)
+    usual = {c.name: c.value for c in facts.subject.kind.constants}
+    fitted = {name: number.value for name, number in facts.extended.parameters.items()}
+    known = {**usual, **facts.recording.constants, **facts.extended.constants, **fitted}
+    return [
+        Setting(
+            "_".join(f"{name}{value:g}" for name, value in constants) if by_constants else "",
+            {**known, **dict(constants)},
+            tuple(runs),
+        )
+        for constants, runs in by_constants.items()
+    ]
+
+
+def _placed(
+    facts: Facts, setting: Setting, model: ModelFile
+) -> tuple[dict[str, Mapping[str, Number]], list[str]]:
+    """What was found, at its places in the model file; and what stands for what."""
+    from sims.robot.native import FIELDS
+
+    places = {"joint": model.joint, "actuator": model.actuator, "channel": model.signals["q"]}
+    causes: dict[str, Mapping[str, Number]] = {}
+    dry, said = 0.0, []
+    for name, numbers in facts.extended.effects.items():
+        effect = library.get(name)
+        if issubclass(effect, Friction) and name not in FIELDS:
+            held = _held(facts, setting, effect, numbers)
+            dry += held
+            said.append(
+                f"{name}: MuJoCo has no such law; frictionloss holds its mean over these runs, "
+                f"{held:.4g} N m"
+            )
+            continue
+        place = places.get(effect.at, "")
+        causes[f"{name}@{place}" if place else name] = numbers
+    if dry:
+        key = f"friction.coulomb@{model.joint}"
+        own = causes.get(key, {}).get("coefficient")
+        total = dry + (own.value if own else 0.0)
+        causes[key] = {"coefficient": Number(total, "N*m", None, None)}
+    return causes, said
+
+
+def _held(
+    facts: Facts, setting: Setting, effect: type[Friction], numbers: Mapping[str, Number]
+) -> float:
+    """The mean limit of a friction over the samples of some runs."""
+    limits = [_limits(facts, setting, run, effect, numbers) for run in setting.runs]
+    seen = np.concatenate(limits)
+    return float(seen[np.isfinite(seen)].mean())
+
+
+def _limits(
+    facts: Facts,
+    setting: Setting,
+    run: Run,
+    effect: type[Friction],
+    numbers: Mapping[str, Number],
+) -> Array:
+    """(T,) the limit of a friction at each sample of a run: its samples are lanes."""
+    kind = facts.subject.kind
+    system = kind.system()
+    (coordinate,) = system.coordinates
+    position = run.channels[coordinate]
+    rate = np.gradient(position, run.times)
+    each = (len(position), 1)
+    theta = np.array([[setting.numbers[p.name] for p in kind.parameters]])
+    coefficients = [numbers[c.name].value for c in effect.on(system) if c.name in numbers]
+    moment = Moment(
+        system,
+        np.repeat(theta, len(position), axis=0),
+        {c.name: np.full(each, setting.numbers[c.name]) for c in kind.constants},
+        (run.times - run.times[0])[:, None],
+        position[:, None],
+        rate[:, None],
+        {name: values[:, None] for name, values in run.inputs.items()},
+    )
+    c = np.array(coefficients)[:, None, None]
+    limit: Array = effect().limit(np.broadcast_to(c, (len(c), *each)), moment)[:, 0]
+    return limit
+
+
+def _described(
+    facts: Facts, setting: Setting, model: ModelFile, stem: str, folder: Path
+) -> Iterator[tuple[str, str]]:
+    """A description of the log for the model, where its runs are marked held out; nothing where the
+    log is of several files.
+    """
+    import tomli_w
+
+    path = facts.recording.path
+    if path.suffix != ".csv" or any(run.log for run in facts.recording.runs):
+        return
+    stated = read_toml(description_of(path))
+    file = relpath(path.resolve(), folder.resolve())
+    document: dict[str, Any] = {
+        "model": f"{stem}.xml",
+        "title": f"{facts.name} as {stem}.xml",
+        "channels": {},
+        "inputs": {},
+        "runs": {run.name: {"held_out": True} for run in setting.runs if _driven(run, model)},
+    }
+    for kind in ("channels", "inputs"):
+        for name, own in stated.get(kind, {}).items():
+            if name in model.signals:
+                document[kind][model.signals[name]] = {"file": file, "column": name, **own}
+    yield f"{stem}.toml", tomli_w.dumps(document)
+
+
+def _driven(run: Run, model: ModelFile) -> bool:
+    """Whether what switches the motor is on all the time."""
+    switches = [values for name, values in run.inputs.items() if name not in model.signals]
+    return all(bool((values > DRIVEN).all()) for values in switches)

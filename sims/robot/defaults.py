@@ -1,0 +1,127 @@
+"""A joint with its actuator as a default class of MJCF, and a robot's file that uses it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from sims.robot.changes import Applied
+from sims.robot.document import FILES, Document
+from sims.robot.markup import UnfitError, number
+from sims.robot.mjcf_out import OWN, texts
+from sims.robot.model import Robot
+from sims.robot.precise import saved, unlike
+from sims.robot.stated import ATTRIBUTES, Element, Values, whole
+from sims.robot.writing import SAME, compiled
+
+_USUAL: Mapping[str, Values] = {
+    "solreffriction": (0.02, 1.0),
+    "solimpfriction": (0.9, 0.95, 0.001, 0.5, 2.0),
+}
+"""What MuJoCo takes where nothing is stated; zero for all others."""
+_OF_THE_POSE = frozenset({"springref"})
+"""Attributes that stay with a joint: they are of where it stands, not of what it is."""
+_NONE, _FIXED, _AFFINE = 0.0, 0.0, 1.0
+"""MuJoCo's enumerations of what a position servo is: no dynamics, a fixed gain, an affine bias."""
+
+
+def default_class(
+    applied: Applied, joint: int, actuator: int | None, name: str, notes: Sequence[str] = ()
+) -> str:
+    """The class as an element ``<default class="NAME">``, with a comment for each cause.
+
+    Args:
+        applied: the model with causes in it.
+        joint: number of the joint in it.
+        actuator: number of its actuator; None without one.
+        name: of the class.
+        notes: further comments.
+    """
+    lines = [f'<default class="{name}">', *(f"  {_comment(note)}" for note in notes)]
+    elements = [Element("joint", joint)]
+    elements += [] if actuator is None else [Element("actuator", actuator)]
+    for element in elements:
+        told = applied.comments.get(element, [])
+        lines += [f"  {_comment(text)}" for text in dict.fromkeys(told)]
+        tag, stated = _stated(element, whole(applied.model, element, applied.wanted))
+        said = "".join(f' {key}="{value}"' for key, value in stated.items())
+        lines.append(f"  <{tag}{said}/>")
+    return "\n".join([*lines, "</default>"])
+
+
+def _stated(element: Element, values: Mapping[str, Values]) -> tuple[str, dict[str, str]]:
+    """The tag of an element in a class, and what it states."""
+    own = {
+        name: value
+        for name, value in values.items()
+        if name not in _OF_THE_POSE and not _is_usual(name, value)
+    }
+    if element.kind == "joint":
+        if not values["frictionloss"][0]:
+            own = {name: value for name, value in own.items() if not name.startswith("sol")}
+        return "joint", texts(own)
+    ranges = {"ctrlrange": "ctrllimited", "forcerange": "forcelimited"}
+    own = {k: v for k, v in own.items() if k not in ranges or values[ranges[k]][0]}
+    if not _is_servo(values):
+        return "general", texts({**own, **{k: values[k] for k in ("gaintype", "biastype")}})
+    gains = {"kp": number(values["gainprm"][0]), "kv": number(-values["biasprm"][2])}
+    return "position", gains | texts(
+        {k: v for k, v in own.items() if not k.startswith(("gain", "bias", "dyn"))}
+    )
+
+
+def _is_usual(name: str, values: Values) -> bool:
+    return values == _USUAL[name] if name in _USUAL else not any(values)
+
+
+def _is_servo(values: Mapping[str, Values]) -> bool:
+    """Whether it is what ``position`` stands for."""
+    kinds = values["dyntype"][0], values["gaintype"][0], values["biastype"][0]
+    offset, stiffness = values["biasprm"][:2]
+    return kinds == (_NONE, _FIXED, _AFFINE) and offset == 0 and stiffness == -values["gainprm"][0]
+
+
+def using(
+    robot: Robot, applied: Applied, joint: int, actuator: int | None, name: str, text: str
+) -> str:
+    """The robot's file, with all causes, in which a joint and its actuator are of the class.
+
+    Args:
+        robot: what was read.
+        applied: its model with causes in it.
+        joint: number of the joint in it.
+        actuator: of its actuator.
+        name: of the class.
+        text: the class, of `default_class`.
+
+    Raises:
+        UnfitError: it would not be the model that was meant; says in what.
+    """
+    folder = robot.path.resolve().parent
+    document = Document(saved(applied.spec, folder).encode(), robot.path)
+    tags = document.numbered(applied.model)
+    tag = tags[Element("joint", joint)]
+    tag.new["class"] = name
+    tag.removed |= {a.name for a in ATTRIBUTES["joint"]} - _OF_THE_POSE
+    if actuator is not None:
+        element = Element("actuator", actuator)
+        tag = tags[element]
+        tag.new["class"] = name
+        tag.removed |= {a.name for a in ATTRIBUTES["actuator"]} | set(OWN)
+        tag.renamed, _ = _stated(element, whole(applied.model, element, applied.wanted))
+    if not any(one.name in FILES for one in document.walk()):
+        for compiler in document.under("compiler"):
+            compiler.removed |= {"meshdir", "texturedir"}
+    document.root.within.insert(
+        0, ([], "<default>\n    " + text.replace("\n", "\n    ") + "\n  </default>")
+    )
+    written = document.written()
+    differs = unlike(compiled(written), applied.model, SAME)
+    if differs:
+        raise UnfitError(differs)
+    return written
+
+
+def _comment(text: str) -> str:
+    # Two hyphens end a comment too early.
+    safe = text.replace("--", "- -")
+    return f"<!-- {safe} -->"

@@ -1,0 +1,52 @@
+"""The servo as MJCF: a position servo with a limit of its force, on a joint that carries a mass.
+
+With K = kt / R, torque = clip(K voltage kp error_gain (goal - q), -K voltage, K voltage) - K kt q':
+the second part is the motor's own voltage, which damps the joint while it is driven.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from sims.system import ModelFile
+
+TEXT = """<mujoco model="servo">
+  <compiler angle="radian"/>
+  <option timestep="0.001" integrator="implicitfast" gravity="0 0 {down}"/>
+  <worldbody>
+    <body name="load">
+      <joint name="joint" type="hinge" axis="0 -1 0" armature="{armature}" damping="{damping}"/>
+      <inertial pos="0 0 {below}" mass="{mass}" diaginertia="{point} {point} {point}"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="motor" joint="joint" kp="{kp}" kv="0" forcelimited="true"
+              forcerange="{least} {most}"/>
+  </actuator>
+</mujoco>
+"""
+POINT = 1e-9
+"""kg m^2 about its centre of mass of what is a point: MuJoCo wants more than zero."""
+
+
+def model_file(numbers: Mapping[str, float]) -> ModelFile:
+    """The servo with these parameters and constants."""
+    k = numbers
+    stall = k["torque_constant"] * k["voltage"] / k["resistance"]
+    text = TEXT.format(
+        down=repr(-k["gravity"]),
+        armature=repr(k["armature"]),
+        damping=repr(k["torque_constant"] ** 2 / k["resistance"]),
+        below=repr(-k["length"]),
+        mass=repr(k["mass"]),
+        point=repr(POINT),
+        kp=repr(stall * k["kp"] * k["error_gain"]),
+        least=repr(-stall),
+        most=repr(stall),
+    )
+    said = (
+        "damping is the motor's own voltage, kt^2/R, of a driven motor: with torque_enable 0 there "
+        "is none",
+        "forcerange is the stall torque at this supply",
+    )
+    return ModelFile(text, "joint", "motor", {"q": "q.joint", "goal": "u.motor"}, said)
