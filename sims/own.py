@@ -22,7 +22,18 @@ from sims.limits import cut, is_number
 from sims.own_engine import OwnEngine
 from sims.own_levels import at_levels, named
 from sims.simulated import Simulated
-from sims.system import Contact, Effect, Engine, Force, Friction, Kind, Level, Moment, System
+from sims.system import (
+    Contact,
+    Effect,
+    Engine,
+    Force,
+    Friction,
+    Hidden,
+    Kind,
+    Level,
+    Moment,
+    System,
+)
 
 
 class OwnSystem(System):
@@ -60,6 +71,8 @@ class OwnSystem(System):
             return "an own simulator does not say when it strikes something"
         if issubclass(effect, Level) and cls.simulator.put is OwnSimulator.put:
             return "its levels cannot be set (it has no method put)"
+        if issubclass(effect, Hidden):
+            return "an own simulator takes forces and no states beside its own"
         if not issubclass(effect, Force | Friction):
             return ""
         if cls.simulator.apply_force is OwnSimulator.apply_force:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from sims import effects as library
 from sims.base import Array, InputError, Parameter, Scenario, Simulator
-from sims.engines import engine_named
+from sims.engines import HIDING, engine_named
+from sims.engines.hidden import integrate
 from sims.limits import is_number
 from sims.plan import Plan, acts, by_object, felt_inputs, make_plan, make_runs
 from sims.system import (
@@ -20,6 +21,7 @@ from sims.system import (
     Engine,
     Force,
     Friction,
+    Hidden,
     Input,
     Lanes,
     Level,
@@ -116,6 +118,11 @@ class Simulated(Simulator):
             raise InputError(
                 f"system {self.system.name} cannot have effect {effect.name}: {reason}"
             )
+        if issubclass(effect, Hidden) and self.engine.name not in HIDING:
+            raise InputError(
+                f"engine {self.engine.name} cannot carry effect {effect.name}, which has a state of"
+                f" its own; choose engine {' or '.join(HIDING)}"
+            )
         return effect()
 
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
@@ -171,10 +178,10 @@ class Simulated(Simulator):
             every = 1 if filtered else plan.every
             own = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
             constants, x, v = self._known(scenarios, initial)
-            forces = _of(acting, (Force, Friction, Contact, Level))
+            forces = _of(acting, (Force, Friction, Contact, Hidden, Level))
             lanes = Lanes(self._declared, own, constants, x, v, plan.steps, inputs, forces, every)
             clock = np.array([s.times[0] for s in runs.distinct])[runs.of, None]
-            motion = self.engine.integrate(lanes)
+            motion = integrate(self.engine, lanes)
             observations = self._read(motion, lanes, plan, sensors, clock)
         # A shorter run has waited at its end; what it showed there was no sample.
         sizes = np.array([s.times.size for s in runs.distinct])

@@ -120,6 +120,11 @@ class Moment:
         return more
 
     @property
+    def inertia(self) -> Array:
+        """(L, 1) generalised inertia."""
+        return self.system.mass(self.theta, self.constants)
+
+    @property
     def primary(self) -> Array:
         """(L, 1) the coordinate that biases, springs and ripples act on."""
         return self.x[:, self.system.primary, None]
@@ -212,6 +217,10 @@ class System(ABC):
         servo: input that is the set point of a servo's primary coordinate; empty where none is.
         uniform: whether its own force is the same everywhere and always, so that it moves along
             parabolas.
+        bends: whether its own force may bend sharply, so that steps are shortened where it does.
+        fastest: rad/s with which it may swing where a look at its forces does not show it; its
+            steps are divided for that, too.
+        guided: how many coordinates, the first ones, dry friction acts on; 0 for all.
         has_model: whether it comes from a model file, whose numbers may be wrong.
         levels: states that are stores, such as a tank's level: they may spill over.
         usual_recording: what its simulated recordings show where the user does not say.
@@ -233,6 +242,9 @@ class System(ABC):
     servo: ClassVar[str] = ""
     bounces: ClassVar[bool] = False
     uniform: ClassVar[bool] = False
+    guided: ClassVar[int] = 0
+    bends: ClassVar[bool] = False
+    fastest: ClassVar[float] = 0.0
     has_model: ClassVar[bool] = False
     levels: ClassVar[tuple[str, ...]] = ()
     usual_recording: ClassVar[UsualRecording] = UsualRecording()
@@ -344,15 +356,22 @@ class Coefficient:
             ``error`` the same, where it is compared with a servo's error, ``reading`` that of the
             channel it acts on, ``input/s`` and ``reading/s`` the same per second; ``level`` that
             of what is stored;
-            ``drive`` is a limit of the drive's force, with units of its own.
+            ``drive`` is a limit of the drive's force and ``travel`` a part of the way that it
+            goes, with units of their own.
         least: what a fit may not go below, where that is not a matter of plausibility.
+        most: what it may not exceed, likewise.
+        tried: sizes from which a search for it begins, where evenly spread ones would be too many.
     """
 
     name: str
     units: tuple[str | None, str | None, str | None]
     plausible: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-    of: Literal["", "input", "input/s", "error", "reading", "reading/s", "drive", "level"] = ""
+    of: Literal[
+        "", "input", "input/s", "error", "reading", "reading/s", "drive", "level", "travel"
+    ] = ""
     least: float | None = None
+    most: float | None = None
+    tried: tuple[float, ...] = ()
 
     def unit(self, kind: Kind) -> str | None:
         """The unit on systems of this kind; None where the effect does not exist there."""
@@ -391,9 +410,10 @@ class Effect(ABC):
             a kind of system does not have come last and stay zero there; a kind that lacks the
             first lacks the effect.
         needs: what the system must have: ``input``; ``ground`` to strike; ``guide``, which a body
-            that flies freely lacks; ``servo``, an input that is a set point; ``gravity``; ``push``,
-            a say in what horizontal acceleration does to it; ``space`` of three dimensions;
-            ``model``, a file that states its numbers; ``level``, something that it stores;
+            that flies freely lacks; ``joint``, one alone; ``servo``, an input that is a set point;
+            ``gravity``; ``push``, a say in what horizontal acceleration does to it; ``space`` of
+            three dimensions; ``model``, a file that states its numbers; ``level``, something that
+            it stores;
             or empty.
         contains: simpler effects that it turns into where some of its coefficients are zero.
         hook: which of the engine's hooks it uses; set by the hook classes.
@@ -441,6 +461,7 @@ class Effect(ABC):
             "ground": "" if system.bounces else "it meets no ground",
             # What bounces flies freely: dry friction and springs have nothing to hold on to.
             "guide": "it flies freely" if system.bounces else "",
+            "joint": "" if _is_joint(system) else "it is not one joint alone",
             "servo": "" if declared.servo else "it has no servo that follows a set point",
             "gravity": "" if heavy else "it states no gravity",
             "push": "" if says_push else "it does not say what horizontal acceleration does",
@@ -458,6 +479,11 @@ class Effect(ABC):
         """The coefficients that the effect has on this system."""
         # Those that the kind does not have come last, so the others are the first ones.
         return tuple(takewhile(lambda c: c.unit(system.kind) is not None, cls.coefficients))
+
+
+def _is_joint(system: System | type[System]) -> bool:
+    """Whether it is a single joint, declared in equations."""
+    return len(system.coordinates) == 1 and not system.bounces and not system.has_model
 
 
 class Force(Effect):
@@ -484,6 +510,45 @@ class Friction(Effect):
     @abstractmethod
     def limit(self, c: Array, moment: Moment) -> Array:
         """(L, 1) largest force, >= 0."""
+
+
+@dataclass(frozen=True)
+class State:
+    """The state of its own that an effect has.
+
+    Attributes:
+        x: (L, 1) position, or whatever else its first number is.
+        v: (L, 1) rate of it.
+    """
+
+    x: Array
+    v: Array
+
+
+class Hidden(Effect):
+    """A force that hangs on more than the system's own motion: on a state that no sensor shows,
+    and that goes on beside it as one more coordinate.
+
+    It is off where its first coefficient is not above zero.
+    """
+
+    hook = "hidden"
+    at: ClassVar[PlaceKind] = "joint"
+    needs = "joint"
+    fastest: ClassVar[float] = 0.0
+    """rad/s with which it may swing, where that is not to be seen at rest."""
+
+    def behind(self, c: Array) -> Array:
+        """(L, 1) share of the joint's inertia that moves with the hidden coordinate, below 1."""
+        return np.zeros_like(c[0])
+
+    def begin(self, c: Array, moment: Moment) -> State:  # noqa: ARG002
+        """Its state when the run begins, at that moment."""
+        return State(np.zeros_like(c[0]), np.zeros_like(c[0]))
+
+    @abstractmethod
+    def act(self, c: Array, moment: Moment, state: State) -> tuple[Array, Array]:
+        """The generalised force (L, D) that it adds, and the rate (L, 1) of `state.v`."""
 
 
 class Value(Effect):

@@ -24,6 +24,7 @@ from sims.system import (
     Effect,
     Force,
     Friction,
+    Hidden,
     Input,
     Level,
     Moment,
@@ -154,6 +155,8 @@ def _contributions(
         ]
     if isinstance(acting, Input):
         return [(acting.times(c, times), times), (acting.feel(c, signal), values)]
+    if isinstance(acting, Hidden):
+        return []  # the engines ask it for nothing where its first coefficient is zero
     if isinstance(acting, Sensor):
         return [(acting.times(c, times), times), (acting.read(c, signal), values)]
     if isinstance(acting, Level):

@@ -18,6 +18,8 @@ NAMES = {
     "pybullet": "sims.engines.bullet",
 }
 """Modules of the engines; one is imported when it is asked for, and says what it requires."""
+HIDING = ("batch",)
+"""Engines that integrate hidden coordinates beside a system's own (`sims.engines.hidden`)."""
 
 
 def stepping() -> str:

@@ -1,5 +1,5 @@
 """Pendulum and slider with anything acting on them, for scipy: one coordinate, events where dry
-friction stops it.
+friction stops it; behind it what it drags along or remembers, which no sensor shows.
 
 Every law is written out here once more, in plain numbers; nothing is shared with the library that
 the exam is about.
@@ -160,20 +160,107 @@ class Joint:
                 lambda t, x, v: push if begin <= self.middle < begin + lasting else 0.0
             )
         self.restless = bool({"force.periodic", "input.lag", "friction.warming"} & set(acting))
+        whole, gravity_of_all = self.inertia, self.weight
+        self.behind = [
+            BEHIND[name](whole, gravity_of_all, *c) for name, c in acting.items() if name in BEHIND
+        ]
+        self.inertia = whole - sum(part.inertia for part in self.behind)
 
     def enter(self, piece):
         self.piece, self.middle = piece, 0.5 * (piece.begin + piece.end)
 
-    def pull(self, t, x, v):
-        """All but dry friction."""
+    def pull(self, t, x, v, *z):
+        """All but dry friction; z is the state of what is behind."""
         total = self.piece.at(t) + self.weight(x)
         for force in self.forces:
             total += force(t, x, v)
+        for part, own in zip(self.behind, batched(z), strict=True):
+            total += part.force(x, v, *own)
         return total
+
+    def rates(self, x, v, *z):
+        """Of the state of what is behind."""
+        parts = zip(self.behind, batched(z), strict=True)
+        return [rate for part, own in parts for rate in part.rates(x, v, *own)]
 
     def limit(self, t, x, v):
         """The largest dry friction."""
         return sum(limit(t, x, v) for limit in self.limits)
+
+
+def batched(z):
+    """In pairs."""
+    return list(zip(z[::2], z[1::2], strict=True))
+
+
+class Load:
+    """A mass behind the one that the sensor shows: `share` of the inertia and of the weight."""
+
+    def __init__(self, inertia, weight, share):
+        self.whole, self.inertia, self.weight = inertia, share * inertia, weight
+        self.share = share
+
+    def force(self, x, v, y, w):
+        return -self.inertia * self.between(x, v, y, w) - self.share * self.weight(x)
+
+    def rates(self, x, v, y, w):
+        return w, self.between(x, v, y, w) + self.weight(y) / self.whole
+
+
+class Sprung(Load):
+    """On a spring that swings with `frequency` rad/s where the first mass is held."""
+
+    def __init__(self, inertia, weight, share, frequency, ratio):
+        super().__init__(inertia, weight, share)
+        self.frequency, self.ratio = frequency, ratio
+
+    def begin(self, x, v):
+        return x + self.weight(x) / self.whole / self.frequency**2, v
+
+    def between(self, x, v, y, w):
+        return self.frequency**2 * (x - y) + 2 * self.ratio * self.frequency * (v - w)
+
+
+class Loose(Load):
+    """Behind a gap with flanks that take every knock and never pull."""
+
+    def __init__(self, inertia, weight, gap, share):
+        super().__init__(inertia, weight, share)
+        self.gap = gap
+
+    def begin(self, x, v):
+        return x, v
+
+    def between(self, x, v, y, w):
+        over = abs(x - y) - self.gap / 2
+        if over <= 0:
+            return 0.0
+        side = copysign(1.0, x - y)
+        damped = 600 * (v - w) * over / (over + self.gap / 100)
+        push = side * (1 - self.share) * (22500 * side * over + damped)
+        return side * max(push, 0.0)
+
+
+class Yielding:
+    """Dry friction whose surfaces give way over `deflection` first; its state is a share of it."""
+
+    inertia = 0.0
+
+    def __init__(self, inertia, weight, limit, deflection):
+        self.most, self.deflection = limit, deflection
+
+    def begin(self, x, v):
+        return 0.0, 0.0
+
+    def force(self, x, v, _, strain):
+        return -self.most * strain
+
+    def rates(self, x, v, _, strain):
+        speed = min(abs(v) / self.deflection, 400.0)
+        return 0.0, speed * (copysign(1.0, v) - strain)
+
+
+BEHIND = {"joint.flexibility": Sprung, "joint.backlash": Loose, "friction.hysteresis": Yielding}
 
 
 def _wave(c, cycles):
@@ -241,8 +328,10 @@ def move(world, scenario, number, instants):
     joint, until = Joint(world, number), float(instants[-1])
     names = ("q", "qd") if world.system == "pendulum" else ("x", "v")
     state = np.array([scenario.initial[name] for name in names])
+    hidden = [value for part in joint.behind for value in part.begin(*state)]
+    state = np.concatenate([state, hidden])
     out = np.empty((instants.size, 2))
-    out[instants <= 0] = state
+    out[instants <= 0] = state[:2]
     for piece in felt(scenario, world.effects, until):
         marks = [
             piece.begin,
@@ -264,7 +353,7 @@ def _through(joint, state, instants, out):
         reached, after, solution = _glide(joint, now, state)
         first, last = np.searchsorted(instants, [now, reached], side="right")
         if last > first:
-            out[first:last] = solution(instants[first:last]).T if solution else state
+            out[first:last] = solution(instants[first:last]).T[:, :2] if solution else state[:2]
         now, state = reached, after
     raise RuntimeError("it never gets through: too many standstills")
 
@@ -273,17 +362,17 @@ def _glide(joint, now, state: np.ndarray) -> tuple[float, np.ndarray, Callable |
     """Until the next standstill, breaking loose or the piece's end: when, the state there, the
     motion (None: none).
     """
-    (x, v), end = state, joint.piece.end
+    (x, v, *z), end = state, joint.piece.end
     way = copysign(1.0, v) if v else 0.0
     if joint.limits and v == 0.0:
-        pull = joint.pull(now, x, 0.0)
+        pull = joint.pull(now, x, 0.0, *z)
         if abs(pull) <= joint.limit(now, x, 0.0):
-            return _loose(joint, now, x), state, None
+            return _held(joint, now, state) if z else (_loose(joint, now, x), state, None)
         way = copysign(1.0, pull)
 
     def rate(t, y):
-        rubbing = way * joint.limit(t, *y) if joint.limits else 0.0
-        return y[1], (joint.pull(t, *y) - rubbing) / joint.inertia
+        rubbing = way * joint.limit(t, *y[:2]) if joint.limits else 0.0
+        return [y[1], (joint.pull(t, *y) - rubbing) / joint.inertia, *joint.rates(*y)]
 
     def turns(t, y):
         return way * y[1]
@@ -299,6 +388,22 @@ def _glide(joint, now, state: np.ndarray) -> tuple[float, np.ndarray, Callable |
     if joint.limits and solved.t_events[0].size:
         after[1] = 0.0
     return float(solved.t[-1]), after, solved.sol
+
+
+def _held(joint, now, state):
+    """Held by dry friction while what is behind moves on: until it breaks loose."""
+    end = joint.piece.end
+
+    def rate(t, y):
+        return [0.0, 0.0, *joint.rates(*y)]
+
+    def excess(t, y):
+        return abs(joint.pull(t, *y)) - joint.limit(t, *y[:2]) * (1 + 1e-9)
+
+    excess.terminal, excess.direction = True, 1
+    settings = {"dense_output": True, "max_step": 0.01, **TOLERANCES}
+    solved = solve_ivp(rate, (now, end), state, "RK45", events=excess, **settings)
+    return float(solved.t[-1]), solved.y[:, -1].copy(), solved.sol
 
 
 def _loose(joint, now, x):

@@ -139,8 +139,32 @@ def _slip(far, setting, rng):
     return lambda s: (sign * far * s, instant)
 
 
+def _flexibility(far, setting, rng):
+    """A load that swings from a few times a run to a fifth of the sampling rate."""
+    low, high = 2 * np.pi * 4 / setting.seconds, 2 * np.pi * min(0.2 * setting.rate, 40.0)
+    frequency = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    ratio = float(np.exp(rng.uniform(np.log(0.01), np.log(0.3))))
+    return lambda s: (min(far * s, 0.95), float(np.clip(frequency, 6, 300)), ratio)
+
+
+def _play(far, setting, rng):
+    """A gap that is a part of the way that it goes."""
+    share, travel = float(rng.uniform(0.2, 0.8)), float(np.median(_ranges(setting)))
+    return lambda s: (0.3 * travel * s, share)
+
+
+def _hysteresis(far, setting, rng):
+    """Surfaces that give way over a few hundredths of the way that it goes."""
+    travel = float(np.median(_ranges(setting)))
+    deflection = float(travel * np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
+    return lambda s: (far * s, deflection)
+
+
 SHAPES = {
     "sensor.slip": _slip,
+    "friction.hysteresis": _hysteresis,
+    "joint.backlash": _play,
+    "joint.flexibility": _flexibility,
     "friction.direction": _one_way,
     "friction.load_direction": _one_way,
     "friction.load_quadratic": _quadratic,

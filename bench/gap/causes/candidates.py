@@ -34,8 +34,12 @@ SMALL = 1e-4
 """Share of a plausible range at which a direction is first taken."""
 LEVELS = (0.15, 0.35, 0.6, 0.85, 0.95, 0.99)
 """Shares of the largest input at which limits, dead bands and plays are tried besides."""
-LIMITED = ("drive", "input/s", "level")
-"""What a coefficient limits of which every small size takes all away."""
+WAYS = (0.003, 0.01, 0.03, 0.1, 0.3)
+"""The same of how far a run goes, for gaps."""
+LIMITED = ("drive", "input/s", "level", "travel")
+"""What a coefficient is a part of where no small size is like a large one: a limit's takes all
+away, and in a gap nothing is passed on.
+"""
 RATES = (0.015, 0.05, 0.12, 0.3, 0.6, 0.9)
 """The same of what is largest for a moment alone: the rate of a command, the error of a servo."""
 NOTHING = 1e-11
@@ -122,9 +126,10 @@ def _first(world: World, name: str) -> Iterator[Probe]:
     count = len(parameters)
     scaling = [i for i in range(count) if i not in shaping]
     travel = world.travel_of(name)
-    grids = [_grid(world, parameters[i], travel) for i in shaping]
+    coefficients = world.effects[name].coefficients
+    grids = [_grid(world, parameters[i], coefficients[i].tried, travel) for i in shaping]
     group = 0
-    leading = world.effects[name].coefficients[0]
+    leading = coefficients[0]
     # Coefficients that scale at one point of the grid act together: a sine with its cosine.
     for point in product(*grids):
         # Of a limit of force or of a rate every small size takes all of it away.
@@ -144,23 +149,29 @@ def _first(world: World, name: str) -> Iterator[Probe]:
     least, _ = parameters[0].bounds
     # Of a limit no small size is like a large one: it is tried where the input reaches it.
     if leading.of in LIMITED or (leading.of in ("input", "error") and least == 0):
-        yield from _limits(world, name, group)
+        shapes = np.array(list(product(*grids)))
+        yield from _limits(world, name, group, shapes if shaping else None)
 
 
-def _limits(world: World, name: str, group: int) -> Iterator[Probe]:
-    """Limits, dead bands and plays of a size that the input reaches."""
+def _limits(world: World, name: str, group: int, shapes: Array | None) -> Iterator[Probe]:
+    """Limits, dead bands and plays of a size that the motion or the input reaches; where other
+    coefficients shape them, at each of these (n, k - 1) too.
+    """
     largest = _reach(world, name)
     if not largest.any():
         return
     # A servo's error is largest for a moment after a jump, as a command's rate is.
-    seldom = world.effects[name].coefficients[0].of in ("input/s", "error")
-    levels = RATES if seldom else LEVELS
-    for number, level in enumerate(levels, start=group):
+    seldom = {"input/s": RATES, "error": RATES, "travel": WAYS}
+    levels = seldom.get(world.effects[name].coefficients[0].of, LEVELS)
+    sizes = [level * largest for level in levels]
+    if shapes is not None:
+        sizes = [np.append(size, shape) for shape in shapes for size in sizes]
+    for number, c in enumerate(sizes, start=group):
         yield Probe(
             effect=name,
             group=number,
             place=0,
-            c=level * largest,
+            c=c,
             signed=False,
             fixed=True,
         )
@@ -174,6 +185,8 @@ def _reach(world: World, name: str) -> Array:
     if of == "drive" or (of == "level" and not _recorded(world, effect)):
         # How large a force gets is not recorded: what is plausible has to do.
         return np.array([p.bounds[1] for p in _parameters(world, name)])
+    if of == "travel":
+        return np.array([world.travel_of(name)])
     found = {"input/s": _fastest, "error": _farthest, "level": _fullest}
     most = found.get(of, _largest)
     return np.array([max(most(world, t, one) for t in world.tracks) for one in members])
@@ -229,8 +242,12 @@ def _parameters(world: World, name: str) -> Sequence[Parameter]:
     return effect_parameters(effect, system, world.channels)
 
 
-def _grid(world: World, parameter: Parameter, travel: float) -> Array:
-    """Sizes to try of a coefficient that shapes, where the position has this range in a run."""
+def _grid(world: World, parameter: Parameter, tried: tuple[float, ...], travel: float) -> Array:
+    """Sizes to try of a coefficient that shapes, where the position has this range in a run; those
+    `tried` of which it says so itself.
+    """
+    if tried:
+        return np.array(tried)
     low, high = parameter.bounds
     if parameter.unit == "Hz":
         # What comes and goes must do so once in a run, or any slow change would be periodic.

@@ -27,7 +27,11 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
     """
     effect = world.effects[name]
     coefficients = effect_parameters(effect, world.simulator.system, world.channels)
-    return [_bounds(coefficient, effect, world) for coefficient in coefficients]
+    most = [c.most for c in effect.coefficients]
+    return [
+        _bounds(coefficient, effect, world, limit)
+        for coefficient, limit in zip(coefficients, most, strict=False)
+    ]
 
 
 def is_instant(coefficient: Parameter) -> bool:
@@ -35,7 +39,9 @@ def is_instant(coefficient: Parameter) -> bool:
     return coefficient.name.endswith(".instant")
 
 
-def _bounds(coefficient: Parameter, effect: Effect, world: World) -> tuple[float, float]:
+def _bounds(
+    coefficient: Parameter, effect: Effect, world: World, most: float | None
+) -> tuple[float, float]:
     """Of one coefficient."""
     low, high = coefficient.bounds
     longest = world.longest
@@ -50,5 +56,5 @@ def _bounds(coefficient: Parameter, effect: Effect, world: World) -> tuple[float
     beyond = DRY if isinstance(effect, Friction) else BEYOND
     # a size whose sign is part of what the effect is
     if low == 0:
-        return 0.0, beyond * high
+        return 0.0, most or beyond * high
     return beyond * low, beyond * high

@@ -18,6 +18,7 @@ from bench.gap.model.tracks import Track, first_of, tracked
 from bench.gap.model.watch import Watch
 from sims import effects as library
 from sims.base import Array, InputError, Parameter, Scenario, unknown
+from sims.engines import HIDING
 from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 from sims.system import Effect, Input, Sensor
@@ -117,7 +118,11 @@ class World:
         usable = library.library(kind.system)
         recorded = {*self.runs[0].channels, *(c.name for c in kind.inputs)}
         # an effect on a channel that nobody recorded shows nowhere
-        shown = [name for name, effect in usable.items() if _shows(effect, recorded)]
+        shown = [
+            name
+            for name, effect in usable.items()
+            if _shows(effect, recorded) and (effect.hook != "hidden" or engine in HIDING)
+        ]
         self.library = shown if candidates is None else list(candidates)
         self.simulator, self._fine = self._simulators()
 

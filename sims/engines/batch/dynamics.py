@@ -43,6 +43,8 @@ class Dynamics:
         self.rubs: list[Array] = []
         self.excess = (np.zeros((shape[0], 1)),) * 2
         self._any_rests = False
+        self._guided = field.guided
+        self._along_guide = np.arange(shape[1]) < field.guided
 
     def begin(self, t: Array, x: Array, v: Array) -> Array:
         """(L, D) acceleration at the beginning of a step; decides what sticks and which way the
@@ -52,8 +54,8 @@ class Dynamics:
         if not self.field.dry:
             return pull / self.field.mass
         limit = self.field.limit(t, x, v)
-        size = length(pull)
-        speed = length(v)
+        size = self.size(pull)
+        speed = self.size(v)
         still = speed == 0
         excess = size - limit
         self.excess = (excess, excess)
@@ -63,6 +65,8 @@ class Dynamics:
         # either has no direction, and must not divide by zero.
         pulled = np.where(size > 0, size, 1.0)
         self.way = np.where(still, pull, v) / np.where(still, pulled, speed)
+        if self._guided < v.shape[1]:
+            self.way = np.where(self._along_guide, self.way, 0.0)
         return self._rubbed(pull, limit, self.way)
 
     def during(self, t: Array, x: Array, v: Array) -> Array:
@@ -71,8 +75,14 @@ class Dynamics:
         if not self.field.dry:
             return pull / self.field.mass
         limit = self.field.limit(t, x, v)
-        self.excess = (self.excess[0], length(pull) - limit)
+        self.excess = (self.excess[0], self.size(pull) - limit)
         return self._rubbed(pull, limit, self._along(v))
+
+    def halted(self, v: Array, faint: Array) -> Array:
+        """Velocities v (n, D) with none along the guide where it is no larger than `faint`
+        (n, 1).
+        """
+        return np.where((self.size(v) <= faint) & self._along_guide, 0.0, v)
 
     def lay(self, lanes: Indices) -> None:
         """These lanes (n,) rest on the ground from now on."""
@@ -97,7 +107,7 @@ class Dynamics:
 
     def _along(self, v: Array) -> Array:
         """Directions of v, turned to the side of the direction at the beginning."""
-        if v.shape[1] == 1:
+        if self._guided == 1:
             return self.way
         # In a plane the direction may turn within the step, but not over to the other side: that
         # is a reversal, which the step is cut for.
@@ -112,8 +122,12 @@ class Dynamics:
         friction = limit * way
         self.rubs.append(friction)  # four a step, from which it is told how friction bends
         slipping = (pull - friction) / self.field.mass
-        result: Array = np.where(self.sticks, 0.0, slipping)
+        result: Array = np.where(self.sticks & self._along_guide, 0.0, slipping)
         return result
+
+    def size(self, v: Array) -> Array:
+        """(n, 1) magnitudes along the guide."""
+        return length(v[:, : self._guided])
 
 
 def dot(a: Array, b: Array) -> Array:

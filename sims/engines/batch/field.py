@@ -68,8 +68,9 @@ class Field:
 
     Attributes:
         mass: (L, 1) generalised inertia.
+        guided: how many coordinates, the first ones, dry friction acts on.
         rubs: (L, 1) in which lanes dry friction acts.
-        pushed: (L, 1) in which lanes other forces of effects act.
+        pushed: (L, 1) in which lanes other forces act that may bend sharply.
     """
 
     def __init__(self, lanes: Lanes) -> None:
@@ -79,12 +80,13 @@ class Field:
             lanes.system, lanes.theta, lanes.constants, start_time, lanes.x, lanes.v
         )
         self.mass = lanes.system.mass(lanes.theta, lanes.constants)
+        self.guided = lanes.system.guided or lanes.x.shape[1]
         self._none = np.zeros_like(self.mass)
         shares = _shares(lanes)
         # With the effect beside its share: so much is known of which hook it has.
         self._forces = [(s, s.effect) for s in shares if isinstance(s.effect, Force)]
         self._frictions = [(s, s.effect) for s in shares if isinstance(s.effect, Friction)]
-        self.pushed = _where(self._forces, len(lanes.x))
+        self.pushed = _where(self._forces, len(lanes.x)) | lanes.system.bends
         self.rubs = _where(self._frictions, len(lanes.x))
         self.feel({name: values[:, :1] for name, values in lanes.inputs.items()})
         # What is the same everywhere and always is asked for once and not at every instant.

@@ -41,7 +41,7 @@ def divisions(lanes: Lanes, field: Field, spans: Array, turn: float = TURN) -> A
     An oscillation then turns by `turn` radians in each at most, and decay is held to a share in
     proportion.
     """
-    parts = np.ones_like(spans)
+    parts = np.maximum(np.ceil(lanes.system.fastest * spans / turn), 1.0)
     for inputs in _instants(lanes):
         field.feel(inputs)
         for x, v in ((lanes.x, lanes.v), (0.0 * lanes.x, 0.0 * lanes.v)):

@@ -95,6 +95,9 @@ class Stepping:
         self._v[...] = lanes.v
         shared = lanes.steps.strides[0] == 0
         self._planned = np.count_nonzero(lanes.steps[:1] if shared else lanes.steps, axis=1)
+        if lanes.system.bends:
+            # What swings behind the system is stepped as finely as that takes, and waited for.
+            self._planned = self._planned * parts[:, 0]
         self._taken = np.zeros(count)
         # A hair longer than the part, so that rounding does not leave a crumb behind the last one.
         self._longest = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
@@ -387,8 +390,8 @@ class Stepping:
         v = v + late * a
         v = v - way * dot(v, way)
         # Exactly zero, not nearly: only a lane of no speed at all can stick.
-        faint = STILL * length(a) * self._longest[i]
-        self._v[i] = np.where(length(v) <= faint, 0.0, v)
+        faint = STILL * self._dynamics.size(a) * self._longest[i]
+        self._v[i] = self._dynamics.halted(v, faint)
 
     def _start_on(self, ground: Ground) -> None:
         """Lift lanes that start in the ground onto it; throw back or lay to rest those that do not

@@ -16,6 +16,7 @@ from sims.engines.compiled.kinds import (
     DIMENSIONS,
     DRY,
     F1,
+    GUIDED,
     IN_T,
     IN_V,
     IN_X,
@@ -60,11 +61,12 @@ def begin(program: Program, block: Block, w: int) -> None:
     a = block.a
     r = block.r
     limits = program.rows[OUT_LIMIT]
+    guided = program.flags[GUIDED]
     for i in range(w):
         limit = r[limits, i]
         pulled(program, block, i, K1)
-        size = length(a, K1, d, i)
-        speed = length(a, V, d, i)
+        size = length(a, K1, guided, i)
+        speed = length(a, V, guided, i)
         a[BEFORE, i] = size - limit
         a[AFTER, i] = size - limit
         still = speed == 0.0
@@ -74,13 +76,14 @@ def begin(program: Program, block: Block, w: int) -> None:
         divisor = speed
         if still:
             divisor = size if size > 0.0 else 1.0
-        for k in range(d):
+        for k in range(guided):
             pull = a[K1 + k, i]
             way = (pull if still else a[V + k, i]) / divisor
             rub = limit * way
             a[WAY + k, i] = way
             a[F1 + k, i] = rub
             a[K1 + k, i] = 0.0 if sticks else (pull - rub) / a[MASS, i]
+        unguided(program, block, i, K1, F1)
 
 
 def begin_on_a_line(program: Program, block: Block, w: int) -> None:
@@ -142,29 +145,39 @@ def during_on_a_line(program: Program, block: Block, w: int, to: int, rub_to: in
 def in_space(program: Program, block: Block, i: int, to: int, rub_to: int) -> None:
     """`during` for a lane of several coordinates."""
     a = block.a
-    d = program.flags[DIMENSIONS]
+    guided = program.flags[GUIDED]
     velocity = program.rows[IN_V]
     limit = block.r[program.rows[OUT_LIMIT], i]
     pulled(program, block, i, to)
-    a[AFTER, i] = length(a, to, d, i) - limit
+    a[AFTER, i] = length(a, to, guided, i) - limit
     # The direction may turn within the step, but not over to the other side: that is a reversal,
     # which the step is cut for.
     square = 0.0
-    for k in range(d):
+    for k in range(guided):
         square += block.r[velocity + k, i] * block.r[velocity + k, i]
     speed = np.sqrt(square)
     along = 0.0
-    for k in range(d):
+    for k in range(guided):
         way = a[WAY + k, i]
         unit = block.r[velocity + k, i] / speed if speed > 0.0 else way
         a[rub_to + k, i] = unit
         along += unit * way
     side = -1.0 if along < 0.0 else 1.0
-    for k in range(d):
+    for k in range(guided):
         rub = limit * (a[rub_to + k, i] * side)
         a[rub_to + k, i] = rub
         slips = (a[to + k, i] - rub) / a[MASS, i]
         a[to + k, i] = 0.0 if block.n[STICKS, i] != 0 else slips
+    unguided(program, block, i, to, rub_to)
+
+
+def unguided(program: Program, block: Block, i: int, to: int, rub_to: int) -> None:
+    """Accelerations of the coordinates that dry friction does not act on, from the forces."""
+    a = block.a
+    for k in range(program.flags[GUIDED], program.flags[DIMENSIONS]):
+        a[WAY + k, i] = 0.0
+        a[rub_to + k, i] = 0.0
+        a[to + k, i] = a[to + k, i] / a[MASS, i]
 
 
 def pulled(program: Program, block: Block, i: int, to: int) -> None:

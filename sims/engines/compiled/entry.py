@@ -57,7 +57,7 @@ def integrate(
         carray(ends_at, (4,)),
         carray(rows_at, (11,)),
         carray(out_at, (d,)),
-        carray(flags_at, (4,)),
+        carray(flags_at, (5,)),
     )
     work = Work(
         carray(order_at, (chosen,)),

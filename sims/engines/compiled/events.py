@@ -23,6 +23,7 @@ from sims.engines.compiled.kinds import (
     F4,
     FLOOR,
     GOAL,
+    GUIDED,
     IMPACT,
     IN_E,
     IN_MU,
@@ -295,6 +296,7 @@ def stop(program: Program, block: Block, i: int) -> None:
     for k in range(d):
         a[V + k, i] -= a[WAY + k, i] * along
     # Exactly zero, not nearly: only a lane of no speed at all can stick.
-    if length(a, V, d, i) <= STILL * length(a, K4, d, i) * a[LONGEST, i]:
-        for k in range(d):
+    guided = program.flags[GUIDED]
+    if length(a, V, guided, i) <= STILL * length(a, K4, guided, i) * a[LONGEST, i]:
+        for k in range(guided):
             a[V + k, i] = 0.0

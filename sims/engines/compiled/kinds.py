@@ -29,7 +29,8 @@ class Program(NamedTuple):
             speed going in; of dry friction's limit, restitution and friction of
             the ground coming out.
         out: (D,) registers of the force.
-        flags: dimensions D; whether dry friction acts, forces of effects act, it bounces.
+        flags: dimensions D; whether dry friction acts, forces of effects act, it bounces; how many
+            coordinates, the first ones, dry friction acts on.
     """
 
     code: Table
@@ -90,7 +91,7 @@ class Block(NamedTuple):
 # Entries of `Program.rows`.
 IN_T, IN_X, IN_V, IN_U, IN_P, IN_E, IN_MU, IN_SPEED, OUT_LIMIT, OUT_E, OUT_MU = range(11)
 # Entries of `Program.flags`.
-DIMENSIONS, DRY, PUSHED, BOUNCES = range(4)
+DIMENSIONS, DRY, PUSHED, BOUNCES, GUIDED = range(5)
 # Rows of `Work.ground`.
 FLOOR, RESTITUTION, RUBBING, LEAST = range(4)
 # Rows of `Block.a`: one of each for a slot; then of each vector the first of LARGEST.
@@ -144,7 +145,7 @@ def check(
     rows = program.rows
     whole = [
         *((program.code, (len(program.code), 5)), (program.ends, (4,)), (rows, (11,))),
-        *((program.out, (d,)), (program.flags, (4,))),
+        *((program.out, (d,)), (program.flags, (5,))),
         *((work.order, (chosen,)), (block.n, (WHOLE, WIDTH))),
     ]
     real = [

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.engines.compiled.graph import CODES, IMPACT, LANE, MOMENT, Graph, Node
-from sims.engines.compiled.kinds import DRY, LARGEST, WIDTH, Block, Numbers, Program, room
+from sims.engines.compiled.kinds import DRY, GUIDED, LARGEST, WIDTH, Block, Numbers, Program, room
 from sims.engines.compiled.nodes import UntracedError, constants
 from sims.engines.compiled.traced import Traced
 from sims.system import Contact, Effect, Force, Friction, Moment, System
@@ -41,7 +41,7 @@ class Model(NamedTuple):
     @property
     def is_smooth(self) -> bool:
         """Whether nothing can happen to a lane within a step."""
-        return not self.program.flags[DRY:].any()
+        return not self.program.flags[DRY:GUIDED].any()
 
     def room(self) -> Block:
         """Room to run it in."""
@@ -88,6 +88,8 @@ class Tracing:
         graph = Graph()
         self.graph = graph
         self.bounces = system.bounces
+        self.bends = system.bends
+        self.guided = system.guided or names.coordinates
         self.t = _vector(graph, 1, MOMENT)
         self.x = _vector(graph, names.coordinates, MOMENT)
         self.v = _vector(graph, names.coordinates, MOMENT)
@@ -161,7 +163,7 @@ class Tracing:
             force=_nodes(force),
             limit=[] if limit is None else _nodes(limit),
             impact=_nodes(e, mu),
-            flags=[self._shape[1], has[0], has[1], self.bounces],
+            flags=[self._shape[1], has[0], has[1] or self.bends, self.bounces, self.guided],
         )
 
     def _shaped(self, values: Any, shape: tuple[int, int]) -> Traced:

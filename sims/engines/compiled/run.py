@@ -9,6 +9,7 @@ import numpy as np
 
 from sims.base import Array
 from sims.engines.batch.field import acts
+from sims.engines.batch.pace import DIVISIONS
 from sims.engines.compiled import known
 from sims.engines.compiled.kinds import WIDTH, Work
 from sims.engines.compiled.machine import Machine
@@ -53,7 +54,8 @@ class _Job:
         self._ground = _ground(lanes)
         records = self._steps.shape[1] // lanes.every + 1
         self._kept = np.empty((count, records, 3 * dimensions))
-        self._parts = ones
+        hidden = np.ceil(lanes.system.fastest * self._spans / turn)
+        self._parts = np.clip(hidden, 1.0, DIVISIONS)
         self._longest = np.empty(count)
         self._x = np.ascontiguousarray(lanes.x, dtype=np.float64)
         self._v = np.ascontiguousarray(lanes.v, dtype=np.float64)
@@ -94,6 +96,9 @@ class _Job:
         )
         parts = self._parts[chosen]
         spans = self._spans[chosen]
+        if lanes.system.bends:
+            # What swings behind the system is stepped as finely as that takes, and waited for.
+            self._planned[chosen] *= parts
         # A hair longer than the part, so that rounding does not leave a crumb behind the last one.
         self._longest[chosen] = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
         # Those that need many steps first: the others fill the slots beside them.

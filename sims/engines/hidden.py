@@ -1,0 +1,211 @@
+"""Lanes on which effects with states of their own act: the system with as many coordinates more.
+
+A hidden coordinate beside those of the system lets any engine of several coordinates integrate an
+effect's state. The enlarged system counts force by the inertia that is left to its own coordinates,
+
+    M' = M (1 - sum of the shares behind)                                  (1)
+
+so that what acts on them needs no change, and a hidden rate r is written as the force M' r. Dry
+friction keeps to the system's own coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from sims.base import Array
+from sims.engines.batch.parts import joined, take
+from sims.system import (
+    Effect,
+    Engine,
+    Force,
+    Friction,
+    Hidden,
+    Lanes,
+    Moment,
+    Motion,
+    State,
+    System,
+)
+
+
+class Enlarged(System):
+    """A system with hidden coordinates behind its own; `enlarged` makes one.
+
+    Its parameters are those of the system, then the coefficients of the effects.
+
+    Attributes:
+        inner: the system.
+        effects: those with a state, each with one coordinate.
+    """
+
+    inner: ClassVar[System]
+    effects: ClassVar[tuple[Hidden, ...]]
+
+    @classmethod
+    def plain(cls, moment: Moment) -> Moment:
+        """The moment as it is without hidden coordinates."""
+        own = len(cls.inner.coordinates)
+        theta = moment.theta[:, : len(cls.inner.parameters)]
+        x, v = moment.x[:, :own], moment.v[:, :own]
+        return replace(moment, system=cls.inner, theta=theta, x=x, v=v)
+
+    @classmethod
+    def coefficients_of(cls, theta: Array) -> list[Array]:
+        """Each effect's coefficients (K, L, 1)."""
+        found = []
+        place = len(cls.inner.parameters)
+        for effect in cls.effects:
+            count = len(effect.coefficients)
+            found.append(theta[:, place : place + count].T[:, :, None])
+            place += count
+        return found
+
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+        """(L, 1) inertia of the system's own coordinates."""
+        whole = self.inner.mass(theta[:, : len(self.inner.parameters)], constants)
+        pairs = zip(self.effects, self.coefficients_of(theta), strict=True)
+        left = np.ones_like(whole)
+        for effect, c in pairs:
+            left = left - effect.behind(c)
+        return whole * left  # (1)
+
+    def weight(self, moment: Moment) -> Array:
+        """(L, D) of the system."""
+        return padded(self.inner.weight(self.plain(moment)), moment)
+
+    def force(self, moment: Moment) -> Array:
+        """(L, D) of the system and the effects, on all coordinates."""
+        plain = self.plain(moment)
+        own = len(self.inner.coordinates)
+        total = self.inner.force(plain)
+        inertia = self.mass(moment.theta, moment.constants)
+        rates = []
+        for k, c in enumerate(self.coefficients_of(moment.theta)):
+            place = slice(own + k, own + k + 1)
+            state = State(moment.x[:, place], moment.v[:, place])
+            force, rate = self.effects[k].act(c, plain, state)
+            total = total + force
+            rates.append(inertia * rate)
+        return np.concatenate([total, *rates], axis=1)
+
+    def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
+        """(L, D) of the system."""
+        return padded(self.inner.push(self.plain(moment), axis), moment)
+
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
+        """What the system's sensors show."""
+        own = len(self.inner.coordinates)
+        return self.inner.observe(x[:, :, :own], v[:, :, :own], a[:, :, :own], constants)
+
+
+class _Pushes(Force):
+    """A force on the system's own coordinates; `_acting` makes one."""
+
+    inner: ClassVar[Force]
+
+    def force(self, c: Array, moment: Moment) -> Array:
+        """As without hidden coordinates."""
+        return padded(self.inner.force(c, _plain(moment)), moment)
+
+
+class _Rubs(Friction):
+    """Dry friction on the system's own coordinates; `_acting` makes one."""
+
+    inner: ClassVar[Friction]
+
+    def limit(self, c: Array, moment: Moment) -> Array:
+        """As without hidden coordinates."""
+        return self.inner.limit(c, _plain(moment))
+
+
+def integrate(engine: Engine, lanes: Lanes) -> Motion:
+    """The motion of lanes, on some of which effects with states may act."""
+    hidden = [(e, c) for e, c in lanes.effects if isinstance(e, Hidden)]
+    if not hidden:
+        return engine.integrate(lanes)
+    others = tuple((e, c) for e, c in lanes.effects if not isinstance(e, Hidden))
+    on = np.array([c[0, :, 0] > 0 for _, c in hidden]).T
+    motions = []
+    for pattern in np.unique(on, axis=0):
+        members = np.flatnonzero((on == pattern).all(axis=1))
+        there = [pair for pair, is_on in zip(hidden, pattern, strict=True) if is_on]
+        part = take(replace(lanes, effects=others), members)
+        effects = [(e, c[:, members]) for e, c in there]
+        motion = engine.integrate(_enlarged(part, effects) if there else part)
+        own = lanes.x.shape[1]
+        parts = (values[:, :, :own] for values in (motion.x, motion.v, motion.a))
+        motions.append((members, Motion(*parts)))
+    return joined(motions, lanes)
+
+
+def _enlarged(lanes: Lanes, effects: Sequence[tuple[Hidden, Array]]) -> Lanes:
+    """The same lanes of the enlarged system."""
+    kinds = tuple(type(effect) for effect, _ in effects)
+    system = enlarged(type(lanes.system), kinds)()
+    inputs = {name: values[:, :1] for name, values in lanes.inputs.items()}
+    start = np.zeros((len(lanes.x), 1))
+    at = Moment(lanes.system, lanes.theta, lanes.constants, start, lanes.x, lanes.v, inputs)
+    states = [effect.begin(c, at) for effect, c in effects]
+    return replace(
+        lanes,
+        system=system,
+        theta=np.concatenate([lanes.theta, *(c[:, :, 0].T for _, c in effects)], axis=1),
+        x=np.concatenate([lanes.x, *(state.x for state in states)], axis=1),
+        v=np.concatenate([lanes.v, *(state.v for state in states)], axis=1),
+        effects=tuple((_acting(type(effect))(), c) for effect, c in lanes.effects),
+    )
+
+
+@cache
+def enlarged(system: type[System], effects: tuple[type[Hidden], ...]) -> type[Enlarged]:
+    """A system with a hidden coordinate for each of these effects."""
+    names = [effect.name for effect in effects]
+    declared: dict[str, Any] = {
+        "inner": system(),
+        "effects": tuple(effect() for effect in effects),
+        "name": f"{system.name} with {' and '.join(names)}",
+        "kind": system.kind,
+        "parameters": system.parameters,
+        "constants": system.constants,
+        "inputs": system.inputs,
+        "channels": system.channels,
+        "coordinates": (*system.coordinates, *names),
+        "rates": (*system.rates, *(f"rate of {name}" for name in names)),
+        "states": system.states,
+        "sensed": system.sensed,
+        "primary": system.primary,
+        "servo": system.servo,
+        "bends": True,
+        "fastest": max(effect.fastest for effect in effects),
+        "guided": len(system.coordinates),
+    }
+    return type("EnlargedSystem", (Enlarged,), declared)
+
+
+@cache
+def _acting(effect: type[Effect]) -> type[Effect]:
+    """An effect on the system's own coordinates, for the enlarged system."""
+    if not issubclass(effect, (Force, Friction)):
+        return effect
+    base = _Pushes if issubclass(effect, Force) else _Rubs
+    declared = {"name": effect.name, "coefficients": effect.coefficients, "inner": effect()}
+    return type("PlainEffect", (base,), {**declared, "says": effect.says})
+
+
+def _plain(moment: Moment) -> Moment:
+    assert isinstance(moment.system, Enlarged)
+    return moment.system.plain(moment)
+
+
+def padded(force: Array, moment: Moment) -> Array:
+    """(L, D) with nothing on the hidden coordinates of the moment."""
+    nothing = np.zeros_like(moment.x[:, force.shape[1] :])
+    return np.concatenate([force, nothing], axis=1)
