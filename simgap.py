@@ -61,11 +61,13 @@ _WHERE = {
         "Effect",
         "Force",
         "Friction",
+        "Hidden",
         "Input",
         "Level",
         "Moment",
         "Sensor",
         "Signal",
+        "State",
         "System",
     ),
 }

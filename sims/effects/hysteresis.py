@@ -23,6 +23,10 @@ _SMALLEST = 1e-9
 """m or rad; the deflection that stands for none, by which nothing can be divided."""
 _WAY = ((2e-4, 0.05), (2e-4, 0.05), (1e-3, 0.3))
 """Plausible deflections before surfaces slide, m or rad."""
+_DAHL = (
+    Coefficient("coulomb", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),
+    Coefficient("deflection", ("m", "m", "rad"), _WAY),
+)
 
 
 class Hysteresis(Hidden):
@@ -33,10 +37,7 @@ class Hysteresis(Hidden):
     says = "friction builds up over a small way after each reversal, and gives that way back"
     source = "P. R. Dahl, AIAA Journal 14(12), 1675 (1976), doi:10.2514/3.61511"
     needs, contains = "joint", ("friction.coulomb",)
-    coefficients = (
-        Coefficient("coulomb", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),
-        Coefficient("deflection", ("m", "m", "rad"), _WAY),
-    )
+    coefficients = _DAHL
 
     def act(self, c: Array, moment: Moment, state: State) -> tuple[Array, Array]:
         """Against the way that it has come."""

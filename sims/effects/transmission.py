@@ -18,7 +18,9 @@ The rest of the library acts on x, where the drive does.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -46,69 +48,83 @@ _RATIO = ((0.005, 1), (0.005, 1), (0.005, 1))
 """Plausible damping ratios."""
 _GAP = ((0, 0.02), (0, 0.02), (0, 0.1))
 """Plausible gaps, m or rad."""
+_SPRUNG = (
+    Coefficient("share", _PURE, _ANY_SHARE, most=_MOST),
+    Coefficient("frequency", ("rad/s", "rad/s", "rad/s"), _SWING),
+    Coefficient("damping", _PURE, _RATIO, tried=(0.03, 0.3)),
+)
+_GAPPED = (
+    Coefficient("gap", ("m", "m", "rad"), _GAP, of="travel"),
+    Coefficient("share", _PURE, _SOME_SHARE, tried=(0.2, 0.5, 0.8)),
+)
 
 
-class Flexibility(Hidden):
-    """A spring with a damper between the drive and what it carries."""
+class Carried(Hidden):
+    """Something behind the drive that has a motion of its own.
 
-    name = "joint.flexibility"
-    noun = "a flexible transmission"
-    says = "what the drive carries hangs on it by a spring, and swings"
-    source = _ELASTIC
-    coefficients = (
-        Coefficient("share", _PURE, _ANY_SHARE, most=_MOST),
-        Coefficient("frequency", ("rad/s", "rad/s", "rad/s"), _SWING),
-        Coefficient("damping", _PURE, _RATIO, tried=(0.03, 0.3)),
-    )
+    Attributes:
+        share: which coefficient is the share of the inertia that it has.
+    """
+
+    share: ClassVar[int] = 0
 
     def behind(self, c: Array) -> Array:
-        """As said."""
-        return np.clip(c[0], 0.0, _MOST)
+        """As the coefficient says."""
+        return np.clip(c[self.share], 0.0, _MOST)
 
     def begin(self, c: Array, moment: Moment) -> State:
-        """Hanging still on the spring, as far away as its weight draws it."""
-        sag = _fall(moment, moment.primary) / (c[1] * c[1])
-        return State(moment.primary + sag, moment.v[:, :1])
+        """Going along with the drive, as far away as the weight draws it."""
+        away = self.hangs(c, _fall(moment, moment.primary))
+        return State(moment.primary + away, moment.v[:, :1])
 
     def act(self, c: Array, moment: Moment, state: State) -> tuple[Array, Array]:
-        """The spring's, to either side."""
-        pull = c[1] * c[1] * (moment.primary - state.x)
-        damp = 2.0 * c[2] * c[1] * (moment.v[:, :1] - state.v)
-        return _two_masses(moment, state, pull + damp, self.behind(c))  # (3)
+        """What the drive's side feels (L, D) and the acceleration (L, 1) of the other one."""
+        pull, share = self.pull(c, moment, state), self.behind(c)
+        # What is behind takes its share of the weight along.
+        near = -share * moment.inertia * (pull + _fall(moment, moment.primary))  # (1)
+        return moment.along_primary(near), pull + _fall(moment, state.x)  # (2)
+
+    def hangs(self, c: Array, fall: Array) -> Array:
+        """(L, 1) how far from the drive it rests where gravity would accelerate it by `fall`."""
+        return 0.0 * c[0] * fall
+
+    @abstractmethod
+    def pull(self, c: Array, moment: Moment, state: State) -> Array:
+        """(L, 1) force in between for each unit of inertia behind."""
 
 
-class Play(Hidden):
+class Flexibility(Carried):
+    """A spring with a damper between the drive and what it carries."""
+
+    name, noun = "joint.flexibility", "a flexible transmission"
+    says = "what the drive carries hangs on it by a spring, and swings"
+    source, coefficients = _ELASTIC, _SPRUNG
+
+    def hangs(self, c: Array, fall: Array) -> Array:
+        """As far as its spring gives."""
+        return fall / (c[1] * c[1])
+
+    def pull(self, c: Array, moment: Moment, state: State) -> Array:
+        """The spring's and the damper's."""
+        damped = 2.0 * c[2] * (moment.v[:, :1] - state.v)
+        return c[1] * (c[1] * (moment.primary - state.x) + damped)  # (3)
+
+
+class Play(Carried):
     """A gap between the drive and what it carries: between its flanks nothing is passed on."""
 
-    name = "joint.backlash"
-    noun = "play in the transmission"
+    name, noun = "joint.backlash", "play in the transmission"
     says = "there is a gap between the drive and what it carries, which knocks from flank to flank"
-    source = _PLAY
-    fastest = CONTACT
-    coefficients = (
-        Coefficient("gap", ("m", "m", "rad"), _GAP, of="travel"),
-        Coefficient("share", _PURE, _SOME_SHARE, tried=(0.2, 0.5, 0.8)),
-    )
+    source, coefficients, share, fastest = _PLAY, _GAPPED, 1, CONTACT
 
-    def behind(self, c: Array) -> Array:
-        """As said."""
-        return np.clip(c[1], 0.0, _MOST)
-
-    def begin(self, c: Array, moment: Moment) -> State:  # noqa: ARG002
-        """In the middle of the gap."""
-        return State(moment.primary, moment.v[:, :1])
-
-    def act(self, c: Array, moment: Moment, state: State) -> tuple[Array, Array]:
-        """The flanks'."""
+    def pull(self, c: Array, moment: Moment, state: State) -> Array:
+        """The flanks'; damped as far as they are pressed in, so that no force jumps."""
         apart = moment.primary - state.x
         beyond = apart - np.clip(apart, -0.5 * c[0], 0.5 * c[0])
-        # Damped as far as a flank is pressed in, so that the force does not jump where it is met.
         pressed = np.abs(beyond) / (np.abs(beyond) + SOFT * c[0])
-        rate = pressed * (moment.v[:, :1] - state.v)
-        share = self.behind(c)
-        pull = (1.0 - share) * CONTACT * (CONTACT * beyond + 4.0 * rate)  # (4)
-        pull = np.where(beyond > 0, np.maximum(pull, 0.0), np.minimum(pull, 0.0))
-        return _two_masses(moment, state, pull, share)
+        push = CONTACT * beyond + 4.0 * pressed * (moment.v[:, :1] - state.v)
+        pull = (1.0 - self.behind(c)) * CONTACT * push  # (4)
+        return np.where(beyond > 0, np.maximum(pull, 0.0), np.minimum(pull, 0.0))
 
 
 def _fall(moment: Moment, y: Array) -> Array:
@@ -117,12 +133,3 @@ def _fall(moment: Moment, y: Array) -> Array:
     weight = moment.system.weight(there)[:, moment.system.primary, None]
     fall: Array = weight / moment.inertia
     return fall
-
-
-def _two_masses(moment: Moment, state: State, pull: Array, share: Array) -> tuple[Array, Array]:
-    """What the drive's side feels (L, D) and the acceleration (L, 1) of the other one, where the
-    force in between is `pull` (L, 1) for each unit of inertia behind.
-    """
-    # What is behind takes its share of the weight along.
-    near = -share * moment.inertia * (pull + _fall(moment, moment.primary))  # (1)
-    return moment.along_primary(near), pull + _fall(moment, state.x)  # (2)

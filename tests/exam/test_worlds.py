@@ -80,6 +80,7 @@ TOGETHER = [
             "clock.skew": (0.01,),
         },
     ),
+    ("slider", {"friction.coulomb": (0.6,), "joint.flexibility": (0.5, 20.0, 0.05)}),
     (
         "slider",
         {"friction.coulomb": (0.6,), "force.periodic": (0.5, 0.5, 0.6), "input.lag": (0.1,)},

@@ -34,6 +34,7 @@ COEFFICIENTS = {
     "force.ripple": (None, (0.4, 0.2, 0.3), (0.02, 0.01, 0.5)),
     "friction.coulomb": (None, 0.7, 0.015),
     "friction.direction": (None, (0.2, 0.6), (1e-3, 3e-3)),
+    "friction.hysteresis": (None, (0.7, 0.02), (0.015, 0.1)),
     "friction.load": (None, 0.2, 0.1),
     "friction.load_direction": (None, None, (0.2, 0.05)),
     "friction.load_quadratic": (None, None, (0.05, 1.0)),
@@ -51,6 +52,8 @@ COEFFICIENTS = {
     "input.power": (None, (-0.3, 0.5), (2.0, 0.5)),
     "input.rate": (None, 8.0, 0.4),
     "input.saturation": (None, 1.5, 0.05),
+    "joint.backlash": (None, (0.02, 0.4), (0.02, 0.4)),
+    "joint.flexibility": (None, (0.3, 30.0, 0.1), (0.3, 30.0, 0.1)),
     "lift.magnus": ((0.3, 0.1), None, None),
     "restitution.speed": (-0.15, None, None),
     "sensor.bias": (0.05, 0.05, 0.05),
@@ -87,6 +90,11 @@ def scenario(system):
 def has(system, effect):
     """Whether the system can have the effect."""
     return effect in effects.library(SIMULATORS[system].system)
+
+
+def carried(effect):
+    """Whether engines of one coordinate can have the effect."""
+    return effects.get(effect).hook != "hidden"
 
 
 def coefficients(system, effect):
@@ -141,7 +149,7 @@ def effects_table():
     for effect in effects.names():
         cells = []
         for system in SIMULATORS:
-            if not has(system, effect):
+            if not has(system, effect) or not carried(effect):
                 cells.append("–")
                 continue
             fixed = {effect: coefficients(system, effect)}

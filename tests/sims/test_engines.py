@@ -25,6 +25,7 @@ from tests.sims.agreement import (
     STEPS,
     THETA,
     apart,
+    carried,
     coefficients,
     has,
     motion,
@@ -39,7 +40,10 @@ TOLERANCE = {"ball": 1.5e-4, "pendulum": 1e-3, "slider": 5e-6, "servo": 1.6e-4}
 LAGGED = {"ball": 5e-3}
 
 CASES = [
-    (system, effect) for effect in COEFFICIENTS for system in SIMULATORS if has(system, effect)
+    (system, effect)
+    for effect in COEFFICIENTS
+    for system in SIMULATORS
+    if has(system, effect) and carried(effect)
 ]
 BUILDS = [(system, engine, {}) for system in SIMULATORS for engine in OTHERS]
 BUILDS += [("ball", engine, {"native_contact": True}) for engine in OTHERS]

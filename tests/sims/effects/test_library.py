@@ -14,7 +14,7 @@ from sims import effects
 from sims.base import InputError
 from sims.effects.table import table
 from sims.simulated import effect_parameters
-from sims.system import KINDS, Contact, Force, Friction, Input, Level, Sensor, Signal
+from sims.system import KINDS, Contact, Force, Friction, Hidden, Input, Level, Sensor, Signal
 from tests.sims.effects.worlds import NAMES, PAIRS, SIMULATORS, SYSTEMS, lanes, moment, run
 
 HOOKS = {
@@ -22,6 +22,7 @@ HOOKS = {
     "contact": (Contact,),
     "input": (Input,),
     "sensor": (Sensor,),
+    "hidden": (Hidden,),
     "level": (Level,),
 }
 UNITS = pint.UnitRegistry()
@@ -105,6 +106,9 @@ def test_what_fits_what():
         "spring.linear",
         "spring.cubic",
         "force.ripple",
+        "friction.hysteresis",
+        "joint.backlash",
+        "joint.flexibility",
     }
     begins = ("input.", "friction.load")
     inputs = {name for name in NAMES if name.startswith(begins)} | {"backlash", "supply.sag"}
@@ -130,6 +134,7 @@ def test_what_fits_what():
         ("servo.deadband", "slider", "no servo"),
         ("state.overflow", "slider", "no level"),
         ("input.power", "servo", "a set point, not a force"),
+        ("joint.flexibility", "ball", "not one joint"),
         ("sensor.eccentricity", "slider", "not defined for a linear system"),
         ("wind", "pendulum", "not defined for a rotary system"),
     ],
@@ -167,6 +172,11 @@ def test_zero_gives_nothing_and_shapes_are_those_of_the_lanes(name, system, coun
         e, speed = np.full((count, 1), 0.7), np.full((count, 1), 3.0)
         assert np.array_equal(effect.restitution(off, e, speed), e)
         assert effect.restitution(on, e, speed).shape == effect.friction(on).shape == (count, 1)
+    elif isinstance(effect, Hidden):  # where it is off no engine asks it
+        state = effect.begin(on, now)
+        force, rate = effect.act(on, now, state)
+        assert force.shape == (count, size)
+        assert {a.shape for a in (rate, state.x, state.v, effect.behind(on))} == {(count, 1)}
     else:
         change = effect.feel if isinstance(effect, Input) else effect.read
         assert np.array_equal(change(off, signal), signal.values)

@@ -64,6 +64,9 @@ NAMES = [
     "servo.derivative",
     "clock.skew",
     "state.overflow",
+    "friction.hysteresis",
+    "joint.backlash",
+    "joint.flexibility",
 ]
 PAIRS = [
     (name, system)

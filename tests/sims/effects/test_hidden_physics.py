@@ -1,0 +1,148 @@
+"""Effects with a state of their own, against closed forms: two masses, play, what yields."""
+
+import numpy as np
+import pytest
+
+from sims.base import InputError, Scenario
+from sims.engines.hidden import enlarged
+from sims.pendulum.simulator import Pendulum
+from sims.slider.simulator import Slider
+from sims.slider.system import SliderSystem
+from tests.sims.effects.worlds import lanes, moment
+
+TIMES = np.arange(200) / 100
+MASS = 1.3
+
+
+def slide(effects, u=0.0, v=0.0, **settings):
+    """Position and velocity (T,) of a slider that is pushed by u."""
+    simulator = Slider(engine="batch", fixed=effects, **settings)
+    run = Scenario(TIMES, {"x": 0.0, "v": v}, {"u": np.broadcast_to(u, TIMES.shape).copy()})
+    return simulator.simulate(np.array([[MASS]]), run)[0].T
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_two_masses_under_a_steady_push_swing_about_their_centre(compiled):
+    share, frequency, push = 0.3, 20.0, 2.0
+    x, v = slide({"joint.flexibility": (share, frequency, 0.0)}, push, compiled=compiled)
+    stretched = push / (MASS * frequency**2)
+    together = frequency / np.sqrt(1 - share)
+    swing = share * stretched * (1 - np.cos(together * TIMES))
+    np.testing.assert_allclose(x, push / MASS * TIMES**2 / 2 + swing, atol=2e-8)
+    rate = share * stretched * together * np.sin(together * TIMES)
+    np.testing.assert_allclose(v, push / MASS * TIMES + rate, atol=1e-6)
+
+
+def test_a_load_hangs_from_its_drive_where_the_run_begins():
+    # At 90 degrees the drive holds the whole weight; the load then stays where it hangs.
+    mass, length, gravity = 0.2, 0.5, 9.81
+    constants = {"mass": mass, "length": length, "gravity": gravity}
+    simulator = Pendulum(constants, engine="batch", fixed={"joint.flexibility": (0.5, 60.0, 0.3)})
+    inertia, torque = 0.06, mass * gravity * length
+    run = Scenario(TIMES, {"q": np.pi / 2, "qd": 0.0}, {"u": np.full(TIMES.shape, torque)})
+    q, _ = simulator.simulate(np.array([[inertia]]), run)[0].T
+    # The weight at the load's own angle is less by the square of how far it hangs.
+    sag = torque / inertia / 60.0**2
+    assert sag > 4e-3
+    less = 0.5 * torque * (1 - np.cos(sag)) / inertia
+    np.testing.assert_allclose(q - np.pi / 2, less * TIMES**2 / 2, atol=2e-4)
+
+
+def test_a_damped_load_comes_to_rest_on_its_drive():
+    pulse = np.where(TIMES < 0.2, 3.0, 0.0)
+    _, v = slide({"joint.flexibility": (0.6, 30.0, 0.5)}, pulse)
+    # All that is left is the momentum of the pulse.
+    np.testing.assert_allclose(v[150:], 3.0 * 0.2 / MASS, rtol=1e-6)
+
+
+def test_through_a_gap_the_drive_moves_alone_until_it_meets_the_flank():
+    gap, share, push = 0.08, 0.4, 1.5
+    x, v = slide({"joint.backlash": (gap, share)}, push)
+    near = (1 - share) * MASS
+    alone = push / near * TIMES**2 / 2
+    apart = alone < gap / 2
+    assert 20 < apart.sum() < 40
+    np.testing.assert_allclose(x[apart], alone[apart], rtol=1e-6, atol=1e-9)
+    met = np.sqrt(gap * near / push)
+    # Nothing bounces: from there on both go together with the momentum that there is.
+    together = x[met + 0.15 < TIMES] - (push / MASS * TIMES**2 / 2)[met + 0.15 < TIMES]
+    assert np.ptp(together) < 2e-4
+    np.testing.assert_allclose(v[-1], push * TIMES[-1] / MASS, rtol=1e-3)
+
+
+def test_surfaces_that_yield_take_the_work_of_their_curve():
+    most, deflection, push = 0.8, 0.05, 2.0
+    x, v = slide({"friction.hysteresis": (most, deflection)}, push)
+    rubbed = most * (x - deflection * (1 - np.exp(-x / deflection)))
+    np.testing.assert_allclose(MASS * v**2 / 2, push * x - rubbed, rtol=2e-5, atol=1e-6)
+
+
+def test_what_yields_little_rubs_as_dry_friction_does():
+    pulses = np.where(TIMES % 0.8 < 0.4, 3.0, -3.0)
+    dry, _ = slide({"friction.coulomb": 0.7}, pulses)
+    yielding, _ = slide({"friction.hysteresis": (0.7, 1e-4)}, pulses)
+    free, _ = slide({}, pulses)
+    assert np.abs(yielding - dry).max() < 0.01 * np.abs(free - dry).max()
+
+
+def test_dry_friction_holds_the_drive_while_the_load_swings_on():
+    # A drive that nothing moves: its load was given no speed, and the push is less than friction.
+    x, v = slide({"joint.flexibility": (0.5, 20.0, 0.1), "friction.coulomb": 2.0}, 1.0)
+    assert not x.any()
+    assert not v.any()
+    # Stopped in full swing it is held, with the load still on its way, until that pulls it loose.
+    knock = np.select([TIMES < 0.15, TIMES < 0.25], [12.0, -12.0])
+    x, v = slide({"joint.flexibility": (0.6, 8.0, 0.01), "friction.coulomb": 4.0}, knock)
+    still = v[1:] == 0.0
+    loose = np.flatnonzero(still[:-1] & ~still[1:])
+    assert loose.size >= 2
+    np.testing.assert_array_equal(x[1:-1][still[:-1] & still[1:]], x[2:][still[:-1] & still[1:]])
+
+
+@pytest.mark.parametrize(
+    "off", [{"joint.flexibility": (0.0, 30.0, 0.1)}, {"joint.backlash": (0.0, 0.3)}]
+)
+def test_what_is_off_changes_no_bit(off):
+    pulses = np.where(TIMES % 0.8 < 0.4, 3.0, -3.0)
+    with_it, without = (slide({**e, "drag.linear": 0.4}, pulses) for e in (off, {}))
+    np.testing.assert_array_equal(with_it, without)
+
+
+def test_lanes_with_and_without_a_state_are_each_as_alone():
+    names = ("joint.flexibility", "friction.hysteresis", "friction.coulomb")
+    simulator = Slider(engine="batch", effects=names)
+    run = Scenario(TIMES, {"x": 0.0, "v": 0.3}, {"u": np.sin(5 * TIMES)})
+    rows = np.zeros((4, len(simulator.parameters)))
+    rows[:, 0] = MASS
+    rows[1, 1:4] = 0.3, 25.0, 0.1
+    rows[2, 4:6] = 0.2, 0.03
+    rows[3, 1:] = 0.3, 25.0, 0.1, 0.2, 0.03, 0.4
+    together = simulator.simulate(rows, run)
+    for row, seen in zip(rows, together, strict=True):
+        np.testing.assert_array_equal(simulator.simulate(row[None], run)[0], seen)
+    assert len({seen[-1, 0] for seen in together}) == 4
+
+
+def test_inertia_is_what_is_left_to_the_drives_side():
+    from sims.effects.hysteresis import Hysteresis
+    from sims.effects.transmission import Flexibility
+
+    system = enlarged(SliderSystem, (Flexibility, Hysteresis))()
+    theta = np.array([[2.0, 0.25, 30.0, 0.1, 0.5, 0.01]])
+    assert system.mass(theta, {})[0, 0] == pytest.approx(1.5)
+    assert system.coordinates == ("x", "joint.flexibility", "friction.hysteresis")
+
+
+def test_a_share_beyond_all_leaves_something_to_either_side():
+    from sims.effects.transmission import Flexibility
+
+    assert Flexibility().behind(lanes(5.0, 30.0, 0.1))[0, 0] == pytest.approx(0.98)
+    at = moment("slider", [[0.1]], [[0.2]], theta=[[2.0]])
+    assert at.inertia[0, 0] == 2.0
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "pybullet"])
+def test_engines_of_one_coordinate_say_that_they_cannot(engine):
+    pytest.importorskip(engine)
+    with pytest.raises(InputError, match=f"engine {engine} cannot carry .*choose engine batch"):
+        Slider(engine=engine, fixed={"joint.flexibility": (0.3, 20.0, 0.1)})
