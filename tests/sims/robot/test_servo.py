@@ -124,3 +124,14 @@ def test_a_speed_limit_of_back_emf_is_a_limit_of_force_and_a_drag():
                          max_step=1e-3)  # fmt: skip
     np.testing.assert_allclose(found[TIMES >= 0.1], expected.y[0], atol=3e-3)
     assert np.gradient(found, TIMES).max() == pytest.approx(speed, rel=1e-2)
+
+
+@pytest.mark.parametrize("phase", [0, 1, 3])
+def test_a_set_point_that_is_taken_in_now_and_then_is_a_delay_on_average(phase):
+    """Every 40 ms, of a command that changes every 10 ms: what is felt is 0 to 30 ms old."""
+    taken = np.maximum((np.arange(TIMES.size) - phase) // 4 * 4 + phase, 0)
+    seldom, plain = seen({}, WAVE[taken]), seen({}, WAVE)
+    delayed = seen({"input.delay@m": 0.015}, WAVE)
+    rest = np.abs(seldom - delayed)[20:].max()
+    assert np.abs(seldom - plain)[20:].max() == pytest.approx(0.0164, rel=1e-2)
+    assert rest < 6e-4

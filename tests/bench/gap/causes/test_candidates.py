@@ -118,6 +118,18 @@ def test_shapes_are_laid_on_a_grid_and_those_of_one_shape_act_together(swing):
     assert 4 <= len(frequencies) <= FREQUENCIES
 
 
+def test_what_dies_away_is_tried_at_times_that_the_runs_can_show(swing):
+    there, fit = swing
+    found = directions(there, fit, ["friction.warming"])
+    times = sorted({float(found.probes[i].c[2]) for i in of(found, "friction.warming")})
+    longest = 3.0 * max(
+        track.scenario.times[-1] - track.scenario.times[0] for track in there.tracks
+    )
+    np.testing.assert_allclose([times[0], times[-1]], [0.5, longest], rtol=1e-12)
+    assert (np.diff(np.log2(times)) <= 1.0).all()
+    assert len(times) == 4
+
+
 def test_what_modifies_an_effect_is_tried_beside_it():
     search, model = searched(
         recording(
