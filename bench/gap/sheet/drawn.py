@@ -14,7 +14,7 @@ from bench.figures import style
 from bench.gap.report.words import clean, estimated, number, pretty, sentence, with_unit
 from bench.gap.sheet.diagram import Diagram
 from bench.gap.sheet.facts import Facts
-from bench.gap.sheet.words import TITLES, beside, called, evidence, reached
+from bench.gap.sheet.words import TITLES, another, beside, called, evidence, reached
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -121,8 +121,9 @@ def _heading(figure: Figure, facts: Facts) -> float:
 
 def _shown(figure: Figure, facts: Facts, top: float) -> float:
     """The table of what is shown; what is left below."""
-    columns = (_MARGIN, 0.17, 0.46, 0.75)
-    for x, text in zip(columns, ("", "quantity", "value (95 %)", "evidence"), strict=True):
+    columns = (_MARGIN, 0.135, 0.405, 0.685, 0.785)
+    heads = ("", "quantity", "value (95 %)", "another run", "evidence")
+    for x, text in zip(columns, heads, strict=True):
         figure.text(x, top, text, weight="bold", va="top")
     for row in facts.rows:
         if row.number is None:
@@ -132,7 +133,8 @@ def _shown(figure: Figure, facts: Facts, top: float) -> float:
             TITLES[row.part],
             clean(called(row), 44),
             clean(estimated(row.number), 54),
-            clean(evidence(row, short=True), 34),
+            another(row),
+            clean(evidence(row, short=True), 30),
         ]
         for x, text in zip(columns, cells, strict=True):
             weight = "bold" if row.state == "found" and x == columns[1] else "normal"

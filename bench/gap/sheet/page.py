@@ -18,9 +18,11 @@ from bench.gap.sheet.diagram import Diagram
 from bench.gap.sheet.facts import Facts
 from bench.gap.sheet.mjcf import CLASS, Made
 from bench.gap.sheet.quantity import Quantity
-from bench.gap.sheet.words import TITLES, beside, called, evidence, reached
+from bench.gap.sheet.words import TITLES, another, beside, called, evidence, reached
 
 _STYLE = Path(__file__).parents[1] / "report" / "page.css"
+HEADS = ("", "quantity", "-value (95 %)", "-in another run", "-the file says", "evidence")
+"""Of the table of what is shown."""
 _REACH = (
     "How small a number these data would have shown: within the 95 % interval given it would not "
     "stand out beside the others, the noise being what the model leaves. What says 'not named' "
@@ -57,12 +59,13 @@ def _found(sheet: Facts) -> Iterator[str]:
                 TITLES[row.part],
                 f"{safe(called(row), 80)}<br>{code(safe(row.name, 80))}",
                 safe(estimated(row.number), 120),
+                safe(another(row), 40),
                 _stated(row),
                 safe(evidence(row), 400),
             ]
         )
         marks.append("found" if row.state == "found" else "")
-    yield table(["", "quantity", "-value (95 %)", "-the file says", "evidence"], rows, marks)
+    yield table(HEADS, rows, marks)
 
 
 def _diagram(diagram: Diagram, drawn: bytes) -> Iterator[str]:

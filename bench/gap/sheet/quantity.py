@@ -15,6 +15,7 @@ from bench.gap.sheet.subject import Stated, Subject
 from bench.gap.verdict import Cause, Verdict
 from sims import effects as library
 from sims.extended import Extended, Number
+from sims.system import FAMILY
 
 State = Literal["found", "fitted", "derived", "not shown"]
 STEP = 1e-6
@@ -37,6 +38,8 @@ class Quantity:
         p_value: chance of a gain like that of the cause if it were not there.
         share: of the gap on held-out runs that the cause closes alone; None if not measured.
         instead: effects that would explain the same share as well.
+        another: half its 95 % interval in a log, or a run, not yet recorded; None where that is not
+            known.
         strongest: whether it is the force of the drive at its limit, at rest.
     """
 
@@ -51,6 +54,7 @@ class Quantity:
     p_value: float | None = None
     share: float | None = None
     instead: tuple[str, ...] = ()
+    another: float | None = None
     strongest: bool = False
 
     def document(self) -> dict[str, Any]:
@@ -59,6 +63,8 @@ class Quantity:
         row["part"] = self.part
         if self.number is not None:
             row |= self.number.table()
+        if self.another is not None:
+            row["another"] = self.another
         if self.stated is not None:
             row["stated"] = self.stated
         if self.reach is not None:
@@ -130,7 +136,8 @@ class _Rows:
             for parameter in self.subject.kind.parameters:
                 number = self.extended.parameters[parameter.name]
                 says = parameter.says or parameter.name
-                yield _row(parameter.name, says, "system", "fitted", number, None)
+                row = _row(parameter.name, says, "system", "fitted", number, None)
+                yield replace(row, another=self.shown.another.get(parameter.name))
             return
         for name, number in self.extended.parameters.items():
             # An effect's coefficient, with its name behind a point where it has several.
@@ -139,7 +146,8 @@ class _Rows:
                 (p for p in self.subject.places if place in (p, f"{p}.{_tail(place)}")), ""
             )
             if there:
-                yield self._of_effect(f"{effect}@{there}", name, number, "fitted")
+                row = self._of_effect(f"{effect}@{there}", name, number, "fitted")
+                yield self._apart(row, f"{effect}@{there}", name)
 
     def causes(self) -> Iterator[Quantity]:
         """What was found, and of a family also what is nothing here."""
@@ -152,7 +160,19 @@ class _Rows:
                 several = sum(other == effect for other, _, _ in own) > 1
                 label = f"{effect} {coefficient}" if several else effect
                 row = self._of_effect(effect, label, number, "found", self._cause(name))
-                yield self._nothing(row, effect, number) if _is_nothing(number) else row
+                if _is_nothing(number):
+                    yield self._nothing(row, effect, number)
+                    continue
+                place = "" if name.partition("@")[2] != FAMILY else f"@{effect.partition('@')[2]}"
+                alone = name if len(numbers) == 1 else f"{name}.{coefficient}{place}"
+                yield self._apart(row, effect, alone)
+
+    def _apart(self, row: Quantity, effect: str, parameter: str) -> Quantity:
+        """With what runs say of it by themselves."""
+        half, stated = self.shown.another.get(parameter), self.subject.stated(effect)
+        if half is None or stated is None:
+            return replace(row, another=half)
+        return replace(row, another=stated.half(half))
 
     def _nothing(self, row: Quantity, effect: str, number: Number) -> Quantity:
         """A number of a cause that stands elsewhere, and is not shown here."""

@@ -22,21 +22,23 @@ as much as can just be told to be there (`bench.gap.identify`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.gap.causes.candidates import LIMITED, Directions, Probe, directions
+from bench.gap.apart import Spread, spreads
+from bench.gap.causes.candidates import LIMITED, Directions, Probe, changes_by, directions
 from bench.gap.identify import FAINT, MIXED
-from bench.gap.measure import UNBOUNDED, Z95, HeldOutRuns, central, curvature, inverted
+from bench.gap.measure import UNBOUNDED, Z95, HeldOutRuns, curvature, derived, inverted
 from bench.gap.model.arrow import schur_complement
 from bench.gap.model.fit import Fitter
 from bench.gap.model.floor import noise_floor
-from bench.gap.model.models import freedom
-from bench.gap.model.noise import Noise, likelihood
+from bench.gap.model.models import Models
+from bench.gap.model.noise import Noise
 from bench.gap.model.problem import Fit, Start
 from bench.gap.model.world import World
 from bench.gap.score_model import theta_of
+from bench.problem.seeds import rng_for
 from sims.base import Array, InputError
 from sims.extended import Extended
 
@@ -44,6 +46,8 @@ ALIKE = 0.999
 """Correlation from which a coefficient of a richer effect is one of a simpler one."""
 
 
+HALVED = 5
+"""How often the smallest gap that a search tries is halved."""
 PART = 0.1
 """Share of the largest part from which a number is one of those that do the same together."""
 
@@ -80,11 +84,14 @@ class Shown:
         free: names of the numbers of the model that were fitted.
         covariance: (q, q) of them.
         reaches: by effect and coefficient, of what is not in it.
+        another: by name, half the 95 % interval of a number of the model in a log, or a run, not
+            yet recorded; of those of which several say something.
     """
 
     free: tuple[str, ...]
     covariance: Array
     reaches: Mapping[tuple[str, str], Reach]
+    another: Mapping[str, float]
 
 
 def shown(world: World, extended: Extended, names: Sequence[str]) -> Shown:
@@ -98,18 +105,44 @@ def shown(world: World, extended: Extended, names: Sequence[str]) -> Shown:
     Raises:
         InputError: it does not follow the runs at all.
     """
-    sigma = noise_floor(world, world.recording).sigma
-    white = Noise(sigma, np.zeros(len(sigma)))
+    floor = noise_floor(world, world.recording)
+    white = Noise(floor.sigma, np.zeros(len(floor.sigma)))
     fit = _fitted(world, extended, white)
-    seen = np.isfinite(world.observed)
-    if not np.isfinite(fit.simulated[seen]).all():
+    if not np.isfinite(fit.simulated[np.isfinite(world.observed)]).all():
         raise InputError(f"{world.recording.path}: the simulation of it fails")
-    residual = np.where(seen, world.observed - fit.simulated, 0.0)
-    left = likelihood(residual, seen, fit.free.size + freedom(world, fit, white))
+    # Nothing is drawn from the stream, as nothing is searched.
+    models = Models(world, white, frozenset(), rng_for("sheet"), floor.stated)
+    model = models.enter(fit)
+    left = model.likelihood
     # What the model leaves is the noise, whatever the recording states of it.
     noise = Noise(np.maximum(left.sigma, 1e-300), left.phi)
-    found = directions(world, fit, names)
-    return _Shown(world, noise, central(world, fit, white), found, residual).shown()
+    found = _with_small_gaps(world, fit, directions(world, fit, names))
+    about = _Shown(world, noise, derived(models, fit), found, models.residual(fit))
+    return about.shown(_another(spreads(models, model)))
+
+
+def _another(found: Sequence[Spread]) -> dict[str, float]:
+    """By name, the interval of a number in a group not yet recorded: a log, or else a run."""
+    by_run = {one.number: Z95 * one.total for one in found if one.by == "run"}
+    return by_run | {one.number: Z95 * one.total for one in found if one.by == "log"}
+
+
+def _with_small_gaps(world: World, fit: Fit, found: Directions) -> Directions:
+    """The directions with gaps smaller than a search tries: what is searched is to be found, and
+    here is asked what would have been.
+    """
+    least: dict[str, Probe] = {}
+    for probe in found.probes:
+        gap = probe.fixed and world.effects[probe.effect].coefficients[0].of not in LIMITED
+        if gap and (probe.effect not in least or probe.c[0] < least[probe.effect].c[0]):
+            least[probe.effect] = probe
+    more = [replace(p, c=p.c * 0.5**n) for p in least.values() for n in range(1, HALVED + 1)]
+    if not more:
+        return found
+    values = np.nan_to_num(changes_by(world, fit, [(probe.effect, probe.c) for probe in more]))
+    return Directions(
+        (*found.probes, *more), np.concatenate([found.values, np.moveaxis(values, 0, -1)], axis=3)
+    )
 
 
 def _fitted(world: World, extended: Extended, noise: Noise) -> Fit:
@@ -145,21 +178,21 @@ class _Shown:
         pull = self.left[self.q : -1, -1] - along @ self.left[: self.q, -1]
         self.leaning = pull / np.maximum(self.powers, 1e-300)  # (2)
 
-    def shown(self) -> Shown:
+    def shown(self, another: Mapping[str, float]) -> Shown:
         """Of each coefficient that scales, at the shape that shows best."""
         best: dict[tuple[str, int], int] = {}
         for k, probe in enumerate(self.found.probes):
             key = probe.effect, probe.place
             if not probe.fixed and (key not in best or self.powers[k] > self.powers[best[key]]):
                 best[key] = k
-        limits = {probe.effect for probe in self.found.probes if probe.fixed}
+        limits = dict.fromkeys(probe.effect for probe in self.found.probes if probe.fixed)
         reaches = {}
         for (name, place), k in best.items():
             if name not in limits and not self._told_already(name, k, best):
                 reaches[name, self._coefficient(name, place)] = self._proportional(k)
         for name in limits:
             reaches[name, self._coefficient(name, 0)] = self._limit(name)
-        return Shown(self.free, self.covariance, reaches)
+        return Shown(self.free, self.covariance, reaches, another)
 
     def _coefficient(self, effect: str, place: int) -> str:
         return self.world.effects[effect].on(self.world.simulator.system)[place].name
@@ -206,9 +239,11 @@ class _Shown:
 
     def _limit(self, name: str) -> Reach:
         probes = [(k, p) for k, p in enumerate(self.found.probes) if p.effect == name and p.fixed]
-        sizes = [float(p.c[0]) for k, p in probes if np.sqrt(self.powers[k]) >= FAINT]
-        # A limit of force or rate acts where it is small, a gap where it is large.
-        below = self.world.effects[name].coefficients[0].of in LIMITED
+        sized = sorted((float(p.c[0]), k) for k, p in probes)
+        sizes = [size for size, k in sized if np.sqrt(self.powers[k]) >= FAINT]
+        # A limit acts the more the smaller it is, a gap the larger it is.
+        least, most = (self.left[self.q + k, self.q + k] for _, k in (sized[0], sized[-1]))
+        below = bool(least > most)
         if not sizes:
             return Reach(np.inf, limit="below" if below else "above")
         return Reach(max(sizes), limit="below") if below else Reach(min(sizes), limit="above")

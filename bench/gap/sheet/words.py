@@ -10,6 +10,11 @@ TITLES = {"system": "Motor", **PARTS}
 """Of the parts of the table."""
 
 
+def another(row: Quantity) -> str:
+    """How well it is known of a run or log not yet recorded."""
+    return "" if row.another is None else f"± {number(row.another, 2)}"
+
+
 def called(row: Quantity) -> str:
     """What a person calls it."""
     return row.name.replace("_", " ") if row.part == "system" else row.says

@@ -52,7 +52,7 @@ def swings(rng: np.random.Generator) -> list[tuple[float, float, float]]:
     return rows
 
 
-def written(folder: Path, runs: int = 2, seed: int = 0) -> Path:
+def written(folder: Path, runs: int = 3, seed: int = 0) -> Path:
     """A recording of it."""
     rng = np.random.default_rng(seed)
     lines = ["run,t,goal,torque_enable,q"]

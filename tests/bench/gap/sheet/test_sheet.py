@@ -84,16 +84,32 @@ def test_drag_cannot_be_told_from_the_motors_own(sheet: DataSheet) -> None:
     assert reach.size > 0.05
 
 
-def test_a_gap_smaller_than_the_error_cannot_show(sheet: DataSheet) -> None:
-    dead = row(sheet, "servo.deadband").reach
-    slow = row(sheet, "input.rate").reach
+def test_gaps_show_from_a_size_on_and_limits_up_to_one(sheet: DataSheet) -> None:
+    dead, band = row(sheet, "servo.deadband").reach, row(sheet, "input.deadband").reach
+    clipped, slow = row(sheet, "input.saturation").reach, row(sheet, "input.rate").reach
     assert dead is not None
-    assert dead.limit == "above"
-    assert 0 < dead.size < 0.2
-    # Commands jump: any limit of their rate would show.
+    assert band is not None
+    assert clipped is not None
     assert slow is not None
-    assert slow.limit == "below"
+    # Friction holds the arm off by up to 0.17 rad: a dead zone of a tenth of that moves it.
+    assert dead.limit == band.limit == "above"
+    assert 0 < dead.size < 0.02
+    assert 0 < band.size < 0.05
+    # Commands go to 1.5 rad, and jump: any limit of their rate would show.
+    assert clipped.limit == slow.limit == "below"
+    assert 1.0 < clipped.size < 1.5
     assert slow.size > 10
+
+
+def test_what_another_run_may_say_is_no_less_than_what_these_say(sheet: DataSheet) -> None:
+    for name in (*TRUTH, "friction.coulomb"):
+        found = row(sheet, name)
+        assert found.number is not None
+        assert found.number.low is not None
+        assert found.another is not None
+        half = found.number.value - found.number.low
+        # These two runs are of one servo: they scatter by little more than their noise.
+        assert half * 0.999 < found.another < 5 * half
 
 
 def test_the_files_say_the_same_and_are_safe(files: Path, sheet: DataSheet) -> None:
