@@ -15,11 +15,18 @@ from bench.gap.design import Design
 from bench.gap.explanation import Explanation
 from bench.gap.model.crew import cores
 from bench.gap.model.watch import Watch
+from bench.gap.rig.worth import SPLITS
 from sims.base import InputError
 from sims.recording.write import publish, refuse_existing
 
 LONGEST = 600.0
 """Seconds of a run that is designed."""
+
+
+LONGER = 5.0
+"""Times as long as it is to last, a run may last where that settles something."""
+REPEATS = 8
+"""Times that anybody would record one run."""
 
 
 @dataclass(frozen=True)
@@ -40,25 +47,13 @@ class NextRecording:
         if found is None:
             return ["no run could be simulated that stays within the limits of what moves"]
         begin = ", ".join(f"{name} = {value:.4g}" for name, value in found.initial.items())
-        lines = [f"record next: {found.says}; begin near {begin}"]
+        lasting = f"{found.times[-1]:.3g} s"
+        lines = [f"record next, {lasting}: {found.says}; begin near {begin}"]
         if found.by == "T":
-            if found.split:
-                sizes = [f"{name} ({math.sqrt(found.told[name]):.3g})" for name in found.split]
-                lines.append(
-                    f"it tells {found.effect} from {', '.join(sizes)}: by so many noises, once "
-                    "every number is fitted again"
-                )
-            stays = [name for name in found.told if name not in found.split]
-            if stays:
-                lines.append(f"no run of this kind tells it from {', '.join(stays)}")
-            else:
-                lines.append("that settles it")
-        else:
-            lines.append(
-                "nothing is open: it narrows what is known of all numbers together "
-                f"{math.exp(min(found.gain, 50.0)):.3g} times"
-            )
-        return lines
+            return [*lines, *_told(found)]
+        factor = math.exp(min(found.gain, 50.0))
+        what = f"it narrows what is known of all numbers together {factor:.3g} times"
+        return [*lines, f"nothing is open: {what}"]
 
     def write(self, path: str | Path) -> None:
         """Write the commands: ``t`` in s and a column for each input, in the SI units of
@@ -77,10 +72,33 @@ class NextRecording:
         publish({path: "\n".join(rows) + "\n"})
 
 
+def _told(found: Design) -> list[str]:
+    """What a run tells apart, and what it does not."""
+    lines = []
+    if found.split:
+        sizes = [f"{name} ({math.sqrt(found.told[name]):.3g})" for name in found.split]
+        lines.append(
+            f"it tells {found.effect} from {', '.join(sizes)}: by so many noises, once every "
+            "number is fitted again, whichever is true"
+        )
+    stays = [name for name in found.told if name not in found.split]
+    if stays:
+        lines.append(f"no run of this kind tells it from {', '.join(stays)}")
+    best = max((found.told[name] for name in stays), default=0.0)
+    if best > 0 and (times := math.ceil(SPLITS / best)) <= REPEATS:
+        lines.append(f"recorded {times} times it would tell it from one more of these")
+    if found.settles:
+        lines.append("that settles it")
+    others = [group for group in found.groups if len(group) > 1 and found.effect not in group]
+    lines += [f"should it be one of {', '.join(group)}: these stay open" for group in others]
+    return lines
+
+
 def design(
     recording: Source | Sequence[Source],
     *,
     seconds: float = 4.0,
+    longest: float | None = None,
     system: str | None = None,
     model: str | Path | None = None,
     free: Sequence[str] = (),
@@ -94,7 +112,9 @@ def design(
 
     Args:
         recording: what there is so far, as for `explain`.
-        seconds: how long the next run may last.
+        seconds: how long the next run is to last.
+        longest: how long it may last where that many seconds do not settle what is open; five times
+            as long where it is not given.
         system: as for `explain`.
         model: as for `explain`.
         free: as for `explain`.
@@ -108,6 +128,9 @@ def design(
     """
     if not 0 < seconds <= LONGEST:
         raise InputError(f"seconds: expected 0 to {LONGEST:g}, found {seconds!r}")
+    most = min(LONGER * seconds, LONGEST) if longest is None else longest
+    if not seconds <= most <= LONGEST:
+        raise InputError(f"longest: expected {seconds:g} to {LONGEST:g}, found {most!r}")
     watch = Watch(None, stop, progress)
-    given = sources_of(recording), seconds, system, model, free, say, watch, jobs or cores()
+    given = sources_of(recording), seconds, most, system, model, free, say, watch, jobs or cores()
     return NextRecording(*explaining.explain_and_design(*given))

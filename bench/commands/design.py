@@ -32,7 +32,13 @@ def add_design(parser: argparse.ArgumentParser) -> None:
         type=seconds,
         metavar="S",
         default=4.0,
-        help="how long the next run may last (default: 4)",
+        help="how long the next run is to last (default: 4)",
+    )
+    parser.add_argument(
+        "--longest",
+        type=seconds,
+        metavar="S",
+        help="how long it may last where that does not settle what is open (default: five times)",
     )
     parser.add_argument("--free", metavar="A,B,...", default="", help="as for `simgap explain`")
     parser.add_argument("--jobs", type=positive, metavar="N", help="processes that work at once")
@@ -53,6 +59,7 @@ def _design(options: argparse.Namespace) -> int:
         proposed = design(
             options.recordings,
             seconds=options.seconds,
+            longest=options.longest,
             system=options.system,
             model=options.model,
             free=names(options.free),

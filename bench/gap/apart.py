@@ -34,6 +34,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bench.gap.along import Kind, along, constant
 from bench.gap.measure import Z95, curved
 from bench.gap.model.fit import prior_of
 from bench.gap.model.models import Model, Models
@@ -46,6 +47,10 @@ LEVEL = 0.01
 """Chance of (3) below which groups do not agree, shared by all numbers that are asked about."""
 SLIGHT = 1e-3
 """Share of a number below which nobody minds what groups scatter, however sure it is."""
+FEWEST = 4
+"""Groups from which it is asked what a number moves with."""
+ALIKE = 2.0
+"""Times the least mean square about its line, what else may be what a number moves with."""
 WIDE = 4.0
 """A group whose interval is wider than so many times the bounds says nothing of a number."""
 
@@ -69,6 +74,16 @@ class Trend:
 
 
 @dataclass(frozen=True)
+class Mover:
+    """What a number moves with: its kind and name (`along`), how, and what else would do."""
+
+    kind: Kind
+    name: str
+    trend: Trend
+    also: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Spread:
     """What groups of runs say of one number.
 
@@ -83,6 +98,7 @@ class Spread:
         chance: of (3).
         agree: whether they do.
         trend: with a constant, or with the order of logs; None where there are too few.
+        mover: what it moves with, if it is sure; None where the groups agree.
     """
 
     number: str
@@ -95,6 +111,7 @@ class Spread:
     chance: float
     agree: bool
     trend: Trend | None = None
+    mover: Mover | None = None
 
     @property
     def total(self) -> float:
@@ -135,9 +152,45 @@ def spreads(models: Models, model: Model) -> tuple[Spread, ...]:
     if not groupings or not model.fit.free.size:
         return ()
     curvatures, gradients = _by_run(models, model)
-    found = [one for by in groupings for one in _spreads(world, model, by, curvatures, gradients)]
+    found = [
+        (by, one) for by in groupings for one in _spreads(world, model, by, curvatures, gradients)
+    ]
     level = LEVEL / max(len(found), 1)
-    return tuple(_judged(one, level) for one in found)
+    judged = [(by, _judged(one, level)) for by, one in found]
+    return tuple(
+        one if one.agree else replace(one, mover=_mover(world, model, by, one))
+        for by, one in judged
+    )
+
+
+def _mover(world: World, model: Model, by: _Grouping, one: Spread) -> Mover | None:
+    """What the groups' values of a number move with."""
+    if by.by not in ("run", "log"):
+        if one.trend is None or one.trend.chance >= LEVEL:
+            return None
+        return Mover(constant(world, by.by), by.by, one.trend)
+    places = {name: list(runs) for name, runs in zip(by.names, by.runs, strict=True)}
+    tried = []
+    for about in along(world, model, one.number):
+        values = np.array([about.values[places[part.group]].mean() for part in one.parts])
+        trend = _trend(one.parts, values) if len(one.parts) >= FEWEST else None
+        if trend is not None:
+            tried.append((_rest(one.parts, values), about, trend))
+    sure = [entry for entry in tried if entry[2].chance < LEVEL / len(tried)]
+    if not sure:
+        return None
+    least, best, trend = min(sure, key=lambda entry: entry[0])
+    # What goes along with it as well cannot be told from it.
+    also = [about.name for rest, about, _ in sure if about is not best and rest < ALIKE * least]
+    return Mover(best.kind, best.name, trend, tuple(also))
+
+
+def _rest(parts: Sequence[Part], numbers: Array) -> float:
+    """Weighted mean square about the line of `_trend`, at least what errors make of it."""
+    values = np.array([part.value for part in parts])
+    weights = np.array([part.error for part in parts]) ** -2.0
+    rest = values - np.polyval(np.polyfit(numbers, values, 1, w=np.sqrt(weights)), numbers)
+    return max(float(weights @ rest**2) / (len(parts) - 2), 1.0)
 
 
 def _judged(one: Spread, level: float) -> Spread:

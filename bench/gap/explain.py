@@ -106,6 +106,7 @@ class Proposed(NamedTuple):
 def explain_and_design(
     recording: Source | Sequence[Source],
     seconds: float,
+    longest: float,
     system: str | None = None,
     model: str | Path | None = None,
     free: Sequence[str] = (),
@@ -113,8 +114,8 @@ def explain_and_design(
     watch: Watch | None = None,
     jobs: int = 1,
 ) -> Proposed:
-    """Explain recordings, and design the next one, of so many seconds at most; the other arguments
-    are those of `explain`.
+    """Explain recordings, and design the next one, of so many seconds, or up to `longest` where
+    these do not settle it; the other arguments are those of `explain`.
     """
     with closing(Crew(jobs)) as crew:
         sources = [recording] if isinstance(recording, Source) else list(recording)
@@ -123,7 +124,7 @@ def explain_and_design(
         with closing(_Explainer(subject, *given, watch or Watch(), crew)) as explainer:
             explanation = explainer.run()
             say("designing the next recording")
-            return Proposed(explanation, explainer.design(seconds))
+            return Proposed(explanation, explainer.design(seconds, longest))
 
 
 class _Subject(NamedTuple):
@@ -255,7 +256,7 @@ class _Explainer:
             if world is not None:
                 world.close()
 
-    def design(self, seconds: float) -> Design | None:
+    def design(self, seconds: float, longest: float) -> Design | None:
         """The next recording, after `run`: that which splits the first set of causes that is open,
         else that which narrows the numbers of what stands.
         """
@@ -267,8 +268,8 @@ class _Explainer:
             keys = [frozenset({*rest, other}) for other in cause.alternatives]
             rivals = [search.models[key] for key in keys if key in search.models]
             if rivals:
-                return design(search, finding.model, rivals, seconds)
-        return design(search, finding.model, (), seconds)
+                return design(search, finding.model, rivals, seconds, longest)
+        return design(search, finding.model, (), seconds, longest)
 
     def _search(self, base: Base, rng: np.random.Generator) -> Search:
         search = Search(self.fitting, self.noise, base.frozen, rng, self.floor.stated)

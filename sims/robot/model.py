@@ -121,6 +121,7 @@ class Robot:
         rated: actuators whose second control is the rate of their first, to be put in with it.
         actuator_tables: actuators that a recording added, by name, as it states them.
         engine_table: step and integrator in place of the file's, as it states them.
+        speeds: of joints, the fastest that a URDF allows, rad/s or m/s; an MJCF states none.
     """
 
     path: Path
@@ -132,6 +133,7 @@ class Robot:
     rated: tuple[str, ...] = ()
     actuator_tables: Mapping[str, Any] = field(default_factory=dict)
     engine_table: Mapping[str, Any] = field(default_factory=dict)
+    speeds: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def compiled(self) -> Any:

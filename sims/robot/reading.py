@@ -105,6 +105,7 @@ def _robot(
         rated=rated,
         actuator_tables=actuators,
         engine_table=engine,
+        speeds=urdf.speeds(root) if kind == "urdf" else {},
     )
     robot.__dict__["compiled"] = model  # which it would compile anew
     return robot

@@ -177,6 +177,17 @@ def _once(parts: Sequence[Element]) -> list[str]:
     return [f"stated twice, the first is read: {listed(twice)}"] if twice else []
 
 
+def speeds(root: Element) -> dict[str, float]:
+    """Of joints, the fastest that they may go, rad/s or m/s; of some it is not said."""
+    found = {}
+    for joint in children(root, "joint"):
+        for limit in children(joint, "limit"):
+            fastest = number(limit.get("velocity"))
+            if joint.get("type") in SINGLE and 0 < fastest < math.inf:
+                found[joint.get("name") or ""] = fastest
+    return found
+
+
 def _limits(joints: Sequence[Element]) -> list[str]:
     unstated, empty, clamped = [], [], []
     for joint in joints:

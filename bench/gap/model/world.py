@@ -371,16 +371,7 @@ class World:
             ]
         # lanes of one run share its scenario, which the simulator then prepares once
         scenarios = [self._parts[share][run] for run in runs]
-        if not self.freed:
-            return scenarios
-        names = [p.name for p in self.freed]
-        values = theta[:, self.own : self.base.size].tolist()
-        return [
-            replace(
-                scenario, constants={**scenario.constants, **dict(zip(names, row, strict=True))}
-            )
-            for scenario, row in zip(scenarios, values, strict=True)
-        ]
+        return [self._freed_in(one, own) for one, own in zip(scenarios, theta, strict=True)]
 
     def together(
         self, fine: bool, theta: Array, runs: Indices, states: Array, share: float
@@ -401,6 +392,49 @@ class World:
         lanes = np.delete(theta, freed, axis=1)
         initial = dict(zip(self.states, states.T, strict=True))
         return simulator.simulate_lanes(lanes, scenarios, initial)
+
+    def elsewhere(self, theta: Array, scenarios: Sequence[Scenario], states: Array) -> Array:
+        """Observations (L, T, C) of lanes in any scenarios, NaN behind the end of a shorter one.
+
+        Args:
+            theta: (L, P).
+            scenarios: (L,).
+            states: (L, s).
+        """
+        self.simulations += len(theta)
+        length = max(scenario.times.size for scenario in scenarios)
+        result = np.full((len(theta), length, len(self.channels)), np.nan)
+        together = max(FEWEST_LANES, LANE_SAMPLES // length)
+        freed = np.arange(self.own, self.base.size)
+        kinds = self.kinds(theta)
+        for kind in np.unique(kinds):
+            simulator = self._fine if kind >= 2 else self.simulator
+            lanes = np.flatnonzero(kinds == kind)
+            for part in np.array_split(lanes, -(-lanes.size // together)):
+                own = [self._freed_in(scenarios[i], theta[i]) for i in part]
+                initial = dict(zip(self.states, states[part].T, strict=True))
+                seen = simulator.simulate_lanes(np.delete(theta[part], freed, 1), own, initial)
+                result[part, : seen.shape[1]] = seen
+        return result
+
+    def _freed_in(self, scenario: Scenario, theta: Array) -> Scenario:
+        """A scenario with the constants that parameters (P,) set."""
+        if not self.freed:
+            return scenario
+        values = theta[self.own : self.base.size].tolist()
+        freed = {p.name: value for p, value in zip(self.freed, values, strict=True)}
+        return replace(scenario, constants={**scenario.constants, **freed})
+
+    def watching(self, observe: Sequence[str], effects: Sequence[str]) -> Simulated:
+        """A simulator of the same with other channels, and with these effects alone; close it."""
+        own: list[str | type[Effect]] = [
+            next((e for e in self.extra if e.name == name), name) for name in effects
+        ]
+        settings: dict[str, Any] = {}
+        if self.engine == "batch":
+            settings = {"time_step": TIME_STEP, "turn": TURN, "patience": PATIENCE}
+        constants = self.recording.constants
+        return self.kind(constants, list(observe), engine=self.engine, effects=own, **settings)
 
     def close(self) -> None:
         """Give back what the engine holds."""

@@ -8,9 +8,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from bench.gap.apart import LEVEL, Spread
+from bench.gap.apart import LEVEL, Mover, Spread
 from bench.gap.measure import Z95
 from bench.gap.report.elements import heading, paragraph, safe, table
+from bench.gap.report.missing import missing
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, estimate, joined, number, probability, sentence, with_unit
 
@@ -44,7 +45,7 @@ def told(story: Story) -> list[str]:
         )
     apart = _clearest([s for s in after if not s.agree])
     for one in apart[:NAMED]:
-        sentences.append(_apart(one))
+        sentences.append(_apart(one, [cause.effect for cause in story.verdict.causes]))
     if len(apart) > NAMED:
         sentences.append(f"{len(apart) - NAMED} more numbers do not agree either")
     if after and not apart:
@@ -62,9 +63,9 @@ def _clearest(apart: Sequence[Spread]) -> list[Spread]:
 
 
 def _rank(one: Spread) -> tuple[bool, int, float]:
-    """What says most first: a constant that it moves with, any constant, logs, runs."""
+    """What says most first: what it moves with, a constant before others; any constant, logs."""
     by = {"log": 1, "run": 2}.get(one.by, 0)
-    return not _moves(one), by, one.chance
+    return not (_moves(one) or one.mover is not None), by, one.chance
 
 
 def _moves(one: Spread) -> bool:
@@ -76,15 +77,24 @@ def _disagreed(before: dict[tuple[str, str], Spread], one: Spread) -> bool:
     return known is not None and not known.agree
 
 
-def _apart(one: Spread) -> str:
+def _apart(one: Spread, known: Sequence[str]) -> str:
     text = (
         f"{_named(one)} differs between {_plural(one.by)}, {with_unit(_span(one), one.unit)} "
         f"(chance {probability(one.chance)}): of a run not yet recorded it is known to "
         f"±{number(Z95 * one.total)}, not to ±{number(Z95 * one.error)}"
     )
-    if _moves(one):
-        text += f"; it {_goes(one)} with {clean(one.by, 40)}"
-    return f"{text}; an effect is missing that makes it move"
+    if one.mover is None:
+        return f"{text}; an effect is missing that makes it move"
+    way = "grows" if one.mover.trend.slope > 0 else "falls"
+    text += f"; it {way} with {_along(one.mover)}"
+    kind, name = one.mover.kind, clean(one.mover.name, 40)
+    what = missing(one.number, kind, name, one.mover.trend.slope > 0, known)
+    return f"{text}: what is missing is {what}"
+
+
+def _along(mover: Mover) -> str:
+    """What a number moves with, and what that cannot be told from."""
+    return " or ".join(clean(name, 40) for name in (mover.name, *mover.also[:2]))
 
 
 def _span(one: Spread) -> str:

@@ -8,8 +8,13 @@ from scipy.integrate import solve_ivp
 
 from bench.cli import main
 from bench.gap.explain import explain
+from bench.gap.report.agreement import told
+from bench.gap.report.missing import NAMES, missing
 from bench.recordings.joined import load_all
+from sims import effects
+from sims.ball.simulator import Ball
 from sims.base import InputError
+from sims.pendulum.simulator import Pendulum
 
 NOISE = 1e-3
 TIMES = np.arange(0.0, 3.0, 0.02)
@@ -78,6 +83,8 @@ def test_a_mass_that_grows_from_day_to_day(tmp_path):
     assert not mass.agree
     assert mass.trend.slope == pytest.approx(0.01, abs=3 * mass.trend.error)
     assert mass.trend.chance < 1e-3
+    assert mass.mover.kind == "time"
+    assert missing("mass", "time", mass.mover.name, True, ()) == "a load that changes"
     assert mass.scatter == pytest.approx(np.std(masses, ddof=1), rel=0.3)
     # For a day not yet recorded the truth is within it; by curvature alone it is not.
     assert abs(mass.value - 2.03) < 2.5 * mass.total
@@ -161,3 +168,59 @@ def test_a_constant_that_logs_state_differently_is_one_of_their_runs(tmp_path):
     assert [run.constants["mass"] for run in joined.runs] == [0.2, 0.2, 0.3, 0.3]
     assert [run.name for run in joined.runs] == ["one: 0", "one: 1", "other: 0", "other: 1"]
     assert [run.held_out for run in joined.runs] == [False, True, False, True]
+
+
+def warm(folder, drags, temperatures):
+    """Runs of a slider whose viscous friction is another one in each, by the closed form for a
+    force that is held: the speed goes to u / drag as exp(-drag t / mass).
+    """
+    rng, rows, mass = np.random.default_rng(0), ["run,t,u,x,temperature"], 2.0
+    for run, (drag, heat) in enumerate(zip(drags, temperatures, strict=True)):
+        x, v, fading = 0.0, 0.5, np.exp(-drag * 0.02 / mass)
+        for t, u in zip(TIMES, 4.0 * np.sin(3 * TIMES + run + 0.3), strict=True):
+            seen = x + NOISE * rng.standard_normal()
+            rows.append(f"{run},{t:.2f},{u:.6f},{seen:.6f},{heat + rng.standard_normal():.1f}")
+            last = u / drag
+            x += last * 0.02 + (v - last) * (1 - fading) * mass / drag
+            v = last + (v - last) * fading
+    path = folder / f"warm{temperatures[1]:g}.csv"
+    path.write_text("\n".join(rows))
+    path.with_suffix(".toml").write_text(
+        f'system = "slider"\n[channels.x]\nunit = "m"\nnoise = {NOISE}\n[inputs.u]\nunit = "N"\n'
+        '[extra.temperature]\nunit = "degC"\n'
+    )
+    return path
+
+
+def test_what_a_number_moves_with_says_what_is_missing(tmp_path):
+    """Friction that falls as it warms, on days in no order."""
+    heat = np.array([3, 0, 7, 5, 1, 8, 2, 6, 4])
+    found = explain(warm(tmp_path, 2.0 - 0.08 * heat, 20.0 + 5.0 * heat))
+    drag = by(found.story.apart.after, "drag.linear", "run")
+    assert (drag.mover.kind, drag.mover.name) == ("other", "temperature")
+    assert drag.mover.trend.slope == pytest.approx(-0.08 / 5.0, rel=0.1)
+    said = " ".join(told(found.story))
+    assert "it falls with temperature: what is missing is friction that depends on temp" in said
+
+
+def test_the_missing_effect_by_what_a_number_moves_with():
+    def name(number, kind, grows=True, known=()):
+        return missing(number, kind, "x", grows, known)
+
+    assert name("drag.linear@elbow", "load") == "friction that depends on the load (friction.load)"
+    assert name("friction.coulomb", "direction").endswith("(friction.direction)")
+    assert name("friction.coulomb", "speed").endswith("(drag.linear)")
+    assert name("friction.coulomb", "speed", grows=False).endswith("(friction.stribeck)")
+    assert name("spring.linear", "amplitude").endswith("(spring.cubic)")
+    # What is in the model already is not missing, and of other numbers nothing is known.
+    known = ("friction.load@elbow",)
+    assert name("drag.linear@elbow", "load", known=known) == "friction that depends on x"
+    assert name("lift.magnus", "speed") == "something that depends on x"
+
+
+def test_effects_that_may_be_missing_are_in_the_library():
+    texts = [text for found in NAMES.values() for text in np.atleast_1d(found)]
+    named = {text.partition("(")[2].rstrip(")") for text in texts if "(" in text}
+    there = {*effects.library(Pendulum.system), *effects.library(Ball.system)}
+    assert named <= there
+    assert len(named) >= 9

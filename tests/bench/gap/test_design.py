@@ -6,6 +6,8 @@ from scipy.integrate import solve_ivp
 
 import simgap
 from bench.cli import main
+from bench.gap.design import _groups, _longer_would
+from bench.gap.rig.worth import Worth
 from bench.recordings.poses import contacts
 from bench.registry import robot
 from sims.base import InputError
@@ -127,6 +129,19 @@ def test_what_is_asked_wrongly_is_one_line(tmp_path, capsys):
     assert out.read_text() == "mine"
     with pytest.raises(InputError, match="seconds: expected 0 to 600, found -1"):
         simgap.design(path, seconds=-1)
+    with pytest.raises(InputError, match="longest: expected 4 to 600, found 2"):
+        simgap.design(path, longest=2)
+
+
+def test_what_hangs_together_and_what_a_longer_run_would_tell():
+    least = np.array([[0, 90, 7, 80.0], [90, 0, 95, 3.0], [7, 95, 0, 60.0], [80, 3, 60, 0]])
+    assert list(_groups(["a", "b", "c", "d"], least)) == [("a", "c"), ("b", "d")]
+    run = Worth(None, least + np.triu(least), 0.0, full=True)
+    # Of 7 and 3 squared noises a run twice as long may make 25 if it is lucky, twice of the first.
+    assert _longer_would(run, 2.0)
+    assert not _longer_would(run, 1.0)
+    run = Worth(None, np.where(least < 10, 1.0, least), 0.0, full=True)
+    assert not _longer_would(run, 5.0)
 
 
 def test_parts_that_touch_are_seen(tmp_path):

@@ -1,0 +1,155 @@
+"""What a rig must not be made to do: leave its joints' ranges, go faster or pull harder than it
+may, touch what it did not touch; by simulation, with all that moves watched, recorded or not.
+
+What a model file states is its limit (a URDF's speed; forces are clamped by the simulation where
+they are limited). What nothing states is limited by what the runs so far did themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bench.gap.model.models import Model
+from bench.gap.model.world import World
+from bench.gap.rig.plans import Run
+from bench.recordings.poses import contacts
+from sims.base import Array, Scenario
+
+TRAVEL = 3.0
+"""Times the range so far that a channel may leave it, where nothing states its limits."""
+FASTER = 2.0
+"""Times the fastest, and the strongest, so far that a robot may be where nothing states it."""
+IDLE = 0.1
+"""Of the fastest, and the strongest, of all joints: what a joint may be that was at rest so far."""
+
+
+class Limits:
+    """Says which runs a rig can make.
+
+    Args:
+        world: of the runs so far.
+        model: fitted to them.
+    """
+
+    def __init__(self, world: World, model: Model) -> None:
+        self.world = world
+        self.past = self._seen(
+            model,
+            [track.scenario for track in world.tracks],
+            np.where(np.isfinite(model.fit.states), model.fit.states, world.guess),
+        )
+        self.bounds = self._bounds()
+
+    def __call__(self, model: Model, runs: Sequence[Run]) -> list[bool]:
+        """Of each run whether it stays within them, were a model true."""
+        if not runs:
+            return []
+        states = np.array([run.states for run in runs])
+        seen = self._seen(model, [run.scenario for run in runs], states)
+        return [self._within(channels) for channels in seen]
+
+    # -- what is watched
+
+    @cached_property
+    def watched(self) -> list[str]:
+        """Channels that are looked at."""
+        kind = self.world.kind
+        if not kind.has_model:
+            moving = {*kind.system.coordinates, *kind.system.rates, *self.world.channels}
+            return [c.name for c in kind.channels if c.name in moving]
+        names = {f"{what}.{joint.name}" for joint in self._joints for what in ("q", "qd", "tau")}
+        return [c.name for c in kind.channels if c.name in names]
+
+    @property
+    def _joints(self) -> list[Any]:
+        robot: Any = self.world.kind
+        return [joint for joint in robot.robot.joints if joint.single]
+
+    def _seen(
+        self, model: Model, scenarios: Sequence[Scenario], states: Array
+    ) -> list[Mapping[str, Array]]:
+        """What is watched in each of some runs, by name; each to its own end."""
+        world = self.world
+        values = {p.name: float(v) for p, v in zip(world.parameters, model.fit.theta, strict=True)}
+        simulator = world.watching(self.watched, model.names)
+        try:
+            theta = np.array([[values.get(p.name, 0.0) for p in simulator.parameters]])
+            freed = {p.name: values[p.name] for p in world.freed}
+            own = [replace(s, constants={**s.constants, **freed}) for s in scenarios]
+            initial = dict(zip(world.states, states.T, strict=True))
+            result = simulator.simulate_lanes(np.repeat(theta, len(own), 0), own, initial)
+        finally:
+            simulator.close()
+        world.simulations += len(own)
+        names = [channel.name for channel in simulator.channels]
+        return [
+            dict(zip(names, lane[: scenario.times.size].T, strict=True))
+            for lane, scenario in zip(result, own, strict=True)
+        ]
+
+    # -- what it may
+
+    def _bounds(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest of each channel that is watched."""
+        ends = {}
+        for name in self.watched:
+            values = np.concatenate([run[name] for run in self.past])
+            values = values[np.isfinite(values)]
+            ends[name] = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+        scales = {channel.name: channel.scale for channel in self.world.kind.channels}
+        if not self.world.kind.has_model:
+            return {name: _wider(*ends[name], scales[name]) for name in ends}
+        stated = self._stated()
+        bounds = {}
+        for name, (low, high) in ends.items():
+            if name in stated:
+                # What the runs so far did they may do again, whatever the file says.
+                bounds[name] = min(stated[name][0], low), max(stated[name][1], high)
+            elif name.startswith("q."):
+                bounds[name] = _wider(low, high, scales[name])
+            else:
+                kind = name.partition(".")[0]
+                most = max(max(map(abs, own)) for key, own in ends.items() if key.startswith(kind))
+                own = FASTER * max(abs(low), abs(high), IDLE * most)
+                bounds[name] = -own, own
+        return bounds
+
+    def _stated(self) -> dict[str, tuple[float, float]]:
+        """What the model file states of them."""
+        robot: Any = self.world.kind
+        found = {f"q.{joint.name}": joint.range for joint in self._joints if joint.range}
+        for name, speed in robot.robot.speeds.items():
+            found[f"qd.{name}"] = (-speed, speed)
+        for joint in self._joints:
+            drives = [a for a in robot.robot.actuators if a.joint == joint.name]
+            clamped = bool(drives) and all(a.force is not None for a in drives)
+            if joint.effort is not None:
+                found[f"tau.{joint.name}"] = (-joint.effort, joint.effort)
+            elif clamped:
+                found[f"tau.{joint.name}"] = (-np.inf, np.inf)
+        return found
+
+    def _within(self, channels: Mapping[str, Array]) -> bool:
+        for name, values in channels.items():
+            low, high = self.bounds[name]
+            slack = 1e-9 * max(abs(low), abs(high)) if np.isfinite([low, high]).all() else 0.0
+            if not np.isfinite(values).all():
+                return False
+            if values.min() < low - slack or values.max() > high + slack:
+                return False
+        return not self.world.kind.has_model or contacts(self.world.kind, channels) <= self._touched
+
+    @cached_property
+    def _touched(self) -> frozenset[tuple[int, int]]:
+        """What touched in the runs so far."""
+        return frozenset().union(*(contacts(self.world.kind, run) for run in self.past))
+
+
+def _wider(low: float, high: float, scale: float) -> tuple[float, float]:
+    slack = TRAVEL * max(high - low, scale)
+    return low - slack, high + slack
