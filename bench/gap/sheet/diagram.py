@@ -22,7 +22,7 @@ from bench.gap.sheet.subject import Subject
 from sims import effects as library
 from sims.base import Array
 from sims.extended import Extended
-from sims.system import Effect, Force, Friction, Kind, Moment, System
+from sims.system import Effect, Force, Friction, Hidden, Kind, Moment, System
 
 POINTS = 201
 """Loads of the diagram."""
@@ -89,6 +89,7 @@ class Diagram:
         breakaway: the drive's force that moves it without a load.
         backdrive: the load that moves it without a drive; infinite where none does.
         laws: names of the effects in it.
+        without: names of those at the joint that have a state of their own, and no law at rest.
         reach: of the axes.
     """
 
@@ -100,6 +101,7 @@ class Diagram:
     backdrive: float
     laws: tuple[str, ...]
     reach: float
+    without: tuple[str, ...] = ()
 
     def document(self) -> dict[str, Any]:
         """As TOML, with the laws that it rests on."""
@@ -147,6 +149,7 @@ def diagram(subject: Subject, extended: Extended, strongest: float | None) -> Di
         float(_root(unpowered, far, 1)[0]),
         found.names,
         reach,
+        found.without,
     )
 
 
@@ -170,6 +173,7 @@ class _Joint:
     def __init__(self, subject: Subject, extended: Extended) -> None:
         self.system = _Slide() if subject.linear else _Bench()
         self.laws: list[tuple[Effect, Array]] = []
+        self.without: tuple[str, ...] = ()
         by_effect: dict[str, dict[str, float]] = {}
         for name, numbers in extended.effects.items():
             for effect, coefficient, number in subject.own(name, numbers):
@@ -177,7 +181,9 @@ class _Joint:
         for name, values in by_effect.items():
             law = library.get(name.partition("@")[0])
             # What a drive's own law does is in the force that it gives.
-            if law.at == "joint" and issubclass(law, Friction | Force):
+            if issubclass(law, Hidden):
+                self.without = (*self.without, law.name)
+            elif law.at == "joint" and issubclass(law, Friction | Force):
                 c = np.array([values.get(one.name, 0.0) for one in law.coefficients])
                 self.laws.append((law(), c[:, None, None]))
         stated = subject.stated(f"friction.coulomb@{subject.joint}") if subject.joint else None

@@ -170,6 +170,8 @@ def _beside(figure: Figure, diagram: Diagram, x: float, y: float) -> None:
     lines.append(f"without power a load of {load} turns it" if turned else "locks itself")
     laws = clean(", ".join(diagram.laws), 100)
     lines.append(f"laws: {laws or 'none, no friction at rest'}")
+    if diagram.without:
+        lines.append(f"not in it, with a state of its own: {', '.join(diagram.without)}")
     text = "\n".join(part for line in lines for part in textwrap.wrap(line, 34))
     figure.text(x, y, text, va="top", linespacing=1.4, fontsize=7.5)
 

@@ -81,6 +81,8 @@ def _diagram(diagram: Diagram, drawn: bytes) -> Iterator[str]:
         f"By the force of the motor and what it works against, where the joint moves, holds and "
         f"slips: {laws}, at position 0 and at the start of a run. The dotted line is balance."
     )
+    if diagram.without:
+        said += f" Not in it, with a state of its own: {', '.join(diagram.without)}."
     yield paragraph(safe(said))
     yield f'<div style="max-width:34rem">{figure(drawn, safe(said), caption)}</div>'
 

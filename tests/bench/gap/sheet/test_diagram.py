@@ -10,7 +10,7 @@ import pytest
 from bench.gap.sheet.diagram import Diagram, diagram
 from bench.gap.sheet.sheet import DataSheet
 from bench.gap.sheet.subject import subject_of
-from bench.registry import simulators
+from bench.registry import effects, simulators
 from sims.extended import Extended, Number
 from tests.bench.gap.sheet.drives import FRICTION
 
@@ -70,3 +70,24 @@ def test_it_reaches_as_far_as_the_drive(sheet: DataSheet) -> None:
     assert sheet.diagram.reach == stall.value
     assert sheet.diagram.breakaway == pytest.approx(FRICTION, rel=0.05)
     assert sheet.document()["diagram"]["laws"] == ["friction.coulomb"]
+
+
+@pytest.mark.parametrize(
+    "name", [effect.name for effect in subject_of(simulators.get("servo"), None).effects()]
+)
+def test_every_effect_of_the_library_has_its_place_in_it(name: str) -> None:
+    """Beside dry friction; what is no law of a joint at rest leaves the band as it is."""
+    coefficients = effects.get(name).on(simulators.get("servo").system)
+    law = {c.name: 0.02 for c in coefficients}
+    dry = {"friction.coulomb": {"coefficient": DRY}}
+    found = of({**dry, name: law})
+    assert np.isfinite(found.breakaway)
+    assert found.breakaway > 0
+    assert (found.forward >= found.back).all()
+
+
+def test_what_has_a_state_of_its_own_is_said_to_be_left_out() -> None:
+    law = {c.name: 0.02 for c in effects.get("friction.hysteresis").coefficients}
+    found = of({"friction.hysteresis": law})
+    assert found.without == ("friction.hysteresis",)
+    assert found.laws == ()
