@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bench.api.explain import Source, explain, sources_of
+from bench.gap.causes.rules import MEANING
 from bench.gap.explanation import Explanation
 from bench.gap.sheet.sheet import DataSheet, sheet
 from bench.gap.sheet.subject import subject_of
@@ -105,11 +106,32 @@ def refuse_joint(
     subject_of(kind, joint)
 
 
+def _sound(verdict: Verdict) -> Verdict:
+    """A verdict whose parts that are used here are what they should be.
+
+    Raises:
+        ValueError: one is not.
+    """
+    texts: list[object] = [verdict.verdict]
+    numbers: list[object] = []
+    for cause in verdict.causes:
+        texts += [cause.effect, *cause.alternatives]
+        numbers.append(cause.p_value)
+    for candidate in verdict.candidates:
+        texts.append(candidate.effect)
+        numbers += [candidate.p_value, candidate.heldout_gain or 0.0]
+    if not all(isinstance(text, str) for text in texts) or verdict.verdict not in MEANING:
+        raise ValueError("a name is no text")
+    if not all(isinstance(number, int | float) for number in numbers):
+        raise ValueError("a number is none")
+    return verdict
+
+
 def _read(folder: Path) -> tuple[Extended, Verdict]:
     """What explain has written to a folder."""
     path = folder / "verdict.json"
     try:
-        verdict = Verdict.of(json.loads(path.read_text(encoding="utf-8")))
+        verdict = _sound(Verdict.of(json.loads(path.read_text(encoding="utf-8"))))
     except OSError as error:
         remedy = "name a folder that simgap explain has written"
         raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None

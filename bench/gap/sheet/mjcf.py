@@ -55,9 +55,12 @@ def mjcf(facts: Facts, folder: Path) -> Made:
         facts: what is on the sheet.
         folder: where the files will lie: from there the log is named.
     """
-    if facts.subject.kind.has_model:
-        return _of_robot(facts)
-    return _of_system(facts, folder)
+    from sims.robot.quiet import quiet
+
+    with quiet():
+        if facts.subject.kind.has_model:
+            return _of_robot(facts)
+        return _of_system(facts, folder)
 
 
 def _of_robot(facts: Facts) -> Made:
@@ -78,7 +81,7 @@ def _of_system(facts: Facts, folder: Path) -> Made:
     made: list[_Class] = []
     files: dict[str, str] = {}
     for setting in settings(facts):
-        model = facts.subject.kind.system.model_file(setting.numbers)
+        model = _model_file(facts, setting)
         if model is None:
             return Made({}, (f"{facts.subject.kind.name} has no form in MJCF",))
         name = class_name("_".join([facts.name, setting.name]) if setting.name else facts.name)
@@ -95,6 +98,14 @@ def _of_system(facts: Facts, folder: Path) -> Made:
             files |= _described(facts, setting, model, stem, folder)
     lines = dict.fromkeys(line for one in made for line in one.said)
     return Made({CLASS: _file(facts, made), **files}, tuple(lines))
+
+
+def _model_file(facts: Facts, setting: Setting) -> ModelFile | None:
+    try:
+        return facts.subject.kind.system.model_file(setting.numbers)
+    except ZeroDivisionError:
+        # A number that somebody has written into the file.
+        return None
 
 
 def _class(
@@ -157,6 +168,7 @@ def settings(facts: Facts) -> list[Setting]:
     for run in facts.recording.runs:
         by_constants.setdefault(tuple(sorted(run.constants.items())), []).append(run)
     usual = {c.name: c.value for c in facts.subject.kind.constants}
+    usual |= {p.name: p.nominal for p in facts.subject.kind.parameters}
     fitted = {name: number.value for name, number in facts.extended.parameters.items()}
     known = {**usual, **facts.recording.constants, **facts.extended.constants, **fitted}
     return [
@@ -189,7 +201,9 @@ def _placed(
             )
             continue
         place = places.get(effect.at, "")
-        causes[f"{name}@{place}" if place else name] = numbers
+        off = Number(0.0, "1", None, None)
+        whole = {c.name: numbers.get(c.name, off) for c in effect.on(facts.subject.kind.system)}
+        causes[f"{name}@{place}" if place else name] = whole
     if dry:
         key = f"friction.coulomb@{model.joint}"
         own = causes.get(key, {}).get("coefficient")
@@ -222,7 +236,8 @@ def _limits(
     rate = np.gradient(position, run.times)
     each = (len(position), 1)
     theta = np.array([[setting.numbers[p.name] for p in kind.parameters]])
-    coefficients = [numbers[c.name].value for c in effect.on(system) if c.name in numbers]
+    there = effect.on(system)
+    coefficients = [numbers[c.name].value if c.name in numbers else 0.0 for c in there]
     moment = Moment(
         system,
         np.repeat(theta, len(position), axis=0),

@@ -117,12 +117,12 @@ class _Rows:
         for derived in self.subject.kind.system.derived:
             try:
                 value = derived.of(known)
-            except KeyError:
+            except (KeyError, ZeroDivisionError):
                 # A constant that differs between runs has no one value.
                 continue
             slopes = []
             for name in free:
-                step = STEP * abs(known[name])
+                step = STEP * (abs(known[name]) or 1.0)
                 slopes.append((derived.of({**known, name: known[name] + step}) - value) / step)
             spread = np.array(slopes)
             half = Z95 * float(np.sqrt(max(spread @ covariance @ spread, 0.0)))
@@ -134,7 +134,9 @@ class _Rows:
         """Parameters of the system, or free numbers of the robot's file here."""
         if not self.subject.joint:
             for parameter in self.subject.kind.parameters:
-                number = self.extended.parameters[parameter.name]
+                nominal = Number(parameter.nominal, parameter.unit, None, None)
+                # What the file does not state is nominal.
+                number = self.extended.parameters.get(parameter.name, nominal)
                 says = parameter.says or parameter.name
                 row = _row(parameter.name, says, "system", "fitted", number, None)
                 yield replace(row, another=self.shown.another.get(parameter.name))

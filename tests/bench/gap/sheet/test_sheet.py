@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +13,10 @@ import tomllib
 from bench.api.datasheet import datasheet
 from bench.cli import main
 from bench.gap.explanation import Explanation
+from bench.gap.sheet.mjcf import mjcf
 from bench.gap.sheet.quantity import Quantity
 from bench.gap.sheet.sheet import DataSheet
+from sims import extended
 from sims.base import InputError
 from tests.bench.gap.sheet.drives import CONSTANTS, FRICTION, NOISE, SAMPLES, TRUTH
 
@@ -141,6 +145,33 @@ def test_faults_are_one_line(log: Path, explained: Explanation, tmp_path: Path) 
         datasheet(log, explained=tmp_path)
     with pytest.raises(InputError, match="expected none, as servo is no robot; found elbow"):
         datasheet(log, explained=explained, joint="elbow")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("p_value", "x"), ("effect", 3), ("alternatives", 1), ("coefficients", []), ("verdict", "so")],
+)
+def test_a_spoilt_verdict_is_refused(
+    log: Path, explained: Explanation, tmp_path: Path, key: str, value: object
+) -> None:
+    document = explained.answer.document()
+    (document if key in document else document["causes"][0])[key] = value
+    (tmp_path / "verdict.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="expected a verdict of simgap explain, found other text"):
+        datasheet(log, explained=tmp_path)
+
+
+def test_numbers_that_a_model_does_not_state_are_nominal(
+    log: Path, explained: Explanation, tmp_path: Path
+) -> None:
+    (tmp_path / "verdict.json").write_text(json.dumps(explained.answer.document()))
+    empty = replace(explained.extended, parameters={}, effects={"friction.coulomb": {}})
+    extended.write(empty, tmp_path / "extended.toml")
+    bare = datasheet(log, explained=tmp_path)
+    number = row(bare, "armature").number
+    assert number is not None
+    assert (number.value, number.low) == (2e-3, None)
+    assert mjcf(bare, tmp_path).contents["model.xml"].count("frictionloss") == 0
 
 
 def test_a_joint_that_is_none_is_refused_before_the_search(
