@@ -1,7 +1,7 @@
 """Tuner against tuner: paired tests over targets with effect sizes, and mean ranks over problems.
 
-Sources: F. Wilcoxon, Biometrics Bulletin 1(6), 1945 (scipy); S. Holm, Scand. J. Statist. 6, 1979
-(statsmodels); D. S. Kerby, Comprehensive Psychology 3, 2014, for the matched-pairs rank-biserial
+Sources: F. Wilcoxon, Biometrics Bulletin 1(6), 1945 (scipy); S. Holm, Scand. J. Statist. 6, 65,
+1979; D. S. Kerby, Comprehensive Psychology 3, 2014, for the matched-pairs rank-biserial
 correlation; J. Demsar, JMLR 7, 2006, for ranks over problems, Friedman's and Nemenyi's tests
 (scikit-posthocs).
 """
@@ -60,8 +60,6 @@ def pairs(curves: Curves) -> pd.DataFrame:
     `error_ratio` the median of a's error over b's. Holm's correction is over all pairs of an
     experiment and range.
     """
-    from statsmodels.stats.multitest import multipletests
-
     parts = []
     for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
         logs = log_errors(curves.of(experiment=str(experiment), range=str(kind)))
@@ -72,9 +70,20 @@ def pairs(curves: Curves) -> pd.DataFrame:
         # A single tuner makes no pair.
         if lines:
             part = pd.DataFrame(lines, columns=PAIR_COLUMNS[:-1])
-            part["p_holm"] = multipletests(part["p_value"].to_numpy(), method="holm")[1]
+            part["p_holm"] = holm(part["p_value"].to_numpy())
             parts.append(part)
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=PAIR_COLUMNS)
+
+
+def holm(p: Array) -> Array:
+    """(n,) p-values p (n,) of one family, each corrected so that the chance of any false alarm
+    among them stays at the level: the k-th smallest times n + 1 - k, none below one before it.
+    """
+    order = np.argsort(p, kind="stable")
+    steps = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
+    corrected = np.empty(len(p))
+    corrected[order] = np.minimum(steps, 1.0)
+    return corrected
 
 
 def _compared(a: Array, b: Array) -> tuple[int, float, float, float, float]:

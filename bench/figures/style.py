@@ -233,6 +233,19 @@ def pdf(figure: Figure) -> bytes:
     return file.getvalue()
 
 
+def printed(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes]:
+    """A figure as the bytes of a PNG and of a PDF file, laid out once for both: finding room takes
+    as long as drawing.
+    """
+    as_png = png(figure, dpi)
+    engine = figure.get_layout_engine()
+    figure.set_layout_engine(None)
+    try:
+        return as_png, pdf(figure)
+    finally:
+        figure.set_layout_engine(engine)
+
+
 def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
     """Write a figure as PNG and PDF, both whole or neither; missing folders are made.
 
@@ -247,9 +260,10 @@ def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
     Raises:
         InputError: the folder cannot be made or written to.
     """
+    as_png, as_pdf = printed(figure, dpi)
     contents = {
-        path.with_name(f"{path.name}.png"): png(figure, dpi),
-        path.with_name(f"{path.name}.pdf"): pdf(figure),
+        path.with_name(f"{path.name}.png"): as_png,
+        path.with_name(f"{path.name}.pdf"): as_pdf,
     }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

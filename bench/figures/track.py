@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.figures.style import BLUE, RUST, SHADE, blank, pdf, png
+from bench.figures.style import BLUE, RUST, SHADE, blank, printed
 from bench.recordings.metres import Heights
 from sims.base import Array
 from sims.camera.render import Image
@@ -26,7 +26,7 @@ _MISSING = RUST
 def drawn(track: Track, heights: Heights, part: slice, title: str) -> tuple[bytes, bytes]:
     """The figure of a track as PNG and PDF; arguments as of `track_figure`."""
     figure = track_figure(track, heights, part, title)
-    return png(figure, _DPI), pdf(figure)
+    return printed(figure, _DPI)
 
 
 def track_figure(track: Track, heights: Heights, part: slice, title: str) -> Figure:

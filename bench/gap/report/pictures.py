@@ -99,7 +99,7 @@ def printed(story: Story) -> dict[str, Printed]:
     with _styled():
         # Within the settings: text is laid out once more when a figure is written.
         figures = {name: figure(story, name) for name in names(story)}
-        return {n: Printed(style.png(f, DPI), style.pdf(f)) for n, f in figures.items()}
+        return {n: Printed(*style.printed(f, DPI)) for n, f in figures.items()}
 
 
 @contextmanager
