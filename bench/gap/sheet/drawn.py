@@ -14,7 +14,7 @@ from bench.figures import style
 from bench.gap.report.words import clean, estimated, number, pretty, sentence, with_unit
 from bench.gap.sheet.diagram import Diagram
 from bench.gap.sheet.facts import Facts
-from bench.gap.sheet.words import TITLES, another, beside, called, evidence, reached
+from bench.gap.sheet.words import TITLES, another, beside, called, evidence, reached, short
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -152,7 +152,7 @@ def _not_shown(figure: Figure, facts: Facts) -> float:
         y = begins - _SMALL * 1.2 * (i % half)
         mixed = beside(row)
         said = reached(row) + (f" (mixed up with {mixed})" if mixed and row.reach else "")
-        figure.text(x, y, clean(row.name, 34), va="top", fontsize=5.6, family="monospace")
+        figure.text(x, y, clean(short(row), 34), va="top", fontsize=5.6, family="monospace")
         figure.text(x + 0.18, y, clean(said, 52), va="top", fontsize=5.6)
     title = "Not shown by these data, and how small a number they would have shown (95 %)"
     figure.text(_MARGIN, begins + 0.018, title, weight="bold", va="top")

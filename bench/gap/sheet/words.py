@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 from bench.gap.report.words import joined, number, percent, probability, with_unit
 from bench.gap.sheet.quantity import Quantity
 from bench.gap.sheet.subject import PARTS
 
+UNLIKELY = 0.05
+"""Chance above which a cause stands only because nobody had the time to judge it."""
 TITLES = {"system": "Motor", **PARTS}
 """Of the parts of the table."""
 
@@ -17,7 +21,20 @@ def another(row: Quantity) -> str:
 
 def called(row: Quantity) -> str:
     """What a person calls it."""
-    return row.name.replace("_", " ") if row.part == "system" else row.says
+    if row.part == "system":
+        return row.name.replace("_", " ")
+    # On a sheet stands the number itself, and not by how much a file is wrong.
+    return row.says if row.stated is None else re.sub("^(wrong|misplaced) ", "", row.says)
+
+
+def short(row: Quantity) -> str:
+    """Its name without the joint or actuator that the whole sheet is of."""
+    effect, _, rest = row.name.partition("@")
+    if not rest:
+        return row.name
+    place, _, coefficient = rest.partition(" ")
+    channel = place.partition(".")[0] if row.part == "channel" else ""
+    return " ".join(part for part in (effect, coefficient, channel) if part)
 
 
 def evidence(row: Quantity, short: bool = False) -> str:
@@ -26,7 +43,8 @@ def evidence(row: Quantity, short: bool = False) -> str:
         return "follows from those below"
     if row.state == "fitted":
         return "fitted" if row.number and row.number.low is not None else "not fixed by these data"
-    said = [probability(row.p_value)]
+    judged = row.p_value is None or row.p_value <= UNLIKELY
+    said = [probability(row.p_value) if judged else "the search ended before it was judged"]
     if row.share is not None:
         closed = percent(row.share)
         said.append(

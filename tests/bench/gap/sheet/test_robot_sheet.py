@@ -10,6 +10,7 @@ from bench.gap.sheet.facts import Facts
 from bench.gap.sheet.quantity import Quantity
 from bench.gap.sheet.sheet import sheet
 from bench.gap.sheet.subject import subject_of
+from bench.gap.sheet.words import called, short
 from bench.recordings.joined import load_all
 from bench.registry import robot
 from sims.base import InputError
@@ -53,7 +54,11 @@ def test_what_was_found_is_added_to_what_the_file_states(log: Path) -> None:
     assert drag.stated == pytest.approx(0.1)
     assert drag.number is not None
     assert (drag.number.value, drag.number.low) == pytest.approx((0.12, 0.115))
+    assert called(drag) == "linear drag"
     armature = row(facts, "inertia.armature@elbow")
+    assert called(armature) == "armature"
+    assert short(row(facts, "sensor.bias@q.elbow")) == "sensor.bias q"
+    assert short(row(facts, "force.ripple@elbow sine")) == "force.ripple sine"
     assert armature.state == "not shown"
     assert armature.stated == pytest.approx(0.005)
     assert row(facts, "friction.coulomb@elbow").state == "found"
