@@ -21,6 +21,9 @@ from bench.gap.verdict import Verdict
 from sims.base import Array
 from sims.extended import Number as Estimate
 
+BORDER = 1e-6
+"""Share of its range within which a parameter is at the border."""
+
 
 @dataclass(frozen=True)
 class Teller:
@@ -166,7 +169,27 @@ class Teller:
         if vague:
             names = ", ".join(vague)
             yield f"the recording does not fix {names} beside the others: kept at the nominal value"
+        yield from self._bordering()
         yield from self.notes
+
+    def _bordering(self) -> Iterator[str]:
+        """Parameters whose fit would have gone on beyond their range."""
+        world = self.assessor.fitting
+        for i in sorted({*world.base.tolist()} - {*self.base.frozen}):
+            parameter = world.parameters[i]
+            low, high = parameter.bounds
+            near = BORDER * (high - low)
+            for model, when in ((self.finding.base, "the base fit"), (self.finding.model, "")):
+                value = float(model.fit.theta[i])
+                if low + near < value < high - near:
+                    continue
+                limit = low if value < 0.5 * (low + high) else high
+                yield (
+                    f"{when and f'in {when} '}{parameter.name} ends at the border of its range,"
+                    f" {limit:g} {parameter.unit}: nothing beyond was tried, and causes may stand"
+                    " in for what lies there"
+                )
+                break
 
     def _why(self) -> Iterator[str]:
         """Why the verdict is what it is, the most important first."""

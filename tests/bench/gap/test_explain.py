@@ -301,3 +301,26 @@ def test_what_only_tables_need_is_not_loaded():
     code = "import sys, bench.gap.explain; print('pandas' in sys.modules, 'scipy' in sys.modules)"
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert printed.stdout.split() == ["False", "False"], printed.stderr
+
+
+def test_a_parameter_that_ends_at_its_border_is_told(tmp_path):
+    """A slide of 95 kg: the system's own range ends at 10 kg, and a gain of the input stands in."""
+    rng, mass, step = np.random.default_rng(0), 95.0, 0.01
+    times, lines = step * np.arange(200), ["run,t,u,x"]
+    for run in range(2):
+        u = 40.0 * (1 + 0.5 * run) * np.where(times < 0.7, 1.0, -1.0)
+        v = np.append(0.0, np.cumsum(u[:-1] * step / mass))
+        x = np.append(0.0, np.cumsum(v[:-1] * step + u[:-1] * step**2 / (2 * mass)))
+        seen = x + 1e-3 * rng.standard_normal(times.size)
+        rows = zip(times, u, seen, strict=True)
+        lines += [f"{run},{t:.4f},{push:.9g},{where:.9g}" for t, push, where in rows]
+    (tmp_path / "heavy.csv").write_text("\n".join(lines) + "\n")
+    units = '[inputs.u]\nunit = "N"\n[channels.x]\nunit = "m"\nnoise = 1e-3\n'
+    (tmp_path / "heavy.toml").write_text(f'system = "slider"\n{units}')
+    found = explained(tmp_path / "heavy.csv")
+    assert any(
+        "mass ends at the border of its range, 10 kg" in said for said in found.story.remains
+    )
+    assert found.answer.causes[0].coefficients["coefficient"].value == pytest.approx(
+        10 / mass - 1, abs=1e-3
+    )
