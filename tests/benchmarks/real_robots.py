@@ -139,15 +139,46 @@ def emps(out, explained):
     print(verdict["verdict"], verdict["heldout"], f"{verdict['seconds']:.0f} s")
 
 
+def emps_slide(out, explained):  # noqa: ARG001
+    """The drive as the system `slider`, which may have a flexible transmission: once fitted on the
+    first run, once on the second with its pulses, in pieces, forces in units of 50 N.
+    """
+    unit, length = 50.0, 500
+    with (ROBOTS / "emps" / "recording.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    lines = ["run,t,u,x"]
+    for run in "12":
+        own = [row for row in rows if row["run"] == run]
+        for k in range(len(own) // length):
+            for i, row in enumerate(own[k * length : (k + 1) * length]):
+                lines.append(f"{run}-{k},{i / 1000},{float(row['u']) / unit!r},{row['x']}")
+    count = len(rows) // 2 // length
+    for fitted, other in ("12", "21"):
+        name = out / f"emps-{fitted}.csv"
+        name.write_text("\n".join(lines) + "\n")
+        held_out = [f'[runs."{other}-{k}"]\nheld_out = true\n' for k in range(count)]
+        units = '[inputs.u]\nunit = "N"\n[channels.x]\nunit = "m"\nnoise = 2.4e-5\n'
+        name.with_suffix(".toml").write_text(f'system = "slider"\n{units}{"".join(held_out)}')
+        simgap("explain", name, "--out", out / f"explained-{fitted}")
+        verdict = json.loads((out / f"explained-{fitted}" / "verdict.json").read_text())
+        print(
+            f"fitted on run {fitted}: mass {unit * verdict['parameters']['mass']['value']:.1f} kg"
+        )
+        for cause in verdict["causes"]:
+            sizes = {k: round(c["value"], 4) for k, c in cause["coefficients"].items()}
+            print(cause["effect"], cause["alternatives"], sizes, f"in units of {unit:g} N")
+        print(verdict["verdict"], verdict["heldout"], f"{verdict['seconds']:.0f} s")
+
+
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("which", choices=("so101", "emps"))
+    parser.add_argument("which", choices=("so101", "emps", "emps_slide"))
     parser.add_argument("--out", type=Path)
     parser.add_argument("--explained", type=Path)
     options = parser.parse_args()
     out = options.out or Path("results/reference/real") / options.which
     out.mkdir(parents=True, exist_ok=True)
-    {"so101": so101, "emps": emps}[options.which](out, options.explained)
+    {"so101": so101, "emps": emps, "emps_slide": emps_slide}[options.which](out, options.explained)
 
 
 if __name__ == "__main__":
