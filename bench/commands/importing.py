@@ -15,7 +15,7 @@ def add_import(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=place,
         help="files of one run (.csv, .tsv, .npz, .parquet), or folders or bags (ROS 1, ROS 2, "
-        "MCAP) that each hold one",
+        "MCAP) that each hold one, or datasets of LeRobot",
     )
     parser.add_argument(
         "--model", metavar="FILE", type=place, required=True, help="what they are of: MJCF or URDF"

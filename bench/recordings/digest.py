@@ -10,6 +10,7 @@ from pathlib import Path
 from sims.base import InputError
 from sims.recording.bags import bag_of
 from sims.recording.description import description_of
+from sims.recording.lerobot import episode_of, files_of
 from sims.recording.mapping import mapped
 
 PIECE = 1 << 20
@@ -44,6 +45,12 @@ def content_of(path: Path) -> bytes:
 
     Nothing where there is none: whoever reads it will say so.
     """
+    episode = episode_of(path)
+    if episode is not None:
+        try:
+            return b"".join(content_of(file) for file in files_of(*episode))
+        except InputError:
+            return b""
     bag = bag_of(path)
     whole = path if bag is None else bag[0]
     files = sorted(whole.rglob("*")) if bag is not None and whole.is_dir() else [whole]

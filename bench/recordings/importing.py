@@ -18,6 +18,7 @@ from bench.recordings.inspection import load
 from bench.recordings.servos import Following, following
 from sims.base import Array, InputError
 from sims.recording.bags import ENDINGS, TIME, is_bag
+from sims.recording.lerobot import is_dataset
 from sims.recording.logs import Log, logs_in, read_log
 from sims.recording.recording import Run
 from sims.recording.write import publish
@@ -54,7 +55,7 @@ def describe(
     """The description of logs of a robot.
 
     Args:
-        logs: files of one run, or folders that each hold those of one.
+        logs: files of one run, folders that each hold those of one, or datasets of LeRobot.
         robot: what they are of.
         model: its model file.
         beside: the folder where the description will stand.
@@ -82,7 +83,7 @@ class Files(NamedTuple):
 
 
 def runs_of(logs: Sequence[Path]) -> dict[str, Files]:
-    """Logs by run: those of each folder or bag, or the files themselves as one run.
+    """Logs by run: those of each folder, bag or episode, or the files themselves as one run.
 
     Raises:
         InputError: there is no log.
@@ -90,6 +91,9 @@ def runs_of(logs: Sequence[Path]) -> dict[str, Files]:
     files = [path for path in logs if not path.is_dir() and not is_bag(path)]
     runs: dict[str, Files] = {}
     for folder in (path for path in logs if path not in files):
+        if is_dataset(folder):
+            runs |= {path.parent.name: Files(path.parent, [path]) for path in logs_in(folder)}
+            continue
         inside = [folder] if is_bag(folder) else [folder, *sorted(folder.iterdir())]
         for one in inside:
             if is_bag(one):

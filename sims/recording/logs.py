@@ -1,5 +1,5 @@
 """Logs as their loggers wrote them: a CSV of any layout, a NumPy archive, a Parquet file, a topic
-of a bag.
+of a bag, an episode of a dataset.
 
 A column is named as the log names it, ``positions[2]`` being the third entry of what holds a list
 or a vector in each row. Nothing is unpickled.
@@ -18,15 +18,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.base import Array, InputError, frozen
-from sims.recording import bags
+from sims.recording import bags, lerobot
+from sims.recording.columnar import WIDEST, columns_of, unreadable
 from sims.user_toml import shown
 
 FORMATS = (".csv", ".tsv", ".txt", ".npz", ".parquet")
 """What can be read, by the name's ending."""
 LARGEST = 2_000_000_000
 """Bytes of a file: more would not fit beside what is made of it."""
-WIDEST = 10_000
-"""Columns of a log, and entries of a list in a cell."""
 SEPARATORS = (",", ";", "\t")
 """Between the cells of a table."""
 _ENTRY = re.compile(r"(?P<base>.*)\[(?P<place>\d{1,5})\]")
@@ -120,6 +119,11 @@ def read_log(path: str | Path) -> Log:
     if bag is not None:
         about = bag[0].stat()
         return _read_topic(Stamp(path, about.st_mtime_ns, about.st_size))
+    episode = lerobot.episode_of(path)
+    if episode is not None:
+        abouts = [file.stat() for file in lerobot.files_of(*episode)]
+        changed = max(about.st_mtime_ns for about in abouts)
+        return _read_episode(Stamp(path, changed, sum(about.st_size for about in abouts)))
     if bags.is_bag(path):
         there = ", ".join(bags.topics(path))
         raise InputError(f"{path}: a bag; name a topic of it, as {path.name}/TOPIC: {there}")
@@ -144,6 +148,15 @@ def _read_topic(stamp: Stamp) -> Log:
     if len(columns) < 2 or not columns[bags.TIME].size:
         raise InputError(f"{stamp.path}: expected messages with numbers, found none")
     return Log(stamp.path, columns, (), "message")
+
+
+@lru_cache(maxsize=8)
+def _read_episode(stamp: Stamp) -> Log:
+    """An episode of a dataset, read once."""
+    episode = lerobot.episode_of(stamp.path)
+    assert episode is not None  # it is one that was asked for
+    columns, texts = lerobot.read_episode(*episode)
+    return Log(stamp.path, columns, tuple(texts), "frame")
 
 
 @lru_cache(maxsize=8)
@@ -287,44 +300,9 @@ def _parquet(path: Path) -> Log:
     try:
         table = parquet.read_table(path)
     except (pyarrow.ArrowException, OSError) as error:
-        what = " ".join(str(error).split())
-        raise InputError(f"{path}: not a Parquet file: {what}") from None
-    columns: dict[str, Array] = {}
-    texts = []
-    for name in table.column_names:
-        values = _arrow(table.column(name))
-        if values is None:
-            texts.append(name)
-        else:
-            columns[name] = frozen(values)
+        raise unreadable(path, error) from None
+    columns, texts = columns_of(table)
     return Log(path, columns, tuple(texts), "row")
-
-
-def _arrow(column: Any) -> Array | None:
-    """(T,) or (T, k) numbers of a column; None where it holds none."""
-    import pyarrow
-
-    kind = column.type
-    if pyarrow.types.is_timestamp(kind):
-        column = column.cast(pyarrow.int64())
-        return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
-    if pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind):
-        return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
-    lists = (
-        pyarrow.types.is_list(kind)
-        or pyarrow.types.is_large_list(kind)
-        or pyarrow.types.is_fixed_size_list(kind)
-    )
-    if not lists:
-        return None
-    rows = column.to_pylist()
-    lengths = {len(row) if row is not None else -1 for row in rows}
-    if len(lengths) != 1 or not 0 < max(lengths) <= WIDEST:
-        return None
-    try:
-        return np.array(rows, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
 
 
 _READERS: Mapping[str, Callable[[Path], Log]] = {
@@ -337,7 +315,10 @@ _READERS: Mapping[str, Callable[[Path], Log]] = {
 
 
 def logs_in(folder: Path) -> Iterator[Path]:
-    """The logs of a folder, or the topics of a bag, in order of name."""
+    """The logs of a folder, the topics of a bag, the episodes of a dataset, in order of name."""
+    if lerobot.is_dataset(folder):
+        yield from lerobot.episodes(folder)
+        return
     if bags.is_bag(folder):
         yield from (folder / topic for topic in bags.topics(folder))
         return

@@ -1,0 +1,71 @@
+"""Tables of columns (Parquet), as numbers by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims.base import Array, InputError, frozen
+
+WIDEST = 10_000
+"""Columns of a log, and entries of a list in a cell."""
+
+
+def columns_of(table: Any) -> tuple[dict[str, Array], list[str]]:
+    """(T,) or (T, k) numbers of a pyarrow table by name, and the names of what holds none."""
+    columns: dict[str, Array] = {}
+    texts = []
+    for name in table.column_names:
+        values = _numbers(table.column(name))
+        if values is None:
+            texts.append(name)
+        else:
+            columns[name] = frozen(values)
+    return columns, texts
+
+
+def unreadable(path: Path, error: Exception) -> InputError:
+    """What to say of a file that pyarrow does not read."""
+    what = " ".join(str(error).split()) or type(error).__name__
+    return InputError(f"{path}: not a Parquet file: {what[:300]}")
+
+
+def may_hold(kind: Any) -> bool:
+    """Whether columns of a type may be numbers, or lists of them."""
+    import pyarrow
+
+    if _is_list(kind):
+        kind = kind.value_type
+    types = pyarrow.types
+    return any(is_one(kind) for is_one in (types.is_integer, types.is_floating, types.is_timestamp))
+
+
+def _is_list(kind: Any) -> bool:
+    import pyarrow
+
+    types = pyarrow.types
+    return bool(types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind))
+
+
+def _numbers(column: Any) -> Array | None:
+    """(T,) or (T, k) numbers of a column; None where it holds none."""
+    import pyarrow
+
+    kind = column.type
+    if pyarrow.types.is_timestamp(kind):
+        column = column.cast(pyarrow.int64())
+        return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
+    if pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind):
+        return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
+    if not _is_list(kind):
+        return None
+    rows = column.to_pylist()
+    lengths = {len(row) if row is not None else -1 for row in rows}
+    if len(lengths) != 1 or not 0 < max(lengths) <= WIDEST:
+        return None
+    try:
+        return np.array(rows, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
