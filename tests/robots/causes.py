@@ -10,6 +10,7 @@ JOINT = (
     "friction.coulomb", "friction.stribeck", "drag.linear", "drag.quadratic", "spring.linear",
     "inertia.armature", "force.bias", "force.ripple", "friction.direction",
     "friction.position", "friction.warming",
+    "friction.load", "friction.load_direction", "friction.load_quadratic",
 )  # fmt: skip
 BODY = ("mass.scale", "mass.offset", "inertia.scale")
 BOTH = ("input.gain", "input.bias", "input.delay", "input.lag", "input.rate", "supply.sag")
@@ -22,6 +23,7 @@ FAMILIES = ("friction.coulomb", "drag.linear")
 SIMPLER = {
     "friction.stribeck": "friction.coulomb", "friction.direction": "drag.linear",
     "input.power": "input.gain",
+    "friction.load_direction": "friction.load", "friction.load_quadratic": "friction.load",
     "friction.position": "friction.coulomb", "friction.warming": "friction.coulomb",
 }  # fmt: skip
 SIGNED = (
@@ -33,6 +35,7 @@ FAR = {  # of effects that need no scale of the motion
     "input.lag": 0.2, "sensor.bias": 0.2, "sensor.gain": 0.3, "sensor.delay": 0.1,
     "clock.skew": 0.06, "gravity.scale": 0.3, "actuator.stiffness": 0.5, "actuator.damping": 0.8,
     "gravity.tilt": 0.2, "mass.offset": 0.1, "servo.derivative": 0.1,
+    "friction.load": 0.5,
 }  # fmt: skip
 
 
@@ -44,6 +47,8 @@ def effects(drive):
 
 def places(machine, effect):
     """Where an effect can be."""
+    if effect.startswith("friction.load"):
+        return [machine.joints[joint] for joint in machine.driven]
     if effect in JOINT:
         return list(machine.joints)
     if effect in BODY:
@@ -169,6 +174,19 @@ def _warming(place, setting, rng):
     return lambda s: (typical["force"] * s, viscous * s, time)
 
 
+def _by_side(place, setting, rng):
+    """One side of the gears several times the other."""
+    shares = [1.0, float(rng.uniform(0.0, 0.3))]
+    rng.shuffle(shares)
+    return lambda s: (0.5 * shares[0] * s, 0.5 * shares[1] * s)
+
+
+def _square(place, setting, rng):
+    """At the forces that act the square makes several times as much as the load itself."""
+    square = float(rng.uniform(2.0, 6.0)) / _at(setting, place)["force"]
+    return lambda s: (0.25 * s, 0.5 * square * s)
+
+
 def _eccentric(place, setting, rng):
     angle = rng.uniform(0, 2 * np.pi)
     sine, cosine = 0.3 * float(np.sin(angle)), 0.3 * float(np.cos(angle))
@@ -186,6 +204,8 @@ def _slip(place, setting, rng):
 SHAPES = {
     "sensor.slip": _slip,
     "friction.direction": _direction,
+    "friction.load_direction": _by_side,
+    "friction.load_quadratic": _square,
     "friction.position": _uneven,
     "friction.warming": _warming,
     "input.rate": _rate,

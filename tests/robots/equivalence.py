@@ -102,6 +102,8 @@ class Rivals:
 
 FREE = {
     "force.ripple": 2, "gravity.tilt": 2, "mass.offset": 3, "friction.stribeck": 2,
-    "input.power": 2, "friction.position": 3, "friction.warming": 2,
+    "input.power": 2,
+    "friction.load_direction": 2, "friction.load_quadratic": 2,
+    "friction.position": 3, "friction.warming": 2,
 }  # fmt: skip
 """Numbers that are fitted; those behind them shape the effect."""

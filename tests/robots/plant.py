@@ -53,6 +53,7 @@ class Plant:
         ahead, back: damping of motion the one way and the other, (N,).
         ripples: (joint, sine, cosine, period).
         uneven: (joint, least, sine, cosine, period) of dry friction over the joint.
+        loads: (joint, motor, external, quadratic) of friction by what the drive carries.
         cold: (joint, dry, viscous, time) of friction that dies away.
         binding, elastic: see there; None where there is none.
     """
@@ -71,6 +72,7 @@ class Plant:
     ripples: list = field(default_factory=list)
     uneven: list = field(default_factory=list)
     cold: list = field(default_factory=list)
+    loads: list = field(default_factory=list)
     binding: Binding | None = None
     elastic: Elastic | None = None
 
@@ -107,20 +109,25 @@ class Plant:
         rubs = (self.coulomb > 0) | (self.extra > 0)
         if self.binding:
             rubs[self.binding.joint] = True
-        for joint, *_ in self.uneven + self.cold:
+        for joint, *_ in self.uneven + self.cold + self.loads:
             rubs[joint] = True
         return rubs
 
-    def limit(self, t, q, v):
-        """Largest dry friction of every joint, (N,)."""
+    def limit(self, t, q, v, drive=None):
+        """Largest dry friction of every joint, (N,); `drive` (N,) is asked for by `loads`."""
         limit = self.coulomb
         if self.stribeck:
             limit = limit + self.extra * np.exp(-((v / self.speed) ** 2))
         if self.binding:
             limit = limit.copy()
             limit[self.binding.joint] += self.binding.limit(q)
-        if self.uneven or self.cold:
+        if self.uneven or self.cold or self.loads:
             limit = limit.copy()
+        against = self.needed(q, v) if self.loads else None
+        for joint, motor, external, quadratic in self.loads:
+            one, other = drive[joint], against[joint]
+            through = min(abs(one), abs(other)) if one * other > 0 else 0.0
+            limit[joint] += abs(motor * one + external * other) + quadratic * through**2
         for joint, least, sine, cosine, period in self.uneven:
             angle = 2 * np.pi * q[joint] / period
             limit[joint] += least + np.hypot(sine, cosine)
@@ -237,12 +244,23 @@ def _uneven(plant, joint, c):
     plant.uneven.append((joint, *c))
 
 
+def _load(plant, joint, c):
+    plant.loads.append((joint, c[0], c[0], c[1] if len(c) > 1 else 0.0))
+
+
+def _by_side(plant, joint, c):
+    plant.loads.append((joint, *c, 0.0))
+
+
 def _cold(plant, joint, c):
     plant.cold.append((joint, *c))
 
 
 FORCES = {
     "friction.coulomb": _adds("coulomb"),
+    "friction.load": _load,
+    "friction.load_direction": _by_side,
+    "friction.load_quadratic": _load,
     "friction.position": _uneven,
     "friction.warming": _cold,
     "friction.direction": _direction,

@@ -71,6 +71,28 @@ def test_friction_over_the_joint_takes_its_work():
     np.testing.assert_allclose(taken, mean * q + wave, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("effect", "lifts"),
+    [
+        ({"friction.load@a": (0.2,)}, 1.2 / 0.8),
+        ({"friction.load_direction@a": (0.3, 0.1)}, 1.1 / 0.7),
+        ({"friction.load_quadratic@a": (0.1, 0.05)}, None),
+    ],
+)
+def test_a_loaded_gear_lifts_beyond_its_drive_line(effect, lifts):
+    text = robots.hanging("one", (0.3,), (1.0,), ("a",))
+    machine = Machine("one", text, (Drive("a", "motor", 0.0, 0.0, 50.0),), (0.5,))
+    pose = np.array([0.5])
+    weight = float(World(machine).plant.needed(pose, 0 * pose)[0])
+    if lifts is None:
+        lifts = (1.1 + 0.05 * abs(weight)) / 0.9
+    world = World(machine, effect)
+    for share, moves in ((1.01, True), (0.99, False)):
+        pulled = {"m_a": np.full(STAMPS.size, share * lifts * weight)}
+        motion = world.move(Run(STAMPS, pulled, pose, 0 * pose), STAMPS[:20])
+        assert (abs(motion.q[-1, 0] - 0.5) > 1e-4) == moves
+
+
 def test_a_joint_that_warms_loses_its_friction():
     dry, viscous, time, inertia = 0.3, 0.2, 0.9, 0.4
     start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([3.0]))

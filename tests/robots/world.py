@@ -202,15 +202,21 @@ class _Course:
         n = self.count
         q, v = state[:n], state[n : 2 * n]
         need = np.abs(self._holding(t, state)[0])
-        limit = self.plant.limit(t, q, v)[self.stuck]
+        limit = self._limit(t, q, v)[self.stuck]
         return float(np.max(need - limit * (1 + 1e-9)))
+
+    def _limit(self, t, q, v):
+        """Largest dry friction of every joint, (N,)."""
+        loaded = self.plant.loads
+        drive = self.drives.forces(self._commands(t), q, v) if loaded else None
+        return self.plant.limit(t, q, v, drive)
 
     def _decide(self, t):
         """Which joints at rest are held, and which way the others go."""
         n = self.count
         q, v = self.state[:n], self.state[n : 2 * n]
         rubs = self.world.rubs
-        limit = self.plant.limit(t, q, v)
+        limit = self._limit(t, q, v)
         resting = rubs & (v == 0.0)
         self.way = np.where(rubs & ~resting, np.sign(v), 0.0)
         self.stuck[:] = False
@@ -254,7 +260,7 @@ class _Course:
         """Friction of the held joints, (S,), and everybody's accelerations, (N,)."""
         n = self.count
         q, v = state[:n], state[n : 2 * n]
-        force = self._force(t, state) - self.way * self.plant.limit(t, q, v)
+        force = self._force(t, state) - self.way * self._limit(t, q, v)
         rest = force - self.plant.needed(q, v)
         mass, free = self.plant.inertia(q), ~self.stuck
         a = np.zeros(n)
@@ -270,7 +276,7 @@ class _Course:
         else:
             force = self._force(t, state)
             if self.world.dry:
-                force = force - self.way * self.plant.limit(t, q, v)
+                force = force - self.way * self._limit(t, q, v)
             a = self.plant.accelerations(q, v, force)
         if not self.elastic:
             return np.concatenate([v, a])

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.gap.causes.moves import NEARER
 from bench.gap.causes.rules import behind_in_excess, is_alike, ratio_of
 from bench.gap.causes.score_test import tail
 from bench.gap.causes.search import Search
@@ -116,9 +117,20 @@ class Alternatives:
             if added == effect:
                 continue
             behind = self._behind(model, other)
-            if is_alike(behind):
+            if is_alike(behind) and not self._buys_nothing(effect, added, behind):
                 rivals.append((behind, added))
         return self._without_richer(rivals)
+
+    def _buys_nothing(self, effect: str, other: str, behind: float) -> bool:
+        """Whether another effect takes more numbers to leave as much: where structure is left, and
+        likelihoods do not count them, each of them must come nearer, as a richer law must.
+        """
+        if not self.structure:
+            return False
+        slots = self.search.world.slots
+        mine, others = (int(slots[name].stop - slots[name].start) for name in (effect, other))
+        further = others - mine
+        return further > 0 and behind > further * behind_in_excess([NEARER])
 
     def _without_richer(self, rivals: list[tuple[float, str]]) -> list[tuple[float, str]]:
         """The rivals without those that contain another one: a family of which one member does as

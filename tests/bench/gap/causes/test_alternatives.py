@@ -18,15 +18,18 @@ def placed(place="", contains=()):
 
 
 def evidence(
-    monkeypatch, trial=None, structure=False, plausible="abc", luck=0.0, best=1e-5, **excess
-):
+    monkeypatch, trial=None, structure=False, plausible="abc", luck=0.0, best=1e-5, sizes=(1, 1, 1),
+    **excess,
+):  # fmt: skip
     scores = SimpleNamespace(
         effects=("a", "b", "c"), chance=np.full(3, luck), by_chance=np.zeros((3, 40))
     )
     search = search_of(model(), BEST, ALIKE, BEHIND, excess={(n,): e for n, e in excess.items()})
     search.scanned = {frozenset(): SimpleNamespace(scores=scores)}
     search.tests = {frozenset(): best}
-    search.world = SimpleNamespace(effects={name: placed() for name in "abc"}, linear=False)
+    slots = {name: slice(0, size) for name, size in zip("abc", sizes, strict=True)}
+    effects = {name: placed() for name in "abc"}
+    search.world = SimpleNamespace(effects=effects, slots=slots, linear=False)
     monkeypatch.setattr(Alternatives, "_is_plausible", lambda self, effect: effect in plausible)
     (found,) = Alternatives(search, trial, structure).evidence(BEST)
     return found
@@ -62,6 +65,24 @@ def test_where_structure_is_left_what_it_leaves_decides_and_the_effect_stands(mo
     found = evidence(monkeypatch, structure=True, a=1.0, b=1.5, c=0.9, plausible="bc")
     assert found.alternatives == ("c",)
     assert found.preferred == "a"
+
+
+@pytest.mark.parametrize(
+    ("sizes", "left", "alternatives"),
+    [
+        ((1, 1, 2), 0.97, ()),
+        ((1, 1, 2), 0.9, ("c",)),
+        ((1, 1, 4), 0.9, ()),
+        ((1, 1, 4), 0.8, ("c",)),
+        ((4, 1, 4), 0.97, ("c",)),
+        ((4, 1, 1), 1.02, ("c",)),
+    ],
+)
+def test_more_numbers_that_leave_as_much_structure_are_no_alternative(
+    monkeypatch, sizes, left, alternatives
+):
+    found = evidence(monkeypatch, structure=True, sizes=sizes, a=1.0, b=9.0, c=left)
+    assert found.alternatives == alternatives
 
 
 @pytest.mark.parametrize("place", ["*", "elbow"])
