@@ -10,7 +10,7 @@ are those of the message's header, or of its writing where it has none, seconds 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -58,13 +58,18 @@ def topics(bag: Path) -> list[str]:
         return sorted({connection.topic.lstrip("/") for connection in reader.connections})
 
 
-def read_topic(bag: Path, topic: str) -> dict[str, Array]:
+def read_topic(bag: Path, topic: str, wanted: Collection[str] = ()) -> dict[str, Array]:
     """(T,) numbers of a topic by name, with its stamps, in their order.
+
+    Args:
+        bag: a file or folder.
+        topic: with the slash that it begins with.
+        wanted: names of numbers, in any case, that are kept; all where none are given.
 
     Raises:
         InputError: there is no such topic, or its messages cannot be read.
     """
-    table = _Table()
+    table = _Table(wanted)
     with _opened(bag) as reader:
         mine = [one for one in reader.connections if one.topic == topic]
         if not mine:
@@ -100,7 +105,9 @@ def _opened(bag: Path) -> Iterator[Any]:
 class _Table:
     """Numbers of messages, by name."""
 
-    def __init__(self) -> None:
+    def __init__(self, wanted: Collection[str] = ()) -> None:
+        # Runs may be told apart by a number of their own.
+        self.wanted = {name.strip().lower() for name in (*wanted, "run")} if wanted else set()
         self.stamps = array("d")
         self.written = array("d")
         self.numbers: dict[str, array[float]] = {}
@@ -113,6 +120,8 @@ class _Table:
         self.stamps.append(seconds)
         self.written.append(_NANO * written)
         for name, value in _numbers("", message, 0):
+            if self.wanted and name.lower() not in self.wanted:
+                continue
             column = self.numbers.setdefault(name, array("d"))
             column.extend([np.nan] * (row - len(column)))
             column.append(value)
@@ -120,14 +129,17 @@ class _Table:
     def columns(self) -> dict[str, Array]:
         """All of it, in the order of the stamps."""
         rows = len(self.stamps)
-        stamps, written = np.array(self.stamps), np.array(self.written)
+        stamps = np.array(self.stamps)
         # A header that nobody filled in says nothing.
-        times = stamps if rows and (stamps > 0).all() else written
-        order = np.argsort(times, kind="stable")
-        result = {TIME: frozen(times[order])}
-        for name, column in self.numbers.items():
+        times = stamps if rows and (stamps > 0).all() else np.array(self.written)
+        order = None if (np.diff(times) >= 0).all() else np.argsort(times, kind="stable")
+        result = {TIME: frozen(times if order is None else times[order])}
+        for name in list(self.numbers):
+            # Given back one by one: a long bag would stand in memory twice.
+            column = self.numbers.pop(name)
             column.extend([np.nan] * (rows - len(column)))
-            result[name] = frozen(np.array(column)[order])
+            values = np.frombuffer(column)
+            result[name] = frozen(values if order is None else values[order])
         return result
 
 

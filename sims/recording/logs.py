@@ -108,8 +108,13 @@ class Log:
         return result
 
 
-def read_log(path: str | Path) -> Log:
+def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> Log:
     """The columns of a log.
+
+    Args:
+        path: of it.
+        wanted: columns that will be asked for: of a bag, which may be larger than the memory, no
+            others are kept if it has these; all where none are given.
 
     Raises:
         InputError: it cannot be read, in one line.
@@ -118,7 +123,11 @@ def read_log(path: str | Path) -> Log:
     bag = bags.bag_of(path)
     if bag is not None:
         about = bag[0].stat()
-        return _read_topic(Stamp(path, about.st_mtime_ns, about.st_size))
+        stamp = Stamp(path, about.st_mtime_ns, about.st_size)
+        log = _read_topic(stamp, wanted)
+        kept = {name.lower() for name in log.columns}
+        # What is missing is to be said with all that there is.
+        return log if {name.strip().lower() for name in wanted} <= kept else _read_topic(stamp)
     episode = lerobot.episode_of(path)
     if episode is not None:
         abouts = [file.stat() for file in lerobot.files_of(*episode)]
@@ -131,8 +140,8 @@ def read_log(path: str | Path) -> Log:
         raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
     kind = path.suffix.lower()
     if kind not in _READERS:
-        wanted = ", ".join(FORMATS)
-        raise InputError(f"{path}: expected a log that ends in one of {wanted}, found '{kind}'")
+        kinds = ", ".join(FORMATS)
+        raise InputError(f"{path}: expected a log that ends in one of {kinds}, found '{kind}'")
     about = path.stat()
     if about.st_size > LARGEST:
         raise InputError(f"{path}: has {about.st_size / 1e9:.1f} GB; at most 2 are read")
@@ -140,12 +149,12 @@ def read_log(path: str | Path) -> Log:
 
 
 @lru_cache(maxsize=8)
-def _read_topic(stamp: Stamp) -> Log:
+def _read_topic(stamp: Stamp, wanted: frozenset[str] = frozenset()) -> Log:
     """A topic of a bag, read once."""
     bag = bags.bag_of(stamp.path)
     assert bag is not None  # it is one that was asked for
-    columns = bags.read_topic(*bag)
-    if len(columns) < 2 or not columns[bags.TIME].size:
+    columns = bags.read_topic(*bag, wanted)
+    if (len(columns) < 2 and not wanted) or not columns[bags.TIME].size:
         raise InputError(f"{stamp.path}: expected messages with numbers, found none")
     return Log(stamp.path, columns, (), "message")
 

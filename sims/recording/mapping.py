@@ -160,8 +160,13 @@ class _Parts:
     def __init__(self, folder: Path, usual: str, sources: Sources, signals: Sequence[str]) -> None:
         self.sources = sources
         files = {name: sources.signals[name].file or usual for name in signals}
+        wanted: dict[str, set[str]] = {}
+        for name, file in files.items():
+            own = wanted.setdefault(file, {sources.time})
+            own.add(sources.signals[name].column)
         self.logs: dict[str, Log] = {
-            name: read_log(folder / Path(file)) for name, file in files.items()
+            name: read_log(folder / Path(file), frozenset(wanted[file]))
+            for name, file in files.items()
         }
 
     def runs(self, name: str) -> list[tuple[str, Array | None]]:

@@ -1,6 +1,7 @@
 """Bags of ROS 1 and 2 as folders of logs: written by rosbags, read topic by topic."""
 
 import tracemalloc
+from array import array
 
 import numpy as np
 import pytest
@@ -143,6 +144,32 @@ def test_a_bag_that_is_cut_or_spoiled_is_one_line_or_read(tmp_path, seed):
         said = str(error)
     assert said.startswith(str(whole))
     assert "\n" not in said
+
+
+def test_what_is_not_wanted_is_not_kept(tmp_path):
+    path = written(tmp_path / "run") / "joint_states"
+    log = read_log(path, frozenset({"time", "Position.hip"}))
+    assert set(log.names()) == {"time", "position.hip"}
+    np.testing.assert_allclose(log.column("position.hip"), np.cos(0.1 * np.arange(200)))
+    # What is not there is said with all that there is.
+    with pytest.raises(InputError, match=r"unknown column 'elbow'; there are: .*velocity\.knee"):
+        read_log(path, frozenset({"time", "elbow"})).column("elbow")
+
+
+def test_a_topic_stands_in_memory_once(tmp_path):
+    """Columns of messages that come in order are given back as they are taken over."""
+    table, rows = bags._Table(), 50_000
+    for name in "abcdefgh":
+        table.numbers[name] = array("d", bytes(8 * rows))
+    table.stamps, table.written = array("d", range(1, rows + 1)), array("d", range(rows))
+    tracemalloc.start()
+    try:
+        columns = table.columns()
+        held, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert columns["h"].size == rows
+    assert most < held + 3 * 8 * rows
 
 
 def test_a_large_bag_is_read_message_by_message(tmp_path):
