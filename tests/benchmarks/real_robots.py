@@ -139,7 +139,7 @@ def emps(out, explained):
     print(verdict["verdict"], verdict["heldout"], f"{verdict['seconds']:.0f} s")
 
 
-def emps_slide(out, explained):  # noqa: ARG001
+def emps_slide(out, explained):
     """The drive as the system `slider`, which may have a flexible transmission: once fitted on the
     first run, once on the second with its pulses, in pieces, forces in units of 50 N.
     """
