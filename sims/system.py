@@ -343,6 +343,12 @@ class System(ABC):
         return None
 
 
+Of = Literal[
+    "", "input", "input/s", "error", "reading", "reading/s", "drive", "level", "travel", "stop"
+]
+"""Whose unit a coefficient has, or what it is of."""
+
+
 @dataclass(frozen=True)
 class Coefficient:
     """A number of an effect, zero where the effect is off.
@@ -355,7 +361,8 @@ class Coefficient:
         of: whose unit it has where `units` are only the usual ones: ``input`` the first input's,
             ``error`` the same, where it is compared with a servo's error, ``reading`` that of the
             channel it acts on, ``input/s`` and ``reading/s`` the same per second; ``level`` that
-            of what is stored;
+            of what is stored; ``stop`` is the stiffness of one that stands where coefficient
+            ``place`` says;
             ``drive`` is a limit of the drive's force and ``travel`` a part of the way that it
             goes, with units of their own.
         least: what a fit may not go below, where that is not a matter of plausibility.
@@ -366,9 +373,7 @@ class Coefficient:
     name: str
     units: tuple[str | None, str | None, str | None]
     plausible: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-    of: Literal[
-        "", "input", "input/s", "error", "reading", "reading/s", "drive", "level", "travel"
-    ] = ""
+    of: Of = ""
     least: float | None = None
     most: float | None = None
     tried: tuple[float, ...] = ()
@@ -417,6 +422,7 @@ class Effect(ABC):
             or empty.
         contains: simpler effects that it turns into where some of its coefficients are zero.
         hook: which of the engine's hooks it uses; set by the hook classes.
+        sharp: whether it begins and ends at a place, within a step: it is followed in finer steps.
         at: of what kind its places in a robot are.
         place: of a robot: the joint, actuator, body or channel where it acts; ``*`` of a family;
             empty for an effect of the world and in systems of one place.
@@ -433,6 +439,7 @@ class Effect(ABC):
     needs: ClassVar[str] = ""
     contains: ClassVar[tuple[str, ...]] = ()
     hook: ClassVar[str]
+    sharp: ClassVar[bool] = False
     at: ClassVar[PlaceKind]
     place: ClassVar[str] = ""
     coordinate: ClassVar[int | None] = None

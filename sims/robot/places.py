@@ -46,6 +46,7 @@ ALONE = frozenset(
         "friction.warming",
         "sensor.eccentricity",
         "sensor.slip",
+        "state.limit",
     }
 )
 """Effects without a family: what shapes them differs from place to place."""

@@ -136,7 +136,7 @@ class Joint:
 
     def __init__(self, world, number):
         k, p = world.constants, world.parameters
-        self.piece = None
+        self.piece, self.latched = None, number % 2 == 0
         if world.system == "pendulum":
             arm = k["mass"] * k["length"]
             self.inertia, gravity = p["inertia"], k["gravity"]
@@ -283,9 +283,10 @@ FORCES: dict[str, Callable[[Joint, list[float]], Law]] = {
     "force.ripple": lambda j, c: lambda t, x, v: _wave(c, x / c[2]),
     "force.periodic": lambda j, c: lambda t, x, v: _wave(c, t * c[2]),
     "ageing": lambda j, c: lambda t, x, v: -c[0] * t * v,  # foreign: damping that grows with time
-    "stop": lambda j, c: (
-        lambda t, x, v: -c[0] * max(x - c[1], 0.0)
-    ),  # foreign: a soft stop on one side
+    "state.limit": lambda j, c: lambda t, x, v: -copysign(1.0, c[0]) * stopped(x, v, *c),
+    "latch": lambda j, c: (
+        lambda t, x, v: -c[0] * max(x - c[1], 0.0) if j.latched else 0.0
+    ),  # foreign: a soft stop that is there in every other run
 }
 LIMITS: dict[str, Callable[[Joint, list[float]], Law]] = {
     "friction.coulomb": lambda j, c: lambda t, x, v: c[0],
@@ -308,12 +309,19 @@ LIMITS: dict[str, Callable[[Joint, list[float]], Law]] = {
         lambda t, x, v: c[0] * inside(x, c[1], c[2])
     ),  # foreign: rough from c1 - c2 to c1 + c2
 }
-FOREIGN = ("patch", "gust", "ageing", "stop")
+FOREIGN = ("patch", "gust", "ageing", "latch")
 
 
 def through(drive, against):
     """What gears transmit from one side to the other; nothing where both pull the same way."""
     return min(abs(drive), abs(against)) if drive * against > 0 else 0.0
+
+
+def stopped(x, v, stiffness, place, loss):
+    """The force of an end stop away from it: Hertz's contact, stated at a depth of 0.01."""
+    side = copysign(1.0, stiffness)
+    depth = max(side * (x - place), 0.0)
+    return abs(stiffness) * depth**1.5 / 0.1 * max(1.0 + loss * side * v, 0.0)
 
 
 def inside(x, centre, half):

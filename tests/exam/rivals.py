@@ -4,6 +4,8 @@ ones.
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from sims import effects as library
@@ -18,6 +20,7 @@ SHAPES = {  # first guesses of what shapes an effect rather than scales it, in t
     "friction.position": [(p,) for p in (0.3, 0.6, 1.2, 2.5, 5.0)],
     "friction.warming": [(s,) for s in (0.7, 2.0, 6.0)],
     "friction.stribeck": [(s,) for s in (0.05, 0.2, 1.0)],
+    "sensor.slip": [(s,) for s in (0.3, 0.7, 1.2, 2.0, 3.0, 4.0)],
     "wind": [(u, v) for u in (-4.0, 0.0, 4.0) for v in (-4.0, 0.0, 4.0)],
 }
 
@@ -59,9 +62,22 @@ def _guesses(setting, observed, name, bare):
         peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
         guesses = [np.array([*bare.theta, share * peak]) for share in (0.9, 0.6)]
         result = [(_left_at(fit, observed, guess, bare), guess) for guess in guesses]
+    elif name == "state.limit":  # nor does a stop
+        guesses = [np.array([*bare.theta, *stop]) for stop in _stops(setting, observed[..., 0])]
+        result = [(_left_at(fit, observed, guess, bare), guess) for guess in guesses]
     else:
         result = [_first_order(fit, observed, shape, bare) for shape in SHAPES.get(name, [()])]
     return sorted(result, key=lambda pair: pair[0])
+
+
+def _stops(setting, path):
+    """Soft and hard stops at either end of where it has been, met late and early."""
+    low, high = float(path.min()), float(path.max())
+    far = 20.0 if setting.system == "pendulum" else 5000.0
+    for share, part in product((0.03, 0.15), (0.001, 0.01, 0.1)):
+        within = share * (high - low)
+        yield part * far, high - within, 0.05
+        yield -part * far, low + within, 0.05
 
 
 def _left_at(fit, observed, theta, bare):

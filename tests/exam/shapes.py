@@ -160,7 +160,16 @@ def _hysteresis(far, setting, rng):
     return lambda s: (far * s, deflection)
 
 
+def _stop(far, setting, rng):
+    """At an end of where it would go, above or below."""
+    side, within = float(rng.choice([-1, 1])), float(rng.uniform(0.05, 0.2))
+    place = float(np.quantile(np.concatenate(_bare(setting)), 1 - within if side > 0 else within))
+    loss = float(rng.uniform(0.0, 0.4)) / (5.0 if setting.system == "pendulum" else 1.0)
+    return lambda s: (side * far * s, place, loss)
+
+
 SHAPES = {
+    "state.limit": _stop,
     "sensor.slip": _slip,
     "friction.hysteresis": _hysteresis,
     "joint.backlash": _play,
@@ -229,8 +238,8 @@ def _ageing(setting, rng):
     return lambda s: (far * s,)
 
 
-def _stop(setting, rng):
-    """Met by the motion in most runs, for a small part of the time."""
+def _latch(setting, rng):
+    """In every other run; met by the motion in most, for a small part of the time."""
     place = float(np.quantile(np.concatenate(_bare(setting)), rng.uniform(0.7, 0.85)))
     far = 10.0 if setting.system == "pendulum" else 2000.0
     return lambda s: (far * s, place)
@@ -269,7 +278,7 @@ FOREIGN = {
     (False, "patch"): _patch,
     (False, "gust"): _gust,
     (False, "ageing"): _ageing,
-    (False, "stop"): _stop,
+    (False, "latch"): _latch,
     (True, "updraft"): _updraft,
     (True, "gust"): _ball_gust,
     (True, "wear"): _wear,

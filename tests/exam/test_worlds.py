@@ -48,6 +48,7 @@ SOMEWHERE = {
         "sensor.eccentricity": (0.05, 0.04), "sensor.gain": (0.05,),
         "sensor.lag": (0.05,), "sensor.slip": (0.05, SLIPPED),
         "spring.cubic": (0.02,), "spring.linear": (0.05,), "supply.sag": (4.0,),
+        "state.limit": (0.5, 0.5, 0.05),
     },
     "slider": {
         "backlash": (0.5,), "clock.skew": (0.02,), "drag.linear": (0.5,), "drag.quadratic": (0.5,),
@@ -66,6 +67,7 @@ SOMEWHERE = {
         "sensor.delay": (0.033,), "sensor.drift": (0.05,), "sensor.gain": (0.05,),
         "sensor.lag": (0.05,), "sensor.slip": (-0.05, SLIPPED),
         "spring.cubic": (2.0,), "spring.linear": (2.0,), "supply.sag": (0.1,), "wind": (0.5, 2.0),
+        "state.limit": (40.0, 0.6, 0.3),
     },
 }  # fmt: skip
 TOGETHER = [
@@ -161,14 +163,16 @@ def test_ageing_damps_by_the_square_of_time():
     np.testing.assert_allclose(v, np.exp(-0.5 * TIMES**2 / (2 * BASE["slider"]["mass"])), atol=1e-7)
 
 
-def test_stop_turns_the_slider_round_in_half_a_period():
-    stiffness, place, speed = 50.0, 0.5, 0.8
-    x, v = strange("slider", {"stop": (stiffness, place)}, (0.0, speed)).T
-    meets, half = place / speed, np.pi * np.sqrt(BASE["slider"]["mass"] / stiffness)
-    assert x.max() == pytest.approx(place + speed * half / np.pi, abs=1e-4)
+def test_a_latch_turns_the_slider_round_in_half_a_period_every_other_time():
+    latch, speed = {"latch": (50.0, 0.5)}, 0.8
+    x, v = strange("slider", latch, (0.0, speed)).T
+    meets, half = 0.5 / speed, np.pi * np.sqrt(BASE["slider"]["mass"] / 50.0)
+    assert x.max() == pytest.approx(0.5 + speed * half / np.pi, abs=1e-4)
     back = meets + half < TIMES
     np.testing.assert_allclose(v[back], -speed, atol=1e-6)
-    np.testing.assert_allclose(x[back], place - speed * (TIMES[back] - meets - half), atol=1e-6)
+    np.testing.assert_allclose(x[back], 0.5 - speed * (TIMES[back] - meets - half), atol=1e-6)
+    other = strange("slider", latch, (0.0, speed), number=1)
+    np.testing.assert_allclose(other[:, 0], speed * TIMES, atol=1e-9)
 
 
 def test_patch_takes_its_work_and_holds_what_is_too_slow():
@@ -183,11 +187,11 @@ def test_patch_takes_its_work_and_holds_what_is_too_slow():
 def test_pendulum_meets_the_same_causes():
     start = (0.5, 0.0)
     free = strange("pendulum", {}, start)
-    far = {"patch": (0.1, 3.0, 0.1), "stop": (1.0, 3.0)}
+    far = {"patch": (0.1, 3.0, 0.1), "latch": (1.0, 3.0)}
     np.testing.assert_allclose(strange("pendulum", far, start), free, atol=1e-6)
     for cause in (
         {"patch": (0.002, 0.2, 0.1)},
-        {"stop": (0.1, 0.2)},
+        {"latch": (0.1, 0.2)},
         {"gust": (0.02, 0.2, 1.0)},
         {"ageing": (1e-3,)},
     ):

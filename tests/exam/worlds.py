@@ -11,7 +11,7 @@ the library has nothing like them:
 | `gust` | force, seconds, begin in run 0, in run 1, ... | pendulum, slider: a force for a while |
 | `gust` | along x, upward, seconds, begin in run 0, ... | ball: an acceleration for a while |
 | `ageing` | growth | pendulum, slider: damping -c t v, which grows with time |
-| `stop` | stiffness, place | pendulum, slider: a spring beyond a place, on one side |
+| `latch` | stiffness, place | pendulum, slider: a spring beyond a place, in every other run |
 | `updraft` | acceleration, centre, half width | ball: upward within a region of x |
 | `wear` | rate | ball: restitution e0 (1 - c t) |
 | `layer` | drag, height | ball: quadratic drag above a height |

@@ -10,7 +10,7 @@ JOINT = (
     "friction.coulomb", "friction.stribeck", "drag.linear", "drag.quadratic", "spring.linear",
     "inertia.armature", "force.bias", "force.ripple", "friction.direction",
     "friction.position", "friction.warming",
-    "friction.load", "friction.load_direction", "friction.load_quadratic",
+    "friction.load", "friction.load_direction", "friction.load_quadratic", "state.limit",
 )  # fmt: skip
 BODY = ("mass.scale", "mass.offset", "inertia.scale")
 BOTH = ("input.gain", "input.bias", "input.delay", "input.lag", "input.rate", "supply.sag")
@@ -201,7 +201,19 @@ def _slip(place, setting, rng):
     return lambda s: (sign * 0.1 * s, instant)
 
 
+def _stop(place, setting, rng):
+    """At an end of where the joint would go, above or below."""
+    typical, index = _at(setting, place), setting.machine.index(place)
+    path = np.concatenate([motion[:, index] for motion in setting.bare])
+    side, within = float(rng.choice([-1.0, 1.0])), float(rng.uniform(0.03, 0.15))
+    stands = float(np.quantile(path, 1 - within if side > 0 else within))
+    stiffness = 20.0 * typical["force"] / typical["travel"]
+    loss = float(rng.uniform(0.0, 0.3)) / typical["speed"]
+    return lambda s: (side * stiffness * s, stands, loss)
+
+
 SHAPES = {
+    "state.limit": _stop,
     "sensor.slip": _slip,
     "friction.direction": _direction,
     "friction.load_direction": _by_side,

@@ -52,6 +52,7 @@ class Plant:
         coulomb, extra, speed: dry friction `coulomb + extra exp(-(v / speed)^2)`, (N,).
         ahead, back: damping of motion the one way and the other, (N,).
         ripples: (joint, sine, cosine, period).
+        stops: (joint, stiffness at a depth of 0.01, place, loss); above where that is positive.
         uneven: (joint, least, sine, cosine, period) of dry friction over the joint.
         loads: (joint, motor, external, quadratic) of friction by what the drive carries.
         cold: (joint, dry, viscous, time) of friction that dies away.
@@ -70,6 +71,7 @@ class Plant:
     ahead: np.ndarray
     back: np.ndarray
     ripples: list = field(default_factory=list)
+    stops: list = field(default_factory=list)
     uneven: list = field(default_factory=list)
     cold: list = field(default_factory=list)
     loads: list = field(default_factory=list)
@@ -148,6 +150,10 @@ class Plant:
         for joint, sine, cosine, period in self.ripples:
             angle = 2 * np.pi * q[joint] / period
             force[joint] += sine * np.sin(angle) + cosine * np.cos(angle)
+        for joint, stiffness, place, loss in self.stops:
+            side = 1.0 if stiffness > 0 else -1.0
+            depth = max(side * (q[joint] - place), 0.0)
+            force[joint] -= stiffness * depth**1.5 / 0.1 * max(1 + loss * side * v[joint], 0.0)
         return force
 
     def accelerations(self, q, v, force):
@@ -240,6 +246,10 @@ def _ripple(plant, joint, c):
     plant.ripples.append((joint, *c))
 
 
+def _stop(plant, joint, c):
+    plant.stops.append((joint, *c))
+
+
 def _uneven(plant, joint, c):
     plant.uneven.append((joint, *c))
 
@@ -270,6 +280,7 @@ FORCES = {
     "spring.linear": _adds("spring"),
     "force.bias": _adds("bias"),
     "force.ripple": _ripple,
+    "state.limit": _stop,
 }
 
 

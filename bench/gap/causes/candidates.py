@@ -21,14 +21,19 @@ from itertools import product
 
 import numpy as np
 
+from bench.gap.causes.reaches import (
+    INSTANTS,
+    firmer,
+    parameters_of,
+    reach,
+    stopping,
+)
 from bench.gap.model.bounds import CYCLES, coefficient_bounds, is_instant
 from bench.gap.model.noise import Mask
 from bench.gap.model.problem import Fit, Start
-from bench.gap.model.tracks import Track
 from bench.gap.model.world import World
 from sims.base import Array, Parameter
-from sims.simulated import effect_parameters
-from sims.system import FAMILY, Effect
+from sims.system import FAMILY
 
 SMALL = 1e-4
 """Share of a plausible range at which a direction is first taken."""
@@ -36,7 +41,7 @@ LEVELS = (0.15, 0.35, 0.6, 0.85, 0.95, 0.99)
 """Shares of the largest input at which limits, dead bands and plays are tried besides."""
 WAYS = (0.003, 0.01, 0.03, 0.1, 0.3)
 """The same of how far a run goes, for gaps."""
-LIMITED = ("drive", "input/s", "level", "travel")
+LIMITED = ("drive", "input/s", "level", "travel", "stop")
 """What a coefficient is a part of where no small size is like a large one: a limit's takes all
 away, and in a gap nothing is passed on.
 """
@@ -54,10 +59,10 @@ LASTING = 3.0
 """Of the longest run, times that are tried of what dies away; one is at most twice the other."""
 MODIFIED = (-0.7, -0.25, 0.0, 0.25, 0.7)
 """Shares of its plausible range at which a coefficient that modifies is tried."""
-INSTANTS = 24
-"""Instants tried of what happens once."""
-FINER = 16
-"""Stamps between two of them that are tried where a fit begins, at most."""
+DEPTHS = (0.005, 0.02, 0.08, 0.2)
+"""Shares of where a coordinate has been that lie beyond the stops that are tried."""
+HARDNESS = (0.003, 0.03, 0.3, 3.0)
+"""Shares of the largest plausible stiffness that they have."""
 LATER = (-8, -4, -2, -1, 1, 2, 4, 8)
 """Samples by which what happens once is made later."""
 SHIFTS = (-1.0, -0.5, 0.5, 1.0)
@@ -122,7 +127,7 @@ def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
 
 def _first(world: World, name: str) -> Iterator[Probe]:
     """Every coefficient that scales an effect, at every shape, a little of it each."""
-    parameters = _parameters(world, name)
+    parameters = parameters_of(world, name)
     # A coefficient that cannot be zero does not scale: it says where or how the others act.
     shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
     count = len(parameters)
@@ -148,6 +153,9 @@ def _first(world: World, name: str) -> Iterator[Probe]:
                 signed=low < 0,
             )
         group += 1
+    if leading.of == "stop":
+        yield from _stops(world, name, group)
+        return
     least, _ = parameters[0].bounds
     # Of a limit no small size is like a large one: it is tried where the input reaches it.
     if leading.of in LIMITED or (leading.of in ("input", "error") and least == 0):
@@ -155,11 +163,18 @@ def _first(world: World, name: str) -> Iterator[Probe]:
         yield from _limits(world, name, group, shapes if shaping else None)
 
 
+def _stops(world: World, name: str, first: int) -> Iterator[Probe]:
+    """Soft and hard stops at either end of where a coordinate has been, met late and early."""
+    either = [c for side in (1.0, -1.0) for c in stopping(world, name, side, HARDNESS, DEPTHS)]
+    for number, c in enumerate(either, start=first):
+        yield Probe(effect=name, group=number, place=0, c=c, signed=True, fixed=True)
+
+
 def _limits(world: World, name: str, group: int, shapes: Array | None) -> Iterator[Probe]:
     """Limits, dead bands and plays of a size that the motion or the input reaches; where other
     coefficients shape them, at each of these (n, k - 1) too.
     """
-    largest = _reach(world, name)
+    largest = reach(world, name)
     if not largest.any():
         return
     # A servo's error is largest for a moment after a jump, as a command's rate is.
@@ -177,71 +192,6 @@ def _limits(world: World, name: str, group: int, shapes: Array | None) -> Iterat
             signed=False,
             fixed=True,
         )
-
-
-def _reach(world: World, name: str) -> Array:
-    """(k,) of each place where an effect limits something, what is reached there."""
-    effect = world.effects[name]
-    members = getattr(effect, "members", ()) or (effect,)
-    of = effect.coefficients[0].of
-    if of == "drive" or (of == "level" and not _recorded(world, effect)):
-        # How large a force gets is not recorded: what is plausible has to do.
-        return np.array([p.bounds[1] for p in _parameters(world, name)])
-    if of == "travel":
-        return np.array([world.travel_of(name)])
-    found = {"input/s": _fastest, "error": _farthest, "level": _fullest}
-    most = found.get(of, _largest)
-    return np.array([max(most(world, t, one) for t in world.tracks) for one in members])
-
-
-def _command(track: Track, effect: Effect) -> Array:
-    """(T,) the input that an effect acts on; the first one where it names none."""
-    signals = track.scenario.inputs
-    nothing = np.zeros(track.scenario.times.size)
-    first = next(iter(signals.values()), nothing)
-    return signals.get(effect.signal, nothing) if effect.signal else first
-
-
-def _largest(world: World, track: Track, effect: Effect) -> float:  # noqa: ARG001
-    """Of a run, of the input."""
-    return float(np.abs(_command(track, effect)).max())
-
-
-def _fastest(world: World, track: Track, effect: Effect) -> float:  # noqa: ARG001
-    """Of a run, from sample to sample of the input, a second."""
-    risen = np.abs(np.diff(_command(track, effect)))
-    return float((risen / np.diff(track.scenario.times)).max(initial=0.0))
-
-
-def _recorded(world: World, effect: Effect) -> str:
-    """The channel that shows the level an effect acts on; empty where that is not recorded."""
-    name = effect.place or world.simulator.system.levels[0]
-    return name if name in world.channels else ""
-
-
-def _fullest(world: World, track: Track, effect: Effect) -> float:
-    """Of a run, of the level."""
-    shown = track.observed[:, world.channels.index(_recorded(world, effect))]
-    return float(np.nanmax(shown, initial=0.0))
-
-
-def _farthest(world: World, track: Track, effect: Effect) -> float:
-    """Of a run, by which a servo is off its set point; zero where that is not recorded."""
-    system = world.simulator.system
-    place = system.primary if effect.coordinate is None else effect.coordinate
-    name = system.coordinates[place]
-    if name not in world.channels:
-        return 0.0
-    turned = system.gear(place) * track.observed[:, world.channels.index(name)]
-    apart = _command(track, effect) - turned
-    return float(np.nanmax(np.abs(apart), initial=0.0))
-
-
-def _parameters(world: World, name: str) -> Sequence[Parameter]:
-    """The coefficients of an effect, with their units and plausible ranges."""
-    effect = world.effects[name]
-    system = world.simulator.system
-    return effect_parameters(effect, system, world.channels)
 
 
 def _grid(world: World, parameter: Parameter, tried: tuple[float, ...], travel: float) -> Array:
@@ -270,23 +220,6 @@ def _grid(world: World, parameter: Parameter, tried: tuple[float, ...], travel: 
     return np.geomspace(low, high, SHAPES)
 
 
-def instants_about(world: World, name: str, c: Array) -> Iterator[Array]:
-    """The coefficients (k,) of an effect that happens once, with its instant between any two
-    stamps that are as near as the next instants that are tried; nothing for other effects.
-    """
-    for i, parameter in enumerate(_parameters(world, name)):
-        if not is_instant(parameter):
-            continue
-        first, last = world.clock
-        stamps = np.unique(np.concatenate([track.scenario.times for track in world.tracks]))
-        between = (stamps[1:] + stamps[:-1]) / 2.0
-        near = between[np.abs(between - c[i]) <= (last - first) / (INSTANTS + 1)]
-        for instant in near[:: -(-near.size // FINER) or 1].tolist():
-            moved = c.copy()
-            moved[i] = instant
-            yield moved
-
-
 def _is_period(parameter: Parameter, travel: float) -> bool:
     """Whether a coefficient is a period over position, of runs that go anywhere."""
     return parameter.name.endswith(".period") and travel > 0
@@ -297,6 +230,10 @@ def neighbours(world: World, fit: Fit) -> Iterator[Start]:
     nearest such minimum.
     """
     for name in fit.effects:
+        for c in firmer(world, name, fit.theta[world.slots[name]]):
+            theta = fit.theta.copy()
+            theta[world.slots[name]] = c
+            yield Start(fit.effects, theta, fit.states)
         bounds = coefficient_bounds(world, name)
         for number, place in enumerate(world.places(name)):
             parameter = world.parameters[place]
@@ -379,7 +316,7 @@ def _modified(world: World, probes: Sequence[Probe], acting: Mask) -> Iterator[P
 
 def _grid_points(world: World, first: Probe, modifiers: Sequence[Probe]) -> Iterator[Probe]:
     """An effect's first probe that acts, with its modifiers at every combination of sizes."""
-    parameters = _parameters(world, first.effect)
+    parameters = parameters_of(world, first.effect)
     points = product(MODIFIED, repeat=len(modifiers))
     for group, point in enumerate(points, start=1):
         # All at zero is the effect as it was tried first.

@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.gap.causes.candidates import Directions, instants_about
+from bench.gap.causes.candidates import Directions
 from bench.gap.causes.gains import Group
+from bench.gap.causes.reaches import instants_about, stops_about
 from bench.gap.causes.score_test import Scores
 from bench.gap.model.base_fit import HORIZONS
 from bench.gap.model.bounds import coefficient_bounds
@@ -123,6 +124,7 @@ def _sizes(
     # A direction that is one whole change says nothing of other sizes.
     if first.fixed:
         yield first.c
+        yield from stops_about(world, name, first.c)
         return
     for share in SHARES:
         c = first.c.copy()

@@ -211,11 +211,24 @@ class World:
         """The range of the coordinate that an effect acts on, in the run where it is largest; 0
         where it is not recorded.
         """
+        return self._range(self._coordinate(effect))
+
+    def ends_of(self, effect: str) -> tuple[float, float]:
+        """The lowest and the highest value of the same over all runs; both 0 where it is not
+        recorded.
+        """
+        name = self._coordinate(effect)
+        if name not in self.channels:
+            return 0.0, 0.0
+        values = self.observed[:, :, self.channels.index(name)]
+        return float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=-np.inf))
+
+    def _coordinate(self, effect: str) -> str:
+        """The coordinate that an effect acts on; none in an own simulator that has none."""
         system = self.simulator.system
         coordinate = self.effects[effect].coordinate
         place = system.primary if coordinate is None else coordinate
-        # an own simulator may have no coordinates at all
-        return self._range(system.coordinates[place] if system.coordinates else "")
+        return system.coordinates[place] if system.coordinates else ""
 
     def _range(self, name: str) -> float:
         """The largest range of a channel in one run, found once; 0 where it is not recorded."""
@@ -240,7 +253,7 @@ class World:
             places = self.places(effect.name)
             if _moves_instants(effect):
                 shifting.extend(places)
-            if isinstance(effect, Sensor) and effect.filters:
+            if effect.sharp or (isinstance(effect, Sensor) and effect.filters):
                 filtering.extend(places)
         # the type matters where there is none: places of an empty list would be floats
         return np.array(shifting, dtype=np.intp), np.array(filtering, dtype=np.intp)

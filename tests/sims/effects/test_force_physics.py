@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.optimize import brentq
 from scipy.special import ellipk
 
 from tests.sims.effects.worlds import run
@@ -315,3 +316,36 @@ def test_gravity_pulls_a_servo_by_the_dead_zone_further_down():
     stiffness = kt * kp * voltage / resistance
     for q, error in ((plain, 1.0 - plain), (dead, 1.0 - dead - width)):
         assert stiffness * error == pytest.approx(0.49 * 9.81 * 0.1 * np.sin(q), rel=1e-5)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_an_end_stop_without_loss_gives_back_what_it_takes(side):
+    """Into Hertz's contact k d^1.5 / 0.1 a motion of energy E goes d^2.5 = E / (4 k)."""
+    times, mass, speed, k = np.arange(0, 1.5, 0.002), 2.0, 0.8, 900.0
+    stop = {"state.limit": (side * k, side * 0.3, 0.0)}
+    x, v = slide(times, stop, mass, 0.0, v=side * speed)
+    deepest = (0.5 * mass * speed**2 / (4 * k)) ** 0.4
+    assert (side * x).max() == pytest.approx(0.3 + deepest, abs=2e-5)
+    assert v[-1] == pytest.approx(-side * speed, rel=1e-4)
+    free = times < 0.3 / speed - 1e-3
+    assert x[free] == pytest.approx(side * speed * times[free], abs=1e-9)
+
+
+@pytest.mark.parametrize("stiffness", [300.0, 3000.0])
+@pytest.mark.parametrize(("loss", "speed"), [(0.05, 0.4), (0.5, 0.8), (1.5, 0.8)])
+def test_what_an_end_stop_gives_back_hangs_on_loss_and_speed_alone(stiffness, loss, speed):
+    """From w dw / (1 + a w) = -F dd / m on the way in and out:
+
+    log((1 + a w) / (1 - a w')) = a (w + w'), with w' the speed that comes back; 1 - 2 a w / 3 of w
+    where that is small.
+    """
+    times = np.arange(0, 3, 0.002)
+    _, v = slide(times, {"state.limit": (stiffness, 0.3, loss)}, 2.0, 0.0, v=speed)
+
+    def missed(back):
+        return np.log((1 + loss * speed) / (1 - loss * back)) - loss * (speed + back)
+
+    back = brentq(missed, 1e-6, min(speed, 1 / loss) * (1 - 1e-9))
+    assert -v[-1] == pytest.approx(back, rel=2e-3)
+    if loss * speed < 0.03:
+        assert back == pytest.approx((1 - 2 * loss * speed / 3) * speed, rel=1e-3)

@@ -103,6 +103,7 @@ def test_what_fits_what():
         "friction.warming",
         "sensor.eccentricity",
         "sensor.slip",
+        "state.limit",
         "spring.linear",
         "spring.cubic",
         "force.ripple",

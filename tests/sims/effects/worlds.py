@@ -67,6 +67,7 @@ NAMES = [
     "friction.hysteresis",
     "joint.backlash",
     "joint.flexibility",
+    "state.limit",
 ]
 PAIRS = [
     (name, system)

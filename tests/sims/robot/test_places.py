@@ -77,6 +77,7 @@ def test_names_are_those_of_the_model(arm):
         "input.rate": ("m_shoulder", "m_elbow", "m_spin", "*"),
         "sensor.eccentricity": ("q.shoulder", "q.elbow", "q.spin"),
         "sensor.slip": ("q.shoulder", "q.elbow", "q.spin"),
+        "state.limit": joints,
         "servo.deadband": ("m_shoulder",),
         "servo.derivative": ("m_shoulder",),
         "gravity.tilt": ("",),

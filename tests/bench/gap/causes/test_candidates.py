@@ -4,13 +4,21 @@ import numpy as np
 import pytest
 
 from bench.gap.causes.candidates import (
-    FINER,
+    DEPTHS,
     FREQUENCIES,
-    INSTANTS,
     SHAPES,
     directions,
-    instants_about,
+    neighbours,
     simulate_with,
+)
+from bench.gap.causes.reaches import (
+    DEEPER,
+    FINER,
+    FIRMER,
+    HARDER,
+    INSTANTS,
+    instants_about,
+    stops_about,
 )
 from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.fit import Fitter
@@ -186,3 +194,35 @@ def test_what_happens_once_is_looked_for_on_the_clock_of_the_stamps():
     assert not list(instants_about(there, "sensor.bias", np.array([0.01])))
     bounds = coefficient_bounds(there, "sensor.slip")
     assert bounds[1] == (0.0, end)
+
+
+def test_stops_are_tried_at_both_ends_of_where_it_has_been():
+    there = world(recording("slider", runs=2, seconds=1, rate=60, noise=["0.003"], inputs=["u=1"]))
+    x = there.observed[..., there.channels.index("x")]
+    low, high = float(np.nanmin(x)), float(np.nanmax(x))
+    assert there.ends_of("state.limit") == (low, high)
+    found = directions(there, fitted(there), ["state.limit"])
+    tried = [found.probes[i].c for i in of(found, "state.limit")]
+    assert {np.sign(c[0]) for c in tried} == {-1.0, 1.0}
+    for stiffness, place, loss in tried:
+        beyond = (high - place if stiffness > 0 else place - low) / (high - low)
+        assert min(abs(beyond - share) for share in DEPTHS) < 1e-9
+        assert loss == 0.0
+    above = np.array([40.0, 0.5 * high, 0.1])
+    around = list(stops_about(there, "state.limit", above))
+    assert len(around) == len(HARDER) * len(DEEPER)
+    assert all(c[0] > 0 and low < c[1] < high for c in around)
+    assert not list(stops_about(there, "spring.linear", np.array([1.0])))
+
+
+def test_a_harder_stop_that_turns_back_at_the_same_place_is_met_later():
+    there = world(recording("slider", runs=2, seconds=1, rate=60, noise=["0.003"], inputs=["u=1"]))
+    fit = fitted(there)
+    _, high = there.ends_of("state.limit")
+    theta = fit.theta.copy()
+    theta[there.slots["state.limit"]] = [40.0, 0.5 * high, 0.1]
+    starts = list(neighbours(there, replace(fit, effects=("state.limit",), theta=theta)))
+    stops = np.array([s.theta[there.slots["state.limit"]] for s in starts])
+    np.testing.assert_allclose(stops[:, 0] / 40.0, FIRMER)
+    # the work of the way in is the same: k d^(5/2)
+    np.testing.assert_allclose(stops[:, 0] * (high - stops[:, 1]) ** 2.5, 40 * (high / 2) ** 2.5)
