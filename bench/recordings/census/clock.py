@@ -27,7 +27,7 @@ def intervals(recording: Recording) -> Iterator[Finding]:
     """Jitter and lost samples, each over all runs."""
     jittered, rests, lost, whole, lossy = [], [], 0, 0, []
     for run in recording.runs:
-        steps = np.diff(run.times)
+        steps = np.diff(_stamps(run))
         if steps.size < 2:
             continue
         ratios = steps / np.median(steps)
@@ -59,6 +59,15 @@ def intervals(recording: Recording) -> Iterator[Finding]:
             "nothing is filled in, but a command that changed in between is not known: log "
             "commands in a file of their own, or at a lower rate",
         )
+
+
+def _stamps(run: Run) -> Array:
+    """When the sensor was read that was read most often: among the instants of a run are those of
+    commands and of other sensors, which have clocks of their own.
+    """
+    seen = [np.isfinite(values) for values in run.channels.values()]
+    often = max(seen, key=lambda one: int(one.sum()), default=np.ones(run.times.size, np.bool_))
+    return run.times[often]
 
 
 def repeated(recording: Recording) -> Iterator[Finding]:

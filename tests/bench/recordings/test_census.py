@@ -101,6 +101,27 @@ def test_lost_samples(kind):
     assert "are lost in 1" in finding.text
 
 
+def test_stamps_of_commands_are_no_samples(kind):
+    """A command's topic has stamps of its own: between two of the sensors none is lost."""
+    run = run_of(4)
+    times = np.sort(np.concatenate([run.times, run.times + 1e-5]))
+
+    def sensed(values):
+        cells = np.full(times.size, np.nan)
+        cells[::2] = values
+        return cells
+
+    channels = {name: sensed(values) for name, values in run.channels.items()}
+    inputs = {name: np.repeat(values, 2) for name, values in run.inputs.items()}
+    spread = replace(run, times=times, channels=channels, inputs=inputs)
+    assert [one.text for one in found(kind, spread) if one.about == "clock"] == []
+    lost = {name: sensed(values) for name, values in run.channels.items()}
+    for values in lost.values():
+        values[200:400] = np.nan
+    (finding,) = (one for one in found(kind, replace(spread, channels=lost)))
+    assert finding.text.startswith("100 samples")
+
+
 def test_samples_that_came_twice(kind):
     run = run_of(3)
     again = np.flatnonzero(np.random.default_rng(0).random(run.times.size) < 0.03)[1:]
