@@ -84,6 +84,8 @@ def _reached(reach: Reach) -> dict[str, Any]:
         row[{"": "resolved", "above": "none_above", "below": "none_below"}[reach.limit]] = (
             reach.size
         )
+        if reach.vague:
+            row["vague"] = True
         if reach.leans:
             row["leans_to"] = reach.leaning
     if reach.mixed:

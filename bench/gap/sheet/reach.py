@@ -63,12 +63,14 @@ class Reach:
         limit: ``above`` of a gap, which shows from that size on; ``below`` of a limit, which shows
             up to it; empty for what is a matter of proportion.
         mixed: numbers of the model that it is mixed up with.
+        vague: whether it could be larger than all that is plausible.
     """
 
     size: float
     leaning: float = 0.0
     limit: str = ""
     mixed: tuple[str, ...] = ()
+    vague: bool = False
 
     @property
     def leans(self) -> bool:
@@ -204,7 +206,7 @@ class _Shown:
         low, high = parameter.bounds
         # Beyond all that is plausible these data say nothing of it.
         if 2.0 * size > UNBOUNDED * (high - low):
-            return Reach(np.inf, mixed=self._mixed(k))
+            return Reach(float(size), mixed=self._mixed(k), vague=True)
         return Reach(float(size), float(self.leaning[k]), mixed=self._mixed(k))
 
     def _place(self, probe: Probe) -> int:

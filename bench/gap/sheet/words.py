@@ -44,7 +44,8 @@ def evidence(row: Quantity, short: bool = False) -> str:
     if row.state == "fitted":
         return "fitted" if row.number and row.number.low is not None else "not fixed by these data"
     judged = row.p_value is None or row.p_value <= UNLIKELY
-    said = [probability(row.p_value) if judged else "the search ended before it was judged"]
+    cut = "not judged" if short else "the search ended before it was judged"
+    said = [probability(row.p_value) if judged else cut]
     if row.share is not None:
         closed = percent(row.share)
         said.append(
@@ -59,8 +60,10 @@ def reached(row: Quantity) -> str:
     """How small a number these data would have shown."""
     reach = row.reach
     if reach is None or reach.size == float("inf"):
-        return "nothing" if reach is not None and reach.mixed else "nothing: not touched"
+        return "nothing: not touched"
     size = number(reach.size, 2)
+    if reach.vague:
+        return with_unit(f"nothing plausible, ± {size}", row.unit)
     if reach.limit:
         return with_unit(f"none {reach.limit} {size}", row.unit)
     if reach.leans:

@@ -86,6 +86,7 @@ def test_drag_cannot_be_told_from_the_motors_own(sheet: DataSheet) -> None:
     assert reach is not None
     assert {"torque_constant", "resistance"} <= set(reach.mixed)
     assert reach.size > 0.05
+    assert reach.vague
 
 
 def test_gaps_show_from_a_size_on_and_limits_up_to_one(sheet: DataSheet) -> None:
