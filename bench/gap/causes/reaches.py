@@ -16,8 +16,8 @@ from sims.base import Array, Parameter
 from sims.simulated import effect_parameters
 from sims.system import Effect
 
-HARDER = tuple(np.geomspace(1e-3, 10.0, 9).tolist())
-"""Shares of the largest plausible stiffness of the stops that a fit may begin with."""
+HARDER = (0.3, 1.0, 3.0)
+"""Times as hard as a stop that scores well, of those that a fit may begin with."""
 DEEPER = tuple(np.geomspace(0.002, 0.4, 10).tolist())
 """Shares of where a coordinate has been that lie beyond them."""
 FIRMER = (0.25, 0.5, 2.0, 4.0)
@@ -114,7 +114,10 @@ def stops_about(world: World, name: str, c: Array) -> Iterator[Array]:
     nothing for other effects.
     """
     if world.effects[name].coefficients[0].of == "stop":
-        yield from stopping(world, name, float(np.sign(c[0])), HARDER, DEEPER)
+        part = abs(c[0]) / parameters_of(world, name)[0].bounds[1]
+        # A robot's lanes cost a hundred times as much.
+        times, depths = ((1.0,), DEEPER[::2]) if world.linear else (HARDER, DEEPER)
+        yield from stopping(world, name, np.sign(c[0]), [part * t for t in times], depths)
 
 
 def firmer(world: World, name: str, c: Array) -> Iterator[Array]:
