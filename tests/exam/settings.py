@@ -31,6 +31,7 @@ PENDULUM = Pendulum(
 )  # tells how far a drawn pendulum swings; gives no data
 MOST_RUNS = 6
 NOISES = ("white", "ar1", "quantised")
+BY_INPUT = ("input.", "backlash", "supply.", "friction.load_")  # shown by a drive alone
 
 
 @dataclass(frozen=True)
@@ -126,10 +127,7 @@ def _ball(rng, times, runs, hidden):
 
 def _pendulum(rng, times, runs, hidden):
     parameters = {"inertia": float(rng.uniform(2e-3, 6e-3))}
-    driven = (
-        any(name.startswith("input.") or name == "backlash" for name in hidden)
-        or rng.random() < 0.5
-    )
+    driven = any(name.startswith(BY_INPUT) for name in hidden) or rng.random() < 0.5
     channels = ("q",) if rng.random() < 0.6 else ("q", "qd")
     form, scenarios = str(rng.choice(["steps", "sine", "chirp"])), []
     while len(scenarios) < runs:
