@@ -138,7 +138,7 @@ class Search(Moves):
         if larger is None:
             return None
         if size == 1:
-            return self._simpler(larger)
+            return self.plainer(self._simpler(larger))
         # An idle effect goes before the exchange, which else puts another idle one in its place.
         return self.plainer(conservative(self, best, self.drop(self.swap(self.drop(larger)))))
 
