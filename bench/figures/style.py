@@ -39,6 +39,10 @@ GREY = "#7F7F7F"
 VIOLET = "#5B3A8E"
 BROWN = "#A6761D"
 RUST = "#A03C00"
+PALE_BLUE = "#DCEBF5"
+"""Where a drive moves ahead."""
+PALE_RUST = "#FBE6DA"
+"""Where it moves back."""
 
 # Greys by what they are for, from dark to light.
 INK = "#333333"

@@ -161,7 +161,8 @@ def test_the_same_seed_gives_the_same_files(tmp_path):
     ("kind", "system"), [("clean", "ball"), ("clean", "pendulum"), ("single", "slider")]
 )
 def test_files_are_recordings(tmp_path, kind, system):
-    item = draw(kind, system, 2)
+    # An effect that these sensors cannot show is not drawn.
+    item = next(filter(None, (draw(kind, system, index) for index in range(2, 9))))
     recording = read_recording(realise(item, tmp_path), SIMULATORS[system].system())
     assert recording.system == system
     assert len(recording.runs) == item.runs

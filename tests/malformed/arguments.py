@@ -22,6 +22,7 @@ VECTORS = (
     "--out new.csv",
     "inspect data.csv --system pendulum --out out", "inspect ball.csv --out out",
     "explain data.csv --out out --engine batch --seed 1 --free gravity --tuner random --force",
+    "datasheet data.csv --name servo --out out", "design data.csv --seconds 1 --out new.csv",
     "score extended.toml data.csv --json --held-out", "score extended.toml data.csv --force",
     "film ball.csv --out new.mp4 --run 1 --size 32 --camera-seed 1 --force",
     "track none.mp4 --out new.csv --ball-diameter 0.1 --fps 30 --scale fall",

@@ -123,6 +123,7 @@ def recordings(draw):
         ("explain", "data.csv", "--out", "out"), ("explain", "data.csv", "--force", "--out", "out"),
         ("score", "extended.toml", "data.csv"), ("score", "extended.toml", "data.csv", "--json"),
         ("film", "data.csv", "--out", "film.mp4", "--size", "32"),
+        ("datasheet", "data.csv", "--out", "out"), ("design", "data.csv", "--out", "out"),
         ("inspect", "data.csv", "--system", "slider", "--out", "out"),
     ]))  # fmt: skip
     return Case(command, files, owns=("out", "film"), numbers=command[0] in ("score", "inspect"))

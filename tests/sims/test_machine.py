@@ -142,7 +142,7 @@ def small():
         ends=np.zeros(4, dtype=np.int64),
         rows=np.array([0, 1, 2, 3, 3, 4, 5, 6, -1, 4, 5]),
         out=np.array([2]),
-        flags=np.array([1, 0, 0, 0]),
+        flags=np.array([1, 0, 0, 0, 1]),
     )
     work = kinds.Work(
         order=np.array([1, 0]), parameters=np.ones((2, 1)), mass=np.ones(2), x=np.ones((2, 1)),

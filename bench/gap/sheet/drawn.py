@@ -55,9 +55,9 @@ def draw(axes: Axes, diagram: Diagram) -> None:
     reach, unit = diagram.reach, pretty(diagram.unit)
     load = diagram.load
     ahead, back = (np.clip(side, -2 * reach, 2 * reach) for side in (diagram.forward, diagram.back))
-    axes.fill_between(load, ahead, 2 * reach, color="#DCEBF5", linewidth=0)
+    axes.fill_between(load, ahead, 2 * reach, color=style.PALE_BLUE, linewidth=0)
     axes.fill_between(load, back, ahead, color=style.GROUND, linewidth=0)
-    axes.fill_between(load, -2 * reach, back, color="#FBE6DA", linewidth=0)
+    axes.fill_between(load, -2 * reach, back, color=style.PALE_RUST, linewidth=0)
     axes.plot(load, ahead, color=style.BLUE, linewidth=1.5)
     axes.plot(load, back, color=style.VERMILION, linewidth=1.5, linestyle=(0, (5, 2)))
     axes.plot(load, load, color=style.JOIN, linewidth=0.8, linestyle=":")

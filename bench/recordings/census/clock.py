@@ -63,11 +63,22 @@ def intervals(recording: Recording) -> Iterator[Finding]:
 
 def _stamps(run: Run) -> Array:
     """When the sensor was read that was read most often: among the instants of a run are those of
-    commands and of other sensors, which have clocks of their own.
+    commands and of other sensors, which have clocks of their own. All instants where these are as
+    even: then what the sensor has not is empty cells.
     """
     seen = [np.isfinite(values) for values in run.channels.values()]
     often = max(seen, key=lambda one: int(one.sum()), default=np.ones(run.times.size, np.bool_))
-    return run.times[often]
+    own = run.times[often]
+    return run.times if _uneven(run.times) <= _uneven(own) else own
+
+
+def _uneven(times: Array) -> float:
+    """Share of the steps that are not as long as most are."""
+    steps = np.diff(times)
+    if not steps.size:
+        return 1.0
+    usual = float(np.median(steps))
+    return float(np.mean(np.abs(steps - usual) > 0.01 * usual))
 
 
 def repeated(recording: Recording) -> Iterator[Finding]:

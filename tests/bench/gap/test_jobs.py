@@ -31,7 +31,8 @@ def test_the_answer_is_the_same_to_the_last_bit_with_one_two_and_eight(monkeypat
 
     monkeypatch.setattr(Crew, "_shared", counted)
     swing = recording(
-        effects=["drag.linear=1e-3", "friction.coulomb=2e-3"], noise=["q=0.003", "qd=0.02"],
+        effects=["drag.linear=1e-3", "friction.coulomb=2e-3", "force.bias=0.02"],
+        noise=["q=0.003", "qd=0.02"],
         runs=3, seconds=1.0, rate=60.0,
     )  # fmt: skip
     documents = []
