@@ -44,7 +44,7 @@ robot: $(STAMP)
 	$(BIN)/simgap score results/robot-example/extended.toml examples/robot/log.csv --held-out
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -132,11 +132,15 @@ def integrate(engine: Engine, lanes: Lanes) -> Motion:
     if not hidden:
         return engine.integrate(lanes)
     others = tuple((e, c) for e, c in lanes.effects if not isinstance(e, Hidden))
-    on = np.array([c[0, :, 0] > 0 for _, c in hidden]).T
+    on = np.array([c[0, :, 0] > 0 for _, c in hidden])
+    # Most calls have none of them, and are as quick as ever.
+    if not on.any():
+        return engine.integrate(replace(lanes, effects=others))
     motions = []
-    for pattern in np.unique(on, axis=0):
-        members = np.flatnonzero((on == pattern).all(axis=1))
-        there = [pair for pair, is_on in zip(hidden, pattern, strict=True) if is_on]
+    numbers = (1 << np.arange(len(hidden))) @ on
+    for number in sorted(set(numbers.tolist())):
+        members = np.flatnonzero(numbers == number)
+        there = [pair for k, pair in enumerate(hidden) if number >> k & 1]
         part = take(replace(lanes, effects=others), members)
         effects = [(e, c[:, members]) for e, c in there]
         motion = engine.integrate(_enlarged(part, effects) if there else part)
