@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -93,10 +93,6 @@ class Enlarged(System):
             total = total + force
             rates.append(inertia * rate)
         return np.concatenate([total, *rates], axis=1)
-
-    def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
-        """(L, D) of the system."""
-        return padded(self.inner.push(self.plain(moment), axis), moment)
 
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]

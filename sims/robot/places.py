@@ -222,7 +222,7 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
         # The difference may take away what the file states, and no more.
         high = max(high, 2.0 * abs(stated))
         low = least = min(-stated, 0.0)
-    return Coefficient(c.name, (unit,) * 3, ((low, high),) * 3, c.of, least)
+    return replace(c, units=(unit,) * 3, plausible=((low, high),) * 3, least=least)
 
 
 def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[Spot]]:
