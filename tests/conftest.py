@@ -84,3 +84,12 @@ def pytest_collection_modifyitems(items):
     for item in items:
         seconds[item.path] += _SECONDS[item.get_closest_marker("slow") is not None]
     items.sort(key=lambda item: -seconds[item.path])
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """One headless browser for all tests of pages; they skip visibly where there is none."""
+    from tests.browser import launched
+
+    with launched() as started:
+        yield started

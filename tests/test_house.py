@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("bench", "methods", "sims")
 ROOMS = {
     "across", "analysis", "api", "checks", "cli", "commands", "compare", "experiments", "figures",
-    "gap", "problem",
+    "gap", "pages", "problem",
     "recordings", "registry", "report", "runs", "sealing", "shot", "sizes", "store", "study",
     "verify",
 }  # fmt: skip

@@ -11,7 +11,7 @@ import textwrap
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -69,6 +69,20 @@ SHADE = "#EEEEEE"
 # Dark and light in turn, so that neighbours differ in grey too.
 _COLOURS = (BLACK, ORANGE, BLUE, SKY, VERMILION, GREEN, PURPLE, GREY, VIOLET, BROWN)
 
+_DARK = {
+    BLACK: "#FFFFFF",
+    ORANGE: "#F2B632",
+    BLUE: "#4D94FF",
+    SKY: "#7CC8F5",
+    VERMILION: "#FF7A3D",
+    GREEN: "#2CC79A",
+    PURPLE: "#E39CC6",
+    GREY: "#9C9C9C",
+    VIOLET: "#B08CF0",
+    BROWN: "#C4934A",
+}
+"""The same colours on a dark page, each three to one against it at least."""
+
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
 
 # Eight against ten colours: the pairs repeat only after forty tuners.
@@ -82,6 +96,9 @@ _LINES = (
     (0, (6, 1, 1, 1, 1, 1)),
     (0, (8, 2)),
 )
+
+_DASHES: dict[Any, tuple[float, ...]] = {"-": (), "--": (3.7, 1.6), "-.": (6.4, 1.6, 1.0, 1.6)}
+"""Matplotlib's named lines, in widths of the line."""
 
 DPI = 160
 """Dots an inch of the PNG files."""
@@ -103,6 +120,29 @@ TITLES = {
     "heldout_error": "Held-out runs, open loop",
 }
 """What a panel shows: a range of targets, or runs of a recording."""
+
+
+class Look(NamedTuple):
+    """How a page draws what belongs to one name.
+
+    Attributes:
+        colour: on a light ground.
+        dark: on a dark ground.
+        dashes: lengths drawn and left out in turn, in widths of the line; empty for a whole line.
+        marker: by matplotlib's letter; empty for none.
+    """
+
+    colour: str
+    dark: str
+    dashes: tuple[float, ...] = ()
+    marker: str = ""
+
+
+def look(place: int) -> Look:
+    """The look of what stands at a place of a list, apart from its neighbours in grey too."""
+    colour, line = _COLOURS[place % len(_COLOURS)], _LINES[place % len(_LINES)]
+    dashes = _DASHES[line] if isinstance(line, str) else tuple(map(float, line[1]))
+    return Look(colour, _DARK[colour], dashes, _MARKERS[place % len(_MARKERS)])
 
 
 class Styles:
@@ -130,6 +170,10 @@ class Styles:
             "linewidth": 1.6,
             "label": tuner,
         }
+
+    def look(self, tuner: str) -> Look:
+        """The same for a page."""
+        return look(self._places[tuner])
 
     def offset(self, tuner: str) -> float:
         """A small shift along a category axis, so that error bars stand beside each other."""
@@ -234,6 +278,17 @@ def pdf(figure: Figure) -> bytes:
     file = BytesIO()
     # Without its date a file is the same whenever it is made.
     figure.savefig(file, format="pdf", metadata={"CreationDate": None})
+    return file.getvalue()
+
+
+def svg(figure: Figure) -> bytes:
+    """A figure as the bytes of an SVG file."""
+    from matplotlib import rc_context
+
+    file = BytesIO()
+    # Without a date and chance names a file is the same whenever it is made.
+    with rc_context({"svg.hashsalt": "simgap"}):
+        figure.savefig(file, format="svg", metadata={"Date": None})
     return file.getvalue()
 
 

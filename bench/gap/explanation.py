@@ -16,13 +16,13 @@ from bench.gap.report import pictures
 from bench.gap.report.account import closes, cut, interval
 from bench.gap.report.agreement import HEAD, rows
 from bench.gap.report.changes import changes
-from bench.gap.report.elements import framed
 from bench.gap.report.page import page
 from bench.gap.report.pictures import Printed
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, estimated, joined, percent
 from bench.gap.robot_files import RobotFiles, robot_files
 from bench.gap.verdict import Cause, Verdict
+from bench.pages.elements import framed
 from sims import extended as extending
 from sims.base import InputError
 from sims.extended import Extended

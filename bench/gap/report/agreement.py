@@ -10,10 +10,10 @@ import numpy as np
 
 from bench.gap.apart import LEVEL, Mover, Spread
 from bench.gap.measure import Z95
-from bench.gap.report.elements import heading, paragraph, safe, table
 from bench.gap.report.missing import missing
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, estimate, joined, number, probability, sentence, with_unit
+from bench.pages.elements import heading, paragraph, safe, table
 
 MOST = 12
 """Rows of the table, those that agree least first."""

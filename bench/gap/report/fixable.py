@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from bench.gap.identify import Number
-from bench.gap.report.elements import code, heading, paragraph, safe, table
 from bench.gap.report.story import Story
 from bench.gap.report.words import joined, number
+from bench.pages.elements import code, heading, paragraph, safe, table
 
 MOST = 12
 """Causes of one kind that are named."""

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from bench.gap.report.account import closes, effort, following, headline, heldout_unit, interval
 from bench.gap.report.agreement import agreement
-from bench.gap.report.elements import bar, code, figure, paragraph, safe, strong
 from bench.gap.report.fixable import fixable
 from bench.gap.report.joints import by_joint
 from bench.gap.report.places import has_places, marks
@@ -29,6 +28,7 @@ from bench.gap.report.sections import (
 )
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, joined, name_of, number, percent, pretty, with_unit
+from bench.pages.elements import bar, code, figure, paragraph, safe, strong
 
 _STYLE = Path(__file__).with_name("page.css")
 _BADGES = {

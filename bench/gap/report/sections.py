@@ -10,7 +10,6 @@ from math import isfinite
 import numpy as np
 
 from bench.gap.report.account import absorbed, experiment, rms, shift
-from bench.gap.report.elements import code, folded, heading, listed, paragraph, safe, strong, table
 from bench.gap.report.places import has_places, of_set, values_of, without_place
 from bench.gap.report.ranking import entries, standing
 from bench.gap.report.story import Place, Side, Story, Tuned
@@ -27,6 +26,7 @@ from bench.gap.report.words import (
     with_unit,
 )
 from bench.gap.verdict import Candidate, Cause
+from bench.pages.elements import code, folded, heading, listed, paragraph, safe, strong, table
 from sims.base import Array
 
 MOST_CANDIDATES = 25

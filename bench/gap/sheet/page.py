@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
-from bench.gap.report.elements import code, figure, heading, listed, paragraph, safe, table
 from bench.gap.report.words import (
     estimated,
     joined,
@@ -19,6 +18,7 @@ from bench.gap.sheet.facts import Facts
 from bench.gap.sheet.mjcf import CLASS, Made
 from bench.gap.sheet.quantity import Quantity
 from bench.gap.sheet.words import TITLES, another, beside, called, evidence, reached
+from bench.pages.elements import code, figure, heading, listed, paragraph, safe, table
 
 _STYLE = Path(__file__).parents[1] / "report" / "page.css"
 HEADS = ("", "quantity", "-value (95 %)", "-in another run", "-the file says", "evidence")

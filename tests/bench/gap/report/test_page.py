@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from bench.gap.identify import Number
-from bench.gap.report.elements import framed
 from bench.gap.report.page import page
 from bench.gap.report.sections import errors_of
+from bench.pages.elements import framed
 from tests.bench.gap.report.test_account import VERDICTS
 from tests.bench.gap.stories import DRAG, EVIL, HELD_OUT, TILT, evil, story
 

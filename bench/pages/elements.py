@@ -6,7 +6,7 @@ from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from bench.gap.report.words import clean
+from bench.pages.text import clean
 
 NUMBERS = "-"
 """A table's head that begins with this is the head of numbers, which stand to the right."""

@@ -1,0 +1,90 @@
+"""Tables that a reader sorts, filters, copies and saves: `Grid`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from bench.pages import elements
+from bench.pages.elements import safe
+from bench.pages.text import number
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FEW = 40
+"""Rows that a page shows without its script, and at once with it."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column that is shown.
+
+    Attributes:
+        name: in the table.
+        head: above it, with its unit; the name where empty.
+        digits: significant digits of a number; 0 for texts, as they stand.
+        says: what it is, shown above the head.
+    """
+
+    name: str
+    head: str = ""
+    digits: int = 0
+    says: str = ""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table to work with.
+
+    Attributes:
+        name: in the page's address and ids: letters, digits and hyphens.
+        title: read aloud, and shown above it.
+        table: name of the table in the page.
+        columns: that are shown; what is saved has all.
+        filters: columns of which a reader chooses a value.
+        only: values chosen at first, by column of `filters`.
+        sort: column by which it is sorted at first; empty for as it stands.
+        switch: column of names that legends switch on and off; empty for none.
+    """
+
+    name: str
+    title: str
+    table: str
+    columns: tuple[Column, ...]
+    filters: tuple[str, ...] = ()
+    only: Mapping[str, str] = field(default_factory=dict)
+    sort: str = ""
+    switch: str = ""
+
+    def spec(self) -> dict[str, Any]:
+        """What the page's script is told, as JSON holds it."""
+        return asdict(self)
+
+    def html(self, frame: pd.DataFrame) -> str:
+        """The table as it stands without a script: what is chosen at first, and a few rows of it.
+
+        Args:
+            frame: the table that the page holds as CSV.
+        """
+        part = frame
+        for name, value in self.only.items():
+            part = part[part[name].astype(str) == value]
+        if self.sort:
+            part = part.sort_values(self.sort, kind="stable")
+        heads = [
+            f"{elements.NUMBERS * bool(c.digits)}{safe(c.head or c.name)}" for c in self.columns
+        ]
+        rows = [self._cells(row) for row in part.head(FEW).to_dict("records")]
+        more = len(part) - FEW
+        note = elements.paragraph(f"{more} more rows.", "soft") if more > 0 else ""
+        return elements.table(heads, rows) + note
+
+    def _cells(self, row: Mapping[Any, Any]) -> Sequence[str]:
+        cells = []
+        for column in self.columns:
+            value = row[column.name]
+            # Longer than elsewhere: of a traceback every line is wanted.
+            cells.append(number(value, column.digits) if column.digits else safe(value, 300))
+        return cells

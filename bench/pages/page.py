@@ -1,0 +1,162 @@
+"""A page: one HTML file that asks nobody for anything.
+
+Styles, scripts, tables and figures are within it, and its Content-Security-Policy forbids every
+request and every script but its own. It is whole without JavaScript: figures are static then, and
+tables show their first rows.
+"""
+
+from __future__ import annotations
+
+import json
+from base64 import b64encode
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.pages import elements
+from bench.pages.chart import Chart, Static
+from bench.pages.elements import safe
+from bench.pages.grid import Grid
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_HERE = Path(__file__).parent
+_LIBRARY = _HERE / "vendor" / "uplot"
+_SCRIPTS = ("text", "tables", "state", "ticks", "look", "draw", "panel", "figure", "grid", "page")
+"""In this order: one that comes later may use what came before."""
+
+
+class Page:
+    """A page that is put together part by part.
+
+    Args:
+        title: of the window.
+        made: what made it, for its foot; safe HTML.
+    """
+
+    def __init__(self, title: str, made: str) -> None:
+        self._title, self._made = title, made
+        self._parts: list[str] = []
+        self._sections: list[tuple[str, str]] = []
+        self._tables: dict[str, str] = {}
+        self._frames: dict[str, pd.DataFrame] = {}
+        self._charts: list[dict[str, Any]] = []
+        self._grids: list[dict[str, Any]] = []
+
+    def add(self, *parts: str) -> None:
+        """Put safe HTML at the end of the page."""
+        self._parts += [part for part in parts if part]
+
+    def section(self, name: str, head: str, *parts: str) -> None:
+        """Put a section at the end of the page, and a link to it above.
+
+        Args:
+            name: in the page's address: letters, digits and hyphens.
+            head: above it; safe HTML.
+            parts: what it holds; safe HTML. A section of nothing is left out.
+        """
+        held = [part for part in parts if part]
+        if held:
+            self._sections.append((name, head))
+            body = "\n".join([f'<h2 id="{name}-head">{head}</h2>', *held])
+            self.add(f'<section id="{name}" aria-labelledby="{name}-head">\n{body}\n</section>')
+
+    def table(self, name: str, frame: pd.DataFrame) -> None:
+        """Keep a table in the page, for charts and grids, to be saved as NAME.csv."""
+        self._frames[name] = frame
+        self._tables[name] = frame.to_csv(index=False)
+
+    def chart(self, chart: Chart) -> str:
+        """A figure as HTML; its tables must be in the page."""
+        self._charts.append(chart.spec())
+        still = _still(chart.static) if chart.static else ""
+        caption = f"<figcaption>{chart.caption}</figcaption>"
+        return (
+            f'<figure class="chart" id="{chart.name}" aria-labelledby="{chart.name}-title">\n'
+            f'<h3 id="{chart.name}-title">{safe(chart.title)}</h3>\n'
+            f'<div class="live"></div>\n{still}\n{caption}\n</figure>'
+        )
+
+    def grid(self, grid: Grid) -> str:
+        """A table to work with as HTML; its table must be in the page."""
+        self._grids.append(grid.spec())
+        shown = grid.html(self._frames[grid.table])
+        head = f'<h3 id="{grid.name}-title">{safe(grid.title)}</h3>'
+        return f'<div class="grid" id="{grid.name}">\n{head}\n{shown}\n</div>'
+
+    def html(self) -> str:
+        """The whole page."""
+        data = {"tables": self._tables, "charts": self._charts, "grids": self._grids}
+        library = (_LIBRARY / "uPlot.iife.min.js").read_text(encoding="utf-8")
+        own = "\n".join(_script(name) for name in _SCRIPTS)
+        script = f'{library}\n(() => {{\n"use strict";\n{own}\n}})();\n'
+        style = f"{(_LIBRARY / 'uPlot.min.css').read_text(encoding='utf-8')}\n{_style()}"
+        return "\n".join(
+            [
+                '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+                f'<meta http-equiv="Content-Security-Policy" content="{_policy(script)}">',
+                '<meta name="viewport" content="width=device-width, initial-scale=1">',
+                f"<title>{safe(self._title, 160)}</title>",
+                f"<style>\n{style}</style>\n</head>\n<body>",
+                '<a class="skip" href="#main">Skip to the results</a>',
+                self._navigation(),
+                '<main id="main">',
+                *self._parts,
+                f'</main>\n<footer class="soft">{elements.paragraph(self._made)}</footer>',
+                f'<script type="application/json" id="data">{embedded(data)}</script>',
+                f"<script>{script}</script>\n</body>\n</html>\n",
+            ]
+        )
+
+    def _navigation(self) -> str:
+        links = [f'<a href="#{name}">{head}</a>' for name, head in self._sections]
+        return f'<nav aria-label="sections">{" ".join(links)}</nav>'
+
+
+def embedded(value: object) -> str:
+    """A value as JSON that may stand in a script element: nothing in it can end the element.
+
+    Raises:
+        ValueError: a number is not finite, which JSON cannot hold.
+    """
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    # "</script>" and "<!--" mean something to whoever reads the page as HTML, whatever is in it.
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _policy(script: str) -> str:
+    """What the page may do: run its one script, show what is within it, and nothing else."""
+    digest = b64encode(sha256(script.encode()).digest()).decode("ascii")
+    return "; ".join(
+        [
+            "default-src 'none'",
+            f"script-src 'sha256-{digest}'",
+            # Styles cannot ask for anything that the other lines forbid.
+            "style-src 'unsafe-inline'",
+            "img-src data: blob:",
+            "base-uri 'none'",
+            "form-action 'none'",
+        ]
+    )
+
+
+def _still(static: Static) -> str:
+    """The printed figure, and what can be taken away without a script."""
+    svg = b64encode(static.svg).decode("ascii")
+    pdf = b64encode(static.pdf).decode("ascii")
+    file = safe(static.file)
+    image = (
+        f'<img class="still" src="data:image/svg+xml;base64,{svg}" data-file="{file}" '
+        f'alt="{safe(static.alternative, 1000)}">'
+    )
+    link = f'<a href="data:application/pdf;base64,{pdf}" download="{file}.pdf">PDF</a>'
+    return f'{image}\n<p class="files">{link}</p>'
+
+
+def _script(name: str) -> str:
+    return (_HERE / "script" / f"{name}.js").read_text(encoding="utf-8")
+
+
+def _style() -> str:
+    return (_HERE / "page.css").read_text(encoding="utf-8")

@@ -1,0 +1,255 @@
+// A figure: its controls, its legend and the panels that are chosen.
+
+const AXES = { x: "across", y: "up" };
+const NAMES = { linear: "linear", log: "logarithmic", symlog: "logarithmic" };
+const WHOLE = "all";
+
+class FigureView {
+  constructor(spec) {
+    this.spec = spec;
+    this.place = document.getElementById(spec.name);
+    this.live = this.place.querySelector(".live");
+    this.views = [];
+    this.facets = this.facetsOf(spec.panels);
+    this.controls = element("div", { class: "controls" });
+    this.legend = element("div", { class: "legend", role: "group", "aria-label": "series: click to switch on and off, with Shift for one alone" });
+    this.panels = element("div", { class: "panels" });
+    this.told = element("p", { class: "told", "aria-live": "polite" });
+    this.live.append(this.controls, this.legend, this.panels, this.told);
+    this.addFiles();
+    this.draw();
+    new ResizeObserver(() => this.resized()).observe(this.live);
+  }
+
+  key(name) {
+    return `${this.spec.name}.${name}`;
+  }
+
+  facetsOf(panels) {
+    const found = new Map();
+    for (const panel of panels) {
+      for (const [name, value] of Object.entries(panel.facets)) found.set(name, (found.get(name) ?? new Set()).add(value));
+    }
+    return [...found].filter(([, values]) => values.size > 1).map(([name, values]) => [name, [...values]]);
+  }
+
+  chosen(name, values) {
+    const first = name === this.spec.beside ? WHOLE : values[0];
+    const value = state.get(this.key(name), first);
+    return value === WHOLE || values.includes(value) ? value : first;
+  }
+
+  shown() {
+    const picks = this.facets.map(([name, values]) => [name, this.chosen(name, values)]);
+    return this.spec.panels.filter((panel) => picks.every(([name, value]) => value === WHOLE || panel.facets[name] === value || !(name in panel.facets)));
+  }
+
+  scale(key, panel) {
+    const axis = panel[AXES[key]];
+    const value = state.get(this.key(key), axis.scale);
+    return axis.scales.includes(value) && !axis.names.length ? value : axis.scale;
+  }
+
+  select(label, options, value, act) {
+    const made = element("select", { on: { change: () => act(made.value) } }, ...options.map(([name, text]) => element("option", { value: name, selected: name === value }, text)));
+    return element("label", {}, `${label} `, made);
+  }
+
+  addControls(panel) {
+    const made = this.facets.map(([name, values]) => {
+      const options = values.map((value) => [value, value]);
+      if (name === this.spec.beside) options.unshift([WHOLE, "all, side by side"]);
+      const first = name === this.spec.beside ? WHOLE : values[0];
+      return this.select(name, options, this.chosen(name, values), (value) => {
+        state.chosen.delete(this.key("zoom"));
+        state.set(this.key(name), value, first);
+      });
+    });
+    for (const key of ["y", "x"]) {
+      const axis = panel[AXES[key]];
+      if (axis.names.length || axis.scales.length < 2) continue;
+      const options = axis.scales.map((scale) => [scale, NAMES[scale]]);
+      made.push(this.select(key === "y" ? "vertical" : "horizontal", options, this.scale(key, panel), (value) => {
+        state.chosen.delete(this.key("zoom"));
+        state.set(this.key(key), value, axis.scale);
+      }));
+    }
+    const button = (text, label, act, off = false) => element("button", { type: "button", "aria-label": label, title: label, disabled: off, on: { click: act } }, text);
+    made.push(
+      element("span", { class: "zoom" },
+        button("+", "zoom in", () => this.scaled(0.6)),
+        button("−", "zoom out", () => this.scaled(1 / 0.6)),
+        button("whole", "show everything again", () => this.reset(), !state.get(this.key("zoom")))),
+    );
+    // The one that was used keeps the focus although all are made anew.
+    const places = [...this.controls.querySelectorAll("select, button")];
+    const focused = places.indexOf(document.activeElement);
+    this.controls.replaceChildren(...made);
+    if (focused >= 0) this.controls.querySelectorAll("select, button")[focused]?.focus();
+  }
+
+  addLegend(panels) {
+    const off = state.off();
+    const series = new Map();
+    for (const panel of panels) for (const one of panel.series) if (!series.has(one.name)) series.set(one.name, one);
+    const names = [...series.keys()];
+    const alone = (name) => {
+      const others = names.filter((other) => other !== name);
+      const already = !off.has(name) && others.every((other) => off.has(other));
+      const next = new Set([...off].filter((other) => !names.includes(other)));
+      if (!already) others.forEach((other) => next.add(other));
+      state.switchOff(next);
+    };
+    const toggle = (name) => {
+      const next = state.off();
+      if (!next.delete(name)) next.add(name);
+      state.switchOff(next);
+    };
+    const made = names.map((name) => {
+      const { look, draw } = series.get(name);
+      const act = (event) => (event.shiftKey || event.detail === 2 ? alone(name) : toggle(name));
+      return element("button", { type: "button", class: "key", "aria-pressed": String(!off.has(name)), "data-name": name, on: { click: act } }, swatch(look, draw), ` ${name}`);
+    });
+    if (names.length > 2) {
+      made.push(element("button", { type: "button", class: "every", on: { click: () => state.switchOff([...off].filter((name) => !names.includes(name))) } }, "all"));
+      made.push(element("button", { type: "button", class: "every", on: { click: () => state.switchOff(new Set([...off, ...names])) } }, "none"));
+    }
+    const focused = document.activeElement?.closest(".legend") === this.legend ? [...this.legend.children].indexOf(document.activeElement) : -1;
+    this.legend.replaceChildren(...made);
+    if (focused >= 0) this.legend.children[focused]?.focus();
+  }
+
+  // Ranges of both axes: zoomed, asked for, or of what is on in all panels that share the axis.
+  ranges(panels, lines, panel, scales) {
+    const zoom = state.get(this.key("zoom")).split(",");
+    const range = (key, at, listsOf) => {
+      if (zoom.length === 4 && zoom[at] !== "") return [Number(zoom[at]), Number(zoom[at + 1])];
+      const axis = panel[AXES[key]];
+      if (axis.names.length) return [-0.6, axis.names.length - 0.4];
+      if (axis.ends && !(scales[key] === "log" && axis.ends[0] <= 0)) return axis.ends;
+      const sharing = panels.map((other, i) => [other, lines[i]]).filter(([other]) => other[AXES[key]].label === axis.label);
+      const lists = sharing.flatMap(([, own]) => own.flatMap(listsOf));
+      if (key === "y" && sharing.some(([, own]) => own.some((line) => line.draw === "bars"))) lists.push([0]);
+      return roomy(scales[key], ...extent(lists, scales[key] === "log"));
+    };
+    return { x: range("x", 0, (line) => [line.xs]), y: range("y", 2, (line) => [line.ys, line.low, line.high]) };
+  }
+
+  draw() {
+    this.views.forEach((view) => view.destroy());
+    const panels = this.shown();
+    const off = state.off();
+    this.addControls(panels[0]);
+    this.addLegend(panels);
+    this.width = this.live.clientWidth;
+    const across = Math.max(1, Math.min(panels.length, Math.floor(this.width / 400)));
+    const width = Math.floor((this.width - 16 * (across - 1)) / across);
+    const height = Math.max(260, Math.min(440, Math.round(width * 0.66)));
+    const lines = panels.map((panel) => linesOf(panel).filter((line) => !off.has(line.name)));
+    this.panels.replaceChildren();
+    this.panels.style.gridTemplateColumns = `repeat(${across}, minmax(0, 1fr))`;
+    this.views = panels.map((panel, i) => {
+      const scales = { x: this.scale("x", panel), y: this.scale("y", panel) };
+      const place = element("div", {
+        class: "panel", tabindex: 0, role: "group",
+        "aria-label": `${panel.title}: ${panel.up.label} against ${panel.across.label}. Arrow keys read values, plus and minus zoom, 0 shows everything.`,
+        on: { keydown: (event) => this.pressed(event, i) },
+      });
+      place.append(element("h4", {}, panel.title));
+      this.panels.append(place);
+      return new PanelView(place, panel, lines[i], {
+        width, height, scales,
+        ranges: this.ranges(panels, lines, panel, scales),
+        sync: this.spec.link || this.spec.name,
+        acts: {
+          zoomed: (x, y) => this.zoomed(x, y),
+          reset: () => this.reset(),
+          told: (text) => { this.told.textContent = text; },
+        },
+      });
+    });
+  }
+
+  pressed(event, place) {
+    const acts = { ArrowRight: () => this.views[place].step(1), ArrowLeft: () => this.views[place].step(-1), "+": () => this.scaled(0.6), "-": () => this.scaled(1 / 0.6), 0: () => this.reset() };
+    if (!acts[event.key] || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    acts[event.key]();
+    // Drawn anew: the panel at this place goes on listening.
+    this.panels.children[place]?.focus({ preventScroll: true });
+  }
+
+  zoomed(x, y) {
+    const now = state.get(this.key("zoom"), ",,,").split(",");
+    const text = (range, at) => (range ? range.map((v) => v.toPrecision(5)) : now.slice(at, at + 2));
+    state.set(this.key("zoom"), [...text(x, 0), ...text(y, 2)].join(","));
+    // Panels that are read together show the same stretch of time.
+    if (this.spec.link && x) {
+      for (const other of FIGURES) if (other !== this && other.spec.link === this.spec.link) state.set(other.key("zoom"), [...text(x, 0), "", ""].join(","));
+    }
+  }
+
+  scaled(factor) {
+    const { u, scales, panel } = this.views[0];
+    const stretch = (key) => {
+      if (panel[AXES[key]].names.length) return null;
+      const ends = [u.scales[key].min, u.scales[key].max].map((v) => forward(scales[key], v));
+      const [middle, half] = [(ends[0] + ends[1]) / 2, ((ends[1] - ends[0]) / 2) * factor];
+      return [backward(scales[key], middle - half), backward(scales[key], middle + half)];
+    };
+    this.zoomed(stretch("x"), stretch("y"));
+  }
+
+  reset() {
+    state.set(this.key("zoom"), "");
+    if (!this.spec.link) return;
+    for (const other of FIGURES) if (other.spec.link === this.spec.link) state.set(other.key("zoom"), "");
+  }
+
+  resized() {
+    if (this.live.clientWidth && this.live.clientWidth !== this.width) this.draw();
+  }
+
+  concerns(key) {
+    return key === "off" || key === "theme" || key.startsWith(`${this.spec.name}.`);
+  }
+
+  // SVG and PNG from the printed figure, the numbers from the table.
+  addFiles() {
+    const still = this.place.querySelector("img.still");
+    const files = this.place.querySelector(".files") ?? element("p", { class: "files" });
+    const button = (text, act) => element("button", { type: "button", on: { click: act } }, text);
+    const made = [];
+    if (still) {
+      const name = still.dataset.file;
+      made.push(button("SVG", () => fileOf(still.src).then((blob) => save(`${name}.svg`, "", blob))));
+      made.push(button("PNG", () => pixels(still).then((blob) => save(`${name}.png`, "", blob))));
+    }
+    for (const name of new Set(this.spec.panels.map((panel) => panel.table))) {
+      made.push(button(`numbers as CSV${name === this.spec.name ? "" : ` (${name})`}`, () => save(`${name}.csv`, "text/csv", DATA.tables[name])));
+    }
+    files.prepend("Save this figure: ");
+    files.append(...made);
+    this.live.after(files);
+  }
+}
+
+// The bytes of an image that lies in the page; nothing is asked of anybody.
+async function fileOf(source) {
+  const text = atob(source.slice(source.indexOf(",") + 1));
+  return new Blob([Uint8Array.from(text, (letter) => letter.charCodeAt(0))], { type: "image/svg+xml" });
+}
+
+async function pixels(still) {
+  const image = new Image();
+  image.src = still.src;
+  await image.decode();
+  const canvas = element("canvas", { width: 2 * image.naturalWidth, height: 2 * image.naturalHeight });
+  const ctx = canvas.getContext("2d");
+  ctx.fillStyle = "#ffffff";
+  ctx.fillRect(0, 0, canvas.width, canvas.height);
+  ctx.drawImage(image, 0, 0, canvas.width, canvas.height);
+  return new Promise((done) => canvas.toBlob(done, "image/png"));
+}
+
+const FIGURES = [];

@@ -1,0 +1,48 @@
+// The page as a whole: light and dark, sections, figures and tables.
+
+const root = document.documentElement;
+root.classList.add("scripted");
+
+function addTheme() {
+  const pick = element("select", { id: "theme", on: { change: () => state.set("theme", pick.value) } },
+    ...[["", "as the system"], ["light", "light"], ["dark", "dark"]].map(([value, text]) => element("option", { value }, text)));
+  document.querySelector("nav").append(element("label", { class: "theme" }, "theme ", pick));
+  return pick;
+}
+
+function applyTheme(pick) {
+  const theme = state.get("theme");
+  if (theme) root.dataset.theme = theme;
+  else delete root.dataset.theme;
+  pick.value = theme;
+}
+
+const themePick = addTheme();
+applyTheme(themePick);
+FIGURES.push(...DATA.charts.map((spec) => new FigureView(spec)));
+const PARTS = [...FIGURES, ...DATA.grids.map((spec) => new GridView(spec))];
+
+state.listen((key) => {
+  if (key === "theme") applyTheme(themePick);
+  for (const part of PARTS) if (part.concerns(key)) part.draw();
+});
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => FIGURES.forEach((figure) => figure.draw()));
+
+// The address holds the view: a link to a section goes there and leaves the view as it is.
+for (const link of document.querySelectorAll('a[href^="#"]')) {
+  link.addEventListener("click", (event) => {
+    const goal = document.getElementById(link.hash.slice(1));
+    if (!goal) return;
+    event.preventDefault();
+    goal.scrollIntoView();
+    goal.setAttribute("tabindex", "-1");
+    goal.focus({ preventScroll: true });
+    state.set("at", link.hash.slice(1));
+  });
+}
+if (state.get("at")) document.getElementById(state.get("at"))?.scrollIntoView();
+window.addEventListener("hashchange", () => {
+  state.read();
+  applyTheme(themePick);
+  PARTS.forEach((part) => part.draw());
+});

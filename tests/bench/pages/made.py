@@ -1,0 +1,100 @@
+"""A small page with everything that a page can hold, and texts that are no markup."""
+
+import numpy as np
+import pandas as pd
+
+from bench.figures import style
+from bench.pages.chart import Axis, Chart, Panel, Rule, Series, Span, Static
+from bench.pages.elements import heading, paragraph, safe
+from bench.pages.grid import Column, Grid
+from bench.pages.page import Page
+
+NAMES = ("least squares", "<b>cma</b> & co", "random", "</script><script>alert(1)</script>")
+STEPS = (0, 1, 2, 3, 5, 10, 20, 50)
+RANGES = {"in": "inside", "wide": "anywhere"}
+ODD = 'a, b\nline two, "quoted" <i>x</i>'
+TITLE = "Title </title><h1 id=broken>& more"
+
+
+def errors():
+    rows = [
+        (name, kind, k, middle, 0.7 * middle, 1.6 * middle)
+        for kind in RANGES
+        for i, name in enumerate(NAMES)
+        for k in STEPS
+        for middle in [10 ** (-0.4 * i - 0.05 * k)]
+    ]
+    return pd.DataFrame(rows, columns=["tuner", "range", "simulations", "median", "low", "high"])
+
+
+def bins():
+    rows = [(n, b, 1.0 + i + b) for i, n in enumerate(NAMES) for b in range(3)]
+    return pd.DataFrame(rows, columns=["tuner", "bin", "count"])
+
+
+def notes():
+    values = [0.0, 1.0, -2.5, 1e-3, 9.996e-4, 0.99951, 123456.0, 99951.0, 3.14159e-12, 1e300]
+    values += [float("nan"), float("inf"), -7.0e-5, 1000.0, 12.5]
+    says = [ODD, *(f"note {i}" for i in range(1, len(values)))]
+    return pd.DataFrame({"says": says, "value": values})
+
+
+def still():
+    figure, axes = style.canvas(1)
+    axes[0].plot(STEPS, np.sqrt(STEPS), color=style.BLUE)
+    return Static(style.svg(figure), style.pdf(figure), 'curves with "quotes" & <b>', "error")
+
+
+def error_chart():
+    def panel(kind, title):
+        series = tuple(
+            Series(n, "median", style.look(i), {"tuner": n, "range": kind}, "low", "high")
+            for i, n in enumerate(NAMES)
+        )
+        across = Axis("simulations", "symlog", ("symlog", "linear"), tuple(float(k) for k in STEPS))
+        return Panel(
+            title,
+            "error",
+            "simulations",
+            series,
+            across,
+            Axis("error [rad]", "log"),
+            {"targets": title},
+            (Rule(0.01, "floor"),),
+            (Span(5.0, 20.0, "later", style.look(2), foot=True),),
+        )
+
+    panels = tuple(panel(kind, title) for kind, title in RANGES.items())
+    return Chart("error", "Error <i>now</i>", "How to read it.", panels, still(), "targets")
+
+
+def bins_chart():
+    across = Axis("distance", names=("inside", "0–1", "1–2"))
+    series = tuple(
+        Series(n, "count", style.look(i), {"tuner": n}, draw=("bars", "points")[i % 2])
+        for i, n in enumerate(NAMES)
+    )
+    panel = Panel("Counts", "bins", "bin", series, across, Axis("targets"))
+    return Chart("bins", "Bins", "Bars and points.", (panel,))
+
+
+def page():
+    made = Page(TITLE, f"Made by {safe('<simgap>')}.")
+    for name, frame in (("error", errors()), ("bins", bins()), ("notes", notes())):
+        made.table(name, frame)
+    made.add(f"<h1>{safe(TITLE)}</h1>", paragraph("A page to test pages with."))
+    made.section("errors", "Errors", made.chart(error_chart()))
+    columns = (
+        Column("tuner"),
+        Column("range"),
+        Column("simulations", digits=5),
+        Column("median", "median [rad]", 3),
+    )
+    table = Grid(
+        "numbers", "All numbers", "error", columns, ("range",), {"range": "wide"}, "median", "tuner"
+    )
+    made.section("rest", "The rest", made.chart(bins_chart()), made.grid(table))
+    odd = Grid("notes", "Notes", "notes", (Column("says"), Column("value", digits=3)))
+    made.section("odd", "Odd texts", made.grid(odd), heading("Nothing below"))
+    made.section("empty", "Nothing", "", "")
+    return made.html()

@@ -1,0 +1,303 @@
+"""The base of every page, in a real browser: each control does what it says, and nothing leaves."""
+
+import base64
+import hashlib
+import json
+import re
+
+import pytest
+
+from bench.pages.page import embedded
+from bench.pages.text import number
+from tests.bench.pages import made
+from tests.browser import REQUIRED, WIDTHS, Opened, launched
+
+CONTROLS = "select:visible, input:visible, canvas:visible, button:not(th button):visible"
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    file = tmp_path_factory.mktemp("page") / "a page, #1.html"
+    file.write_text(made.page(), encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def opened(browser, path):
+    with Opened(browser, path) as one:
+        yield one
+        assert one.complaints == []
+
+
+def rows(page, name):
+    """The cells of a table as they are shown."""
+    return [
+        line.locator("td").all_inner_texts() for line in page.locator(f"#{name} tbody tr").all()
+    ]
+
+
+def broken(tmp_path, html):
+    file = tmp_path / "broken.html"
+    file.write_text(f"<!DOCTYPE html><html lang=en><title>x</title><main>{html}</main>")
+    return file
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", WIDTHS)
+def test_nothing_is_complained_of_and_nothing_is_in_the_way(browser, path, width, scheme):
+    with Opened(browser, path, width=width, color_scheme=scheme) as one:
+        assert one.page.locator("canvas").count() == 3
+        assert one.overflow() <= 0
+        assert one.barriers() == []
+        assert one.complaints == []
+
+
+@pytest.mark.parametrize(
+    ("html", "complaint"),
+    [
+        ("<script>console.error('oh')</script>", "console: oh"),
+        ("<script>nothing.there()</script>", "script: nothing is not defined"),
+        ('<img alt="" src="http://localhost:9/x.png">', "request: http://localhost:9/x.png"),
+    ],
+)
+def test_a_page_that_errs_or_asks_is_noticed(browser, tmp_path, html, complaint):
+    with Opened(browser, broken(tmp_path, html)) as one:
+        assert complaint in one.complaints
+
+
+@pytest.mark.parametrize(
+    ("html", "rule"),
+    [
+        ('<img src="data:,">', "image-alt"),
+        ("<p style='color:#bbb;background:#fff'>hardly to be read</p>", "color-contrast"),
+        ("<select><option>a</option></select>", "select-name"),
+    ],
+)
+def test_what_keeps_people_out_is_noticed(browser, tmp_path, html, rule):
+    with Opened(browser, broken(tmp_path, html)) as one:
+        assert any(found.startswith(rule) for found in one.barriers())
+
+
+def test_without_a_browser_the_tests_skip_but_where_it_is_required(monkeypatch):
+    monkeypatch.setattr("tests.browser.chromium", lambda: "")
+    monkeypatch.delenv(REQUIRED, raising=False)
+    with pytest.raises(pytest.skip.Exception, match="apt-get install chromium"), launched():
+        pass
+    monkeypatch.setenv(REQUIRED, "1")
+    with pytest.raises(pytest.fail.Exception, match="apt-get install chromium"), launched():
+        pass
+
+
+def test_texts_are_no_markup(opened):
+    assert opened.page.title() == made.TITLE
+    assert opened.page.locator("#broken, #error b, #error h3 i, td i").count() == 0
+    assert opened.text("h1") == made.TITLE
+    assert opened.text("#error h3") == "Error <i>now</i>"
+    keys = [text.strip() for text in opened.page.locator("#error .key").all_inner_texts()]
+    assert keys == list(made.NAMES)
+
+
+def test_nothing_in_the_data_ends_the_script_element():
+    value = {"</script><!--": ["&lt;", "\u2028", "<"]}
+    assert not re.search("[<>&]", embedded(value))
+    assert json.loads(embedded(value)) == value
+    with pytest.raises(ValueError, match="JSON compliant"):
+        embedded(float("nan"))
+
+
+def test_the_policy_allows_the_pages_script_and_no_other(opened, path):
+    html = path.read_text(encoding="utf-8")
+    script = re.search(r"<script>(.*)</script>\n</body>", html, re.DOTALL)[1]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in html
+    # Neither an injected script nor a request of the page itself gets past it.
+    opened.page.evaluate(
+        "() => { const s = document.createElement('script'); s.textContent = 'window.ran = 1';"
+        " document.body.append(s); }"
+    )
+    assert opened.page.evaluate("window.ran") is None
+    asked = "fetch('http://localhost:9/').then(() => 'went', (e) => String(e))"
+    assert "Failed to fetch" in opened.page.evaluate(asked)
+    assert any("Content Security Policy" in text for text in opened.complaints)
+    opened.complaints.clear()
+
+
+def test_a_series_that_is_switched_off_is_gone_everywhere_and_stays_so(browser, opened, path):
+    page = opened.page
+    before = page.locator("#error canvas").first.screenshot()
+    page.locator("#error .key").first.click()
+    assert page.locator("#error .key").first.get_attribute("aria-pressed") == "false"
+    assert page.locator("#bins .key").first.get_attribute("aria-pressed") == "false"
+    assert page.locator("#error canvas").first.screenshot() != before
+    assert "least squares" not in {row[0] for row in rows(page, "numbers")}
+    assert len(rows(page, "numbers")) == 8 * 3
+    with Opened(browser, path, "#" + page.evaluate("location.hash.slice(1)")) as again:
+        assert again.page.locator("#error .key").first.get_attribute("aria-pressed") == "false"
+        assert again.page.locator("#error .key[aria-pressed=true]").count() == 3
+    page.get_by_role("button", name="all", exact=True).first.click()
+    assert page.locator("#error .key[aria-pressed=true]").count() == 4
+    assert opened.state() == ""
+    page.locator("#error .key").nth(2).click(modifiers=["Shift"])
+    on = page.locator("#error .key[aria-pressed=true]").all_inner_texts()
+    assert [text.strip() for text in on] == ["random"]
+
+
+def test_facets_and_scales_are_chosen_and_kept(browser, opened, path):
+    page = opened.page
+    assert page.locator("#error .panel").count() == 2
+    page.locator("#error").get_by_label("targets").select_option("anywhere")
+    assert page.locator("#error .panel h4").all_inner_texts() == ["anywhere"]
+    before = page.locator("#error canvas").screenshot()
+    page.locator("#error").get_by_label("vertical").select_option("linear")
+    assert page.locator("#error canvas").screenshot() != before
+    assert set(opened.state().split("&")) == {"error.targets=anywhere", "error.y=linear"}
+    with Opened(browser, path, f"#{opened.state()}") as again:
+        assert again.page.locator("#error .panel h4").all_inner_texts() == ["anywhere"]
+        assert again.page.locator("#error").get_by_label("vertical").input_value() == "linear"
+
+
+def test_dragging_zooms_and_whole_shows_everything_again(opened):
+    page = opened.page
+    box = page.locator("#error .u-over").first.bounding_box()
+    before = page.locator("#error canvas").first.screenshot()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.2 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.9 * box["width"], box["y"] + 0.7 * box["height"], steps=4)
+    page.mouse.up()
+    page.wait_for_function("location.hash.includes('zoom')")
+    low, high, least, most = map(
+        float, re.search(r"error\.zoom=(.*)", opened.state())[1].split(",")
+    )
+    # Half and nine tenths of an axis that is 2.2 decades long, with 4 % more at both ends.
+    assert (low, high) == (pytest.approx(3.98, rel=0.03), pytest.approx(35.4, rel=0.03))
+    assert 1e-4 < least < most < 1
+    assert page.locator("#error canvas").first.screenshot() != before
+    page.locator("#error").get_by_role("button", name="show everything again").click()
+    assert opened.state() == ""
+    page.mouse.move(0, 0)
+    assert page.locator("#error canvas").first.screenshot() == before
+
+
+def test_what_stands_at_the_cursor_is_what_the_table_holds(opened):
+    page = opened.page
+    box = page.locator("#error .u-over").nth(1).bounding_box()
+    page.mouse.move(box["x"] + 0.99 * box["width"], box["y"] + 0.5 * box["height"])
+    page.locator("#error .tip").nth(1).wait_for()
+    shown = page.locator("#error .tip").nth(1).inner_text().replace("\n", " ")
+    frame = made.errors()
+    last = frame[(frame["range"] == "wide") & (frame["simulations"] == 50)]
+    assert "simulations: 50" in shown
+    for _, row in last.iterrows():
+        numbers = (number(row["median"]), number(row["low"]), number(row["high"]))
+        assert "{} {} ({} to {})".format(row["tuner"], *numbers) in shown
+
+
+def test_the_keyboard_reads_values_and_zooms(opened):
+    page = opened.page
+    page.locator("#error .panel").first.focus()
+    for _ in range(3):
+        page.keyboard.press("ArrowRight")
+    frame = made.errors()
+    third = frame[(frame["range"] == "in") & (frame["simulations"] == 2)]
+    said = opened.text("#error .told")
+    assert said.startswith("inside. simulations: 2. least squares")
+    assert all(number(value) in said for value in third["median"])
+    page.keyboard.press("+")
+    assert "error.zoom=" in opened.state()
+    page.keyboard.press("0")
+    assert opened.state() == ""
+    assert page.evaluate("document.activeElement.className") == "panel"
+
+
+def test_a_table_is_sorted_filtered_and_searched(opened):
+    page = opened.page
+    shown = rows(page, "numbers")
+    frame = made.errors()
+    wide = frame[frame["range"] == "wide"].sort_values("median", kind="stable")
+    assert [row[3] for row in shown] == [number(value) for value in wide["median"]]
+    page.locator("#numbers").get_by_role("button", name="simulations").click()
+    assert page.locator("#numbers th").nth(2).get_attribute("aria-sort") == "ascending"
+    page.locator("#numbers").get_by_role("button", name="simulations").click()
+    assert [row[2] for row in rows(page, "numbers")][:5] == ["50"] * 4 + ["20"]
+    page.locator("#numbers").get_by_label("range").select_option("")
+    assert opened.text("#numbers .count") == "64 of 64 rows"
+    assert len(rows(page, "numbers")) == 40
+    page.get_by_role("button", name="show all 64 rows").click()
+    assert len(rows(page, "numbers")) == 64
+    page.locator("#numbers").get_by_label("search").fill("RANDOM wide")
+    assert {tuple(row[:2]) for row in rows(page, "numbers")} == {("random", "wide")}
+    assert "numbers.words=RANDOM wide" in opened.state()
+
+
+def test_numbers_and_odd_texts_are_shown_as_elsewhere(opened):
+    shown = rows(opened.page, "notes")
+    expected = [number(v) if v != float("inf") else "∞" for v in made.notes()["value"]]
+    assert [row[1] for row in shown] == expected
+    assert shown[0][0].replace("\n", " ") == made.ODD.replace("\n", " ")
+
+
+def test_what_is_copied_and_saved_has_every_digit(opened):
+    page = opened.page
+    opened.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    page.locator("#numbers").get_by_role("button", name="copy").click()
+    page.get_by_role("button", name="copied").wait_for()
+    lines = page.evaluate("navigator.clipboard.readText()").splitlines()
+    assert lines[0] == "tuner\trange\tsimulations\tmedian"
+    frame = made.errors()
+    wide = frame[frame["range"] == "wide"].sort_values("median", kind="stable")
+    assert [float(line.split("\t")[3]) for line in lines[1:]] == list(wide["median"])
+    saved = opened.saved(page.locator("#numbers").get_by_role("button", name="save as CSV").click)
+    assert saved == ("error.csv", frame.to_csv(index=False).encode())
+    saved = opened.saved(page.locator("#error .files").get_by_role("button", name="CSV").click)
+    assert saved == ("error.csv", frame.to_csv(index=False).encode())
+
+
+def test_a_figure_is_saved_as_svg_png_and_pdf(opened):
+    files, still = opened.page.locator("#error .files"), made.still()
+    for kind, role, begins in (
+        ("SVG", "button", b"<?xml"),
+        ("PDF", "link", b"%PDF-"),
+        ("PNG", "button", b"\x89PNG"),
+    ):
+        name, content = opened.saved(files.get_by_role(role, name=kind, exact=True).click)
+        assert name == f"error.{kind.lower()}"
+        assert content.startswith(begins)
+        if kind != "PNG":
+            assert content == getattr(still, kind.lower())
+    assert opened.complaints == []
+
+
+def test_the_theme_is_chosen_and_kept(browser, opened, path):
+    ground = "getComputedStyle(document.body).backgroundColor"
+    assert opened.page.evaluate(ground) == "rgb(255, 255, 255)"
+    opened.page.get_by_label("theme").select_option("dark")
+    assert opened.page.evaluate(ground) == "rgb(22, 24, 28)"
+    with Opened(browser, path, "#theme=dark") as again:
+        assert again.page.evaluate(ground) == "rgb(22, 24, 28)"
+
+
+def test_a_link_to_a_section_keeps_the_view(opened):
+    opened.page.get_by_label("theme").select_option("dark")
+    opened.page.get_by_role("link", name="The rest").click()
+    assert opened.state() == "theme=dark&at=rest"
+    assert opened.page.evaluate("document.getElementById('rest').getBoundingClientRect().top < 100")
+    assert opened.page.locator("nav a").all_inner_texts() == ["Errors", "The rest", "Odd texts"]
+
+
+def test_without_a_script_figures_are_static_and_tables_stand(browser, path):
+    with Opened(browser, path, java_script_enabled=False) as one:
+        page = one.page
+        assert page.locator("#error img.still").is_visible()
+        assert page.locator("button, .live *").count() == 0
+        assert page.locator("#numbers tbody tr").count() == 32
+        name, content = one.saved(page.locator("#error .files").get_by_role("link").click)
+        assert (name, content[:5]) == ("error.pdf", b"%PDF-")
+
+
+def test_on_paper_there_are_printed_figures_and_no_controls(opened):
+    opened.page.get_by_label("theme").select_option("dark")
+    opened.page.emulate_media(media="print")
+    assert opened.page.locator("#error img.still").is_visible()
+    assert not opened.page.locator(CONTROLS).count()
+    ground = "getComputedStyle(document.body).backgroundColor"
+    assert opened.page.evaluate(ground) == "rgb(255, 255, 255)"
