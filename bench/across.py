@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -34,7 +34,31 @@ _TUNERS = 3
 """Tuners that Friedman's test needs at least."""
 
 
-def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> None:
+class Across(NamedTuple):
+    """What several comparisons have given together.
+
+    Attributes:
+        together: they.
+        files: what was written.
+    """
+
+    together: Together
+    files: list[Path]
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        ranked = self.together.ranked
+        return {
+            "problems": list(ranked.index),
+            "ranks": {str(tuner): list(ranked[tuner]) for tuner in ranked},
+            "mean_ranks": ranked.mean().sort_values().to_dict(),
+            "friedman_p": self.together.tests[0] if self.together.comparable else None,
+            "trusted": self.together.trusted,
+            "files": self.files,
+        }
+
+
+def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> Across:
     """Statistics over several comparisons: ranks over problems, joint runtime distribution, ERT and
     pairs of each.
 
@@ -43,15 +67,20 @@ def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> No
     """
     together = read_together(folders)
     out.mkdir(parents=True, exist_ok=True)
+    files = []
     for name, text in together.tables().items():
-        write(out / f"{name}.csv", text)
+        files.append(out / f"{name}.csv")
+        write(files[-1], text)
     means = together.ranked.mean().sort_values().round(2)
     count = len(together.ranked)
     say(f"mean rank over {count} problems (1 is best)\n{means.to_string()}")
     if not together.comparable:
         say(f"no critical-difference diagram: it needs {PROBLEMS} problems and {_TUNERS} tuners")
     for name, figure in together.figures().items():
-        say(f"figure  {save(figure, out / 'figures' / name)[0]}")
+        drawn = save(figure, out / "figures" / name)
+        say(f"figure  {drawn[0]}")
+        files += drawn
+    return Across(together, files)
 
 
 def read_together(folders: Sequence[Path]) -> Together:

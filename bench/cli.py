@@ -2,6 +2,7 @@
 
 Heavy packages are imported by the commands that need them, so that `simgap --help` is quick. A
 fault of the user's is one line on stderr and exit code 2; an internal error keeps its traceback.
+With ``--json`` both are a document too (`bench.commands.answer`).
 """
 
 from __future__ import annotations
@@ -12,17 +13,32 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from bench import __version__
+from bench.commands.answer import (
+    DONE,
+    EXITS,
+    FAULT,
+    INTERRUPTED,
+    WRONG,
+    Answer,
+    Json,
+    Printer,
+    Words,
+)
 from bench.commands.check import add_check
-from bench.commands.compare import add_compare, add_plot, add_status, add_verify
+from bench.commands.compare import add_compare
+from bench.commands.completion import add_completion
 from bench.commands.datasheet import add_datasheet
 from bench.commands.design import add_design
 from bench.commands.explain import add_explain, add_score
 from bench.commands.film import add_film, add_track
 from bench.commands.importing import add_import
-from bench.commands.interrupts import INTERRUPTED
-from bench.commands.listing import add_list
+from bench.commands.info import add_info
+from bench.commands.listing import add_list, add_schema
+from bench.commands.plot import add_plot
 from bench.commands.recordings import add_inspect, add_simulate
+from bench.commands.status import add_status
 from bench.commands.train import add_train
+from bench.commands.verify import add_verify
 
 COMMANDS = (
     ("compare", add_compare, "run an experiment: tuners x targets x seeds; write table and figure"),
@@ -40,9 +56,16 @@ COMMANDS = (
     ("score", add_score, "error of an extended simulator on another recording"),
     ("film", add_film, "render a recorded ball as a video"),
     ("track", add_track, "track a ball in a video; write a recording"),
-    ("list", add_list, "list tuners, simulators, systems, effects or experiments"),
+    ("list", add_list, "list tuners, simulators, systems, effects, experiments or schemas"),
+    ("schema", add_schema, "print the JSON schema of what a command prints with --json"),
+    ("info", add_info, "versions, engines, platform and paths, for a report of a fault"),
+    ("completion", add_completion, "print a script by which a shell completes simgap's commands"),
 )
 """Name, what adds its options, and its line of help, in the order of `simgap --help`."""
+
+
+class _UsageError(Exception):
+    """A command line that no command understands."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -51,42 +74,64 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         from sims.base import InputError  # its message can be printed, whatever was typed
 
-        self.exit(2, f"simgap: {InputError(message)}; see {self.prog} --help\n")
+        raise _UsageError(f"{InputError(message)}; see {self.prog} --help")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    options = parser().parse_args(arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    printer: Printer = Json() if "--json" in words else Words()
+    try:
+        options = parser().parse_args(words)
+    except _UsageError as error:
+        printer.fault("usage", str(error), FAULT)
+        sys.exit(FAULT)
     from sims.base import InputError  # after the parser, which has ended the quick `--help`
 
     try:
-        code: int = options.command(options)
+        with printer.working():
+            answer: Answer = options.command(options, printer.say)
+        printer.answer(answer)
     except InputError as error:
-        print(f"simgap: {error}", file=sys.stderr)
-        return 2
+        printer.fault("input", str(error), FAULT)
+        return FAULT
     except MemoryError as error:  # whoever insisted
-        print(f"simgap: not enough memory: {error}", file=sys.stderr)
-        return 2
+        printer.fault("memory", f"not enough memory: {error}", FAULT)
+        return FAULT
     except BrokenPipeError:  # `simgap list ... | head`
         sys.stderr.close()
-        return 0
+        return DONE
     except KeyboardInterrupt:
-        print("simgap: interrupted before there was a result", file=sys.stderr)
+        printer.fault("interrupted", "interrupted before there was a result", INTERRUPTED)
         return INTERRUPTED
-    return code
+    except Exception as error:
+        printer.fault("internal", f"{type(error).__name__}: {error}", WRONG)
+        raise
+    return answer.code
 
 
 def parser() -> argparse.ArgumentParser:
     """The parser of the command line, all commands in it."""
+    codes = "\n".join(f"  {code:<4} {says}" for code, says in EXITS.items())
     whole = _Parser(
         prog="simgap",
         description="Compare methods that tune simulator parameters; find what tuning cannot fix.",
+        epilog=f"exit codes:\n{codes}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     whole.add_argument("--version", action="version", version=f"simgap {__version__}")
     commands = whole.add_subparsers(required=True, metavar="COMMAND", title="commands")
 
     for name, add, says in COMMANDS:
-        add(commands.add_parser(name, help=says))
+        command = commands.add_parser(name, help=says)
+        add(command)
+        # Commands that speak of commands ask it.
+        command.set_defaults(parser=whole)
+        command.add_argument(
+            "--json",
+            action="store_true",
+            help=f"print one JSON document, and nothing else (`simgap schema {name}`)",
+        )
     return whole
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -48,7 +48,36 @@ class Doubt(NamedTuple):
         return f"{self.file}{f', row {self.row}' if self.row else ''}: {self.says}"
 
 
-def verify(folder: Path, say: Say, plugins: Sequence[str] = (), every: bool = False) -> int:
+class Verified(NamedTuple):
+    """What came of looking whether a comparison tells the truth.
+
+    Attributes:
+        folder: the comparison's.
+        checked: what was looked at, in words.
+        doubts: what does not follow.
+    """
+
+    folder: Path
+    checked: tuple[str, ...]
+    doubts: tuple[Doubt, ...]
+
+    @property
+    def follows(self) -> bool:
+        """Whether all of it does."""
+        return not self.doubts
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        doubts = [doubt._asdict() for doubt in self.doubts]
+        return {
+            "folder": self.folder,
+            "follows": self.follows,
+            "checked": self.checked,
+            "doubts": doubts,
+        }
+
+
+def verify(folder: Path, say: Say, plugins: Sequence[str] = (), every: bool = False) -> Verified:
     """See whether a finished comparison tells the truth, and say so.
 
     Args:
@@ -56,9 +85,6 @@ def verify(folder: Path, say: Say, plugins: Sequence[str] = (), every: bool = Fa
         say: prints a line.
         plugins: plugin files beside those that it names.
         every: whether every simulation is made again, and not a share.
-
-    Returns:
-        How many things do not follow.
 
     Raises:
         InputError: it is not finished, or damaged.
@@ -69,24 +95,30 @@ def verify(folder: Path, say: Say, plugins: Sequence[str] = (), every: bool = Fa
         raise InputError(f"{folder}: not finished, and its salt not revealed; resume it first")
     if experiment.shot:
         raise InputError(f"{folder}: expected a comparison, found a bounce shot")
+    checks: list[str] = []
+
+    def note(line: str) -> None:
+        checks.append(line)
+        say(line)
+
     # A fault in experiment.toml's salt has been refused by who read it.
     stored = checked(folder)
-    say(_salt(experiment))
+    note(_salt(experiment))
     files = [*held.plugins, *(str(Path(plugin).resolve()) for plugin in plugins)]
     admit(list(dict.fromkeys(files)), experiment)
     problem = Problem(experiment)
     try:
-        doubts = _rows(stored, problem, say, every)
+        doubts = _rows(stored, problem, note, every)
     finally:
         problem.close()
-    doubts += _tables(folder, stored, say)
+    doubts += _tables(folder, stored, note)
     for doubt in doubts[:20]:
         say(f"DOES NOT FOLLOW  {folder}/{doubt}")
     if len(doubts) > 20:
         say(f"and {len(doubts) - 20} more")
     if not doubts:
         say("all of it follows")
-    return len(doubts)
+    return Verified(folder, tuple(checks), tuple(doubts))
 
 
 def _salt(experiment: Experiment) -> str:

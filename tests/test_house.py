@@ -16,7 +16,8 @@ PACKAGES = ("bench", "methods", "sims")
 ROOMS = {
     "across", "analysis", "api", "checks", "cli", "commands", "compare", "experiments", "figures",
     "gap", "pages", "problem",
-    "recordings", "registry", "report", "runs", "sealing", "shot", "sizes", "store", "study",
+    "recordings", "registry", "report", "runs", "schemas", "sealing", "shot", "sizes", "store",
+    "study",
     "verify",
 }  # fmt: skip
 

@@ -5,7 +5,7 @@ check isolated.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from bench.checks.base import CheckError
 from bench.checks.processes import LIMIT
@@ -23,6 +23,43 @@ _KNOWN = "known: "
 _IDLE = "not applicable: "
 """Begins the line of a check that found nothing to check."""
 _MARKS = {_KNOWN: "known ", _IDLE: "-     "}
+_OUTCOMES = {"ok    ": "passed", "known ": "known", "-     ": "not applicable", "FAILED": "failed"}
+"""What a mark is called where there is no room to be saved."""
+
+
+class Checked(NamedTuple):
+    """What the conformance suite has found.
+
+    Attributes:
+        name: of the subject.
+        kind: tuner, simulator or effect.
+        qualified: its class.
+        lines: of each check by its title: what was found, nothing where all is well.
+    """
+
+    name: str
+    kind: str
+    qualified: str
+    lines: dict[str, str]
+
+    @property
+    def passed(self) -> bool:
+        """Whether no check failed."""
+        return all(_mark(line) != "FAILED" for line in self.lines.values())
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        checks = [
+            {"check": title, "outcome": _OUTCOMES[_mark(line)], "says": line.strip()}
+            for title, line in self.lines.items()
+        ]
+        return {
+            "name": self.name,
+            "kind": self.kind,
+            "class": self.qualified,
+            "passed": self.passed,
+            "checks": checks,
+        }
 
 
 def kind_of(name: str) -> str:
@@ -55,8 +92,8 @@ def attempt(kind: str, name: str, place: int) -> str:
     return f"{_IDLE}{outcome.reason}" if outcome else ""
 
 
-def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> bool:
-    """Make every check and say how each ends; returns whether all is well.
+def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> Checked:
+    """Make every check and say how each ends.
 
     Args:
         name: registered name of a tuner, simulator or effect.
@@ -74,24 +111,29 @@ def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> bool:
         if check in _HERE and not any(isinstance(end, Exception) for end in ends.values()):
             # It runs the subject here too, which is known to be safe now.
             ends[place] = attempt(kind, name, place)
-    lines = [
-        _line(ends.get(place, "not made: the subject does not survive the others"))
-        for place in range(len(checks))
-    ]
-    for check, line in zip(checks, lines, strict=True):
-        title = check.__name__.removeprefix("check_").replace("_", " ")
+    lines = {
+        check.__name__.removeprefix("check_").replace("_", " "): _line(
+            ends.get(place, "not made: the subject does not survive the others")
+        )
+        for place, check in enumerate(checks)
+    }
+    for title, line in lines.items():
         below = f"\n        {line.removeprefix(_KNOWN)}" if line else ""
         say(f"{_mark(line)}  {title}{below}")
-    failed = [line for line in lines if _mark(line) == "FAILED"]
-    idle = sum(line.startswith(_IDLE) for line in lines)
+    checked = Checked(name, kind, f"{subject.__module__}.{subject.__qualname__}", lines)
+    say(f"{kind} {name} ({checked.qualified}): {_summary(checked)}")
+    return checked
+
+
+def _summary(checked: Checked) -> str:
+    """How many checks failed."""
+    failed = sum(_mark(line) == "FAILED" for line in checked.lines.values())
+    idle = sum(line.startswith(_IDLE) for line in checked.lines.values())
+    made = len(checked.lines) - idle
     rest = f", {idle} not applicable" if idle else ""
-    summary = (
-        f"{len(failed)} of {len(checks) - idle} checks failed{rest}"
-        if failed
-        else f"all {len(checks) - idle} checks passed{rest}"
-    )
-    say(f"{kind} {name} ({subject.__module__}.{subject.__qualname__}): {summary}")
-    return not failed
+    if failed:
+        return f"{failed} of {made} checks failed{rest}"
+    return f"all {made} checks passed{rest}"
 
 
 def _mark(line: str) -> str:

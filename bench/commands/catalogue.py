@@ -1,90 +1,79 @@
-"""What `simgap list` prints."""
+"""What `simgap list` prints: the documents of `bench.commands.index` in words."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
-from bench.problem import experiment
-from bench.problem.robots import missing
-from bench.registry import SkippedError, simulators, tuners
-from sims import effects
-from sims.base import Channel, Simulator
-from sims.system import KINDS
+from bench.commands.answer import Document
+from bench.commands.index import PARTS
 
 
 def lines(what: str) -> list[str]:
-    """The lines for tuners, simulators, systems, effects or experiments."""
-    kinds: dict[str, Callable[[], list[str]]] = {
-        "tuners": lambda: [f"{name:18} {tuners.describe(name)}" for name in tuners.names()],
-        "simulators": lambda: [
-            f"{name:18} {simulators.describe(name)}" for name in simulators.names()
-        ],
-        "systems": _systems,
-        "effects": _effects,
-        "experiments": _experiments,
-    }
-    return kinds[what]()
+    """The lines for tuners, simulators, systems, effects, experiments or schemas."""
+    return told(what, PARTS[what]())
 
 
-def _experiments() -> list[str]:
-    """Every experiment that comes with the project: its sentence, then its tags."""
-    loaded = [experiment.load(name) for name in experiment.names()]
-    return [f"{each.name:22} {_says(each)} [{', '.join(each.tags)}]" for each in loaded]
+def told(what: str, documents: list[Document]) -> list[str]:
+    """The same of documents that are at hand."""
+    lay = _LAID_OUT.get(what, _plain)
+    return [line for document in documents for line in lay(document)]
 
 
-def _says(each: experiment.Experiment) -> str:
-    """Its sentence, and why it cannot be used here, where a robot's file is missing."""
-    reason = missing(each)
-    return f"skipped: {reason}. {each.says}" if reason else each.says
+def _plain(each: Document) -> list[str]:
+    return [f"{each['name']:18} {_says(each)}"]
 
 
-def _systems() -> list[str]:
-    """Every simulator's declaration: parameters, constants, inputs, states and channels with units
-    and ranges.
-    """
-    result = []
-    for name in simulators.names():
-        try:
-            result += _system(simulators.get(name))
-        except SkippedError as error:
-            result.append(f"{name}: skipped: {error.reason}")
-    return result
+def _says(each: Document) -> str:
+    """Its sentence, or why it cannot be used here."""
+    skipped = each.get("skipped")
+    return f"skipped: {skipped}" if skipped else each["says"]
 
 
-def _system(kind: type[Simulator]) -> list[str]:
-    result = [f"{kind.name}: {kind.says}"]
-    for p in kind.parameters:
-        low, high = p.bounds
-        inner = f", training {p.training[0]:g} to {p.training[1]:g}" if p.training else ""
+def _experiment(each: Document) -> list[str]:
+    """Its sentence, then its tags; before it why it cannot be used here."""
+    says = f"{_says(each)}. {each['says']}" if each["skipped"] else each["says"]
+    return [f"{each['name']:22} {says} [{', '.join(each['tags'])}]"]
+
+
+def _system(each: Document) -> list[str]:
+    result = [f"{each['name']}: {_says(each)}"]
+    if each["skipped"]:
+        return result
+    for p in each["parameters"]:
+        low, high = p["bounds"]
+        training = p["training"]
+        inner = f", training {training[0]:g} to {training[1]:g}" if training else ""
         result.append(
-            f"  parameter {p.name:18} {p.unit:12} {low:g} to {high:g}{inner}; nominal "
-            f"{p.nominal:g}  {p.says}"
+            f"  parameter {p['name']:18} {p['unit']:12} {low:g} to {high:g}{inner}; nominal "
+            f"{p['nominal']:g}  {p['says']}"
         )
-    result += [f"  constant  {c.name:18} {c.unit:12} {c.value:g}  {c.says}" for c in kind.constants]
-    result += _channels("input", kind.inputs)
-    result += [f"  state     {name:18} {value:>12g}" for name, value in kind.states.items()]
-    return result + _channels("channel", kind.channels)
+    result += [
+        f"  constant  {c['name']:18} {c['unit']:12} {c['value']:g}  {c['says']}"
+        for c in each["constants"]
+    ]
+    result += _channels("input", each["inputs"])
+    result += [f"  state     {s['name']:18} {s['value']:>12g}" for s in each["states"]]
+    return result + _channels("channel", each["channels"])
 
 
-def _channels(what: str, channels: Iterable[Channel]) -> list[str]:
-    return [f"  {what:9} {c.name:18} {c.unit:12} {c.says}".rstrip() for c in channels]
+def _channels(what: str, channels: list[Document]) -> list[str]:
+    return [f"  {what:9} {c['name']:18} {c['unit']:12} {c['says']}".rstrip() for c in channels]
 
 
-def _effects() -> list[str]:
-    """Every effect: its sentence, then each coefficient with unit and plausible range on each kind
-    of system.
-    """
-    result = []
-    for name in effects.names():
-        try:
-            effect = effects.get(name)
-        except SkippedError as error:
-            result.append(f"{name}: skipped: {error.reason}")
-            continue
-        result.append(f"{name} ({effect.hook}): {effect.says}")
-        for c in effect.coefficients:
-            for kind in KINDS:
-                if (unit := c.unit(kind)) is not None:
-                    low, high = c.range(kind)
-                    result.append(f"  {c.name:14} {kind:7} {unit:18} {low:g} to {high:g}")
+def _effect(each: Document) -> list[str]:
+    """Its sentence, then each coefficient with unit and plausible range on each kind of system."""
+    if each["skipped"]:
+        return [f"{each['name']}: {_says(each)}"]
+    result = [f"{each['name']} ({each['hook']}): {each['says']}"]
+    for c in each["coefficients"]:
+        for on in c["on"]:
+            spread = f"{on['low']:g} to {on['high']:g}"
+            result.append(f"  {c['name']:14} {on['kind']:7} {on['unit']:18} {spread}")
     return result
+
+
+_LAID_OUT: dict[str, Callable[[Document], list[str]]] = {
+    "systems": _system,
+    "effects": _effect,
+    "experiments": _experiment,
+}

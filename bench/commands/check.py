@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from bench.commands.answer import DONE, WRONG, Answer, Say
 from bench.commands.options import file
 
 
@@ -23,9 +24,10 @@ def add_check(check: argparse.ArgumentParser) -> None:
     check.set_defaults(command=_check)
 
 
-def _check(options: argparse.Namespace) -> int:
+def _check(options: argparse.Namespace, say: Say) -> Answer:
     from bench.checks.command import run
     from bench.registry import load_plugins
 
     load_plugins(options.plugin)
-    return 0 if run(options.name, options.plugin, print) else 1
+    checked = run(options.name, options.plugin, say)
+    return Answer(checked.document(), DONE if checked.passed else WRONG)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from bench.commands.answer import Answer, Say
 from bench.commands.interrupts import Interrupts
 from bench.commands.options import (
     add_force,
@@ -56,7 +57,7 @@ def add_datasheet(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_datasheet)
 
 
-def _datasheet(options: argparse.Namespace) -> int:
+def _datasheet(options: argparse.Namespace, say: Say) -> Answer:
     """Make a sheet, and the explanation that it is from where there is none."""
     from bench.api.datasheet import datasheet, refuse_joint
     from bench.api.explain import explain
@@ -96,8 +97,8 @@ def _datasheet(options: argparse.Namespace) -> int:
         )
     paths = made.write(options.out)
     for line in made.lines():
-        print(line)
-    print("")
+        say(line)
+    say("")
     for path in paths:
-        print(f"{path.suffix[1:]:7} {path}")
-    return 0
+        say(f"{path.suffix[1:]:7} {path}")
+    return Answer({"sheet": made.document(), "files": paths})

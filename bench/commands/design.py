@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from bench.commands.answer import WRONG, Answer, Say
 from bench.commands.options import add_model, add_plugin, names, place, positive, seconds
 
 
@@ -46,7 +47,7 @@ def add_design(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_design)
 
 
-def _design(options: argparse.Namespace) -> int:
+def _design(options: argparse.Namespace, say: Say) -> Answer:
     from bench.api.design import design
     from bench.commands.interrupts import Interrupts
     from bench.commands.progress import Look
@@ -68,11 +69,17 @@ def _design(options: argparse.Namespace) -> int:
             stop=interrupts.asked,
             progress=look.show,
         )
-    print(proposed.explanation)
+    say(str(proposed.explanation))
     for line in proposed.lines():
-        print(line)
+        say(line)
+    document = {
+        "verdict": proposed.explanation.answer.document(),
+        "design": None if proposed.design is None else proposed.design.document(),
+        "says": proposed.lines(),
+        "commands": None if proposed.design is None else options.out,
+    }
     if proposed.design is None:
-        return 1
+        return Answer(document, WRONG)
     proposed.write(options.out)
-    print(f"commands {options.out}")
-    return 0
+    say(f"commands {options.out}")
+    return Answer(document)

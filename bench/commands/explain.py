@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
+from dataclasses import asdict
 from pathlib import Path
 
-from bench.commands.interrupts import INTERRUPTED, Interrupts
+from bench.commands.answer import DONE, INTERRUPTED, WRONG, Answer, Say
+from bench.commands.interrupts import Interrupts
 from bench.commands.options import (
     add_force,
     add_model,
@@ -122,13 +123,12 @@ def add_score(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--held-out", action="store_true", help="only the runs that are marked held_out"
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
     add_plugin(parser, "systems")
     add_force(parser)
     parser.set_defaults(command=_score)
 
 
-def _explain(options: argparse.Namespace) -> int:
+def _explain(options: argparse.Namespace, say: Say) -> Answer:
     """Explain a recording, write what was found, print the account."""
     from bench.api.explain import explain
     from bench.commands.progress import Look
@@ -141,7 +141,7 @@ def _explain(options: argparse.Namespace) -> int:
         raise InputError("--cluster: expected --each beside it, as it is for many recordings")
     load_plugins(options.plugin)
     if options.each:
-        return _explain_each(options)
+        return _explain_each(options, say)
     # Before the work, which may take minutes.
     if options.out is not None:
         refuse_full(options.out)
@@ -166,18 +166,26 @@ def _explain(options: argparse.Namespace) -> int:
     folder = options.out or stamped(Path("results"), f"explain-{options.recordings[0].stem}")
     paths = explanation.write(folder)
     for line in account(explanation.story):
-        print(line)
+        say(line)
     for line in explanation.unsaid:
-        print(line)
-    print(f"\nreport  {paths[-1]}")
+        say(line)
+    say(f"\nreport  {paths[-1]}")
     for path in paths:
         if path.suffix not in _PICTURED:
-            print(f"{path.stem:7} {path}")
+            say(f"{path.stem:7} {path}")
     cut = explanation.answer.cut
-    return INTERRUPTED if cut is not None and cut.by == "interrupt" else 0
+    document = {
+        "verdict": explanation.answer.document(),
+        "title": explanation.story.title,
+        "unsaid": explanation.unsaid,
+        "folder": folder,
+        "files": paths,
+    }
+    interrupted = cut is not None and cut.by == "interrupt"
+    return Answer(document, INTERRUPTED if interrupted else DONE)
 
 
-def _explain_each(options: argparse.Namespace) -> int:
+def _explain_each(options: argparse.Namespace, say: Say) -> Answer:
     """Explain every recording by itself, as the rows come in, and print what they say together."""
     from bench.gap.each import TABLE, Row, explain_each, logs_of, told
     from bench.gap.model.crew import cores
@@ -197,24 +205,28 @@ def _explain_each(options: argparse.Namespace) -> int:
     def done(row: Row) -> None:
         causes = [" or ".join([c["effect"], *c["alternatives"]]) for c in row.causes]
         seconds = "" if row.seconds is None else f" ({row.seconds:.0f} s)"
-        print(f"{row.log}: {row.error or row.verdict} {'; '.join(causes)}".rstrip() + seconds)
+        say(f"{row.log}: {row.error or row.verdict} {'; '.join(causes)}".rstrip() + seconds)
 
     with Interrupts() as interrupts:
         pool = cluster_pool(options.cluster) or pool_of(min(options.jobs or cores(), len(logs)))
         with pool:
             pool.load([Plugin(str(path)) for path in options.plugin])
             rows = explain_each(logs, out, settings, pool, done, interrupts.asked)
-    print("")
-    for line in told(rows):
-        print(line)
-    print(f"\ntable   {out / TABLE}")
-    if len(rows) < len(logs):
-        print(f"{len(logs) - len(rows)} of {len(logs)} left: the same command goes on with them")
-        return INTERRUPTED
-    return int(any(row.error for row in rows))
+    together = told(rows)
+    for line in ("", *together, f"\ntable   {out / TABLE}"):
+        say(line)
+    left = len(logs) - len(rows)
+    code = WRONG if any(row.error for row in rows) else DONE
+    if left:
+        say(f"{left} of {len(logs)} left: the same command goes on with them")
+        code = INTERRUPTED
+    folders = {log.name: log.folder for log in logs}
+    found = [{**asdict(row), "folder": folders[row.log]} for row in rows]
+    document = {"logs": found, "together": together, "left": left, "table": out / TABLE}
+    return Answer(document, code)
 
 
-def _score(options: argparse.Namespace) -> int:
+def _score(options: argparse.Namespace, say: Say) -> Answer:
     """Print a model's error on a recording."""
     from bench.api.explain import score
     from bench.registry import load_plugins
@@ -222,11 +234,8 @@ def _score(options: argparse.Namespace) -> int:
     load_plugins(options.plugin)
     result = score(options.model, options.recording, held_out=options.held_out, force=options.force)
     units = result.pop("units")
-    if options.json:
-        print(json.dumps(result, allow_nan=False))
-        return 0
     for channel, error in result["rmse"].items():
-        print(f"{channel}: RMSE {error:.4g} {units[channel]}")
+        say(f"{channel}: RMSE {error:.4g} {units[channel]}")
     counts = f"{result['runs']} runs, {result['samples']} samples"
-    print(f"{result['normalised_rmse']:.4g} times the noise; {counts}")
-    return 0
+    say(f"{result['normalised_rmse']:.4g} times the noise; {counts}")
+    return Answer(result)

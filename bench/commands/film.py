@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from bench.commands.answer import Answer, Say
 from bench.commands.options import add_force, place
 
 
@@ -60,7 +61,7 @@ def add_track(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=track)
 
 
-def film(options: argparse.Namespace) -> int:
+def film(options: argparse.Namespace, say: Say) -> Answer:
     """Film a recorded ball."""
     from bench.recordings.film import write
 
@@ -72,12 +73,21 @@ def film(options: argparse.Namespace) -> int:
         options.camera_seed,
         options.force,
     )
-    print(f"{options.out}: {frames} frames, {seconds:.4g} s, {options.size} x {options.size} px")
-    print(f"{options.out.with_suffix('.camera.toml')}: the camera")
-    return 0
+    camera = options.out.with_suffix(".camera.toml")
+    say(f"{options.out}: {frames} frames, {seconds:.4g} s, {options.size} x {options.size} px")
+    say(f"{camera}: the camera")
+    return Answer(
+        {
+            "film": options.out,
+            "camera": camera,
+            "frames": frames,
+            "seconds": seconds,
+            "pixels": options.size,
+        }
+    )
 
 
-def track(options: argparse.Namespace) -> int:
+def track(options: argparse.Namespace, say: Say) -> Answer:
     """Track a ball, write the recording and its picture."""
     from bench.figures.track import drawn
     from bench.recordings.tracking import write
@@ -87,5 +97,6 @@ def track(options: argparse.Namespace) -> int:
     for note in found.notes:
         print(f"simgap: {options.video}: {note}", file=sys.stderr)
     for line in found.lines:
-        print(line)
-    return 0
+        say(line)
+    files = [options.out.with_suffix(ending) for ending in (".csv", ".toml", ".png", ".pdf")]
+    return Answer({**found.document(), "recording": options.out, "files": files})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from bench.commands.answer import Answer, Say
 from bench.commands.options import names, place
 
 
@@ -32,14 +33,14 @@ def add_import(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_import)
 
 
-def _import(options: argparse.Namespace) -> int:
+def _import(options: argparse.Namespace, say: Say) -> Answer:
     from bench.api.recordings import import_logs
 
     made = import_logs(options.logs, options.model, options.out, held_out=names(options.held_out))
-    print(f"{options.out}: {len(made.guessed)} guesses, each marked there; nothing was copied")
+    say(f"{options.out}: {len(made.guessed)} guesses, each marked there; nothing was copied")
     for line in made.guessed:
-        print(f"guess: {line}")
+        say(f"guess: {line}")
     for line in made.untold:
-        print(f"not told: {line}")
-    print(f"next: simgap inspect {options.out}")
-    return 0
+        say(f"not told: {line}")
+    say(f"next: simgap inspect {options.out}")
+    return Answer({"description": options.out, "guesses": made.guessed, "untold": made.untold})

@@ -6,9 +6,6 @@ import signal
 import sys
 import threading
 
-INTERRUPTED = 130
-"""Exit code of what a person interrupted, as shells have it."""
-
 
 class Interrupts:
     """While it is entered the first Ctrl-C is noted, and the second one is an interrupt as ever."""

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
 
+from bench.commands.answer import Document
 from bench.recordings.robotic import about
 from bench.registry import robot
 from sims import effects
@@ -31,6 +32,39 @@ def lines(model: Path) -> Iterator[str]:
     yield f"  --free also takes MuJoCo's words: {', '.join(kind.system.words())}"
 
 
+def document(model: Path) -> Document:
+    """The same for programs."""
+    kind = cast(type[RobotSimulator], robot(model))
+    acting = there(kind.system)
+    return {
+        "model": model,
+        "about": list(about(kind)),
+        "joints": [
+            {
+                "name": joint.name,
+                "kind": joint.kind,
+                "range": joint.range,
+                "unit": joint.unit,
+                "effort": joint.effort,
+                "effort_unit": joint.force_unit,
+            }
+            for joint in kind.robot.joints
+        ],
+        "actuators": [
+            {"name": a.name, "kind": a.kind, "joint": a.joint, "range": a.range, "force": a.force}
+            for a in kind.robot.actuators
+        ],
+        "bodies": [
+            {"name": body.name, "mass": body.mass, "aliases": body.aliases}
+            for body in kind.robot.bodies
+        ],
+        "inputs": [{"name": c.name, "unit": c.unit} for c in kind.inputs],
+        "channels": [{"name": c.name, "unit": c.unit, "says": c.says} for c in kind.channels],
+        "effects": acting,
+        "free": list(kind.system.words()),
+    }
+
+
 def _joints(robot: Robot) -> Iterator[str]:
     for joint in robot.joints:
         limits = "" if joint.range is None else _range(joint.range, joint.unit)
@@ -51,11 +85,16 @@ def _range(ends: tuple[float, float], unit: str) -> str:
 
 def _effects(system: type[RobotSystem]) -> Iterator[str]:
     """A line for each kind of place with the effects that can act there."""
-    there: dict[str, list[str]] = {}
+    for kind, named in there(system).items():
+        at = "of the world" if kind == "world" else f"at a {kind}, as {named[0]}@NAME or @*"
+        yield f"  effects {at.replace('a actuator', 'an actuator')}: {', '.join(named)}"
+
+
+def there(system: type[RobotSystem]) -> dict[str, list[str]]:
+    """Effects that can act on a robot, by the kind of their places."""
+    found: dict[str, list[str]] = {}
     for name in effects.names():
         effect = effects.get(name)
         if system.placed(effect):
-            there.setdefault(effect.at, []).append(name)
-    for kind, named in there.items():
-        at = "of the world" if kind == "world" else f"at a {kind}, as {named[0]}@NAME or @*"
-        yield f"  effects {at.replace('a actuator', 'an actuator')}: {', '.join(named)}"
+            found.setdefault(effect.at, []).append(name)
+    return found

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
+from bench.commands.answer import DONE, WRONG, Answer, Document, Say
 from bench.commands.options import add_force, add_model, add_plugin, names, place, positive
 
 
@@ -90,7 +92,7 @@ def add_inspect(inspect: argparse.ArgumentParser) -> None:
     inspect.set_defaults(command=_inspect)
 
 
-def _simulate(options: argparse.Namespace) -> int:
+def _simulate(options: argparse.Namespace, say: Say) -> Answer:
     from bench.api.recordings import simulate
     from bench.commands.wishes import wish
     from bench.recordings.simulate import ready
@@ -119,19 +121,32 @@ def _simulate(options: argparse.Namespace) -> int:
         ),
     )
     simulated.write(options.out)
-    channels = ", ".join(simulated.recording.runs[0].channels)
+    first = simulated.recording.runs[0]
+    truth = options.out.with_suffix(".truth.toml")
     runs = f"{options.runs} run{'s' * (options.runs > 1)}"
-    print(
+    say(
         f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels "
-        f"{channels}"
+        f"{', '.join(first.channels)}"
     )
-    print(f"{options.out.with_suffix('.truth.toml')}: what made it")
-    return 0
+    say(f"{truth}: what made it")
+    return Answer(
+        {
+            "recording": options.out,
+            "description": options.out.with_suffix(".toml"),
+            "truth": truth,
+            "system": simulated.recording.system,
+            "runs": options.runs,
+            "seconds": options.seconds,
+            "rate": options.rate,
+            "channels": list(first.channels),
+            "inputs": list(first.inputs),
+        }
+    )
 
 
-def _inspect(options: argparse.Namespace) -> int:
+def _inspect(options: argparse.Namespace, say: Say) -> Answer:
     from bench.figures.recording import draw
-    from bench.recordings import robotic
+    from bench.recordings import facts, robotic
     from bench.recordings.census.census import census
     from bench.recordings.inspection import load, summary
     from bench.recordings.stamps import oddities
@@ -142,27 +157,42 @@ def _inspect(options: argparse.Namespace) -> int:
     if options.free and not options.check:
         raise InputError("--free says what --check asks about; give --check besides")
     recording, kind = load(options.recording, options.system, options.model)
-    for line in (*robotic.about(kind), *summary(recording, kind)):
-        print(line)
-    for text in (*(o.text for o in oddities(recording, kind)), *robotic.odd(recording, kind)):
-        print(f"odd: {text}")
-    for finding in census(recording, kind):
-        print(f"finding: {finding.line}")
-    for path in draw(
-        recording,
-        kind,
-        options.out or Path("results/inspect", options.recording.resolve().parent.name),
+    about = list(robotic.about(kind))
+    odd = [*(o.text for o in oddities(recording, kind)), *robotic.odd(recording, kind)]
+    findings = list(census(recording, kind))
+    for line in (
+        *about,
+        *summary(recording, kind),
+        *(f"odd: {text}" for text in odd),
+        *(f"finding: {finding.line}" for finding in findings),
     ):
-        print(path)
-    return _checked(options) if options.check else 0
+        say(line)
+    folder = options.out or Path("results/inspect", options.recording.resolve().parent.name)
+    files = draw(recording, kind, folder)
+    for path in files:
+        say(str(path))
+    numbers = _checked(options, say) if options.check else None
+    document = {
+        **facts.document(recording, kind),
+        "robot": about,
+        "odd": odd,
+        "findings": [finding._asdict() for finding in findings],
+        "check": numbers,
+        "files": files,
+    }
+    lost = any(n["free"] and n["word"] == "not identifiable" for n in numbers or ())
+    return Answer(document, WRONG if lost else DONE)
 
 
-def _checked(options: argparse.Namespace) -> int:
-    """Say what the recording can fix; 1 if a free number is none of it."""
+def _checked(options: argparse.Namespace, say: Say) -> list[Document]:
+    """Say what the recording can fix, number by number."""
     from bench.gap.check import check
     from bench.gap.identify import told
 
     free = names(options.free or "")
     numbers = check(options.recording, options.system, options.model, free)
-    print("", *told(numbers), sep="\n")
-    return int(any(n.free and n.word == "not identifiable" for n in numbers))
+    say("\n".join(("", *told(numbers))))
+    return [
+        {**asdict(number), "mixed": [{"with": n, "correlation": c} for n, c in number.mixed]}
+        for number in numbers
+    ]

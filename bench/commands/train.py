@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from bench.commands.answer import Answer, Say
 from bench.commands.options import add_force, add_plugin, add_trust, place, positive
 
 
@@ -42,7 +43,7 @@ def add_train(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_train)
 
 
-def _train(options: argparse.Namespace) -> int:
+def _train(options: argparse.Namespace, say: Say) -> Answer:
     from bench.api.train import Losses, choose, taught
     from bench.commands.progress import Bars
     from bench.runs.runner import seeds_of
@@ -60,6 +61,7 @@ def _train(options: argparse.Namespace) -> int:
     )
     seeds = options.seeds or seeds_of(experiment, entry)
     check_training(experiment, entry, seeds, options.force)
+    trained, files = [], []
     with Bars("epoch") as bars:
         losses = Losses(experiment, bars.start)
         for seed in range(seeds):
@@ -70,13 +72,25 @@ def _train(options: argparse.Namespace) -> int:
                 raise InputError(f"tuner {entry.label}: {error}; give a larger --budget") from None
             how = "trained earlier with" if training.found else "trained with"
             cost = f"{training.simulations} simulations in {training.seconds:.1f} s"
-            print(f"{training.path}: {how} {cost}")
+            say(f"{training.path}: {how} {cost}")
+            trained.append(
+                {
+                    "seed": seed,
+                    "weights": training.path,
+                    "found": training.found,
+                    "simulations": training.simulations,
+                    "seconds": training.seconds,
+                }
+            )
     if losses.rows:
         folder = options.out or Path("results", "train", f"{entry.label}-{experiment.name}")
         title = f"{entry.label} on {experiment.name}, {training.simulations} simulations"
-        for path in losses.write(folder, title):
-            print(path)
+        files = losses.write(folder, title)
+        for path in files:
+            say(str(path))
     budget = f" --training-budget {options.budget}" if options.budget else ""
     trust = " --trust" if options.trust else ""
-    print(f"found by: simgap compare {options.experiment or experiment.name}{budget}{trust}")
-    return 0
+    command = f"simgap compare {options.experiment or experiment.name}{budget}{trust}"
+    say(f"found by: {command}")
+    told = {"tuner": entry.label, "experiment": experiment.name, "found_by": command}
+    return Answer({**told, "trainings": trained, "files": files})

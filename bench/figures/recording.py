@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from bench.figures.style import APART, BLUE, GROUND, RUST, blank, save
-from bench.recordings.inspection import declared
+from bench.recordings.facts import declared
 from sims.base import Array, Simulator
 from sims.recording.recording import Recording, Run
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -63,6 +63,23 @@ class Design:
     def settles(self) -> bool:
         """Whether nothing would be open afterwards, whatever is true."""
         return len(self.groups) == len(self.told) + 1
+
+    def document(self) -> dict[str, Any]:
+        """For programs, without the commands themselves, which are a table."""
+        return {
+            "says": self.says,
+            "by": self.by,
+            "gain": self.gain,
+            "effect": self.effect,
+            "told": dict(self.told),
+            "split": self.split,
+            "settles": self.settles,
+            "seconds": float(self.times[-1]),
+            "inputs": list(self.inputs),
+            "initial": dict(self.initial),
+            "constants": dict(self.constants),
+            "groups": self.groups,
+        }
 
 
 def design(

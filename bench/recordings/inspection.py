@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.recordings.noise import NoiseEstimate, estimated, gaps
+from bench.recordings.facts import declared, run_facts, signal_facts
 from bench.registry import robot, simulators
-from sims.base import Array, Channel, InputError, Simulator
+from sims.base import InputError, Simulator
 from sims.limits import LARGEST
 from sims.recording.description import model_of
 from sims.recording.recording import Recording, Run, divided, read_recording, system_of
@@ -124,57 +124,34 @@ def summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
 
 
 def _run_row(run: Run) -> tuple[str, ...]:
-    intervals = 1e3 * np.diff(run.times)
-    low, high = float(intervals.min()), float(intervals.max())
-    # The mean would be drawn away by a gap.
-    median = float(np.median(intervals))
-    missing = sum(int(np.isnan(v).sum()) for v in run.channels.values())
+    facts = run_facts(run)
     return (
-        run.name,
-        "held out" if run.held_out else "fitting",
-        str(run.times.size),
-        f"{run.times[-1] - run.times[0]:.4g}",
-        f"{1e3 / median:.4g}",
-        f"{low:.4g}",
-        f"{median:.4g}",
-        f"{high:.4g}",
-        str(gaps(run.times)),
-        str(missing),
+        facts.name,
+        "held out" if facts.held_out else "fitting",
+        str(facts.samples),
+        f"{facts.seconds:.4g}",
+        f"{facts.rate:.4g}",
+        *(f"{1e3 * t:.4g}" for t in (facts.shortest, facts.median, facts.longest)),
+        str(facts.gaps),
+        str(facts.missing),
     )
 
 
 def _signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[str, ...]]:
     for channel, what in declared(recording, kind):
-        signals = [(run.times, _of(run, channel.name)) for run in recording.runs]
-        values = np.concatenate([v for _, v in signals])
-        missing = np.isnan(values)
-        # An input is what was commanded: it has no noise.
-        measured = what == "channel"
-        noise = estimated(signals) if measured else NoiseEstimate(np.nan, 0.0)
-        stated = recording.noise.get(channel.name)
-        not_stated = "-" if measured else ""
+        facts = signal_facts(recording, channel, what)
+        not_stated = "-" if what == "channel" else ""
         yield (
-            channel.name,
+            facts.name,
             what,
-            channel.unit,
-            f"{np.nanmin(values):.4g}",
-            f"{np.nanmax(values):.4g}",
-            f"{missing.mean():.1%}" if missing.any() else "0",
-            not_stated if stated is None else f"{stated:.3g}",
-            f"{noise.sigma:.3g}" if np.isfinite(noise.sigma) else "",
-            f"in steps of {noise.step:.3g}" if noise.step else "",
+            facts.unit,
+            f"{facts.low:.4g}",
+            f"{facts.high:.4g}",
+            f"{facts.missing:.1%}" if facts.missing else "0",
+            not_stated if facts.stated is None else f"{facts.stated:.3g}",
+            f"{facts.estimated:.3g}" if np.isfinite(facts.estimated) else "",
+            f"in steps of {facts.step:.3g}" if facts.step else "",
         )
-
-
-def declared(recording: Recording, kind: type[Simulator]) -> list[tuple[Channel, str]]:
-    """The recorded inputs and channels, each with the word for what it is."""
-    first = recording.runs[0]
-    inputs = [(c, "input") for c in kind.inputs if c.name in first.inputs]
-    return inputs + [(c, "channel") for c in kind.channels if c.name in first.channels]
-
-
-def _of(run: Run, name: str) -> Array:
-    return run.channels[name] if name in run.channels else run.inputs[name]
 
 
 def _constants(recording: Recording, kind: type[Simulator]) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,10 +23,36 @@ _DIGITS = 9
 
 
 class Found(NamedTuple):
-    """What was tracked: notes for the user, and lines to print."""
+    """What was tracked.
+
+    Attributes:
+        notes: for the user, before anything else.
+        frames: of the part that is recorded.
+        seen: of them, with the ball.
+        how: where metres come from.
+        noise_pixels: 1 sigma of one sample.
+        noise: the same of a height, m.
+        lines: all of it in words.
+    """
 
     notes: tuple[str, ...]
+    frames: int
+    seen: int
+    how: str
+    noise_pixels: float
+    noise: float
     lines: tuple[str, ...]
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "frames": self.frames,
+            "frames_with_ball": self.seen,
+            "metres_from": self.how,
+            "noise_pixels": self.noise_pixels,
+            "noise_metres": self.noise,
+            "notes": self.notes,
+        }
 
 
 Draw = Callable[[Track, metres.Heights, slice, str], tuple[bytes, bytes]]
@@ -92,7 +118,7 @@ def write(
         f"noise of one sample: {seen.noise:.2g} px, {1e3 * noise:.2g} mm",
         f"{pictures[0]}: the track",
     )
-    return Found(tuple(notes), lines)
+    return Found(tuple(notes), frames, count, heights.how, float(seen.noise), noise, lines)
 
 
 def _noise(seen: Track, heights: metres.Heights, part: slice) -> float:

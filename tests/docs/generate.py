@@ -1,28 +1,34 @@
 """Writes the pages below docs/reference from the code: commands from the parser, keys of an
-experiment and of verdict.json from fields and docstrings, thresholds from the rules.
+experiment and of verdict.json from fields and docstrings, thresholds from the rules, what commands
+print for programs from the schemas; and those schemas that are of a table's columns.
 
 Run by `python -m tests.docs.generate`; a test says when it has to be.
 """
 
-import argparse
 import ast
 import dataclasses
 import inspect
+import json
 import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Literal, get_args, get_origin, get_type_hints, is_typeddict
 
 from bench.cli import parser
+from bench.commands import index
+from bench.commands.answer import EXITS
 from bench.gap.causes import rules
 from bench.gap.causes.rules import MEANING
 from bench.gap.model.watch import Cut
 from bench.gap.propose import Experiment as NextExperiment
 from bench.gap.verdict import Candidate, Cause, Heldout, Verdict
 from bench.problem.experiment import Experiment
+from bench.schemas import names as schema_names
+from bench.schemas import schema
 from bench.shot.settings import Settings
+from bench.store.schema import SHOT_TABLE, STATUS, TABLE, Empty
 from sims.extended import Number
-from tests.docs.pages import DOCS
+from tests.docs.pages import DOCS, ROOT
 
 COMMAND = "python -m tests.docs.generate"
 NOTE = f"<!-- Written by `{COMMAND}` from the code; change it there. -->"
@@ -56,18 +62,18 @@ def summary(cls):
 
 def commands():
     """Every command, its usage and its options."""
-    whole = parser()
-    (choices,) = [a for a in whole._actions if isinstance(a, argparse._SubParsersAction)]
-    says = {action.dest: action.help for action in choices._choices_actions}
+    found = index.commands(parser())
     listing = [("command", "what it does")]
-    listing += [(f"[`{name}`](#simgap-{name})", says[name]) for name in choices.choices]
+    listing += [(f"[`{each['name']}`](#simgap-{each['name']})", each["says"]) for each in found]
+    codes = [("exit code", "what it says"), *((str(code), says) for code, says in EXITS.items())]
     parts = [
-        "`simgap COMMAND --help` says the same. Exit code 0: done; 1: something failed in a run "
-        "or a check; 2: a fault of the input, told in one line; 130: interrupted.",
+        "`simgap COMMAND --help` says the same, `simgap list --json` to programs. With `--json` "
+        "every command prints [one JSON document](json.md), and nothing else to stdout.",
+        table(*codes),
         table(*listing),
     ]
-    for name, command in choices.choices.items():
-        parts += [f"## simgap {name}", f"{sentence(says[name])}", options(name, command)]
+    for each in found:
+        parts += [f"## simgap {each['name']}", f"{sentence(each['says'])}", options(each)]
     return page("Commands", *parts)
 
 
@@ -76,31 +82,32 @@ def sentence(text):
     return text[0].upper() + text[1:] + "."
 
 
-def options(name, command):
+def options(command):
     """A command's arguments and options as a table."""
     rows = [("argument or option", "what")]
-    # argparse has no public way to ask a parser for what was added to it.
-    for action in command._actions:
-        if isinstance(action, argparse._HelpAction):
+    for option in command["options"]:
+        # All of them have it, and it is said above.
+        if option["flags"] == ["--json"]:
             continue
-        what = (action.help or "").replace("|", "\\|")
-        if action.choices:
-            what = "; ".join(filter(None, [what, "one of " + ", ".join(action.choices)]))
-        if isinstance(action, argparse._AppendAction | argparse._ExtendAction):
+        what = option["says"].replace("|", "\\|")
+        if option["choices"]:
+            what = "; ".join(filter(None, [what, "one of " + ", ".join(option["choices"])]))
+        if option["repeatable"]:
             what += "; may be repeated"
-        if action.required and action.option_strings:
+        if option["required"] and option["flags"]:
             what += " (required)"
-        rows.append((f"`{spelt(action)}`", what))
-    return table(*rows)
+        rows.append((f"`{spelt(option)}`", what))
+    return table(*rows) if len(rows) > 1 else "No options but `--json`."
 
 
-def spelt(action):
+def spelt(option):
     """An option as it is typed."""
-    metavar = action.metavar or action.dest.upper()
-    several = f"{metavar} ..." if action.nargs == "+" else metavar
-    if not action.option_strings:
-        return f"[{metavar}]" if action.nargs == "?" else several
-    return " ".join([*action.option_strings, *([] if action.nargs == 0 else [several])])
+    metavar = option["metavar"]
+    several = f"{metavar} ..." if option["several"] else metavar
+    if not option["flags"]:
+        return several if option["required"] else f"[{metavar}]"
+    value = [] if option["type"] == "flag" else [several]
+    return " ".join([*option["flags"], *value])
 
 
 # Keys of an experiment.
@@ -283,16 +290,144 @@ def thresholds(module):
     return table(*rows)
 
 
+# What commands print for programs.
+
+DRAFT = "https://json-schema.org/draft/2020-12/schema"
+ROWS = {
+    "table": ("A row of table.csv of a comparison", TABLE),
+    "shot-table": ("A row of table.csv of a bounce shot", SHOT_TABLE),
+    "run-status": ("A row of status.csv", STATUS),
+}
+"""Schemas that are of the columns of a table."""
+JSON_KINDS = {str: "string", bool: "boolean", int: "integer", float: "number"}
+LARGEST = 2.0**53
+
+
+def row_schema(name):
+    """The schema of a table's row, from the columns that are declared."""
+    title, columns = ROWS[name]
+    document = {
+        "$schema": DRAFT,
+        "$id": f"{name}.schema.json",
+        "title": title,
+        "description": "A column a key (docs/results.md). What is no finite number is null.",
+        "type": "object",
+        "required": [column.name for column in columns if column.required],
+        "properties": {column.name: cell_schema(column) for column in columns},
+        "additionalProperties": False,
+    }
+    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+
+
+def cell_schema(column):
+    """The schema of one cell."""
+    kind = JSON_KINDS[column.kind]
+    empty = column.empty is not Empty.NEVER or column.infinite or "" in column.words
+    cell = {"type": [kind, "null"] if empty else kind}
+    if words := [word for word in column.words if word]:
+        cell["enum"] = [*words, None] if empty else words
+    if abs(column.low) < LARGEST:
+        cell["minimum"] = int(column.low) if column.kind is int else column.low
+    if abs(column.high) < LARGEST:
+        cell["maximum"] = column.high
+    return cell
+
+
+def json_documents():
+    """What every command prints with --json, and the other forms, from the schemas."""
+    commands_of = [each["name"] for each in index.commands(parser())]
+    others = [name for name in schema_names() if name not in commands_of]
+    parts = [
+        "`simgap COMMAND --json` prints one JSON document and nothing else to stdout; progress and "
+        "warnings are on stderr. Where it comes to nothing the document is "
+        "[`error`](#error), and the exit code says so too "
+        "([exit codes](commands.md)). What is no finite number is null; paths are as they were "
+        "given. `simgap schema NAME` prints the exact form (JSON Schema, draft 2020-12); the files "
+        "are in `bench/schemas`, and in the wheel. Later versions add keys and remove none: take "
+        "what you know and leave the rest.",
+    ]
+    for name in [*commands_of, *others]:
+        known = schema(name)
+        parts += [f"## {name}", sentence(known["title"])]
+        if name == "verdict":
+            parts += ["Its keys have [a page of their own](verdict.md)."]
+            continue
+        if name in ROWS:
+            parts += ["Its columns are on the page [results](../results.md)."]
+            continue
+        parts += document_tables(known)
+    return page("What commands print for programs", *parts)
+
+
+def document_tables(known):
+    """The keys of a document, of each form that it may have."""
+    forms = known.get("anyOf", [known])
+    parts = [sentence(known["description"])] if "description" in known else []
+    for form in forms:
+        rows = list(key_rows(form, ""))
+        parts.append(table(("key", "type", "what"), *rows) if rows else "Any keys.")
+    return parts
+
+
+def key_rows(known, before):
+    """A row for each key, those of what it holds below it."""
+    for key, inner in known.get("properties", {}).items():
+        name = f"{before}{key}"
+        says = inner.get("description", "").replace("|", "\\|")
+        yield f"`{name}`", json_kind(inner), says
+        yield from inner_rows(inner, name)
+
+
+def inner_rows(inner, name):
+    """Rows for what stands within a key: objects, lists of them, objects by name."""
+    for form in inner.get("anyOf", ()):
+        yield from inner_rows(form, name)
+    if "items" in inner:
+        yield from inner_rows(inner["items"], f"{name}[]")
+    elif isinstance(inner.get("additionalProperties"), dict):
+        yield from inner_rows(inner["additionalProperties"], f"{name}.NAME")
+    elif "properties" in inner:
+        yield from key_rows(inner, f"{name}.")
+
+
+def json_kind(known):
+    """A schema's kind in words."""
+    if "const" in known:
+        return f"`{known['const']}`"
+    if "$ref" in known:
+        name = known["$ref"].partition(".")[0]
+        within = known["$ref"].partition("#")[2]
+        return f"a part of [`{name}`](#{name})" if within else f"[`{name}`](#{name})"
+    if "anyOf" in known:
+        return " or ".join(dict.fromkeys(json_kind(form) for form in known["anyOf"]))
+    kinds = known.get("type", "value")
+    kinds = [kinds] if isinstance(kinds, str) else kinds
+    if "enum" in known:
+        spelled = [f"`{word}`" for word in known["enum"] if word is not None]
+        return " or ".join([*spelled, *(["null"] if None in known["enum"] else [])])
+    words_of = {"string": "text", "integer": "whole number", "boolean": "true or false"}
+    if "items" in known:
+        words_of["array"] = f"list of {json_kind(known['items'])}"
+    if isinstance(known.get("additionalProperties"), dict):
+        words_of["object"] = f"by name: {json_kind(known['additionalProperties'])}"
+    return " or ".join(words_of.get(kind, kind) for kind in kinds)
+
+
 PAGES = {
     "reference/commands.md": commands,
     "reference/experiment.md": experiment_keys,
+    "reference/json.md": json_documents,
     "reference/verdict.md": verdict_keys,
 }
 """What writes each page."""
 
 
 def main():
-    """Write all pages."""
+    """Write all schemas of rows and all pages."""
+    for name in ROWS:
+        path = ROOT / "bench" / "schemas" / f"{name}.schema.json"
+        path.write_text(row_schema(name), encoding="utf-8")
+        print(path)
     for name, make in PAGES.items():
         (DOCS / name).write_text(make(), encoding="utf-8")
         print(DOCS / name)

@@ -1,0 +1,76 @@
+"""The command `simgap completion`: a script for a shell, which completes commands, options, files
+and names without starting Python.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from bench.commands.answer import Answer, Say
+from bench.commands.index import is_path
+
+SHELLS = ("bash", "zsh", "fish", "tcsh")
+_FUNCTIONS = """
+_simgap_experiments() {{ compgen -W "{experiments}" -- "$1"; compgen -f -- "$1"; }}
+_simgap_parts() {{ compgen -W "{parts}" -- "$1"; }}
+_simgap_schemas() {{ compgen -W "{schemas}" -- "$1"; }}
+"""
+"""By which bash knows names; the other shells complete files there."""
+
+
+def add_completion(parser: argparse.ArgumentParser) -> None:
+    """The options of `simgap completion`."""
+    parser.add_argument("shell", choices=SHELLS, help="which shell the script is for")
+    parser.set_defaults(command=_completion)
+
+
+def _completion(options: argparse.Namespace, say: Say) -> Answer:
+    script = completion(options.parser, options.shell)
+    say(script.rstrip("\n"))
+    return Answer({"shell": options.shell, "script": script})
+
+
+def completion(parser: argparse.ArgumentParser, shell: str) -> str:
+    """The script for a shell; `parser` is that of the command line."""
+    import shtab
+
+    from bench.problem import experiment
+    from bench.registry import REGISTRIES
+    from bench.schemas import names
+
+    (commands,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    for name, command in commands.choices.items():
+        for action in command._actions:
+            _complete(name, action, shtab)
+    words = {
+        "experiments": experiment.names(),
+        "parts": [name for registry in REGISTRIES for name in registry.names()],
+        "schemas": names(),
+    }
+    known = {key: " ".join(values) for key, values in words.items()}
+    functions = _FUNCTIONS.format(**known) if shell == "bash" else ""
+    script: str = shtab.complete(parser, shell=shell, preamble=functions)
+    return script
+
+
+_WORDS = {
+    ("compare", "experiment"): "_simgap_experiments",
+    ("train", "experiment"): "_simgap_experiments",
+    ("check", "name"): "_simgap_parts",
+    ("schema", "name"): "_simgap_schemas",
+}
+"""By command and argument the function that knows its words."""
+
+
+def _complete(command: str, action: argparse.Action, shtab: Any) -> None:
+    """Say what completes an argument: words that are known, or a file."""
+    known = _WORDS.get((command, action.dest))
+    if known:
+        complete = {**shtab.FILE, "bash": known}
+    elif is_path(action):
+        complete = shtab.FILE
+    else:
+        return
+    # The library looks for an attribute of this name.
+    action.complete = complete  # type: ignore[attr-defined]

@@ -1,0 +1,220 @@
+"""What there is, as documents: commands with their options, tuners, simulators, systems, effects,
+experiments and schemas. `simgap list` prints them, in words or as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from typing import Any
+
+from bench.commands.answer import EXITS, Document
+
+_TYPES = {
+    "_StoreTrueAction": "flag",
+    "positive": "whole number",
+    "natural": "whole number",
+    "int": "whole number",
+    "float": "number",
+    "seconds": "number",
+    "place": "path",
+    "file": "path",
+}
+"""What an option takes, by the function that reads it, or by what argparse makes of it."""
+
+
+def everything(parser: argparse.ArgumentParser) -> Document:
+    """The whole index; `parser` is that of the command line."""
+    return {"commands": commands(parser), **{name: make() for name, make in PARTS.items()}}
+
+
+def commands(parser: argparse.ArgumentParser) -> list[Document]:
+    """Every command with its options, as `simgap --help` has them."""
+    # argparse has no public way to ask a parser for what was added to it.
+    (choices,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    says = {action.dest: action.help for action in choices._choices_actions}
+    return [
+        {
+            "name": name,
+            "says": says[name],
+            "schema": name,
+            "exit_codes": list(EXITS),
+            "options": [
+                _option(action)
+                for action in command._actions
+                if not isinstance(action, argparse._HelpAction)
+            ],
+        }
+        for name, command in choices.choices.items()
+    ]
+
+
+def _option(action: argparse.Action) -> Document:
+    """An argument or option."""
+    default = None if action.default in ([], "") else action.default
+    read = getattr(action.type, "__name__", "")
+    flag = _TYPES.get(type(action).__name__)
+    return {
+        "name": action.dest,
+        "flags": list(action.option_strings),
+        "metavar": action.metavar or action.dest.upper(),
+        "type": flag or _TYPES.get(read, "text"),
+        "choices": list(action.choices) if action.choices else None,
+        "default": default,
+        "required": action.required,
+        "several": action.nargs == "+",
+        "repeatable": isinstance(action, argparse._AppendAction | argparse._ExtendAction),
+        "says": action.help or "",
+    }
+
+
+def is_path(action: argparse.Action) -> bool:
+    """Whether an argument is the path of a file or folder."""
+    return _TYPES.get(getattr(action.type, "__name__", "")) == "path"
+
+
+def tuners() -> list[Document]:
+    """Every tuner: whether it learns, uses chance, and what it needs."""
+    from bench.registry import tuners as registry
+
+    def told(kind: Any) -> Document:
+        return {
+            "learned": bool(kind.learned),
+            "stochastic": bool(kind.stochastic),
+            "requires": list(getattr(kind, "requires", ())),
+        }
+
+    return [_part(registry, name, told) for name in registry.names()]
+
+
+def simulators() -> list[Document]:
+    """Every simulator, in a line."""
+    from bench.registry import simulators as registry
+
+    return [_part(registry, name, lambda _: {}) for name in registry.names()]
+
+
+def systems() -> list[Document]:
+    """Every simulator's declaration: numbers, states and signals with units and ranges."""
+    from bench.registry import simulators as registry
+
+    return [_part(registry, name, _declared) for name in registry.names()]
+
+
+def _declared(kind: Any) -> Document:
+    parameters = [
+        {
+            "name": p.name,
+            "unit": p.unit,
+            "nominal": p.nominal,
+            "bounds": p.bounds,
+            "training": p.training,
+            "log": p.log,
+            "says": p.says,
+        }
+        for p in kind.parameters
+    ]
+    constants = [
+        {"name": c.name, "unit": c.unit, "value": c.value, "says": c.says} for c in kind.constants
+    ]
+    return {
+        "parameters": parameters,
+        "constants": constants,
+        "inputs": _channels(kind.inputs),
+        "states": [{"name": name, "value": value} for name, value in kind.states.items()],
+        "channels": _channels(kind.channels),
+    }
+
+
+def _channels(channels: Iterable[Any]) -> list[Document]:
+    return [{"name": c.name, "unit": c.unit, "says": c.says} for c in channels]
+
+
+def effects() -> list[Document]:
+    """Every effect: where it acts, and each coefficient with its unit and plausible range on each
+    kind of system.
+    """
+    from sims.effects import registry
+
+    return [_part(registry, name, _acting) for name in registry.names()]
+
+
+def _acting(effect: Any) -> Document:
+    from sims.system import KINDS
+
+    coefficients = [
+        {
+            "name": c.name,
+            "on": [
+                {"kind": kind, "unit": unit, "low": c.range(kind)[0], "high": c.range(kind)[1]}
+                for kind in KINDS
+                if (unit := c.unit(kind)) is not None
+            ],
+        }
+        for c in effect.coefficients
+    ]
+    return {
+        "noun": effect.noun,
+        "hook": effect.hook,
+        "places": getattr(effect, "at", None),
+        "needs": effect.needs,
+        "contains": list(effect.contains),
+        "source": effect.source,
+        "coefficients": coefficients,
+    }
+
+
+def experiments() -> list[Document]:
+    """Every experiment that comes with the project."""
+    from bench.problem import experiment
+    from bench.problem.robots import missing
+
+    told = []
+    for name in experiment.names():
+        each = experiment.load(name)
+        told.append(
+            {
+                "name": each.name,
+                "says": each.says,
+                "skipped": missing(each) or None,
+                "title": each.title,
+                "tags": list(each.tags),
+                "simulator": each.simulator,
+                "model": each.model or None,
+                "ranges": list(each.ranges),
+                "targets": each.targets,
+                "budget": each.budget,
+                "tuners": [asdict(entry)["label"] for entry in each.tuners],
+            }
+        )
+    return told
+
+
+def schemas() -> list[Document]:
+    """Every schema that `simgap schema NAME` prints."""
+    from bench.schemas import names, schema
+
+    return [{"name": name, "says": schema(name)["title"]} for name in names()]
+
+
+def _part(registry: Any, name: str, told: Callable[[Any], Document]) -> Document:
+    """A registered part, or why it cannot be used here."""
+    from bench.registry import SkippedError
+
+    try:
+        part = registry.get(name)
+    except SkippedError as error:
+        return {"name": name, "says": None, "skipped": error.reason}
+    return {"name": name, "says": registry.describe(name), "skipped": None, **told(part)}
+
+
+PARTS: dict[str, Callable[[], list[Document]]] = {
+    "tuners": tuners,
+    "simulators": simulators,
+    "systems": systems,
+    "effects": effects,
+    "experiments": experiments,
+    "schemas": schemas,
+}
+"""What `simgap list` has lists of, beside commands and the places of a robot."""

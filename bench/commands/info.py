@@ -1,0 +1,173 @@
+"""The command `simgap info`: what a report of a fault has to say of the machine."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from bench.commands.answer import Answer, Document, Say
+
+
+def add_info(parser: argparse.ArgumentParser) -> None:
+    """The options of `simgap info`."""
+    parser.set_defaults(command=_info)
+
+
+def _info(options: argparse.Namespace, say: Say) -> Answer:  # noqa: ARG001
+    found = info()
+    for line in _told(found):
+        say(line)
+    return Answer(found)
+
+
+def info() -> Document:
+    """Versions, engines, platform and paths."""
+    import os
+    import platform
+
+    from bench import __version__
+
+    return {
+        "simgap": __version__,
+        "revision": _revision(),
+        "python": platform.python_version(),
+        "implementation": platform.python_implementation(),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "processors": _processors(),
+        "memory": _memory(),
+        "paths": {
+            "simgap": str(_HOME),
+            "cache": str(_cache()),
+            "SIMGAP_DATA": os.environ.get("SIMGAP_DATA"),
+            "SIMGAP_ROBOTS": os.environ.get("SIMGAP_ROBOTS"),
+        },
+        "engines": list(_engines()),
+        "packages": list(_packages()),
+    }
+
+
+_HOME = Path(__file__).resolve().parents[2]
+"""Where simgap's packages lie."""
+
+
+def _cache() -> Path:
+    from bench.runs.training import folder
+
+    return folder()
+
+
+def _revision() -> str | None:
+    """The commit of a checkout, with a + where its files differ; None of an installed wheel."""
+    import subprocess
+
+    if not (_HOME / ".git").exists():
+        return None
+    said = ("git", "-C", str(_HOME), "describe", "--always", "--dirty=+", "--abbrev=12")
+    try:
+        done = subprocess.run(said, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() or None
+
+
+def _processors() -> int | None:
+    import os
+
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count()
+
+
+def _memory() -> int | None:
+    """Bytes of the machine; None where it does not say."""
+    import os
+
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def _engines() -> Iterator[Document]:
+    """Every engine: its package is loaded, since one that is there may not work."""
+    from bench import __version__
+    from sims import bullet
+    from sims.engines import mujoco_bodies
+
+    loads = {"pybullet": bullet.engine, "mujoco": mujoco_bodies.library}
+    yield {"name": "batch", "version": __version__, "missing": None}
+    for name, load in loads.items():
+        yield {"name": name, "version": _version(name), "missing": _missing(name, load)}
+
+
+def _packages() -> Iterator[Document]:
+    """What simgap needs, and what its extras do, as the installed metadata has it."""
+    from importlib.metadata import PackageNotFoundError, requires
+
+    from packaging.requirements import Requirement
+
+    try:
+        wanted = [Requirement(text) for text in requires("simgap") or ()]
+    except PackageNotFoundError:  # run from its source, without an install
+        wanted = []
+    for each in wanted:
+        extra = _extra(str(each.marker or ""))
+        if extra == "dev" or not (each.marker is None or each.marker.evaluate({"extra": extra})):
+            continue
+        version = _version(each.name)
+        remedy = f'pip install "simgap[{extra}]"' if extra else f"pip install {each.name}"
+        missing = None if version else f"not installed ({remedy})"
+        if version and not each.specifier.contains(version, prereleases=True):
+            missing = f"expected {each.specifier}"
+        yield {"name": each.name, "of": extra, "version": version, "missing": missing}
+
+
+def _extra(marker: str) -> str:
+    """The extra that a requirement is of; empty where it is of none."""
+    _, _, behind = marker.partition("extra == ")
+    return behind.split()[0].strip("\"')") if behind else ""
+
+
+def _version(package: str) -> str | None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _missing(package: str, load: Callable[[], Any]) -> str | None:
+    """Why a package cannot be used; None where it can."""
+    try:
+        load()
+    except ModuleNotFoundError:
+        return f"not installed (pip install {package})"
+    except Exception as error:  # of another machine, half installed
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+def _told(found: Document) -> Iterator[str]:
+    """The same in words."""
+    revision = f" ({found['revision']})" if found["revision"] else ""
+    yield f"simgap {found['simgap']}{revision}, {found['implementation']} {found['python']}"
+    memory = f", {found['memory'] / 2**30:.3g} GiB" if found["memory"] else ""
+    yield f"{found['platform']}, {found['processors']} processors{memory}"
+    yield ""
+    for name, path in found["paths"].items():
+        yield f"{name:14} {path or 'not set'}"
+    yield ""
+    yield from (_line(engine, "engine ") for engine in found["engines"])
+    yield ""
+    for package in found["packages"]:
+        yield _line(package, f"[{package['of']}] " if package["of"] else "")
+
+
+def _line(each: Document, before: str) -> str:
+    version = each["version"] or ""
+    missing = f"MISSING: {each['missing']}" if each["missing"] else ""
+    return f"{before + each['name']:26} {'  '.join(filter(None, [version, missing]))}"

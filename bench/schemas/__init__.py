@@ -1,0 +1,56 @@
+"""The published forms of what commands print with ``--json``, and of the files that programs read:
+JSON Schema, draft 2020-12, a file each. A command's schema has its name.
+
+``error`` is the form of every command's faults; ``verdict``, ``table`` and ``run-status`` are those
+of verdict.json, and of a row of table.csv and of status.csv.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from importlib import resources
+from typing import Any
+
+from sims.base import unknown
+
+_ENDING = ".schema.json"
+
+
+def names() -> list[str]:
+    """Every schema's name, sorted."""
+    files = [file.name for file in resources.files(__name__).iterdir()]
+    return sorted(name.removesuffix(_ENDING) for name in files if name.endswith(_ENDING))
+
+
+@cache
+def _read(name: str) -> str:
+    return resources.files(__name__).joinpath(f"{name}{_ENDING}").read_text(encoding="utf-8")
+
+
+def schema(name: str) -> dict[str, Any]:
+    """One of them.
+
+    Raises:
+        InputError: there is none of that name.
+    """
+    if name not in names():
+        raise unknown("schema", name, names())
+    found: dict[str, Any] = json.loads(_read(name))
+    return found
+
+
+def faults(document: Any, name: str) -> list[str]:
+    """What in a document is not as the schema says: a line each, with its place.
+
+    Raises:
+        InputError: there is no schema of that name.
+    """
+    from jsonschema import Draft202012Validator
+    from referencing import Registry, Resource
+
+    # Schemas name each other by their files' names.
+    known = [(f"{each}{_ENDING}", Resource.from_contents(schema(each))) for each in names()]
+    validator = Draft202012Validator(schema(name), registry=Registry().with_resources(known))
+    found = sorted(validator.iter_errors(document), key=lambda error: error.json_path)
+    return [f"{error.json_path}: {error.message}" for error in found]
