@@ -30,6 +30,7 @@ class Axis:
         ticks: where there are ticks, if somewhere in particular.
         names: of categories at 0, 1, 2, ...; empty for numbers.
         ends: the range shown at first; that of the data where None.
+        holds: values that the range of the data is widened to.
     """
 
     label: str
@@ -38,6 +39,7 @@ class Axis:
     ticks: tuple[float, ...] = ()
     names: tuple[str, ...] = ()
     ends: tuple[float, float] | None = None
+    holds: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Series:
         high: column of its upper end.
         draw: how.
         shift: along a category axis, so that marks of several series stand side by side.
+        under: points beneath the lines, and not upon them.
     """
 
     name: str
@@ -63,6 +66,29 @@ class Series:
     high: str = ""
     draw: Draw = "line"
     shift: float = 0.0
+    under: bool = False
+
+
+@dataclass(frozen=True)
+class Tell:
+    """A line of what is said at the cursor: the number of a column, with its unit, and the same
+    once more in another unit.
+
+    Attributes:
+        says: what it is.
+        y: column of the panel's table.
+        unit: of the column; empty for a pure number.
+        look: beside it; None for none.
+        times: factor to the other unit; 0 for none.
+        also: the other unit.
+    """
+
+    says: str
+    y: str
+    unit: str = ""
+    look: Look | None = None
+    times: float = 0.0
+    also: str = ""
 
 
 @dataclass(frozen=True)
@@ -76,7 +102,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class Span:
-    """A part of the horizontal axis: ground behind the curves, or a strip at their foot.
+    """A part of an axis: ground behind the curves, or a strip at their foot.
 
     Attributes:
         low: where it begins.
@@ -84,6 +110,7 @@ class Span:
         says: what it stands for.
         look: its colour; grey where None.
         foot: a strip at the foot of the panel, and not the whole height.
+        along: which axis it is a part of.
     """
 
     low: float
@@ -91,6 +118,7 @@ class Span:
     says: str
     look: Look | None = None
     foot: bool = False
+    along: Literal["x", "y"] = "x"
 
 
 @dataclass(frozen=True)
@@ -107,7 +135,10 @@ class Panel:
         facets: what tells it from the other panels, e.g. ``{"targets": "in the training range"}``;
             a reader chooses among values.
         rules: lines across it.
-        spans: parts of the horizontal axis.
+        spans: parts of its axes.
+        tells: what is said at the cursor, of rows as those of the first series; the series
+            themselves where empty.
+        height: pixels; by its width where 0.
     """
 
     title: str
@@ -119,6 +150,8 @@ class Panel:
     facets: Mapping[str, str] = field(default_factory=dict)
     rules: tuple[Rule, ...] = ()
     spans: tuple[Span, ...] = ()
+    tells: tuple[Tell, ...] = ()
+    height: int = 0
 
 
 @dataclass(frozen=True)
@@ -147,9 +180,16 @@ class Chart:
         title: above it.
         caption: how to read it; safe HTML.
         panels: of which those side by side share their axes where these have the same label.
-        static: the same as it is printed; None where there is none.
+        static: the same as it is printed; None where there is none: the figure is then there with
+            the script alone.
         beside: the facet whose panels stand side by side at first; of every other one panel shows.
         link: charts with the same text move their cursors and horizontal zoom together.
+        columns: panels side by side where there is room; as many as fit where 0.
+        along: zoom the horizontal axis alone; the vertical one follows what is in sight.
+        toggles: facets whose panels are switched on and off one by one.
+        off: values of toggles that are off at first.
+        lights: the facet by which panels light up together with whatever in the page bears the same
+            name.
     """
 
     name: str
@@ -159,6 +199,11 @@ class Chart:
     static: Static | None = None
     beside: str = ""
     link: str = ""
+    columns: int = 0
+    along: bool = False
+    toggles: tuple[str, ...] = ()
+    off: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    lights: str = ""
 
     def spec(self) -> dict[str, Any]:
         """What the page's script is told, as JSON holds it."""
@@ -168,4 +213,9 @@ class Chart:
             "panels": [asdict(panel) for panel in self.panels],
             "beside": self.beside,
             "link": self.link,
+            "columns": self.columns,
+            "along": self.along,
+            "toggles": self.toggles,
+            "off": self.off,
+            "lights": self.lights,
         }

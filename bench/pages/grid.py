@@ -45,8 +45,12 @@ class Grid:
         columns: that are shown; what is saved has all.
         filters: columns of which a reader chooses a value.
         only: values chosen at first, by column of `filters`.
-        sort: column by which it is sorted at first; empty for as it stands.
+        sort: column by which it is sorted at first, downwards with ``,down`` behind it; empty for
+            as it stands.
         switch: column of names that legends switch on and off; empty for none.
+        marked: a column, and the beginning of its text in rows that stand out; empty for none.
+        lights: column of names by which rows light up together with whatever in the page bears the
+            same name.
     """
 
     name: str
@@ -57,6 +61,8 @@ class Grid:
     only: Mapping[str, str] = field(default_factory=dict)
     sort: str = ""
     switch: str = ""
+    marked: tuple[str, ...] = ()
+    lights: str = ""
 
     def spec(self) -> dict[str, Any]:
         """What the page's script is told, as JSON holds it."""
@@ -72,14 +78,20 @@ class Grid:
         for name, value in self.only.items():
             part = part[part[name].astype(str) == value]
         if self.sort:
-            part = part.sort_values(self.sort, kind="stable")
+            name, _, way = self.sort.partition(",")
+            part = part.sort_values(name, kind="stable", ascending=way != "down")
         heads = [
             f"{elements.NUMBERS * bool(c.digits)}{safe(c.head or c.name)}" for c in self.columns
         ]
-        rows = [self._cells(row) for row in part.head(FEW).to_dict("records")]
+        shown = part.head(FEW).to_dict("records")
+        rows = [self._cells(row) for row in shown]
+        marks = ["found" if self._stands_out(row) else "" for row in shown]
         more = len(part) - FEW
         note = elements.paragraph(f"{more} more rows.", "soft") if more > 0 else ""
-        return elements.table(heads, rows) + note
+        return elements.table(heads, rows, marks) + note
+
+    def _stands_out(self, row: Mapping[Any, Any]) -> bool:
+        return bool(self.marked) and str(row[self.marked[0]]).startswith(self.marked[1])
 
     def _cells(self, row: Mapping[Any, Any]) -> Sequence[str]:
         cells = []

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
+from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,10 +34,11 @@ class Page:
     Args:
         title: of the window.
         made: what made it, for its foot; safe HTML.
+        style: rules of CSS besides those that every page has.
     """
 
-    def __init__(self, title: str, made: str) -> None:
-        self._title, self._made = title, made
+    def __init__(self, title: str, made: str, style: str = "") -> None:
+        self._title, self._made, self._own_style = title, made, style
         self._parts: list[str] = []
         self._sections: list[tuple[str, str]] = []
         self._tables: dict[str, str] = {}
@@ -72,10 +74,26 @@ class Page:
         self._charts.append(chart.spec())
         still = _still(chart.static) if chart.static else ""
         caption = f"<figcaption>{chart.caption}</figcaption>"
+        kind = "chart" if chart.static else "chart alive"
         return (
-            f'<figure class="chart" id="{chart.name}" aria-labelledby="{chart.name}-title">\n'
+            f'<figure class="{kind}" id="{chart.name}" aria-labelledby="{chart.name}-title">\n'
             f'<h3 id="{chart.name}-title">{safe(chart.title)}</h3>\n'
             f'<div class="live"></div>\n{still}\n{caption}\n</figure>'
+        )
+
+    def picture(self, name: str, static: Static, caption: str, tables: Sequence[str] = ()) -> str:
+        """A figure that is the same on the screen and on paper, with its files to take away.
+
+        Args:
+            name: in the page's address: letters, digits and hyphens.
+            static: the figure.
+            caption: how to read it; safe HTML.
+            tables: of the page, with its numbers.
+        """
+        of = f' data-tables="{safe(" ".join(tables))}"' if tables else ""
+        return (
+            f'<figure class="picture" id="{name}"{of}>\n{_still(static)}\n'
+            f"<figcaption>{caption}</figcaption>\n</figure>"
         )
 
     def grid(self, grid: Grid) -> str:
@@ -91,7 +109,7 @@ class Page:
         library = (_LIBRARY / "uPlot.iife.min.js").read_text(encoding="utf-8")
         own = "\n".join(_script(name) for name in _SCRIPTS)
         script = f'{library}\n(() => {{\n"use strict";\n{own}\n}})();\n'
-        style = f"{(_LIBRARY / 'uPlot.min.css').read_text(encoding='utf-8')}\n{_style()}"
+        style = f"{(_LIBRARY / 'uPlot.min.css').read_text(encoding='utf-8')}\n{_style()}{self._own_style}"
         return "\n".join(
             [
                 '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',

@@ -19,6 +19,12 @@ function spot(u, x, y) {
 function drawSpans(u, spans) {
   clipped(u, (ctx, box) => {
     for (const span of spans) {
+      if (span.along === "y") {
+        const [top, foot] = [span.high, span.low].map((value) => u.valToPos(value, "y", true));
+        ctx.fillStyle = span.look ? styled(span.look).colour : ink("shade");
+        ctx.fillRect(box.left, top, box.width, foot - top);
+        continue;
+      }
       const from = Math.max(u.valToPos(span.low, "x", true), box.left);
       const to = Math.min(u.valToPos(span.high, "x", true), box.left + box.width);
       if (to <= from) continue;

@@ -10,12 +10,15 @@ class FigureView {
     this.place = document.getElementById(spec.name);
     this.live = this.place.querySelector(".live");
     this.views = [];
-    this.facets = this.facetsOf(spec.panels);
+    const facets = this.facetsOf(spec.panels);
+    this.facets = facets.filter(([name]) => !spec.toggles.includes(name));
+    this.toggles = facets.filter(([name]) => spec.toggles.includes(name));
     this.controls = element("div", { class: "controls" });
     this.legend = element("div", { class: "legend", role: "group", "aria-label": "series: click to switch on and off, with Shift for one alone" });
+    this.switches = this.toggles.map(([name]) => element("div", { class: "legend switches", role: "group", "aria-label": `${name}: click to switch on and off, with Shift for one alone` }));
     this.panels = element("div", { class: "panels" });
     this.told = element("p", { class: "told", "aria-live": "polite" });
-    this.live.append(this.controls, this.legend, this.panels, this.told);
+    this.live.append(this.controls, ...this.switches, this.legend, this.panels, this.told);
     this.addFiles();
     this.draw();
     new ResizeObserver(() => this.resized()).observe(this.live);
@@ -39,9 +42,47 @@ class FigureView {
     return value === WHOLE || values.includes(value) ? value : first;
   }
 
+  // Values of a toggle that are on.
+  on(name, values) {
+    const key = this.key(name);
+    const off = this.spec.off[name] ?? [];
+    if (!state.get(key)) return new Set(values.filter((value) => !off.includes(value)));
+    return new Set(state.get(key).split(",").map(decodeURIComponent).filter((value) => values.includes(value)));
+  }
+
+  switchOn(name, values, on) {
+    const text = (wanted) => values.filter((value) => wanted.has(value)).map(encodeURIComponent).join(",") || "-";
+    const off = this.spec.off[name] ?? [];
+    const first = new Set(values.filter((value) => !off.includes(value)));
+    state.set(this.key(name), text(on) === text(first) ? "" : text(on));
+  }
+
   shown() {
     const picks = this.facets.map(([name, values]) => [name, this.chosen(name, values)]);
-    return this.spec.panels.filter((panel) => picks.every(([name, value]) => value === WHOLE || panel.facets[name] === value || !(name in panel.facets)));
+    const on = this.toggles.map(([name, values]) => [name, this.on(name, values)]);
+    return this.spec.panels.filter((panel) =>
+      picks.every(([name, value]) => value === WHOLE || panel.facets[name] === value || !(name in panel.facets)) &&
+      on.every(([name, values]) => !(name in panel.facets) || values.has(panel.facets[name])));
+  }
+
+  addSwitches() {
+    this.toggles.forEach(([name, values], i) => {
+      const on = this.on(name, values);
+      const act = (value) => (event) => {
+        const next = new Set(on);
+        if (event.shiftKey) {
+          const alone = on.size === 1 && on.has(value);
+          next.clear();
+          (alone ? values : [value]).forEach((one) => next.add(one));
+        } else if (!next.delete(value)) next.add(value);
+        this.switchOn(name, values, next);
+      };
+      const lights = name === this.spec.lights;
+      const made = values.map((value) => element("button", { type: "button", class: "key", "aria-pressed": String(on.has(value)), "data-lights": lights && value, on: { click: act(value) } }, value));
+      const every = (text, wanted) => element("button", { type: "button", class: "every", on: { click: () => this.switchOn(name, values, new Set(wanted)) } }, text);
+      if (values.length > 2) made.push(every("all", values), every("none", []));
+      refill(this.switches[i], element("span", { class: "soft" }, `${name} `), ...made);
+    });
   }
 
   scale(key, panel) {
@@ -81,11 +122,7 @@ class FigureView {
         button("−", "zoom out", () => this.scaled(1 / 0.6)),
         button("whole", "show everything again", () => this.reset(), !state.get(this.key("zoom")))),
     );
-    // The one that was used keeps the focus although all are made anew.
-    const places = [...this.controls.querySelectorAll("select, button")];
-    const focused = places.indexOf(document.activeElement);
-    this.controls.replaceChildren(...made);
-    if (focused >= 0) this.controls.querySelectorAll("select, button")[focused]?.focus();
+    refill(this.controls, ...made);
   }
 
   addLegend(panels) {
@@ -114,14 +151,14 @@ class FigureView {
       made.push(element("button", { type: "button", class: "every", on: { click: () => state.switchOff([...off].filter((name) => !names.includes(name))) } }, "all"));
       made.push(element("button", { type: "button", class: "every", on: { click: () => state.switchOff(new Set([...off, ...names])) } }, "none"));
     }
-    const focused = document.activeElement?.closest(".legend") === this.legend ? [...this.legend.children].indexOf(document.activeElement) : -1;
-    this.legend.replaceChildren(...made);
-    if (focused >= 0) this.legend.children[focused]?.focus();
+    refill(this.legend, ...made);
   }
 
   // Ranges of both axes: zoomed, asked for, or of what is on in all panels that share the axis.
   ranges(panels, lines, panel, scales) {
     const zoom = state.get(this.key("zoom")).split(",");
+    const part = this.spec.along && zoom[0] ? zoom.slice(0, 2).map(Number) : null;
+    const sighted = (line, list) => (part && list ? list.filter((_, i) => line.xs[i] >= part[0] && line.xs[i] <= part[1]) : list);
     const range = (key, at, listsOf) => {
       if (zoom.length === 4 && zoom[at] !== "") return [Number(zoom[at]), Number(zoom[at + 1])];
       const axis = panel[AXES[key]];
@@ -130,35 +167,40 @@ class FigureView {
       const sharing = panels.map((other, i) => [other, lines[i]]).filter(([other]) => other[AXES[key]].label === axis.label);
       const lists = sharing.flatMap(([, own]) => own.flatMap(listsOf));
       if (key === "y" && sharing.some(([, own]) => own.some((line) => line.draw === "bars"))) lists.push([0]);
+      lists.push(axis.holds);
       return roomy(scales[key], ...extent(lists, scales[key] === "log"));
     };
-    return { x: range("x", 0, (line) => [line.xs]), y: range("y", 2, (line) => [line.ys, line.low, line.high]) };
+    return { x: range("x", 0, (line) => [line.xs]), y: range("y", 2, (line) => [line.ys, line.low, line.high].map((list) => sighted(line, list))) };
   }
 
   draw() {
     this.views.forEach((view) => view.destroy());
     const panels = this.shown();
     const off = state.off();
-    this.addControls(panels[0]);
+    this.addControls(panels[0] ?? this.spec.panels[0]);
+    this.addSwitches();
     this.addLegend(panels);
     this.width = this.live.clientWidth;
-    const across = Math.max(1, Math.min(panels.length, Math.floor(this.width / 400)));
+    const most = this.spec.columns ? (this.width < 560 ? 1 : this.spec.columns) : Math.floor(this.width / 400);
+    const across = Math.max(1, Math.min(panels.length, most));
     const width = Math.floor((this.width - 16 * (across - 1)) / across);
     const height = Math.max(260, Math.min(440, Math.round(width * 0.66)));
     const lines = panels.map((panel) => linesOf(panel).filter((line) => !off.has(line.name)));
-    this.panels.replaceChildren();
+    const nothing = element("p", { class: "soft" }, "Everything is switched off.");
+    this.panels.replaceChildren(...(panels.length ? [] : [nothing]));
     this.panels.style.gridTemplateColumns = `repeat(${across}, minmax(0, 1fr))`;
     this.views = panels.map((panel, i) => {
       const scales = { x: this.scale("x", panel), y: this.scale("y", panel) };
       const place = element("div", {
-        class: "panel", tabindex: 0, role: "group",
+        class: "panel", tabindex: 0, role: "group", "data-lights": panel.facets[this.spec.lights] ?? false,
         "aria-label": `${panel.title}: ${panel.up.label} against ${panel.across.label}. Arrow keys read values, plus and minus zoom, 0 shows everything.`,
         on: { keydown: (event) => this.pressed(event, i) },
       });
       place.append(element("h4", {}, panel.title));
       this.panels.append(place);
       return new PanelView(place, panel, lines[i], {
-        width, height, scales,
+        width, height: panel.height || height, scales,
+        along: this.spec.along,
         ranges: this.ranges(panels, lines, panel, scales),
         sync: this.spec.link || this.spec.name,
         acts: {
@@ -190,6 +232,7 @@ class FigureView {
   }
 
   scaled(factor) {
+    if (!this.views.length) return;
     const { u, scales, panel } = this.views[0];
     const stretch = (key) => {
       if (panel[AXES[key]].names.length) return null;
@@ -197,7 +240,7 @@ class FigureView {
       const [middle, half] = [(ends[0] + ends[1]) / 2, ((ends[1] - ends[0]) / 2) * factor];
       return [backward(scales[key], middle - half), backward(scales[key], middle + half)];
     };
-    this.zoomed(stretch("x"), stretch("y"));
+    this.zoomed(stretch("x"), this.spec.along ? null : stretch("y"));
   }
 
   reset() {
@@ -214,24 +257,36 @@ class FigureView {
     return key === "off" || key === "theme" || key.startsWith(`${this.spec.name}.`);
   }
 
-  // SVG and PNG from the printed figure, the numbers from the table.
   addFiles() {
-    const still = this.place.querySelector("img.still");
-    const files = this.place.querySelector(".files") ?? element("p", { class: "files" });
-    const button = (text, act) => element("button", { type: "button", on: { click: act } }, text);
-    const made = [];
-    if (still) {
-      const name = still.dataset.file;
-      made.push(button("SVG", () => fileOf(still.src).then((blob) => save(`${name}.svg`, "", blob))));
-      made.push(button("PNG", () => pixels(still).then((blob) => save(`${name}.png`, "", blob))));
-    }
-    for (const name of new Set(this.spec.panels.map((panel) => panel.table))) {
-      made.push(button(`numbers as CSV${name === this.spec.name ? "" : ` (${name})`}`, () => save(`${name}.csv`, "text/csv", DATA.tables[name])));
-    }
-    files.prepend("Save this figure: ");
-    files.append(...made);
-    this.live.after(files);
+    this.live.after(filesOf(this.place, this.spec.name, [...new Set(this.spec.panels.map((panel) => panel.table))]));
   }
+}
+
+// The one that was used keeps the focus although all are made anew.
+function refill(place, ...made) {
+  const usable = () => [...place.querySelectorAll("select, button")];
+  const focused = usable().indexOf(document.activeElement);
+  place.replaceChildren(...made);
+  if (focused >= 0) usable()[focused]?.focus();
+}
+
+// SVG and PNG from the printed figure, the numbers from the tables.
+function filesOf(place, own, tables) {
+  const still = place.querySelector("img.still");
+  const files = place.querySelector(".files") ?? element("p", { class: "files" });
+  const button = (text, act) => element("button", { type: "button", on: { click: act } }, text);
+  const made = [];
+  if (still) {
+    const name = still.dataset.file;
+    made.push(button("SVG", () => fileOf(still.src).then((blob) => save(`${name}.svg`, "", blob))));
+    made.push(button("PNG", () => pixels(still).then((blob) => save(`${name}.png`, "", blob))));
+  }
+  for (const name of tables) {
+    made.push(button(`numbers as CSV${name === own ? "" : ` (${name})`}`, () => save(`${name}.csv`, "text/csv", DATA.tables[name])));
+  }
+  files.prepend("Save this figure: ");
+  files.append(...made);
+  return files;
 }
 
 // The bytes of an image that lies in the page; nothing is asked of anybody.

@@ -99,6 +99,14 @@ class GridView {
     return found;
   }
 
+  // Whether a row stands out, and what it lights up with.
+  standing(row) {
+    const { spec, held } = this;
+    const text = (name) => held.rows[row][held.places.get(name)];
+    const found = spec.marked.length && text(spec.marked[0]).startsWith(spec.marked[1]);
+    return { class: found && "found", "data-lights": (spec.lights && text(spec.lights)) || false };
+  }
+
   cell(row, { name, digits }) {
     const { held } = this;
     const text = held.rows[row][held.places.get(name)];
@@ -113,7 +121,7 @@ class GridView {
     const every = state.get(this.key("rows")) === "all";
     const shown = every ? rows : rows.slice(0, FEW);
     this.body.replaceChildren(...shown.map((row) =>
-      element("tr", {}, ...spec.columns.map((column) => element("td", { class: column.digits ? "number" : false }, this.cell(row, column))))));
+      element("tr", this.standing(row), ...spec.columns.map((column) => element("td", { class: column.digits ? "number" : false }, this.cell(row, column))))));
     const { name, down } = this.sorting();
     this.heads.forEach((head, i) => {
       if (spec.columns[i].name === name) head.setAttribute("aria-sort", down ? "descending" : "ascending");

@@ -20,6 +20,7 @@ function applyTheme(pick) {
 const themePick = addTheme();
 applyTheme(themePick);
 FIGURES.push(...DATA.charts.map((spec) => new FigureView(spec)));
+for (const place of document.querySelectorAll("figure.picture")) filesOf(place, place.id, (place.dataset.tables ?? "").split(" ").filter(Boolean));
 const PARTS = [...FIGURES, ...DATA.grids.map((spec) => new GridView(spec))];
 
 state.listen((key) => {
@@ -27,6 +28,24 @@ state.listen((key) => {
   for (const part of PARTS) if (part.concerns(key)) part.draw();
 });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => FIGURES.forEach((figure) => figure.draw()));
+
+// What bears the same name lights up together: a joint in a list, its curves, its place in a picture.
+function light(event) {
+  const name = event.target.closest?.("[data-lights]")?.dataset.lights;
+  for (const one of document.querySelectorAll("[data-lights]")) one.classList.toggle("lit", one.dataset.lights === name);
+}
+for (const happens of ["mouseover", "focusin"]) document.addEventListener(happens, light);
+
+// What is to be typed elsewhere is copied with a click.
+for (const text of document.querySelectorAll("pre.copied")) {
+  const button = element("button", { type: "button", class: "copy", on: { click: async () => {
+    button.textContent = (await copied(text.textContent)) ? "copied" : "not copied";
+    setTimeout(() => { button.textContent = "copy"; }, 1500);
+  } } }, "copy");
+  const frame = element("div", { class: "copying" });
+  text.replaceWith(frame);
+  frame.append(text, button);
+}
 
 // The address holds the view: a link to a section goes there and leaves the view as it is.
 for (const link of document.querySelectorAll('a[href^="#"]')) {

@@ -51,8 +51,9 @@ function aligned(lines, log) {
 
 class PanelView {
   // `scales` and `ranges` by "x" and "y"; `acts`: zoomed([x0, x1, y0, y1]), reset(), told(text).
-  constructor(place, panel, lines, { width, height, scales, ranges, sync, acts }) {
+  constructor(place, panel, lines, { width, height, scales, ranges, sync, along, acts }) {
     this.panel = panel;
+    this.along = along;
     this.lines = lines;
     this.acts = acts;
     this.scales = scales;
@@ -87,12 +88,12 @@ class PanelView {
         cursor: {
           // Cursors move together; whoever zooms tells the others by the page's state.
           sync: { key: sync, scales: ["x", null], filters: { pub: (type) => type === "mousemove" || type === "mouseleave" } },
-          drag: { x: true, y: true, uni: 24, setScale: false },
+          drag: { x: true, y: !along, uni: 24, setScale: false },
           points: { size: 7 },
           bind: { dblclick: () => () => acts.reset() },
         },
         hooks: {
-          drawClear: [(u) => { drawSpans(u, panel.spans); lines.forEach((line) => drawBand(u, line)); }],
+          drawClear: [(u) => { drawSpans(u, panel.spans); lines.forEach((line) => drawBand(u, line)); lines.filter((line) => line.under).forEach((line) => drawMarks(u, line)); }],
           draw: [(u) => this.over(u)],
           setSelect: [(u) => this.selected(u)],
           setCursor: [(u) => this.show(u)],
@@ -122,14 +123,14 @@ class PanelView {
     const bars = this.lines.filter((line) => line.draw === "bars");
     bars.forEach((line) => drawBars(u, line, bars.length));
     drawRules(u, this.panel.rules);
-    this.lines.forEach((line) => drawMarks(u, line));
+    this.lines.filter((line) => !line.under).forEach((line) => drawMarks(u, line));
   }
 
   selected(u) {
     const { left, top, width, height } = u.select;
-    if (width < 4 && height < 4) return;
+    if (width < 4 && (height < 4 || this.along)) return;
     const x = width < 4 ? null : [u.posToVal(left, "x"), u.posToVal(left + width, "x")];
-    const y = height < 4 ? null : [u.posToVal(top + height, "y"), u.posToVal(top, "y")];
+    const y = height < 4 || this.along ? null : [u.posToVal(top + height, "y"), u.posToVal(top, "y")];
     // Later: the library must have let go of the mouse before its panel is drawn anew.
     setTimeout(() => this.acts.zoomed(x, y));
   }
@@ -149,6 +150,21 @@ class PanelView {
     return { x, found };
   }
 
+  // What is said there: look, how it is drawn, name, value with its unit, in brackets what else.
+  said(x, found) {
+    if (!this.panel.tells.length) {
+      return found.map(({ line, value, interval }) => [line.look, line.draw, line.name, readable(value), interval ? ` (${between(...interval)})` : ""]);
+    }
+    const held = table(this.panel.table);
+    const xs = held.values(this.panel.x);
+    const row = held.where(this.panel.series[0].where).find((place) => xs[place] === x);
+    const withUnit = (value, unit) => `${readable(value)}${unit && ` ${unit}`}`;
+    return this.panel.tells.map(({ look, says, y, unit, times, also }) => {
+      const value = row === undefined ? NaN : held.values(y)[row];
+      return [look, look && !look[2].length && look[3] ? "points" : "line", says, withUnit(value, unit), times ? ` (${withUnit(value * times, also)})` : ""];
+    });
+  }
+
   head(x) {
     const { names, label } = this.panel.across;
     return names.length ? names[x] : `${label}: ${readable(x, 5)}`;
@@ -164,9 +180,7 @@ class PanelView {
     const { x, found } = this.at(idx);
     this.tip.replaceChildren(
       element("strong", {}, this.head(x)),
-      ...found.map(({ line, value, interval }) =>
-        element("div", {}, swatch(line.look, line.draw), ` ${line.name} `, element("b", {}, readable(value)), interval ? ` (${between(...interval)})` : ""),
-      ),
+      ...this.said(x, found).map(([look, draw, name, value, more]) => element("div", {}, look && swatch(look, draw), ` ${name} `, element("b", {}, value), more)),
     );
     this.tip.hidden = !found.length;
     const { offsetWidth: wide, offsetHeight: tall } = this.tip;
@@ -185,7 +199,7 @@ class PanelView {
     const next = there[Math.max(0, Math.min(there.length - 1, now < 0 ? (by > 0 ? 0 : there.length - 1) : now + by))];
     const { x, found } = this.at(next);
     u.setCursor({ left: u.valToPos(x, "x"), top: found.length ? u.valToPos(found[0].value, "y") : 0 });
-    const told = found.map(({ line, value, interval }) => `${line.name} ${readable(value)}${interval ? ` (${between(...interval)})` : ""}`);
+    const told = this.said(x, found).map(([, , name, value, more]) => `${name} ${value}${more}`);
     this.acts.told(`${this.panel.title}. ${this.head(x)}. ${told.join("; ")}`);
   }
 

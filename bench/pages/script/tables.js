@@ -46,6 +46,7 @@ class Table {
     [this.head, ...this.rows] = cells(this.text);
     this.numbers = new Map();
     this.places = new Map(this.head.map((column, place) => [column, place]));
+    this.found = new Map();
   }
 
   column(name) {
@@ -62,6 +63,12 @@ class Table {
 
   // Places of the rows with these texts in these columns.
   where(wanted) {
+    const key = JSON.stringify(wanted);
+    if (!this.found.has(key)) this.found.set(key, this.look(wanted));
+    return [...this.found.get(key)];
+  }
+
+  look(wanted) {
     const tests = Object.entries(wanted).map(([name, text]) => [this.places.get(name), text]);
     const found = [];
     this.rows.forEach((row, place) => {

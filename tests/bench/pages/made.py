@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from bench.figures import style
-from bench.pages.chart import Axis, Chart, Panel, Rule, Series, Span, Static
+from bench.pages.chart import Axis, Chart, Panel, Rule, Series, Span, Static, Tell
 from bench.pages.elements import heading, paragraph, safe
 from bench.pages.grid import Column, Grid
 from bench.pages.page import Page
@@ -13,6 +13,8 @@ NAMES = ("least squares", "<b>cma</b> & co", "random", "</script><script>alert(1
 STEPS = (0, 1, 2, 3, 5, 10, 20, 50)
 RANGES = {"in": "inside", "wide": "anywhere"}
 ODD = 'a, b\nline two, "quoted" <i>x</i>'
+JOINTS = ("elbow", "wrist, <i>left</i>", "hip")
+COMMAND = "simgap score 'a <b>' && more"
 TITLE = "Title </title><h1 id=broken>& more"
 
 
@@ -78,9 +80,45 @@ def bins_chart():
     return Chart("bins", "Bins", "Bars and points.", (panel,))
 
 
+def motion():
+    times = np.arange(0, 10, 0.1)
+    rows = [
+        (joint, round(t, 3), 3 * i + t, 10 * np.sin(t) + i)
+        for i, joint in enumerate(JOINTS)
+        for t in times
+    ]
+    return pd.DataFrame(rows, columns=["joint", "t", "q", "left"])
+
+
+def motion_chart():
+    panels = []
+    for joint in JOINTS:
+        where = {"joint": joint}
+        tells = (
+            Tell("position", "q", "rad", style.look(1)),
+            Tell("residual", "left", "noises", None, 0.5, "rad"),
+        )
+        for y, span in (("q", ()), ("left", (Span(-2.0, 2.0, "", along="y"),))):
+            series = (
+                Series("seen", y, style.look(0), where, draw="points", under=True),
+                Series("simulated", y, style.look(1), where),
+            )
+            up = Axis(f"{y} [rad]", scales=("linear",), holds=(-20.0, 20.0))
+            across = Axis("time [s]", scales=("linear",))
+            about = {"facets": where, "spans": span, "tells": tells, "height": 160}
+            panels.append(Panel(f"{joint}: {y}", "motion", "t", series, across, up, **about))
+    options = {"columns": 2, "along": True, "toggles": ("joint",), "off": {"joint": ("hip",)}}
+    return Chart("motion", "Motion", "Joints.", tuple(panels), lights="joint", **options)
+
+
 def page():
     made = Page(TITLE, f"Made by {safe('<simgap>')}.")
-    for name, frame in (("error", errors()), ("bins", bins()), ("notes", notes())):
+    for name, frame in (
+        ("error", errors()),
+        ("bins", bins()),
+        ("notes", notes()),
+        ("motion", motion()),
+    ):
         made.table(name, frame)
     made.add(f"<h1>{safe(TITLE)}</h1>", paragraph("A page to test pages with."))
     made.section("errors", "Errors", made.chart(error_chart()))
@@ -96,5 +134,17 @@ def page():
     made.section("rest", "The rest", made.chart(bins_chart()), made.grid(table))
     odd = Grid("notes", "Notes", "notes", (Column("says"), Column("value", digits=3)))
     made.section("odd", "Odd texts", made.grid(odd), heading("Nothing below"))
+    told = Grid(
+        "joints",
+        "Joints",
+        "motion",
+        (Column("joint"), Column("t", digits=3)),
+        marked=("joint", "elb"),
+        sort="t,down",
+        lights="joint",
+    )
+    made.section("joint", "Joint by joint", made.chart(motion_chart()), made.grid(told))
+    made.add(made.picture("same", still(), "The same everywhere.", ("bins", "notes")))
+    made.add(f'<pre class="copied">{safe(COMMAND)}</pre>')
     made.section("empty", "Nothing", "", "")
     return made.html()

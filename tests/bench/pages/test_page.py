@@ -46,7 +46,7 @@ def broken(tmp_path, html):
 @pytest.mark.parametrize("width", WIDTHS)
 def test_nothing_is_complained_of_and_nothing_is_in_the_way(browser, path, width, scheme):
     with Opened(browser, path, width=width, color_scheme=scheme) as one:
-        assert one.page.locator("canvas").count() == 3
+        assert one.page.locator("canvas").count() == 3 + 4
         assert one.overflow() <= 0
         assert one.barriers() == []
         assert one.complaints == []
@@ -281,7 +281,12 @@ def test_a_link_to_a_section_keeps_the_view(opened):
     opened.page.get_by_role("link", name="The rest").click()
     assert opened.state() == "theme=dark&at=rest"
     assert opened.page.evaluate("document.getElementById('rest').getBoundingClientRect().top < 100")
-    assert opened.page.locator("nav a").all_inner_texts() == ["Errors", "The rest", "Odd texts"]
+    assert opened.page.locator("nav a").all_inner_texts() == [
+        "Errors",
+        "The rest",
+        "Odd texts",
+        "Joint by joint",
+    ]
 
 
 def test_without_a_script_figures_are_static_and_tables_stand(browser, path):
@@ -301,3 +306,87 @@ def test_on_paper_there_are_printed_figures_and_no_controls(opened):
     assert not opened.page.locator(CONTROLS).count()
     ground = "getComputedStyle(document.body).backgroundColor"
     assert opened.page.evaluate(ground) == "rgb(255, 255, 255)"
+
+
+def test_panels_are_switched_on_and_off_one_by_one(browser, opened, path):
+    page = opened.page
+    motion = page.locator("#motion")
+    heads = motion.locator(".panel h4")
+    shown = [f"{joint}: {y}" for joint in made.JOINTS[:2] for y in ("q", "left")]
+    assert heads.all_inner_texts() == shown
+    motion.locator(".switches .key", has_text="hip").click()
+    assert len(heads.all_inner_texts()) == 6
+    motion.locator(".switches .key", has_text="wrist").click(modifiers=["Shift"])
+    assert heads.all_inner_texts() == shown[2:]
+    with Opened(browser, path, page.evaluate("location.hash")) as again:
+        assert again.page.locator("#motion .panel h4").all_inner_texts() == shown[2:]
+    motion.locator(".switches .key", has_text="wrist").click()
+    assert "Everything is switched off." in motion.inner_text()
+    motion.get_by_role("button", name="all", exact=True).click()
+    motion.locator(".switches .key", has_text="hip").click()
+    # As at first: the address says nothing of it.
+    assert opened.state() == ""
+
+
+def test_one_stretch_of_time_is_zoomed_in_every_panel_and_the_vertical_axis_follows(opened):
+    page = opened.page
+    box = page.locator("#motion .u-over").first.bounding_box()
+    page.locator("#motion .u-over").first.scroll_into_view_if_needed()
+    box = page.locator("#motion .u-over").first.bounding_box()
+    before = page.locator("#motion canvas").nth(3).screenshot()
+    page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 0.5 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.6 * box["height"], steps=4)
+    page.mouse.up()
+    page.wait_for_function("location.hash.includes('zoom')")
+    low, high, least, most = re.search(r"motion\.zoom=(.*)", opened.state())[1].split(",")
+    # A quarter and a half of 9.9 s with 4 % more at both ends.
+    assert float(low) == pytest.approx(2.28, abs=0.1)
+    assert float(high) == pytest.approx(4.95, abs=0.1)
+    assert (least, most) == ("", "")
+    assert page.locator("#motion canvas").nth(3).screenshot() != before
+
+
+def test_at_the_cursor_stands_what_is_to_be_told_in_both_units(opened):
+    panel = opened.page.locator("#motion .panel").nth(3)
+    panel.focus()
+    for _ in range(3):
+        panel.press("ArrowRight")
+    row = made.motion()[made.motion()["joint"] == made.JOINTS[1]].iloc[2]
+    expected = (
+        f"wrist, <i>left</i>: left. time [s]: 0.2. position {number(row['q'])} rad; "
+        f"residual {number(row['left'])} noises ({number(row['left'] / 2)} rad)"
+    )
+    assert opened.text("#motion .told") == expected
+
+
+def test_what_bears_one_name_lights_up_together(opened):
+    page = opened.page
+    page.locator("#joints tbody tr", has_text="wrist").first.hover()
+    lit = page.locator("#motion .panel.lit h4").all_inner_texts()
+    assert lit == [f"{made.JOINTS[1]}: {y}" for y in ("q", "left")]
+    page.locator("#motion .panel").first.hover()
+    assert page.locator("#joints tr.lit td:first-child").all_inner_texts().count("elbow") > 5
+    assert page.locator("#joints tr.found").count() == page.locator("#joints tr.lit").count()
+    # The last comes first: sorted downwards.
+    assert rows(page, "joints")[0][1] == "9.9"
+
+
+def test_a_command_is_copied_with_a_click(opened):
+    opened.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    opened.page.locator(".copying button").click()
+    opened.page.locator(".copying").get_by_role("button", name="copied").wait_for()
+    assert opened.page.evaluate("navigator.clipboard.readText()") == made.COMMAND
+
+
+def test_a_picture_is_the_same_on_the_screen_and_has_its_files(browser, opened, path):
+    picture = opened.page.locator("#same")
+    assert picture.locator("img.still").is_visible()
+    texts = picture.locator(".files button, .files a").all_inner_texts()
+    assert texts == ["PDF", "SVG", "PNG", "numbers as CSV (bins)", "numbers as CSV (notes)"]
+    name, content = opened.saved(picture.get_by_role("button", name="notes").click)
+    assert (name, content) == ("notes.csv", made.notes().to_csv(index=False).encode())
+    # A figure without a printed one is not promised where no script can draw it.
+    with Opened(browser, path, java_script_enabled=False) as one:
+        assert one.page.locator("#same img.still").is_visible()
+        assert not one.page.locator("#motion").is_visible()
