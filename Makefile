@@ -3,6 +3,7 @@
 # make robot     the same for a robot: an arm's model file and a log, with friction in the elbow
 # make test      the tests
 # make check     lint, types and import rules
+# make docs      the site, to be read without a network: site/html/index.html (Python 3.11 or newer)
 # make exam      hides causes in hundreds of recordings and has explain find them (about 6 minutes; QUICK=--quick)
 # make benchmark measurements printed as ratios
 # make chaos     100 kills at random moments; what is resumed must equal what was never disturbed (about 10 minutes)
@@ -15,7 +16,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: compare explain robot test check exam benchmark chaos malformed mutants reference multi install
+.PHONY: compare explain robot test check exam benchmark chaos malformed mutants reference multi docs install
 install: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml
@@ -85,6 +86,10 @@ multi: $(STAMP)
 	for e in $(SEVERAL); do $(BIN)/simgap compare $$e --targets 3 --seeds 2 --budget 50 --salt public $(if $(TUNERS),--tuners $(TUNERS)) --out $(MULTI)/$$e --allow-failures || exit 1; done
 	$(BIN)/simgap plot $(SEVERAL:%=$(MULTI)/%) --out $(MULTI)/all
 	$(BIN)/python -m tests.benchmarks.multi $(MULTI) > $(MULTI)/tables.md
+
+docs: $(STAMP)
+	$(BIN)/python -m tests.docs.generate
+	$(BIN)/python -m tests.docs.site --notebooks
 
 exam: $(STAMP)
 	$(BIN)/python -m tests.exam $(QUICK)

@@ -300,7 +300,7 @@ class Compared:
     @cached_property
     def tables(self) -> dict[str, pd.DataFrame]:
         """The tables by name: table, ert, pairs, break_even, who_wins; of a bounce shot table and
-        shots; see docs/results.md.
+        shots; see docs/results-films.md.
         """
         if self.experiment.shot:
             return {name: self._csv(name) for name in ("table", "shots")}

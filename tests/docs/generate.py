@@ -28,6 +28,7 @@ from bench.schemas import schema
 from bench.shot.settings import Settings
 from bench.store.schema import SHOT_TABLE, STATUS, TABLE, Empty
 from sims.extended import Number
+from tests.docs import names, tuners
 from tests.docs.pages import DOCS, ROOT
 
 COMMAND = "python -m tests.docs.generate"
@@ -237,7 +238,7 @@ def verdict_keys():
     words_of = [("verdict", "says"), *((f"`{name}`", text) for name, text in MEANING.items())]
     parts = [
         "What `simgap explain` writes for programs: one JSON object with these keys and no others; "
-        "in Python `found.answer`. How it is found is on the page [explain.md](../explain.md).",
+        "in Python `found.answer`. How it is found is on the page [verdicts](../verdicts.md).",
         "## The six verdicts",
         table(*words_of),
         "## The keys",
@@ -413,10 +414,43 @@ def json_kind(known):
     return " or ".join(words_of.get(kind, kind) for kind in kinds)
 
 
+# Tuners and public names.
+
+
+def how_tuners_work():
+    """Every tuner: method, equations, sources, options."""
+    return page(
+        "How each tuner works",
+        "Written from the modules in `methods/`, in whose code the equations' numbers stand. Which "
+        "one to take: [by measured numbers](../choosing-a-tuner.md). How to write one: [add a "
+        "tuner](../add-a-tuner.md).",
+        "![Error against number of simulations](../../results/reference/ball-drop/figures/"
+        "error-vs-simulations.png)",
+        "*Ten of them on the bouncing ball (`simgap compare ball-drop --salt public`): a line is "
+        "the median over 100 targets.*",
+        *tuners.sections(),
+    )
+
+
+def public_names():
+    """Every name of simgap that has a docstring."""
+    return page(
+        "Public names",
+        "`import simgap`: `simgap.compare` and so on; how they go together is on the page "
+        "[Python](../python.md). Each line that begins with `:::` says where a name is defined; "
+        "on the site its signature and docstring stand there.",
+        *names.sections(),
+    )
+
+
 PAGES = {
+    "reference/api.md": public_names,
     "reference/commands.md": commands,
     "reference/experiment.md": experiment_keys,
     "reference/json.md": json_documents,
+
+
+    "reference/tuners.md": how_tuners_work,
     "reference/verdict.md": verdict_keys,
 }
 """What writes each page."""

@@ -1,11 +1,33 @@
 """What stands on the pages: fenced blocks, tables, links and headings."""
 
 import re
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
+LINK = re.compile(r"(!?\[[^\]]*\])\(([^)\s]+)\)")
+"""A link or a picture: what is shown, and where it leads."""
 FENCE = re.compile(r"^```(?P<language>\w*) ?(?P<name>[^\n`]*)\n(?P<text>.*?)^```$", re.M | re.S)
+
+
+def pages():
+    """The Markdown pages of the project."""
+    below = [ROOT.glob("*.md")]
+    below += [(ROOT / name).rglob("*.md") for name in ("docs", "sims", "results/reference")]
+    return sorted(page for found in below for page in found)
+
+
+@cache
+def anchors(page):
+    """The anchors that GitHub gives to a page's headings, in order."""
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    found = []
+    for heading in re.findall(r"^#+ (.*)$", text, re.M):
+        # Lower case, spaces as hyphens, all other marks away; a second one of a name is numbered.
+        words = re.sub(r"[^\w\- ]", "", LINK.sub("", heading).lower()).replace(" ", "-")
+        found.append(f"{words}-{found.count(words)}" if words in found else words)
+    return found
 
 
 def text_of(page):

@@ -2,6 +2,8 @@
 
 import pytest
 
+import simgap
+from tests.docs import names, tuners
 from tests.docs.generate import COMMAND, PAGES, ROWS, row_schema
 from tests.docs.pages import ROOT, text_of
 
@@ -15,3 +17,24 @@ def test_the_page_is_what_the_code_says(name):
 def test_the_schema_of_a_row_is_what_the_columns_say(name):
     path = ROOT / "bench" / "schemas" / f"{name}.schema.json"
     assert path.read_text() == row_schema(name), f"{path} is stale; renew it with: {COMMAND}"
+
+
+def test_every_public_name_is_on_its_page():
+    public = {name for name in dir(simgap) if name in simgap.__all__}
+    assert set(names.listed()) | names.UNDOCUMENTED == public
+
+
+def test_every_tuner_is_on_its_page():
+    page = text_of("reference/tuners.md")
+    assert len(tuners.registered()) > 12
+    assert [name for name, *_ in tuners.registered() if f"`{name}`" not in page] == []
+
+
+def test_every_equation_is_set_once_and_used():
+    page = text_of("reference/tuners.md")
+    assert [words for words, latex in tuners.SET.items() if latex not in page] == []
+
+
+def test_an_equation_that_is_changed_in_the_code_has_to_be_set_anew():
+    with pytest.raises(KeyError, match="EI = f"):
+        list(tuners.paragraphs("With m the mean:\n\n    (1)  EI = f - m"))

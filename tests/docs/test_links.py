@@ -1,39 +1,17 @@
 """Links between pages lead somewhere, headings within them too, and every page is in the index."""
 
 import re
-from functools import cache
 
 import pytest
 
-from tests.docs.pages import DOCS, FENCE, ROOT
-
-LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
-
-
-def pages():
-    """The Markdown pages of the project."""
-    below = [ROOT.glob("*.md")]
-    below += [(ROOT / name).rglob("*.md") for name in ("docs", "sims", "results/reference")]
-    return sorted(page for found in below for page in found)
-
-
-@cache
-def anchors(page):
-    """The anchors that GitHub gives to a page's headings."""
-    text = FENCE.sub("", page.read_text(encoding="utf-8"))
-    found = []
-    for heading in re.findall(r"^#+ (.*)$", text, re.M):
-        # Lower case, spaces as hyphens, all other marks away; a second one of a name is numbered.
-        words = re.sub(r"[^\w\- ]", "", LINK.sub("", heading).lower()).replace(" ", "-")
-        found.append(f"{words}-{found.count(words)}" if words in found else words)
-    return found
+from tests.docs.pages import DOCS, FENCE, LINK, ROOT, anchors, pages
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page):
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     broken = []
-    for link in LINK.findall(text):
+    for _, link in LINK.findall(text):
         if "://" in link:
             continue
         name, _, anchor = link.partition("#")
@@ -58,6 +36,6 @@ def test_files_that_a_page_names_are_there(page):
 
 def test_every_page_below_docs_is_in_the_index():
     index = (DOCS / "index.md").read_text(encoding="utf-8")
-    listed = {(DOCS / link.partition("#")[0]).resolve() for link in LINK.findall(index)}
+    listed = {(DOCS / link.partition("#")[0]).resolve() for _, link in LINK.findall(index)}
     there = {p.resolve() for p in pages() if DOCS in p.parents and p.name != "index.md"}
     assert there <= listed, f"not in docs/index.md: {sorted(p.name for p in there - listed)}"

@@ -1,4 +1,4 @@
-"""The page on results describes every file, column and figure that is written, and no other."""
+"""The pages on results describe every file, column and figure that is written, and no other."""
 
 import json
 import re
@@ -27,7 +27,8 @@ from tests.conftest import PLUGINS
 from tests.docs.pages import quoted, section, tables, text_of
 from tests.experiments import SPRING, spring_experiment
 
-PAGE = text_of("results.md")
+PAGES = ("results.md", "results-explain.md", "results-films.md")
+PAGE = "\n".join(text_of(page) for page in PAGES)
 SPRING_PLUGIN = str(PLUGINS / "spring.py")
 PARAMETERS, CHANNELS, TUNERS = ("rate", "decay"), ("x",), ("random", "least_squares", "small")
 TABLES = (

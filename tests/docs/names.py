@@ -1,0 +1,54 @@
+"""The page of public names; the site's tool reads their docstrings from the source."""
+
+import inspect
+
+import simgap
+
+GROUPS = {
+    "Commands": (
+        "What the commands do, as functions.",
+        "compare sweep explain simulate score design datasheet import_logs read_recording "
+        "load_plugins parametrize",
+    ),
+    "What they give back": (
+        "Results, with tables as frames and figures as matplotlib figures.",
+        "Compared Explanation NextRecording DataSheet Extended Recording Run Experiment",
+    ),
+    "For tuners": (
+        "The contract of a [tuner](../add-a-tuner.md).",
+        "Tuner Task Ask Evaluation Practice Scene from_callback BudgetExceededError",
+    ),
+    "For simulators": (
+        "The contract of a simulator, and of [one's own](../own-simulator.md).",
+        "Simulator Parameter Channel Constant Scenario OwnSimulator BulletWorld System",
+    ),
+    "For effects": (
+        "The contract of an [effect](../../sims/effects/README.md), by hook.",
+        "Effect Coefficient Force Friction Contact Input Sensor Level Hidden State Moment Signal",
+    ),
+    "Faults": ("What is the user's to mend.", "InputError"),
+}
+"""Headings of the page: a sentence, and the names below it."""
+UNDOCUMENTED = {"Array", "Steps", "__version__", "main", "tuners", "simulators", "effects"}
+"""Aliases and objects, which docs/python.md has in its tables."""
+
+
+def listed():
+    """Every name on the page."""
+    return [name for _, names in GROUPS.values() for name in names.split()]
+
+
+def sections():
+    """The page's parts: below each heading a line for each name, which the site replaces by what
+    the source says.
+    """
+    parts = []
+    for heading, (says, names) in GROUPS.items():
+        parts += [f"## {heading}", says]
+        parts += [f"::: {address(getattr(simgap, name))}" for name in names.split()]
+    return parts
+
+
+def address(thing):
+    """Where a class or function is defined."""
+    return f"{inspect.unwrap(thing).__module__}.{thing.__qualname__}"

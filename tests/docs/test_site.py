@@ -1,0 +1,166 @@
+"""The site is built without a fault, asks nothing of the network, and its links lead somewhere."""
+
+from html.parser import HTMLParser
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+from tests.docs.pages import DOCS, pages
+from tests.docs.site import build
+from tests.docs.stage import Stage, place
+
+tomllib = pytest.importorskip("tomllib")  # the site's tool, too, is for Python 3.11 and newer
+pytest.importorskip("zensical")
+
+FETCHED = {
+    "audio": "src",
+    "iframe": "src",
+    "img": "src",
+    "link": "href",
+    "script": "src",
+    "source": "src",
+    "video": "src",
+}
+"""By element: the attribute whose address a browser asks for by itself."""
+
+
+class Page(HTMLParser):
+    """What a page of the site names: ids, links, and what a browser fetches with it."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.ids, self.links, self.fetched, self.classes = set(), [], [], set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        named = dict(attributes)
+        self.ids.add(named.get("id"))
+        self.classes.update((named.get("class") or "").split())
+        if tag == "a" and named.get("href"):
+            self.links.append(named["href"])
+        if named.get(FETCHED.get(tag)):
+            self.fetched.append(named[FETCHED[tag]])
+
+
+def parsed(built):
+    """Every page of a built site, by its path."""
+    return {file: Page(file.read_text(encoding="utf-8")) for file in built.rglob("*.html")}
+
+
+def from_elsewhere(page):
+    """What a page would ask the network for."""
+    return [address for address in page.fetched if urlsplit(address).netloc]
+
+
+def lost(site):
+    """Links and pictures that lead nowhere within a site: (page, address)."""
+    found = []
+    for file, page in site.items():
+        for address in [*page.links, *page.fetched]:
+            parts = urlsplit(address)
+            if parts.scheme or parts.netloc:
+                continue
+            target = (file.parent / unquote(parts.path)).resolve() if parts.path else file
+            there = target in site and parts.fragment in {"", *site[target].ids}
+            if not there and (parts.fragment or not target.is_file()):
+                found.append((file.name, address))
+    return found
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """The site, built with every warning an error."""
+    return build(tmp_path_factory.mktemp("docs") / "site")
+
+
+@pytest.fixture(scope="module")
+def site(built):
+    """Its pages, but for those that the project's own reports are."""
+    there = parsed(built)
+    return {file: page for file, page in there.items() if file.name != "404.html"}
+
+
+@pytest.mark.slow
+def test_nothing_is_asked_of_the_network(built, site):
+    assert len(site) > 80
+    assert {
+        file.name: from_elsewhere(page) for file, page in site.items() if from_elsewhere(page)
+    } == {}
+    styles = [file.read_text(encoding="utf-8") for file in built.rglob("*.css")]
+    assert styles
+    assert not any("url(http" in style or "@import" in style for style in styles)
+    # The tool's script asks the network for these where a page has them.
+    used = set().union(*(page.classes for page in site.values()))
+    assert not used & {"mermaid", "glightbox", "pyodide"}
+
+
+@pytest.mark.slow
+def test_links_and_pictures_of_the_site_lead_somewhere(site):
+    assert sum(len(page.links) for page in site.values()) > 5000
+    assert lost(site) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["compare", "explain", "add-a-tuner", "verdicts", "start"])
+def test_the_front_page_leads_there_in_one_click(built, site, page):
+    front = (built / "index.html").read_text(encoding="utf-8")
+    cards = front[front.index('class="grid cards"') : front.index('id="one-page-a-task"')]
+    assert f"{page}.html" in Page(cards).links
+
+
+@pytest.mark.slow
+def test_equations_are_set_without_a_script(built):
+    page = (built / "reference" / "tuners.html").read_text(encoding="utf-8")
+    assert page.count("<math") > 20
+    assert "```" not in page
+
+
+@pytest.mark.slow
+def test_public_names_have_their_docstrings(built):
+    page = (built / "reference" / "api.html").read_text(encoding="utf-8")
+    assert "Everything a tuner gets of one target" in page
+    assert ":::" not in page.replace("<code>:::</code>", "")
+
+
+def test_every_page_is_in_the_navigation():
+    settings = tomllib.loads((DOCS / "zensical.toml").read_text(encoding="utf-8"))
+
+    def leaves(entry):
+        """The pages below an entry."""
+        if isinstance(entry, str):
+            return [entry]
+        inner = entry if isinstance(entry, list) else entry.values()
+        return [page for part in inner for page in leaves(part)]
+
+    listed = leaves(settings["project"]["nav"])
+    notebooks = sorted((DOCS / "notebooks").glob("*.ipynb"))
+    assert sorted(listed) == sorted(str(place(page)) for page in [*pages(), *notebooks])
+
+
+# What finds faults finds these.
+
+
+def test_a_picture_from_elsewhere_is_found():
+    assert from_elsewhere(
+        Page('<img src="https://example.org/a.png"><a href="https://x.org">x</a>')
+    )
+    assert from_elsewhere(Page('<script src="//cdn.example.org/a.js"></script>'))
+    assert not from_elsewhere(Page('<img src="a.png"><a href="https://example.org">x</a>'))
+
+
+@pytest.mark.parametrize("address", ["gone.html", "there.html#gone", "#gone", "gone.png"])
+def test_a_link_that_leads_nowhere_is_found(tmp_path, address):
+    (tmp_path / "there.html").write_text('<h1 id="here">a</h1>', encoding="utf-8")
+    sound = '<a href="there.html#here">x</a><a href="https://example.org">x</a>'
+    (tmp_path / "page.html").write_text(sound, encoding="utf-8")
+    assert lost(parsed(tmp_path)) == []
+    (tmp_path / "page.html").write_text(f'{sound}<a href="{address}">x</a>', encoding="utf-8")
+    assert lost(parsed(tmp_path)) == [("page.html", address)]
+
+
+def test_a_page_is_laid_out_as_it_is_told(tmp_path):
+    text = Stage(tmp_path).page(DOCS / "verdicts.md")
+    assert "# What the verdicts mean {#what-the-verdicts-mean}" in text
+    text = Stage(tmp_path).page(DOCS / "explain.md")
+    assert "(sims/effects/index.md)" in text
+    assert (tmp_path / "sims" / "effects" / "index.md").exists()
