@@ -31,4 +31,4 @@ def test_the_experiment_of_the_page_reads_as_it_says(tmp_path):
     experiment = load(str(path))
     assert experiment.targets == 3
     assert str(experiment.recording.path).endswith("swing.csv")
-    assert [*experiment.tuners] == ["least_squares", "cma_es", "random"]
+    assert [entry.tuner for entry in experiment.tuners] == ["least_squares", "cma_es", "random"]

@@ -5,6 +5,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
+from tests.browser import WIDTHS, Opened
 from tests.docs.pages import DOCS, pages
 from tests.docs.site import build
 from tests.docs.stage import Stage, place
@@ -122,6 +123,12 @@ def test_public_names_have_their_docstrings(built):
     assert ":::" not in page.replace("<code>:::</code>", "")
 
 
+@pytest.mark.slow
+def test_sources_are_shown_and_not_searched(built):
+    assert "class" in (built / "source" / "examples" / "puck.py.html").read_text(encoding="utf-8")
+    assert "source/examples/puck" not in (built / "search.json").read_text(encoding="utf-8")
+
+
 def test_every_page_is_in_the_navigation():
     settings = tomllib.loads((DOCS / "zensical.toml").read_text(encoding="utf-8"))
 
@@ -164,3 +171,33 @@ def test_a_page_is_laid_out_as_it_is_told(tmp_path):
     text = Stage(tmp_path).page(DOCS / "explain.md")
     assert "(sims/effects/index.md)" in text
     assert (tmp_path / "sims" / "effects" / "index.md").exists()
+
+
+# In a real browser.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["index", "verdicts", "reference/tuners", "reference/api"])
+@pytest.mark.parametrize("width", WIDTHS)
+def test_a_page_is_whole_from_a_disk(browser, built, name, width):
+    with Opened(browser, built / f"{name}.html", width=width) as opened:
+        opened.page.wait_for_load_state("load")
+        assert opened.complaints == []
+        assert opened.overflow() <= 0
+
+
+@pytest.mark.slow
+def test_the_search_finds_a_page_from_a_disk(browser, built):
+    with Opened(browser, built / "index.html") as opened:
+        opened.page.keyboard.press("Control+k")
+        opened.page.locator("input:focus").fill("eccentricity")
+        results = opened.page.locator("a:visible", has_text="Causes and their places")
+        results.last.click(timeout=10_000)  # those of the page itself come first
+        opened.page.wait_for_url("**/places.html*")
+        assert opened.complaints == []
+
+
+@pytest.mark.slow
+def test_the_front_page_keeps_nobody_out(browser, built):
+    with Opened(browser, built / "index.html") as opened:
+        assert opened.barriers() == []
