@@ -448,8 +448,6 @@ PAGES = {
     "reference/commands.md": commands,
     "reference/experiment.md": experiment_keys,
     "reference/json.md": json_documents,
-
-
     "reference/tuners.md": how_tuners_work,
     "reference/verdict.md": verdict_keys,
 }
