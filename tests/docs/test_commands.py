@@ -26,8 +26,10 @@ def refused(words):
     """Whether the program's parser refuses a command line."""
     try:
         parser().parse_args(words)
-    except SystemExit as end:
+    except SystemExit as end:  # --help
         return bool(end.code)
+    except Exception:  # whatever the parser says of it
+        return True
     return False
 
 
