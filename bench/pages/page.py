@@ -109,7 +109,8 @@ class Page:
         library = (_LIBRARY / "uPlot.iife.min.js").read_text(encoding="utf-8")
         own = "\n".join(_script(name) for name in _SCRIPTS)
         script = f'{library}\n(() => {{\n"use strict";\n{own}\n}})();\n'
-        style = f"{(_LIBRARY / 'uPlot.min.css').read_text(encoding='utf-8')}\n{_style()}{self._own_style}"
+        styles = (_LIBRARY / "uPlot.min.css").read_text(encoding="utf-8"), _style()
+        style = "\n".join([*styles, self._own_style])
         return "\n".join(
             [
                 '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
