@@ -56,7 +56,11 @@ COMMANDS = (
     ("score", add_score, "error of an extended simulator on another recording"),
     ("film", add_film, "render a recorded ball as a video"),
     ("track", add_track, "track a ball in a video; write a recording"),
-    ("list", add_list, "list tuners, simulators, systems, effects, experiments or schemas"),
+    (
+        "list",
+        add_list,
+        "list tuners, simulators, systems, effects, experiments, references or schemas",
+    ),
     ("schema", add_schema, "print the JSON schema of what a command prints with --json"),
     ("info", add_info, "versions, engines, platform and paths, for a report of a fault"),
     ("completion", add_completion, "print a script by which a shell completes simgap's commands"),

@@ -23,6 +23,7 @@ from bench.runs.size import check_comparison
 from bench.runs.survey import admit
 from bench.store.csvs import Csv
 from bench.store.folder import Stored, read
+from bench.store.reference import find
 from bench.store.schema import SHOT_STATUS, SHOT_TABLE, SHOTS
 from methods.base import Tuner
 from sims.base import InputError, unknown
@@ -326,15 +327,22 @@ class Compared:
         """Names of the figures that there are; those of a bounce shot are files in its folder."""
         return [] if self.experiment.shot else comparison.names(self._stored)
 
-    def figure(self, name: str = "error") -> Figure:
+    def figure(self, name: str = "error", behind: str | Sequence[str] = ()) -> Figure:
         """One of the figures, made anew; a notebook shows it inline.
 
+        Args:
+            name: of the figure.
+            behind: reference results, or folders of comparisons, in grey behind it, as
+                ``ball-drop``; two at most.
+
         Raises:
-            InputError: there is none of that name.
+            InputError: there is none of that name, or a reference cannot be drawn behind it.
         """
         if self.experiment.shot:
             raise InputError(f"figures of a bounce shot are files: {self.folder / 'figures'}")
-        return comparison.figure(self._stored, self._labels, name)
+        asked = [behind] if isinstance(behind, str) else behind
+        references = [find(one) for one in asked]
+        return comparison.figure(self._stored, self._labels, name, behind=references)
 
     def summary(self) -> pd.DataFrame:
         """The last mean error of each tuner, the best first, with how many runs failed."""

@@ -9,7 +9,7 @@ from bench.commands.index import PARTS
 
 
 def lines(what: str) -> list[str]:
-    """The lines for tuners, simulators, systems, effects, experiments or schemas."""
+    """The lines for tuners, simulators, systems, effects, experiments, references or schemas."""
     return told(what, PARTS[what]())
 
 
@@ -72,8 +72,14 @@ def _effect(each: Document) -> list[str]:
     return result
 
 
+def _reference(each: Document) -> list[str]:
+    what = f"{each['says']} [simgap {each['simgap']}, {each['started'][:10]}, "
+    return [f"{each['name']:26} {what}{each['targets']} targets, budget {each['budget']}]"]
+
+
 _LAID_OUT: dict[str, Callable[[Document], list[str]]] = {
     "systems": _system,
     "effects": _effect,
     "experiments": _experiment,
+    "references": _reference,
 }

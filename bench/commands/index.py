@@ -191,6 +191,25 @@ def experiments() -> list[Document]:
     return told
 
 
+def references() -> list[Document]:
+    """Every reference result that `simgap plot --behind NAME` draws."""
+    from bench.store.reference import find, names
+
+    return [
+        {
+            "name": each.name,
+            "says": each.document.get("title") or each.document.get("says", ""),
+            "simgap": each.simgap,
+            "revision": each.revision or None,
+            "started": each.started,
+            "budget": each.document.get("budget"),
+            "targets": each.document.get("targets"),
+            "tuners": each.tuners,
+        }
+        for each in map(find, names())
+    ]
+
+
 def schemas() -> list[Document]:
     """Every schema that `simgap schema NAME` prints."""
     from bench.schemas import names, schema
@@ -215,6 +234,7 @@ PARTS: dict[str, Callable[[], list[Document]]] = {
     "systems": systems,
     "effects": effects,
     "experiments": experiments,
+    "references": references,
     "schemas": schemas,
 }
 """What `simgap list` has lists of, beside commands and the places of a robot."""

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from bench.analysis.statistics import Statistics
 from bench.figures import errors, identifiability, runtimes
-from bench.figures.style import Styles, mark
+from bench.figures.style import BEHIND, Styles, mark
 from bench.problem.experiment import Experiment
 from bench.problem.problem import Problem
 from bench.store.folder import Stored
-from sims.base import unknown
+from sims.base import InputError, unknown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from bench.store.reference import Reference
 
 FILES: Mapping[str, str] = {
     "error": "error-vs-simulations",
@@ -27,6 +29,9 @@ FILES: Mapping[str, str] = {
     "directions": "stiff-sloppy-prediction",
 }
 """Every figure's name, in the order in which they are written, and that of its files."""
+
+FRONT = ("error", "misfit", "directions")
+"""Figures of errors against simulations, which references may stand behind."""
 
 
 class Labels(NamedTuple):
@@ -75,7 +80,11 @@ def names(stored: Stored) -> list[str]:
 
 
 def figure(
-    stored: Stored, labels: Labels, name: str, statistics: Statistics | None = None
+    stored: Stored,
+    labels: Labels,
+    name: str,
+    statistics: Statistics | None = None,
+    behind: Sequence[Reference] = (),
 ) -> Figure:
     """One figure of a comparison.
 
@@ -84,25 +93,50 @@ def figure(
         labels: of its axes, see `labels_of`.
         name: one of `names(stored)`.
         statistics: of `statistics_of(stored)`, for who makes several figures.
+        behind: reference results that are drawn in grey behind it, where it is one of `FRONT`.
 
     Raises:
-        InputError: the comparison has no figure of that name.
+        InputError: the comparison has no figure of that name, or a reference cannot be drawn
+            behind it.
     """
     if name not in (known := names(stored)):
         raise unknown("figure", name, known)
-    return mark(_figure(stored, labels, name, statistics), stored.experiment.trusted)
+    if behind:
+        refuse_behind(stored, name, behind)
+    return mark(_figure(stored, labels, name, statistics, behind), stored.experiment.trusted)
 
 
-def _figure(stored: Stored, labels: Labels, name: str, statistics: Statistics | None) -> Figure:
+def refuse_behind(stored: Stored, name: str, behind: Sequence[Reference]) -> None:
+    """Refuse references that cannot be drawn behind a figure.
+
+    Raises:
+        InputError: they are of another problem, too many to be told apart, or the figure shows no
+            errors against simulations.
+    """
+    if name not in FRONT:
+        raise InputError(f"figure {name}: expected one of {', '.join(FRONT)} before a reference")
+    if len(behind) > len(BEHIND):
+        raise InputError(f"expected {len(BEHIND)} references at most, found {len(behind)}")
+    for reference in behind:
+        reference.mismatches(stored.experiment)
+
+
+def _figure(
+    stored: Stored,
+    labels: Labels,
+    name: str,
+    statistics: Statistics | None,
+    behind: Sequence[Reference],
+) -> Figure:
     experiment, runs = stored.experiment, stored.runs
     if name == "error":
-        return errors.error_figure(experiment, runs, labels.channel, labels.parameter)
+        return errors.error_figure(experiment, runs, labels.channel, labels.parameter, behind)
     if name == "misfit":
-        return errors.misfit_figure(experiment, runs, labels.channel)
+        return errors.misfit_figure(experiment, runs, labels.channel, behind)
     if name == "distance":
         return errors.distance_figure(experiment, runs, labels.parameter)
     if name == "directions":
-        return identifiability.directions_figure(experiment, runs, labels.channel)
+        return identifiability.directions_figure(experiment, runs, labels.channel, behind)
     if name == "spectra":
         assert stored.spectra is not None
         return identifiability.spectra_figure(experiment, stored.spectra)

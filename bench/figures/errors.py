@@ -6,6 +6,7 @@ Bands and bars are 95 % bootstrap intervals of the median over targets.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,13 +14,15 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from bench.analysis.table import checkpoints, interval, target_curves
-from bench.figures.style import FLOOR, SOFT, TITLES, Styles, canvas, finish
+from bench.figures.style import FLOOR, SOFT, TITLES, Styles, behind_id, canvas, finish
 from bench.problem.experiment import Experiment
 from sims.base import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from bench.store.reference import Reference
 
 _RESAMPLES = 500
 """Of the bootstrap: enough for a band a few pixels wide."""
@@ -32,7 +35,11 @@ _BINS = 4
 
 
 def error_figure(
-    experiment: Experiment, runs: pd.DataFrame, channel: str, parameter: str
+    experiment: Experiment,
+    runs: pd.DataFrame,
+    channel: str,
+    parameter: str,
+    behind: Sequence[Reference] = (),
 ) -> Figure:
     """Error against simulations.
 
@@ -43,6 +50,7 @@ def error_figure(
         runs: rows of runs.parquet.
         channel: the error channel with its unit, e.g. ``q [rad]``.
         parameter: the parameter with its unit where there is one; empty for several.
+        behind: reference results that are drawn in grey behind these.
     """
     real = "real" in experiment.ranges
     # Of a recording nobody knows the truth: what counts is its error on what was not fitted.
@@ -55,7 +63,7 @@ def error_figure(
         panels = [(runs[runs["range"] == r], metric, TITLES[r], label) for r in ranges]
 
     figure, axes = canvas(len(panels))
-    style = Styles(experiment, runs, panels[0][1])
+    style = Styles(experiment, runs, panels[0][1], behind)
     what = "starts" if real else "targets"
     for axis, (part, metric, title, label) in zip(axes, panels, strict=True):
         samples_panel(axis, part, metric, experiment.budget, style)
@@ -65,13 +73,15 @@ def error_figure(
     return figure
 
 
-def misfit_figure(experiment: Experiment, runs: pd.DataFrame, channel: str) -> Figure:
+def misfit_figure(
+    experiment: Experiment, runs: pd.DataFrame, channel: str, behind: Sequence[Reference] = ()
+) -> Figure:
     """What tuning leaves where the targets come from another simulator: the floor that no parameter
     removes. Arguments as of `error_figure`.
     """
     ranges = _ranges(experiment, runs)
     figure, axes = canvas(len(ranges))
-    style = Styles(experiment, runs, "obs_error")
+    style = Styles(experiment, runs, "obs_error", behind)
     for axis, kind in zip(axes, ranges, strict=True):
         part = runs[runs["range"] == kind]
         samples_panel(axis, part, "obs_error", experiment.budget, style)
@@ -108,8 +118,22 @@ def samples_panel(axis: Axes, runs: pd.DataFrame, metric: str, budget: int, styl
         # Marks only where tables have numbers; the line goes through all points.
         axis.plot(points, np.median(curves, axis=0), markevery=marks, markersize=4.5, **look)
         axis.fill_between(points, low, high, color=look["color"], alpha=0.13, linewidth=0)
+    for reference in style.behind:
+        _grey_lines(axis, reference, str(runs["range"].iloc[0]), metric, budget, style)
     axis.set_yscale("log")
     simulations_axis(axis, budget)
+
+
+def _grey_lines(
+    axis: Axes, reference: Reference, kind: str, metric: str, budget: int, style: Styles
+) -> None:
+    """Each tuner's median of a reference, at the numbers of simulations that its table has."""
+    for tuner in reference.tuners:
+        curve = reference.curve(tuner, kind, metric, budget)
+        if len(curve):
+            medians = np.maximum(curve["median"].to_numpy(dtype=np.float64), FLOOR)
+            name, look = behind_id(reference, tuner), style.grey(reference, tuner)
+            axis.plot(curve["simulations"], medians, gid=name, **look)
 
 
 def simulations_axis(axis: Axes, budget: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +28,8 @@ from bench.problem.identifiability import STIFF
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from bench.store.reference import Reference
 
 _FLOOR = 1e-6
 """1 sigma in training widths below which a figure shows no difference."""
@@ -148,7 +151,9 @@ def directional(experiment: Experiment, runs: pd.DataFrame) -> list[str]:
     return [m for m in _ROWS if m in runs and runs[m].notna().any()]
 
 
-def directions_figure(experiment: Experiment, runs: pd.DataFrame, channel: str) -> Figure:
+def directions_figure(
+    experiment: Experiment, runs: pd.DataFrame, channel: str, behind: Sequence[Reference] = ()
+) -> Figure:
     """Errors along stiff and along sloppy directions, and of prediction, against simulations; a
     column a range.
 
@@ -156,12 +161,13 @@ def directions_figure(experiment: Experiment, runs: pd.DataFrame, channel: str) 
         experiment: what was compared.
         runs: rows of runs.parquet, which have some metric of `directional`.
         channel: the error channel with its unit, e.g. ``q [rad]``.
+        behind: reference results that are drawn in grey behind these.
     """
     metrics = directional(experiment, runs)
     ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
     size = (1.8 + 4.0 * len(ranges), 1.2 + 2.3 * len(metrics))
     figure, axes = blank(len(metrics), len(ranges), size, sharey="row", sharex=True)
-    style = Styles(experiment, runs, metrics[0])
+    style = Styles(experiment, runs, metrics[0], behind)
     for row, metric in zip(axes, metrics, strict=True):
         for axis, kind in zip(row, ranges, strict=True):
             part = runs[(runs["range"] == kind) & runs[metric].notna()]

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    from bench.store.reference import Reference
 
 # Okabe and Ito's eight colours, safe for colour-blind readers: M. Okabe, K. Ito, Color Universal
 # Design, 2002.
@@ -61,6 +64,8 @@ SLOPE = "#BBBBBB"
 """The incline of a bounce shot."""
 BAND = "#CFCFCF"
 """What noise alone gives, and what is not needed."""
+BEHIND = ("#9C9C9C", "#C2C2C2")
+"""Reference results behind one's own: the first, and a second."""
 GROUND = "#E4E4E4"
 """Behind held-out runs."""
 SHADE = "#EEEEEE"
@@ -148,9 +153,22 @@ def look(place: int) -> Look:
 class Styles:
     """Colour, marker and line of each tuner: fixed by its place in the experiment, listed by its
     final error.
+
+    Args:
+        experiment: what was compared.
+        runs: rows of runs.parquet.
+        metric: by whose last value tuners are listed.
+        behind: reference results that curves are drawn in front of; `BEHIND` of them at most.
     """
 
-    def __init__(self, experiment: Experiment, runs: pd.DataFrame, metric: str) -> None:
+    def __init__(
+        self,
+        experiment: Experiment,
+        runs: pd.DataFrame,
+        metric: str,
+        behind: Sequence[Reference] = (),
+    ) -> None:
+        self.experiment, self.behind = experiment, behind
         present = set(runs["tuner"].unique())
         # A place counts tuners that did not run too: a colour means the same in every figure.
         self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
@@ -174,6 +192,24 @@ class Styles:
     def look(self, tuner: str) -> Look:
         """The same for a page."""
         return look(self._places[tuner])
+
+    def grey(self, reference: Reference, tuner: str) -> dict[str, Any]:
+        """Keyword arguments for plotting `tuner` of a reference: grey and thin, with the marker and
+        line that it has among the user's own.
+        """
+        # Those that the user does not have take the places behind.
+        others = [each for each in reference.tuners if each not in self._places]
+        taken = 1 + max(self._places.values(), default=-1)
+        i = self._places[tuner] if tuner in self._places else taken + others.index(tuner)
+        return {
+            "color": BEHIND[self.behind.index(reference)],
+            "marker": _MARKERS[i % len(_MARKERS)],
+            "markerfacecolor": "white",
+            "markersize": 3.5,
+            "linestyle": _LINES[i % len(_LINES)],
+            "linewidth": 1.0,
+            "zorder": 1.5,
+        }
 
     def offset(self, tuner: str) -> float:
         """A small shift along a category axis, so that error bars stand beside each other."""
@@ -230,14 +266,18 @@ def finish(
     # A panel may lack a tuner that another has; of those in both, the first panel's is shown.
     for axis in reversed(axes):
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    labels = [label for label in style.order if label in handles]
+    listed = [(handles[label], label) for label in style.order if label in handles]
+    for reference in style.behind:
+        listed += _behind_entries(axes, style, reference)
+        caption += _behind_caption(reference, style.experiment)
+    size = 9.0 if len(listed) <= _ROWS else 7.0
     figure.legend(
-        [handles[label] for label in labels],
-        labels,
+        [handle for handle, _ in listed],
+        [label for _, label in listed],
         loc="outside right upper",
         title=heading,
-        fontsize=9,
-        title_fontsize=8,
+        fontsize=size,
+        title_fontsize=min(size, 8),
         frameon=False,
         handlelength=3.2,
     )
@@ -246,6 +286,39 @@ def finish(
             axis.set_ylabel("")
     figure.suptitle(experiment.title or experiment.name, fontsize=11)
     below(figure, caption, letters=17)
+
+
+_ROWS = 18
+"""Of a legend in letters of the usual size."""
+
+
+def _behind_entries(
+    axes: list[Axes], style: Styles, reference: Reference
+) -> list[tuple[Line2D, str]]:
+    """What a legend lists of a reference: a heading, and its tuners that are drawn."""
+    from matplotlib.lines import Line2D
+
+    drawn = {line.get_gid() for axis in axes for line in axis.get_lines()}
+    heading = f"thin, grey: {reference.name},\nsimgap {reference.simgap}"
+    return [
+        (Line2D([], [], linestyle="none"), heading),
+        *(
+            (Line2D([], [], **style.grey(reference, tuner)), tuner)
+            for tuner in reference.tuners
+            if behind_id(reference, tuner) in drawn
+        ),
+    ]
+
+
+def _behind_caption(reference: Reference, experiment: Experiment) -> str:
+    differs = reference.mismatches(experiment)
+    told = f"; differs in {'; '.join(differs)}" if differs else ""
+    return f" Grey: medians of the reference {reference.provenance}{told}."
+
+
+def behind_id(reference: Reference, tuner: str) -> str:
+    """By which a reference's line is known in a figure."""
+    return f"behind {reference.name} {tuner}"
 
 
 def below(figure: Figure, caption: str, letters: int) -> None:
