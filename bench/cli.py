@@ -24,6 +24,7 @@ from bench.commands.answer import (
     Printer,
     Words,
 )
+from bench.commands.bundle import add_bundle
 from bench.commands.check import add_check
 from bench.commands.compare import add_compare
 from bench.commands.completion import add_completion
@@ -44,7 +45,12 @@ COMMANDS = (
     ("compare", add_compare, "run an experiment: tuners x targets x seeds; write table and figure"),
     ("train", add_train, "train a learned tuner ahead of the comparisons that use it"),
     ("status", add_status, "what a comparison's folder holds, and what is missing"),
-    ("verify", add_verify, "see whether a finished comparison follows from its salt and its rows"),
+    (
+        "verify",
+        add_verify,
+        "see whether a comparison, an explanation or an archive of one is what it says",
+    ),
+    ("bundle", add_bundle, "pack a comparison or an explanation as one archive that verifies"),
     ("check", add_check, "run the conformance suite on a tuner, a simulator or an effect"),
     ("plot", add_plot, "write table and figures of a comparison again, or of several together"),
     ("simulate", add_simulate, "write a recording of a simulated system, its truth apart"),

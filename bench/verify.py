@@ -77,7 +77,13 @@ class Verified(NamedTuple):
         }
 
 
-def verify(folder: Path, say: Say, plugins: Sequence[str] = (), every: bool = False) -> Verified:
+def verify(
+    folder: Path,
+    say: Say,
+    plugins: Sequence[str] = (),
+    every: bool = False,
+    own_plugins: bool = True,
+) -> Verified:
     """See whether a finished comparison tells the truth, and say so.
 
     Args:
@@ -85,6 +91,7 @@ def verify(folder: Path, say: Say, plugins: Sequence[str] = (), every: bool = Fa
         say: prints a line.
         plugins: plugin files beside those that it names.
         every: whether every simulation is made again, and not a share.
+        own_plugins: whether the plugin files that it names are run; not those of a stranger's.
 
     Raises:
         InputError: it is not finished, or damaged.
@@ -104,7 +111,8 @@ def verify(folder: Path, say: Say, plugins: Sequence[str] = (), every: bool = Fa
     # A fault in experiment.toml's salt has been refused by who read it.
     stored = checked(folder)
     note(_salt(experiment))
-    files = [*held.plugins, *(str(Path(plugin).resolve()) for plugin in plugins)]
+    named = held.plugins if own_plugins else []
+    files = [*named, *(str(Path(plugin).resolve()) for plugin in plugins)]
     admit(list(dict.fromkeys(files)), experiment)
     problem = Problem(experiment)
     try:

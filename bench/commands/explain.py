@@ -22,6 +22,12 @@ from bench.commands.options import (
 _PICTURED = (".html", ".png", ".pdf")
 """Endings of what is for the eye: the report names the pictures."""
 
+_SETTINGS = (
+    "system", "model", "engine", "free", "tuner", "seed", "budget", "whole", "pieces", "force",
+    "plugin",
+)  # fmt: skip
+"""Options on which an answer depends."""
+
 
 def add_explain(parser: argparse.ArgumentParser) -> None:
     """The options of `simgap explain`."""
@@ -134,6 +140,7 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
     from bench.commands.progress import Look
     from bench.gap.report.account import account
     from bench.registry import load_plugins
+    from bench.store.made import now, write_explained
     from sims.base import InputError
     from sims.files import refuse_full, stamped
 
@@ -145,6 +152,7 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
     # Before the work, which may take minutes.
     if options.out is not None:
         refuse_full(options.out)
+    started = now()
     with Look() as look, Interrupts() as interrupts:
         explanation = explain(
             options.recordings,
@@ -165,6 +173,8 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
         )
     folder = options.out or stamped(Path("results"), f"explain-{options.recordings[0].stem}")
     paths = explanation.write(folder)
+    settings = {name: getattr(options, name) for name in _SETTINGS}
+    made = write_explained(folder, started, settings, options.recordings)
     for line in account(explanation.story):
         say(line)
     for line in explanation.unsaid:
@@ -179,7 +189,7 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
         "title": explanation.story.title,
         "unsaid": explanation.unsaid,
         "folder": folder,
-        "files": paths,
+        "files": [*paths, made],
     }
     interrupted = cut is not None and cut.by == "interrupt"
     return Answer(document, INTERRUPTED if interrupted else DONE)

@@ -6,18 +6,15 @@ from __future__ import annotations
 
 import json
 import os
-import platform
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
-from datetime import datetime, timezone
-from importlib.metadata import distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench import __version__
 from bench.problem.experiment import Experiment, parse
 from bench.store.journal import Journal
+from bench.store.made import machine, now, packages
 from bench.store.schema import ENVIRONMENT, OLDER, RUNS, STATUS, Columns
 from bench.store.segments import FOLDER, read_plan
 from bench.store.sound import check_table, checked_files
@@ -95,14 +92,11 @@ def create(
         "plugins": [str(Path(p).resolve()) for p in configuration.plugins],
         "jobs": jobs,
         "seals": list(seals),
-        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "python": sys.version,
-        "platform": platform.platform(),
-        "machine": platform.machine(),
-        "processors": os.cpu_count(),
+        "started": now(),
+        **machine(),
         "fingerprint": configuration.fingerprint,
         "stepping": stepping(),
-        "packages": dict(sorted({d.metadata["Name"]: d.version for d in distributions()}.items())),
+        "packages": packages(),
     }
     try:
         # What there is of a folder is never without what it is for.

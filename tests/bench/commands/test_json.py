@@ -123,10 +123,22 @@ def status(ask, run, **_):
 
 
 @case
-def verify(ask, run, **_):
+def verify(ask, place, run, explained, **_):
     found = ask("verify", run, *PLUGIN)
     assert found["follows"]
     assert found["comparisons"][0]["doubts"] == []
+    yield found
+    yield ask("verify", explained)
+    ask("bundle", run, "--out", place / "run.zip")
+    found = ask("verify", place / "run.zip", *PLUGIN)
+    assert found["archive"]["kind"] == "comparison"
+    yield found
+
+
+@case
+def bundle(ask, place, explained, log, **_):
+    found = ask("bundle", explained, "--with", log, "--out", place / "explained.zip")
+    assert found["kind"] == "explanation"
     yield found
 
 

@@ -1,0 +1,362 @@
+"""`simgap bundle` and what `simgap verify` does of an archive: the folder of a comparison or an
+explanation as one file for a paper's supplement, and whether one made elsewhere is what it says.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bench import __version__
+from bench.gap.score_model import scored
+from bench.gap.verdict import Verdict
+from bench.registry import simulators
+from bench.schemas import faults
+from bench.store.archive import MANIFEST, Unpacked, pack, unpacked
+from bench.store.folder import CONFIGURATION, configuration
+from bench.store.made import environment, sha256
+from bench.store.segments import FOLDER
+from bench.study import parts_of
+from bench.verify import Doubt, Verified, verify
+from sims.base import InputError
+from sims.extended import Extended, opened
+from sims.files import first_line
+
+Say = Callable[[str], None]
+VERDICT = "verdict.json"
+EXTENDED = "extended.toml"
+_FORMAT = 1
+_BESIDE = "recordings"
+"""The folder of recordings in an explanation's archive."""
+_PLUGINS = "plugins"
+"""The folder of plugin files in a comparison's."""
+_SAME = 1e-3
+"""Share by which a held-out error may differ: initial states are estimated anew, perhaps on another
+machine.
+"""
+
+
+class Bundled(NamedTuple):
+    """An archive that was written.
+
+    Attributes:
+        archive: the file.
+        kind: comparison or explanation.
+        files: in it.
+        command: that makes its content again.
+        left_out: files of the folder that are not in it, and why.
+    """
+
+    archive: Path
+    kind: str
+    files: int
+    command: str
+    left_out: tuple[str, ...]
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        size = self.archive.stat().st_size
+        return {**self._asdict(), "bytes": size, "sha256": sha256(self.archive)}
+
+
+def bundle(folder: Path, out: Path | None = None, recordings: Sequence[Path] = ()) -> Bundled:
+    """Write a folder as one archive.
+
+    Args:
+        folder: of a finished comparison, a sweep or an explanation.
+        out: the file to write, a new one; NAME.zip here where None.
+        recordings: of an explanation, tables that go with it, each with its description.
+
+    Raises:
+        InputError: it is no such folder, not finished, or the file is there already.
+    """
+    kind = _kind(folder)
+    name = folder.resolve().name
+    files, left_out = _files(folder)
+    if kind == "comparison":
+        if recordings:
+            raise InputError("--with: recordings go with an explanation; leave them out")
+        files |= _of_plugins(folder)
+        command = f"simgap compare {name}/{CONFIGURATION}"
+    else:
+        files |= _of_recordings(recordings)
+        command = _explaining(folder)
+    about = {
+        "format": _FORMAT,
+        "kind": kind,
+        "name": name,
+        "simgap": str(environment(parts_of(folder)[0]).get("simgap") or __version__),
+        "bundled_by": __version__,
+        "command": command,
+    }
+    archive = out or Path(f"{name}.zip")
+    pack(archive, name, files, about)
+    return Bundled(archive, kind, len(files), command, tuple(left_out))
+
+
+def _kind(folder: Path) -> str:
+    if (folder / VERDICT).is_file() and (folder / EXTENDED).is_file():
+        return "explanation"
+    for part in parts_of(folder):
+        configuration(part)
+        if (part / FOLDER).exists():
+            raise InputError(f"{part}: not finished; resume it first")
+    return "comparison"
+
+
+def _files(folder: Path) -> tuple[dict[str, Path], list[str]]:
+    """The files of a folder by their paths in it, and what is left out."""
+    found, left_out = {}, []
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink():
+            left_out.append(f"{name}: a link")
+        elif path.is_file() and any(part.startswith(".") for part in Path(name).parts):
+            left_out.append(f"{name}: hidden")
+        elif path.is_file() and name != MANIFEST:
+            found[name] = path
+    return found, left_out
+
+
+def _of_plugins(folder: Path) -> dict[str, Path]:
+    """The plugin files that a comparison needs: who looks at it may read them before they run."""
+    plugins = [Path(file) for part in parts_of(folder) for file in configuration(part).plugins]
+    there = [file for file in dict.fromkeys(plugins) if file.is_file()]
+    return {f"{_PLUGINS}/{file.name}": file for file in there}
+
+
+def _of_recordings(tables: Sequence[Path]) -> dict[str, Path]:
+    files = {}
+    for table in tables:
+        if not table.is_file():
+            raise InputError(f"{table}: no such file")
+        for path in (table, table.with_suffix(".toml")):
+            if path.is_file():
+                files[f"{_BESIDE}/{path.name}"] = path
+    return files
+
+
+def _explaining(folder: Path) -> str:
+    """The command that makes an explanation again, as far as its folder knows."""
+    made = environment(folder)
+    tables = [each["file"] for each in made.get("recordings", []) if each["file"][-5:] != ".toml"]
+    words = ["simgap", "explain", *(tables or ["RECORDING.csv"])]
+    for name, value in made.get("settings", {}).items():
+        if value is True:
+            words.append(f"--{name}")
+        elif value is not False:
+            joined = ",".join(map(str, value)) if isinstance(value, list) else str(value)
+            words += [f"--{name}", joined]
+    return shlex.join(words)
+
+
+class Checked(NamedTuple):
+    """What came of looking at an explanation.
+
+    Attributes:
+        checked: what was looked at, in words.
+        unchecked: what could not be, and why.
+        doubts: what does not follow.
+    """
+
+    checked: list[str]
+    unchecked: list[str]
+    doubts: list[Doubt]
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        doubts = [doubt._asdict() for doubt in self.doubts]
+        return {**self._asdict(), "follows": not self.doubts, "doubts": doubts}
+
+
+class Archived(NamedTuple):
+    """What came of looking at an archive.
+
+    Attributes:
+        archive: what it says of itself, with what was counted.
+        doubts: files that are not as its manifest says; then nothing else was looked at.
+        comparisons: each that is in it.
+        explanation: the one that is in it.
+    """
+
+    archive: dict[str, Any]
+    doubts: list[Doubt]
+    comparisons: list[Verified]
+    explanation: Checked | None
+
+    @property
+    def follows(self) -> bool:
+        """Whether all of it does."""
+        sound = not self.doubts and all(each.follows for each in self.comparisons)
+        return sound and not (self.explanation and self.explanation.doubts)
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        compared = [each.document() for each in self.comparisons]
+        told = self.explanation.document() if self.explanation else None
+        archive = {**self.archive, "doubts": [doubt._asdict() for doubt in self.doubts]}
+        parts = {"archive": archive, "comparisons": compared, "explanation": told}
+        return {"follows": self.follows, **parts}
+
+
+def verify_archive(
+    archive: Path, say: Say, plugins: Sequence[str] = (), every: bool = False
+) -> Archived:
+    """See whether an archive is what it says, and what is in it tells the truth.
+
+    Args:
+        archive: of `bundle`, made elsewhere.
+        say: prints a line.
+        plugins: plugin files; those that the archive names or holds are never run.
+        every: whether every simulation is made again, and not a share.
+
+    Raises:
+        InputError: it is none, or nothing that anybody should unpack.
+    """
+    with unpacked(archive) as found:
+        about = _about(archive, found)
+        count, size = about["files"], about["bytes"]
+        say(f"{archive}: {about['kind']} of simgap {about['simgap']}, {count} files, {size} bytes")
+        doubts = [Doubt(fault.file, 0, fault.says) for fault in found.faults]
+        if doubts:
+            _told(doubts, archive, say)
+            return Archived(about, doubts, [], None)
+        say(f"{MANIFEST}: every file is there and has its SHA-256, and there is no other")
+        if about["kind"] == "explanation":
+            explained = _explained(found.folder, say)
+            _told(explained.doubts, archive, say)
+            return Archived(about, [], [], explained)
+        compared = [
+            verify(part, say, plugins, every, own_plugins=False)._replace(
+                folder=archive / part.relative_to(found.folder.parent)
+            )
+            for part in parts_of(found.folder)
+        ]
+        return Archived(about, [], compared, None)
+
+
+def _about(archive: Path, found: Unpacked) -> dict[str, Any]:
+    manifest = found.manifest
+    return {
+        "file": archive,
+        "kind": manifest["kind"],
+        "files": len(manifest["files"]),
+        "bytes": sum(each["bytes"] for each in manifest["files"]),
+        "simgap": manifest["simgap"],
+        "command": manifest["command"],
+    }
+
+
+def _told(doubts: Sequence[Doubt], where: Path, say: Say) -> None:
+    for doubt in doubts[:20]:
+        say(f"DOES NOT FOLLOW  {where}/{doubt}")
+    if len(doubts) > 20:
+        say(f"and {len(doubts) - 20} more")
+
+
+def verify_explanation(folder: Path, say: Say) -> Checked:
+    """See what can be seen of an explanation: that its parts are sound and say the same, and that
+    its held-out error comes out again where the recording lies in it.
+    """
+    found = _explained(folder, say)
+    _told(found.doubts, folder, say)
+    return found
+
+
+def _explained(folder: Path, say: Say) -> Checked:
+    found = Checked([], [], [])
+
+    def note(line: str) -> None:
+        found.checked.append(line)
+        say(line)
+
+    verdict = _verdict(folder, found)
+    if verdict is None:
+        return found
+    note(f"{VERDICT}: of the form of schema verdict: {verdict.verdict}")
+    try:
+        extended, _, _ = opened(folder / EXTENDED, simulators.get)
+    except InputError as error:
+        text = str(error).replace(f"{folder}/", "")
+        # What a robot's file was is known by its hash; that it is not here is no doubt.
+        if "model" in text and "no such file" in text:
+            found.unchecked.append(f"{EXTENDED}: {text}")
+            say(f"not checked: {found.unchecked[-1]}")
+        else:
+            found.doubts.append(Doubt(EXTENDED, 0, text))
+        return found
+    note(f"{EXTENDED}: loads as a simulator of {extended.system or extended.name}")
+    found.doubts.extend(_unlike(verdict, extended))
+    if not found.doubts:
+        note(f"{VERDICT} and {EXTENDED} have the same numbers")
+    _scored(folder, verdict, found, note)
+    for line in found.unchecked:
+        say(f"not checked: {line}")
+    if not found.doubts:
+        say("all of it follows" if not found.unchecked else "what could be checked follows")
+    return found
+
+
+def _verdict(folder: Path, found: Checked) -> Verdict | None:
+    try:
+        document = json.loads((folder / VERDICT).read_text(encoding="utf-8"))
+        wrong = faults(document, "verdict")
+        if not wrong:
+            return Verdict.of(document)
+    except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
+        wrong = [first_line(error)]
+    found.doubts.extend(Doubt(VERDICT, 0, line) for line in wrong)
+    return None
+
+
+def _unlike(verdict: Verdict, extended: Extended) -> Iterator[Doubt]:
+    """Numbers of the verdict that the extended simulator does not have, or has otherwise."""
+    for name, number in verdict.parameters.items():
+        other = extended.parameters.get(name)
+        if other is not None and not math.isclose(number.value, other.value, rel_tol=1e-9):
+            yield Doubt(VERDICT, 0, f"{name}: {number.value:.9g}, in {EXTENDED} {other.value:.9g}")
+    for cause in verdict.causes:
+        known: Mapping[str, Any] = extended.effects.get(cause.effect, {})
+        for name, number in cause.coefficients.items():
+            value = known[name].value if name in known else math.nan
+            if not math.isclose(number.value, value, rel_tol=1e-9):
+                what = f"{cause.effect} {name}"
+                yield Doubt(VERDICT, 0, f"{what}: {number.value:.9g}, in {EXTENDED} {value:.9g}")
+
+
+def _scored(folder: Path, verdict: Verdict, found: Checked, note: Say) -> None:
+    """Score the extended simulator on the recording, where it lies in the folder."""
+    made = environment(folder)
+    stated = verdict.heldout.rmse_extended if verdict.heldout else None
+    tables = sorted((folder / _BESIDE).glob("*.csv"))
+    if stated is None:
+        found.unchecked.append("held-out error: the verdict states none")
+        return
+    if len(tables) != 1:
+        where = f"{len(tables)} recordings are" if tables else "the recording is not"
+        found.unchecked.append(f"held-out error: {where} in it (simgap bundle --with LOG.csv)")
+        return
+    hashes = {each["file"]: each["sha256"] for each in made.get("recordings", [])}
+    for path in (tables[0], tables[0].with_suffix(".toml")):
+        if path.name in hashes and path.is_file() and sha256(path) != hashes[path.name]:
+            wrong = f"expected the recording that was explained, SHA-256 {hashes[path.name][:12]}"
+            found.doubts.append(Doubt(f"{_BESIDE}/{path.name}", 0, f"{wrong}; found another"))
+            return
+    try:
+        result = scored(folder / EXTENDED, tables[0], held_out=True)
+    except InputError as error:
+        found.unchecked.append(f"held-out error: {str(error).replace(f'{folder}/', '')}")
+        return
+    assert verdict.heldout is not None
+    units = result["units"]
+    alike = [e for name, e in result["rmse"].items() if units[name] == verdict.heldout.unit]
+    again = math.sqrt(sum(e * e for e in alike) / len(alike)) if alike else math.nan
+    if not math.isclose(stated, again, rel_tol=_SAME):
+        what = f"rmse_extended on held-out runs: {stated:.6g}, scored again {again:.6g}"
+        found.doubts.append(Doubt(VERDICT, 0, what))
+        return
+    note(f"{VERDICT}: rmse_extended on held-out runs comes out again: {again:.6g}")

@@ -1,0 +1,87 @@
+"""With what results were made: versions and machine, and of an explanation what was asked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import sys
+from collections.abc import Iterable, Mapping
+from datetime import datetime, timezone
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import Any
+
+from bench import __version__
+from sims.files import write
+
+ENVIRONMENT = "environment.json"
+
+
+def machine() -> dict[str, Any]:
+    """Python and the machine."""
+    return {
+        "python": sys.version,
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "processors": os.cpu_count(),
+    }
+
+
+def packages() -> dict[str, str]:
+    """The version of every package that is installed."""
+    return dict(sorted({d.metadata["Name"]: d.version for d in distributions()}.items()))
+
+
+def now() -> str:
+    """The time, UTC."""
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def write_explained(
+    folder: Path, started: str, settings: Mapping[str, Any], recordings: Iterable[Path]
+) -> Path:
+    """Write what an explanation was made with and of.
+
+    Args:
+        folder: the explanation's.
+        started: time, UTC.
+        settings: of `simgap explain`, by the names of its options.
+        recordings: the tables; each stands with its description where there is one.
+    """
+    told = {
+        "simgap": __version__,
+        "command": "explain",
+        "settings": {key: value for key, value in settings.items() if value not in (None, [], "")},
+        "recordings": [
+            {"file": path.name, "sha256": sha256(path)}
+            for table in recordings
+            for path in dict.fromkeys([table, table.with_suffix(".toml")])
+            if path.is_file()
+        ],
+        "started": started,
+        **machine(),
+        "packages": packages(),
+    }
+    path = folder / ENVIRONMENT
+    write(path, json.dumps(told, indent=1, default=str) + "\n")
+    return path
+
+
+def environment(folder: Path) -> dict[str, Any]:
+    """What environment.json says; empty where there is none, as beside an older explanation."""
+    try:
+        told = json.loads((folder / ENVIRONMENT).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def sha256(path: Path) -> str:
+    """Of a file's content."""
+    with path.open("rb") as file:
+        digest = hashlib.sha256()
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
