@@ -1,0 +1,175 @@
+"""The pages on how often explain is right say what the summaries beside them say."""
+
+import json
+
+import pytest
+
+from bench.gap.causes.rules import MEANING
+from tests.docs.numbers.account import NUMBER, Account
+from tests.docs.numbers.tables import document, frame
+from tests.docs.pages import quoted, section, tables, text_of
+from tests.exam import report as exam_report
+from tests.robots import report as robots_report
+
+
+def percent(share):
+    """A share as the pages say it, and as they bound it."""
+    return 100 * share["share"], 100 * share["low"], 100 * share["high"]
+
+
+def exam():
+    """results/reference/exam."""
+    page = Account("results/reference/exam/README.md")
+    summary = document("exam/summary.json")
+    items = frame("exam/items.csv")
+    page.written(exam_report.page(summary))
+    single, double = (
+        summary["single"]["named as data tell"],
+        summary["double"]["named as data tell"],
+    )
+    page.says("no alarm (none of {})", summary["clean"]["alarms"]["of"])
+    assert summary["clean"]["alarms"]["count"] == 0
+    page.says("Of single causes {} %", 100 * single["share"])
+    page.says("of pairs {} of {} (", double["count"], double["of"])
+    page.says("a median of {} s", summary["seconds"]["median"])
+    page.says("the slowest twentieth {} s", summary["seconds"]["p95"])
+    amiss = items[(items.part == "marks") & items.outcome.isin(["unnamed", "missed"])]
+    sizes = dict(zip(amiss.question.str.split("/").str[3], amiss["size"], strict=True))
+    page.says("a flexible joint at {} times", sizes["joint.flexibility"])
+    page.says("a ripple at {}, a slip at {},", sizes["force.ripple"], sizes["sensor.slip"])
+    page.known("All 873 questions, asked of one version (bfcb99b, 54 effects) in 10", "of that day")
+    page.known("It is 100 more than with 42", "of the sheet before")
+    for before in ("(98.9 %", "(43 before)", "s (0.4 before)", "s (2.8)"):
+        page.known(before, "of the exam before, which is not kept")
+    return page
+
+
+def robots():
+    """results/reference/robots."""
+    page = Account("results/reference/robots/README.md")
+    summary = document("robots/summary.json")
+    page.written(robots_report.page(summary))
+    kinds = frame("robots/items.csv").kind.value_counts()
+    page.says("All {} clean recordings and all {} of", kinds["clean"], kinds["numerics"])
+    rest = kinds.drop(["clean", "numerics"]).sum()
+    page.says("questions {}, in an order", rest)
+    page.known("of the other 333", "the sheet of that day")
+    held = summary["coverage"]
+    page.says("Intervals hold in {} of {}:", held["count"], held["of"])
+    page.known("One of the first 33", "how it was asked")
+    page.known("fewer than among the first 33 (39 of 41)", "how it was asked")
+    page.known("at 2 ms missed the speeds of stiff servos by 0.1 to 0.5", "of a run before")
+    page.known("Two of the 27 asked last", "how it was asked")
+    page.known("the sheet with it (596", "the sheet since")
+    page.known("below 25 (pairs", "asked since, and not kept")
+    page.known("in all 25.", "asked since, and not kept")
+    page.known("Of the new sheet 22 were asked: 9 drawn by chance", "asked since, and not kept")
+    page.known("4 of `servo.deadband`, 3 right", "asked since, and not kept")
+    page.known("at a scale of 7.7 noises it stands 24th of 300", "asked since, and not kept")
+    page.known("9 of `input.rate`, 6 right", "asked since, and not kept")
+    return page
+
+
+def next_recording():
+    """results/reference/next-recording."""
+    page = Account("results/reference/next-recording/README.md")
+    sets, fresh = frame("next-recording/sets.csv"), frame("next-recording/fresh.csv")
+    told, kept = said(sets), sets.kept & sets.outcome.isin(["settled", "split"])
+    page.says("of {} sets |", len(sets))
+    page.says("said to be told | 12 | {} |", told.sum())
+    page.known("| said to be told | 12", "of the code before")
+    page.says("and told, the truth kept | 5 | {} |", (told & kept).sum())
+    page.known("and told, the truth kept | 5", "of the code before")
+    page.says("no run of this kind | 12 | {} |", (~told).sum())
+    page.known("by no run of this kind | 12", "of the code before")
+    page.says("of {} {} were said to be told", len(fresh), said(fresh).sum())
+    assert (fresh.kept & (fresh.outcome == "settled"))[said(fresh)].all()
+    rest = fresh[~said(fresh)].outcome.value_counts()
+    page.says("of the {} that no run was said", rest.sum())
+    page.says("to tell {} were split", rest["split"])
+    page.says("{} stayed open, none was lost", rest["open"])
+    untold = sets[~told]
+    page.says(
+        "Of these {} one more run still split {}", len(untold), (untold.outcome == "split").sum()
+    )
+    page.says("{} of delays were lost", (untold.outcome == "lost").sum())
+    most = {row.Index: max(json.loads(row.worth).values()) for row in untold.itertuples()}
+    tilts = [most[i] for i in untold.index[untold.groups.map(members) == TILT]]
+    page.says("a driven pendulum ({})", len(tilts))
+    page.says("tilt's square | {} to {} |", min(tilts), max(tilts))
+    late = [most[i] for i in untold.index[untold.groups.map(members) <= LATE]]
+    page.says("of a few ms ({})", len(late))
+    page.says("of that length nearly | {} to {} |", min(late), max(late))
+    for words, member in (
+        ("on the slider", "wind"),
+        ("0.7 %)", "spring.cubic"),
+        ("pendulum", "drag.linear"),
+    ):
+        (worth,) = (most[i] for i in untold.index if member in members(untold.groups[i]))
+        page.says(f"{words} | {{}} |", worth)
+    page.known("a gain of 0.7 %", "the truth of that question")
+    page.known("drawn by seed 0, the first 24", "how it was asked")
+    page.known("4 s or up to 20 s", "how it was asked")
+    page.known("begun up to 1 %", "how it was asked")
+    page.known("of the 25 squared noises", "the threshold of design")
+    return page
+
+
+def verdicts():
+    """docs/verdicts.md."""
+    page = Account("docs/verdicts.md")
+    exam, robots = document("exam/summary.json"), document("robots/summary.json")
+    of = robots["named"]
+    counts = {
+        "nothing hidden": (exam["clean"]["alarms"], robots["alarms"]),
+        "one cause: named, or": (exam["single"]["named as data tell"], of["single"]["fair"]),
+        "one cause: named alone": (exam["single"]["named alone"], of["single"]["strict"]),
+        "two causes": (exam["double"]["named as data tell"], of["double"]["any"]),
+        "a cause that": (exam["foreign"]["right"], robots["foreign"]),
+        "95 % intervals": (exam["coverage"]["all"], robots["coverage"]),
+    }
+
+    def value(row, heading):
+        """Count, of how many, and what else the cell has: percent, and its interval."""
+        if heading == "":
+            return None
+        (shares,) = (pair for words, pair in counts.items() if row[""].startswith(words))
+        share = shares["robots" in heading]
+        numbers = [share["count"], share["of"], *percent(share)]
+        return numbers[: len(NUMBER.findall(row[heading]))]
+
+    assert page.table("| [ball", value) == 12 * 2 + 8
+    page.known("95 % intervals that hold", "the level")
+    page.known("In brackets 95 % intervals", "the level")
+    page.known("above 12,000 samples that lie closer than 10 ms", "bench/gap/causes/foresee.py")
+    page.known("odds of 33 to 1", "held by the thresholds, below")
+    return page
+
+
+TILT = {"gravity.tilt", "sensor.bias"}
+LATE = {"input.delay", "input.lag", "sensor.delay", "sensor.lag"}
+
+
+def members(groups):
+    """The causes of a set."""
+    return set(groups.replace(" | ", "/").split("/"))
+
+
+def said(sets):
+    """Whether the proposed run was said to tell all of a set apart."""
+    return sets.groups.str.contains("|", regex=False)
+
+
+PAGES = {"verdicts": verdicts, "exam": exam, "robots": robots, "next-recording": next_recording}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_every_number_is_that_of_the_tables(name):
+    page = PAGES[name]()
+    assert page.wrong == []
+    assert page.left() == []
+
+
+def test_the_words_of_the_verdicts_are_those_of_the_rules():
+    (_, *rows) = tables(section(text_of("verdicts.md"), "## The six verdicts"))[0]
+    assert {quoted(verdict)[0]: says for verdict, says, _ in rows} == MEANING
