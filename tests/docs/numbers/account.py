@@ -13,8 +13,10 @@ from tests.docs.pages import FENCE, ROOT
 
 NUMBER = re.compile(r"(?<![\w.,/-])[-−]?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?(?![\w]|-\w)")
 """A number of the text, not one of a name such as UR5 or squash-018."""
-NO_TEXT = re.compile(r"`[^`\n]*`|\]\([^)]*\)|<!--(?:.|\n)*?-->|^#+ .*$|^\d+\. |95 %\s+interval", re.M)
-"""Code, addresses, comments, headings and the level of intervals: no statements."""
+NO_TEXT = re.compile(
+    r"`[^`\n]*`|\]\([^)]*\)|<!--(?:.|\n)*?-->|^#+ .*$|^\d+\. |95 %\s+interval", re.M
+)
+"""Code, addresses, comments, headings, counts of lists, the level of intervals: no statements."""
 
 
 TABLE = re.compile(r"(?:^ *\|.*\n?)+", re.M)
