@@ -36,6 +36,10 @@ EVEN_COLUMNS = [
 ]
 COSTS: Array = np.logspace(-6, 3, 181)
 """Seconds that a simulation may take."""
+MOST_TARGETS = 1e4
+"""That may share a training where simulations in total are put against targets."""
+SECONDS_COLUMNS = ["range", "tuner", "simulation_seconds", "seconds"]
+TOTAL_COLUMNS = ["range", "tuner", "targets", "simulations"]
 SHARED = 100
 """Targets that share one training where it is asked who wins at which cost."""
 
@@ -143,3 +147,37 @@ def winners(held: Mapping[str, Price], targets: float) -> list[tuple[float, floa
         (float(COSTS[begin]), float(COSTS[end - 1]), names[best[begin]])
         for begin, end in itertools.pairwise(edges)
     ]
+
+
+def seconds_table(prices: Mapping[str, Mapping[str, Price]]) -> pd.DataFrame:
+    """Seconds for a target by the cost of a simulation, `SECONDS_COLUMNS`; nothing of who never
+    reaches the error.
+
+    Args:
+        prices: of reaching one error, by range, by tuner.
+    """
+    parts = []
+    for kind, by_tuner in prices.items():
+        for tuner, price in by_tuner.items():
+            seconds = price.seconds(COSTS, SHARED)
+            # A logarithmic axis has no place for who is there from the start.
+            if np.isfinite(price.effort.ert()) and seconds[0] > 0:
+                columns = (kind, tuner, COSTS, seconds)
+                parts.append(pd.DataFrame(dict(zip(SECONDS_COLUMNS, columns, strict=True))))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=SECONDS_COLUMNS)
+
+
+def totals_table(prices: Mapping[str, Mapping[str, Price]]) -> pd.DataFrame:
+    """Simulations in total by number of targets, training included, `TOTAL_COLUMNS`. Arguments and
+    what is left out as in `seconds_table`.
+    """
+    targets = np.logspace(0, np.log10(MOST_TARGETS), 200)
+    parts = []
+    for kind, by_tuner in prices.items():
+        for tuner, price in by_tuner.items():
+            ert = float(price.effort.ert())
+            total = price.fit_simulations + targets * ert
+            if np.isfinite(ert) and total[0] > 0:
+                columns = (kind, tuner, targets, total)
+                parts.append(pd.DataFrame(dict(zip(TOTAL_COLUMNS, columns, strict=True))))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=TOTAL_COLUMNS)

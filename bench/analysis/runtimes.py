@@ -18,6 +18,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from bench.analysis.curves import Curves
+from bench.analysis.table import checkpoints
 from bench.problem.seeds import rng_for
 from sims.base import Array
 
@@ -170,7 +171,33 @@ def ert_table(curves: Curves, levels: tuple[float, ...], budget: int) -> pd.Data
     return pd.DataFrame(lines, columns=ERT_COLUMNS)
 
 
+SHARE_COLUMNS = ["range", "tuner", "simulations", "share"]
+_POINTS = 60
+"""Numbers of simulations of a runtime distribution, on a logarithmic scale."""
+
+
 def solved(curves: Curves, spread: Array, points: NDArray[np.int64]) -> Array:
     """(P,) share of pairs of run and threshold reached after each of `points` simulations."""
     times = np.concatenate([reached(curves, float(t)) for t in spread])
     return np.array([(times <= k).mean() for k in points])
+
+
+def share_table(curves: Curves, spread: Array) -> pd.DataFrame:
+    """Runtime distributions, `SHARE_COLUMNS`: the share of (run, threshold) pairs reached for good,
+    at numbers of simulations on a logarithmic scale and at those that tables name.
+
+    Args:
+        curves: of the deciding metric, all ranges.
+        spread: thresholds of that metric.
+    """
+    budget = curves.values.shape[1] - 1
+    between = np.geomspace(1, budget, _POINTS).astype(int)
+    points = np.unique(np.concatenate([[0], between, checkpoints(budget)]))
+    parts = []
+    for kind in dict.fromkeys(curves.keys["range"]):
+        part = curves.of(range=str(kind))
+        for tuner in part.tuners():
+            share = solved(part.of(tuner=tuner), spread, points)
+            columns = (str(kind), tuner, points, share)
+            parts.append(pd.DataFrame(dict(zip(SHARE_COLUMNS, columns, strict=True))))
+    return pd.concat(parts, ignore_index=True)

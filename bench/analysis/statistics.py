@@ -10,7 +10,8 @@ import pandas as pd
 
 from bench.analysis.amortisation import Price, prices
 from bench.analysis.curves import Rows, primary
-from bench.analysis.runtimes import thresholds
+from bench.analysis.medians import by_distance, median_curves
+from bench.analysis.runtimes import share_table, thresholds
 from bench.problem.experiment import Experiment
 
 PRICED = 3
@@ -32,6 +33,7 @@ class Statistics:
         curves: the metric of every run.
         spread: thresholds of the runtime distribution.
         levels: thresholds of the tables.
+        all_runs: those too that lack the metric that decides.
     """
 
     def __init__(
@@ -46,6 +48,37 @@ class Statistics:
         self.curves = self._rows.curves(self.metric)
         self.spread, self.levels = thresholds(self.curves, in_widths)
         self._budget, self._costs = experiment.budget, costs
+        self.all_runs = runs
+        self._medians: dict[tuple[str, str], pd.DataFrame] = {}
+
+    def of(self, kind: str) -> pd.DataFrame:
+        """All rows of a range."""
+        return self.all_runs[self.all_runs["range"] == kind]
+
+    def medians(self, metric: str, kind: str) -> pd.DataFrame:
+        """Medians of a metric against simulations in a range, of the runs that have it; see
+        `bench.analysis.medians.median_curves`.
+        """
+        key = metric, kind
+        if key not in self._medians:
+            part = self.of(kind)
+            self._medians[key] = median_curves(part[part[metric].notna()], metric, self._budget)
+        return self._medians[key]
+
+    @property
+    def parameter_metric(self) -> str:
+        """One parameter's error counts in its own unit, several ones' in training widths."""
+        return "param_abs_error" if "param_abs_error" in self.all_runs else "param_error"
+
+    @cached_property
+    def distances(self) -> pd.DataFrame:
+        """Errors by distance from the training range; see `bench.analysis.medians.by_distance`."""
+        return by_distance(self.of("wide"), self.parameter_metric, self._budget)
+
+    @cached_property
+    def shares(self) -> pd.DataFrame:
+        """The runtime distribution of every range; see `bench.analysis.runtimes.share_table`."""
+        return share_table(self.curves, self.spread)
 
     @cached_property
     def prices(self) -> dict[float, dict[str, dict[str, Price]]]:

@@ -128,25 +128,26 @@ def _figure(
     statistics: Statistics | None,
     behind: Sequence[Reference],
 ) -> Figure:
-    experiment, runs = stored.experiment, stored.runs
-    if name == "error":
-        return errors.error_figure(experiment, runs, labels.channel, labels.parameter, behind)
-    if name == "misfit":
-        return errors.misfit_figure(experiment, runs, labels.channel, behind)
-    if name == "distance":
-        return errors.distance_figure(experiment, runs, labels.parameter)
-    if name == "directions":
-        return identifiability.directions_figure(experiment, runs, labels.channel, behind)
+    experiment = stored.experiment
     if name == "spectra":
         assert stored.spectra is not None
         return identifiability.spectra_figure(experiment, stored.spectra)
-    return _of_statistics(experiment, name, statistics or statistics_of(stored))
+    numbers = statistics or statistics_of(stored)
+    if name == "error":
+        return errors.error_figure(experiment, numbers, *labels, behind)
+    if name == "misfit":
+        return errors.misfit_figure(experiment, numbers, labels.channel, behind)
+    if name == "distance":
+        return errors.distance_figure(experiment, numbers, labels.parameter)
+    if name == "directions":
+        return identifiability.directions_figure(experiment, numbers, labels.channel, behind)
+    return _of_effort(experiment, name, numbers)
 
 
-def _of_statistics(experiment: Experiment, name: str, statistics: Statistics) -> Figure:
+def _of_effort(experiment: Experiment, name: str, statistics: Statistics) -> Figure:
     style = Styles(experiment, statistics.runs, statistics.metric)
     if name == "runtime":
-        return runtimes.runtime_figure(experiment, style, statistics.curves, statistics.spread)
+        return runtimes.runtime_figure(experiment, style, statistics)
     # Tables have every level; a figure has the one at which there is most to see.
     level = statistics.level
     draw = runtimes.cost_figure if name == "cost" else runtimes.amortisation_figure

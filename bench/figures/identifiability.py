@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from bench.analysis.spectra import COLUMNS
+from bench.analysis.statistics import Statistics
 from bench.figures.errors import samples_panel
 from bench.figures.style import (
     BLUE,
@@ -44,7 +45,7 @@ _WHERE = {
 }
 _MARKS = (("o", BLUE), ("^", VERMILION))
 """Of the ranges, in their order."""
-_ROWS = {
+ROWS = {
     "stiff_error": "along stiff directions\n[training widths]",
     "sloppy_error": "along sloppy directions\n[training widths]",
     "heldout_error": "of prediction,\nRMSE of {channel}",
@@ -148,21 +149,22 @@ def directional(experiment: Experiment, runs: pd.DataFrame) -> list[str]:
     """
     if "real" in experiment.ranges:
         return []
-    return [m for m in _ROWS if m in runs and runs[m].notna().any()]
+    return [m for m in ROWS if m in runs and runs[m].notna().any()]
 
 
 def directions_figure(
-    experiment: Experiment, runs: pd.DataFrame, channel: str, behind: Sequence[Reference] = ()
+    experiment: Experiment, statistics: Statistics, channel: str, behind: Sequence[Reference] = ()
 ) -> Figure:
     """Errors along stiff and along sloppy directions, and of prediction, against simulations; a
     column a range.
 
     Args:
         experiment: what was compared.
-        runs: rows of runs.parquet, which have some metric of `directional`.
+        statistics: of it; its runs have some metric of `directional`.
         channel: the error channel with its unit, e.g. ``q [rad]``.
         behind: reference results that are drawn in grey behind these.
     """
+    runs = statistics.all_runs
     metrics = directional(experiment, runs)
     ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
     size = (1.8 + 4.0 * len(ranges), 1.2 + 2.3 * len(metrics))
@@ -176,10 +178,10 @@ def directions_figure(
                 middle = {"ha": "center", "transform": axis.transAxes}
                 axis.text(0.5, 0.5, "no target has any", fontsize=8, **middle)
                 continue
-            samples_panel(axis, part, metric, experiment.budget, style)
+            samples_panel(axis, statistics, metric, kind, style)
             axis.set_title(f"{TITLES[kind]} ({part['target'].nunique()} targets)", fontsize=9)
             if axis is row[0]:
-                what = _ROWS[metric].format(channel=channel)
+                what = ROWS[metric].format(channel=channel)
                 axis.set_ylabel(f"error {what}\nmedian", fontsize=9)
             # Rows share their horizontal axis: it is named under the last.
             if metric != metrics[-1]:

@@ -10,9 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from bench.analysis.amortisation import COSTS, SHARED, Price, break_even, winners
-from bench.analysis.curves import Curves
-from bench.analysis.runtimes import percentile_interval, resampled, solved
+from bench.analysis.amortisation import (
+    MOST_TARGETS,
+    SHARED,
+    Price,
+    break_even,
+    seconds_table,
+    totals_table,
+    winners,
+)
+from bench.analysis.runtimes import percentile_interval, resampled
+from bench.analysis.statistics import Statistics
 from bench.analysis.table import checkpoints
 from bench.figures.errors import simulations_axis
 from bench.figures.style import INK, TITLES, Styles, blank, canvas, finish
@@ -25,50 +33,46 @@ if TYPE_CHECKING:
 
 Prices = Mapping[str, Mapping[str, Price]]
 """By range of targets, by tuner."""
-_POINTS = 60
-"""Numbers of simulations at which a distribution is drawn, on a logarithmic scale."""
-_MOST_TARGETS = 1e4
-"""That may share a training in the figure of amortisation."""
 _WIDE = 30.0
 """Factor of cost over which a tuner must win for its name to fit above its part of the strip."""
 
 
-def runtime_figure(experiment: Experiment, style: Styles, curves: Curves, spread: Array) -> Figure:
+def runtime_figure(experiment: Experiment, style: Styles, statistics: Statistics) -> Figure:
     """Share of (run, threshold) pairs that are reached, against simulations.
 
     Args:
         experiment: what was compared.
         style: of its tuners.
-        curves: of the deciding metric, all ranges.
-        spread: thresholds of that metric.
+        statistics: of it.
     """
-    ranges = list(dict.fromkeys(curves.keys["range"]))
+    spread, table = statistics.spread, statistics.shares
+    ranges = list(dict.fromkeys(table["range"]))
     figure, axes = canvas(len(ranges))
-    budget = curves.values.shape[1] - 1
-    ticks = checkpoints(budget)
-    between = np.geomspace(1, budget, _POINTS).astype(int)
-    points = np.unique(np.concatenate([[0], between, ticks]))
-    marks = [int(np.flatnonzero(points == k)[0]) for k in ticks]
+    budget = int(table["simulations"].max())
     for axis, kind in zip(axes, ranges, strict=True):
-        part = curves.of(range=str(kind))
-        for tuner in part.tuners():
+        for tuner, line in table[table["range"] == kind].groupby("tuner", sort=False):
+            points = line["simulations"].to_numpy()
+            marks = np.flatnonzero(np.isin(points, checkpoints(budget))).tolist()
             # Steps, not slopes: between two simulations nothing is reached.
-            share = solved(part.of(tuner=tuner), spread, points)
-            look = style.of(tuner)
-            axis.step(points, share, where="post", markevery=marks, markersize=4.5, **look)
+            look = style.of(str(tuner))
+            axis.step(points, line["share"], where="post", markevery=marks, markersize=4.5, **look)
         simulations_axis(axis, budget)
         axis.set_ylim(-0.02, 1.02)
         axis.set_ylabel("share of (run, threshold) pairs reached for good")
-        targets = part.keys["target"].nunique()
+        targets = statistics.curves.of(range=str(kind)).keys["target"].nunique()
         axis.set_title(f"{TITLES[str(kind)]} ({targets} targets)", fontsize=10)
+    finish(figure, axes, style, experiment, spread_caption(spread))
+    return figure
+
+
+def spread_caption(spread: Array) -> str:
+    """How a runtime distribution over these thresholds is read."""
     span = f"from {spread[0]:.2g} to {spread[-1]:.2g} on a logarithmic scale"
-    caption = (
+    return (
         f"{len(spread)} thresholds {span}. "
         "Reached: the recommendation's error stays at or below it from there on. "
         "A failed run reaches none."
     )
-    finish(figure, axes, style, experiment, caption)
-    return figure
 
 
 def amortisation_figure(
@@ -84,14 +88,11 @@ def amortisation_figure(
         level: of the deciding metric.
     """
     figure, axes = canvas(len(prices))
-    targets = np.logspace(0, np.log10(_MOST_TARGETS), 200)
+    table = totals_table(prices)
     for axis, (kind, by_tuner) in zip(axes, prices.items(), strict=True):
-        for tuner, price in by_tuner.items():
-            ert = float(price.effort.ert())
-            total = price.fit_simulations + targets * ert
-            # A logarithmic axis has no place for who never gets there, or is there from the start.
-            if np.isfinite(ert) and total[0] > 0:
-                axis.plot(targets, total, markevery=25, markersize=4.5, **style.of(tuner))
+        for tuner, line in table[table["range"] == kind].groupby("tuner", sort=False):
+            look = style.of(str(tuner))
+            axis.plot(line["targets"], line["simulations"], markevery=25, markersize=4.5, **look)
         _mark_even(axis, by_tuner)
         axis.set_xscale("log")
         axis.set_yscale("log")
@@ -115,13 +116,13 @@ def _mark_even(axis: Axes, prices: Mapping[str, Price]) -> None:
     for learned in learning:
         for search in searching:
             even = float(break_even(learned, search))
-            if not 1 <= even <= _MOST_TARGETS:
+            if not 1 <= even <= MOST_TARGETS:
                 continue
             total = even * float(search.effort.ert())
             picked = resampled(len(learned.effort.successes), "break-even")
             # Some resamples may never break even: their bar ends where the figure does.
             spread = percentile_interval(break_even(learned, search, picked))
-            ends = np.clip(spread, 1, _MOST_TARGETS)
+            ends = np.clip(spread, 1, MOST_TARGETS)
             axis.plot(ends, [total, total], color=INK, linewidth=1.0, alpha=0.6, zorder=4)
             axis.plot(even, total, "o", markersize=9, markerfacecolor="none", color=INK, zorder=5)
 
@@ -131,11 +132,11 @@ def cost_figure(experiment: Experiment, style: Styles, prices: Prices, level: fl
     Arguments as of `amortisation_figure`.
     """
     figure, axes = canvas(len(prices))
+    table = seconds_table(prices)
     for axis, (kind, by_tuner) in zip(axes, prices.items(), strict=True):
-        for tuner, price in by_tuner.items():
-            seconds = price.seconds(COSTS, SHARED)
-            if np.isfinite(price.effort.ert()) and seconds[0] > 0:
-                axis.plot(COSTS, seconds, markevery=20, markersize=4.5, **style.of(tuner))
+        for tuner, line in table[table["range"] == kind].groupby("tuner", sort=False):
+            across, up = line["simulation_seconds"], line["seconds"]
+            axis.plot(across, up, markevery=20, markersize=4.5, **style.of(str(tuner)))
         axis.set_xscale("log")
         axis.set_yscale("log")
         _strip(axis, by_tuner, style)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from bench.analysis.medians import FLOOR
 from bench.problem.experiment import Experiment
 from sims.base import InputError
 from sims.files import write_all
@@ -107,9 +108,6 @@ _DASHES: dict[Any, tuple[float, ...]] = {"-": (), "--": (3.7, 1.6), "-.": (6.4, 
 
 DPI = 160
 """Dots an inch of the PNG files."""
-
-FLOOR = 1e-9
-"""Errors below this are drawn here: less than rounding in the observation."""
 
 CAPTION = (
     "Line: median over targets of the recommendation's error (mean over seeds). "
