@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pandas as pd
@@ -16,10 +16,13 @@ from bench.analysis.statistics import Statistics
 from bench.analysis.table import summary, table
 from bench.figures import comparison
 from bench.figures.comparison import Labels, labels_of, statistics_of
-from bench.figures.style import TRUSTED, save
+from bench.figures.style import TRUSTED, Pictures, keep, taken
+from bench.pages.comparison.page import comparison_page
+from bench.pages.comparison.results import Results
 from bench.problem.experiment import Experiment
 from bench.problem.problem import Problem
-from bench.store.folder import Stored, read
+from bench.store.folder import CONFIGURATION, Stored, environment, read
+from bench.store.segments import FOLDER, read_plan
 from bench.store.status import FAILURES
 from sims.files import write
 
@@ -42,6 +45,8 @@ NEEDED = (
     "simulator_seconds",
 )
 """Columns of the runs that tables and figures use."""
+REPORT = "report.html"
+"""The page of a comparison, in its folder."""
 WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
 _SHOWN = (3, 10)
 """Numbers of simulations of which errors along directions are said, beside the whole budget."""
@@ -65,7 +70,20 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     made = tables(stored, statistics)
     for name, frame in made.items():
         write(folder / f"{name}.csv", frame.to_csv(index=False))
-    figures = _drawn(folder, stored, labels, statistics)
+    pictures = _drawn(stored, labels, statistics)
+    figures = _kept(folder, pictures)
+    results = Results(
+        stored,
+        labels,
+        statistics,
+        made,
+        pictures,
+        environment(folder),
+        str(folder),
+        (folder / CONFIGURATION).read_text(encoding="utf-8"),
+        _missing(folder, stored),
+    )
+    write(folder / REPORT, comparison_page(results))
 
     lines = made["table"]
     for text in _results(lines, labels):
@@ -80,6 +98,7 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     say(f"more    {folder}/{', '.join(f'{name}.csv' for name in made if name != 'table')}")
     for figure in figures:
         say(f"figure  {figure}")
+    say(f"report  {folder / REPORT}")
     # A tuner that cannot be used here is no failure of the comparison.
     return int((failed["status"] != "skipped").sum())
 
@@ -128,13 +147,26 @@ def _who_wins(experiment: str, statistics: Statistics) -> pd.DataFrame:
     return pd.DataFrame(lines, columns=WINNER_COLUMNS)
 
 
-def _drawn(folder: Path, stored: Stored, labels: Labels, statistics: Statistics) -> list[Path]:
-    """Write every figure that there is; the PNG files."""
-    paths = []
-    for name in comparison.names(stored):
-        figure = comparison.figure(stored, labels, name, statistics)
-        paths.append(save(figure, folder / "figures" / comparison.FILES[name])[0])
-    return paths
+def _drawn(stored: Stored, labels: Labels, statistics: Statistics) -> dict[str, Pictures]:
+    """Every figure that there is, by name."""
+    return {
+        name: taken(comparison.figure(stored, labels, name, statistics))
+        for name in comparison.names(stored)
+    }
+
+
+def _kept(folder: Path, pictures: Mapping[str, Pictures]) -> list[Path]:
+    """Write the figures; the PNG files."""
+    return [
+        keep(folder / "figures" / comparison.FILES[name], picture.png, picture.pdf)[0]
+        for name, picture in pictures.items()
+    ]
+
+
+def _missing(folder: Path, stored: Stored) -> int:
+    """Runs that are planned and not made yet."""
+    plan = read_plan(folder) if (folder / FOLDER).exists() else None
+    return max(len(plan) - int(stored.runs["run"].nunique()), 0) if plan else 0
 
 
 def _marks(experiment: Experiment) -> list[str]:

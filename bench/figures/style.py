@@ -7,8 +7,9 @@ they are.
 
 from __future__ import annotations
 
+import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -102,6 +103,9 @@ _LINES = (
     (0, (6, 1, 1, 1, 1, 1)),
     (0, (8, 2)),
 )
+
+_LONG = re.compile(rb"\b[1-9]\d*\.\d{3,}\b")
+"""A number of an SVG file with more digits than it needs; those below 1 are scales."""
 
 _DASHES: dict[Any, tuple[float, ...]] = {"-": (), "--": (3.7, 1.6), "-.": (6.4, 1.6, 1.0, 1.6)}
 """Matplotlib's named lines, in widths of the line."""
@@ -360,18 +364,39 @@ def svg(figure: Figure) -> bytes:
     # Without a date and chance names a file is the same whenever it is made.
     with rc_context({"svg.hashsalt": "simgap"}):
         figure.savefig(file, format="svg", metadata={"Date": None})
-    return file.getvalue()
+    # A hundredth of a point is less than any printer shows, and half of the file.
+    return _LONG.sub(lambda match: f"{float(match[0]):.2f}".encode(), file.getvalue())
 
 
 def printed(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes]:
     """A figure as the bytes of a PNG and of a PDF file, laid out once for both: finding room takes
     as long as drawing.
     """
+    as_png, as_pdf = _laid_out_once(figure, dpi, pdf)
+    return as_png, as_pdf
+
+
+def taken(figure: Figure, dpi: int = DPI) -> Pictures:
+    """A figure as the bytes of a PNG, a PDF and an SVG file, laid out once for all."""
+    return Pictures(*_laid_out_once(figure, dpi, pdf, svg))
+
+
+class Pictures(NamedTuple):
+    """One figure as the bytes of three kinds of files."""
+
+    png: bytes
+    pdf: bytes
+    svg: bytes
+
+
+def _laid_out_once(
+    figure: Figure, dpi: int, *makers: Callable[[Figure], bytes]
+) -> tuple[bytes, ...]:
     as_png = png(figure, dpi)
     engine = figure.get_layout_engine()
     figure.set_layout_engine(None)
     try:
-        return as_png, pdf(figure)
+        return as_png, *(make(figure) for make in makers)
     finally:
         figure.set_layout_engine(engine)
 
@@ -390,7 +415,11 @@ def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
     Raises:
         InputError: the folder cannot be made or written to.
     """
-    as_png, as_pdf = printed(figure, dpi)
+    return keep(path, *printed(figure, dpi))
+
+
+def keep(path: Path, as_png: bytes, as_pdf: bytes) -> list[Path]:
+    """Write a figure's files, both or neither; returns and raises as `save`."""
     contents = {
         path.with_name(f"{path.name}.png"): as_png,
         path.with_name(f"{path.name}.pdf"): as_pdf,

@@ -13,7 +13,7 @@ from bench.pages.text import number
 if TYPE_CHECKING:
     import pandas as pd
 
-FEW = 40
+FEW = 15
 """Rows that a page shows without its script, and at once with it."""
 
 
@@ -66,7 +66,7 @@ class Grid:
 
     def spec(self) -> dict[str, Any]:
         """What the page's script is told, as JSON holds it."""
-        return asdict(self)
+        return {**asdict(self), "few": FEW}
 
     def html(self, frame: pd.DataFrame) -> str:
         """The table as it stands without a script: what is chosen at first, and a few rows of it.

@@ -64,10 +64,17 @@ class Page:
             body = "\n".join([f'<h2 id="{name}-head">{head}</h2>', *held])
             self.add(f'<section id="{name}" aria-labelledby="{name}-head">\n{body}\n</section>')
 
-    def table(self, name: str, frame: pd.DataFrame) -> None:
-        """Keep a table in the page, for charts and grids, to be saved as NAME.csv."""
+    def table(self, name: str, frame: pd.DataFrame, digits: int | None = None) -> None:
+        """Keep a table in the page, for charts and grids, to be saved as NAME.csv.
+
+        Args:
+            name: of the table.
+            frame: its rows.
+            digits: significant digits of its numbers; all where None.
+        """
         self._frames[name] = frame
-        self._tables[name] = frame.to_csv(index=False)
+        style = None if digits is None else f"%.{digits}g"
+        self._tables[name] = frame.to_csv(index=False, float_format=style)
 
     def chart(self, chart: Chart) -> str:
         """A figure as HTML; its tables must be in the page."""

@@ -144,30 +144,34 @@ def configuration(folder: Path) -> Configuration:
         raise InputError(
             f"{folder}: expected the folder of a comparison with {CONFIGURATION} in it, found none"
         )
-    environment = _environment(folder)
-    experiment = parse(str(environment["experiment"]), read_toml(path), path)
+    held = environment(folder)
+    experiment = parse(str(held["experiment"]), read_toml(path), path)
     return Configuration(
         experiment,
-        list(environment["plugins"]),
-        dict(environment.get("fingerprint", {})),
-        tuple(environment.get("seals", ())),
+        list(held["plugins"]),
+        dict(held.get("fingerprint", {})),
+        tuple(held.get("seals", ())),
     )
 
 
-def _environment(folder: Path) -> dict[str, Any]:
-    """What environment.json says, checked; keys that are not declared are left out."""
+def environment(folder: Path) -> dict[str, Any]:
+    """What environment.json says, checked; keys that are not declared are left out.
+
+    Raises:
+        InputError: it is damaged.
+    """
     path = folder / "environment.json"
     wrong, remedy = f"{path}: not a complete comparison", "restore it, or start a new comparison"
     try:
-        environment = json.loads(path.read_text(encoding="utf-8"))
+        said = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{wrong}: {first_line(error)}; {remedy}") from None
-    if not isinstance(environment, dict):
-        raise InputError(f"{wrong}: expected a table, found {shown(environment)}; {remedy}")
+    if not isinstance(said, dict):
+        raise InputError(f"{wrong}: expected a table, found {shown(said)}; {remedy}")
     for key in ENVIRONMENT:
-        if key not in environment and key not in OLDER:
+        if key not in said and key not in OLDER:
             raise InputError(f"{wrong}: expected a key {key}, found none; {remedy}")
-    given = {key: value for key, value in environment.items() if key in ENVIRONMENT}
+    given = {key: value for key, value in said.items() if key in ENVIRONMENT}
     # Some systems do not say how many there are.
     if given["processors"] is None:
         del given["processors"]

@@ -59,10 +59,10 @@ function drawRules(u, rules) {
   });
 }
 
-function drawBand(u, line) {
+function drawBand(u, line, count) {
   if (!line.low || line.draw === "points" || line.draw === "bars") return;
   clipped(u, (ctx) => {
-    ctx.fillStyle = faint(styled(line.look).colour, dark() ? 0.22 : 0.14);
+    ctx.fillStyle = faint(styled(line.look).colour, (dark() ? 0.2 : 0.14) * (count > 4 ? 0.6 : 1));
     ctx.beginPath();
     let begun = false;
     const there = line.xs.map((_, i) => i).filter((i) => Number.isFinite(line.low[i]) && Number.isFinite(line.high[i]));
@@ -96,11 +96,13 @@ function drawMarks(u, line) {
   if (!marker && !points) return;
   const size = (line.xs.length > MARKED ? 2 : 4) * devicePixelRatio;
   const wanted = points ? null : new Set(line.marks);
+  // Along a smooth curve a few are enough to tell it from the others.
+  const every = wanted && !wanted.size && line.xs.length > 16 ? Math.ceil(line.xs.length / 8) : 1;
   clipped(u, (ctx) => {
     ctx.fillStyle = ctx.strokeStyle = colour;
     ctx.lineWidth = 1.2 * devicePixelRatio;
     line.xs.forEach((value, i) => {
-      if (!Number.isFinite(line.ys[i]) || (wanted && wanted.size && !wanted.has(value))) return;
+      if (i % every || !Number.isFinite(line.ys[i]) || (wanted && wanted.size && !wanted.has(value))) return;
       const [x, y] = spot(u, value + line.shift, line.ys[i]);
       ctx.fill(markerPath(marker || "o", x, y, size));
       if (!points || !line.low || !Number.isFinite(line.low[i])) return;

@@ -115,6 +115,10 @@ class FigureView {
         state.set(this.key(key), value, axis.scale);
       }));
     }
+    if (this.spec.panels.some(({ series }) => series.some(({ low }) => low))) {
+      const on = state.get(this.key("intervals")) !== "off";
+      made.push(element("button", { type: "button", class: "toggle", "aria-pressed": String(on), on: { click: () => state.set(this.key("intervals"), on ? "off" : "") } }, "intervals"));
+    }
     const button = (text, label, act, off = false) => element("button", { type: "button", "aria-label": label, title: label, disabled: off, on: { click: act } }, text);
     made.push(
       element("span", { class: "zoom" },
@@ -181,11 +185,14 @@ class FigureView {
     this.addSwitches();
     this.addLegend(panels);
     this.width = this.live.clientWidth;
-    const most = this.spec.columns ? (this.width < 560 ? 1 : this.spec.columns) : Math.floor(this.width / 400);
+    // Names of categories need more room than numbers.
+    const need = Math.max(370, ...panels.map((panel) => 76 * panel.across.names.length + 80));
+    const most = this.spec.columns ? (this.width < 560 ? 1 : this.spec.columns) : Math.floor(this.width / need);
     const across = Math.max(1, Math.min(panels.length, most));
     const width = Math.floor((this.width - 16 * (across - 1)) / across);
     const height = Math.max(260, Math.min(440, Math.round(width * 0.66)));
-    const lines = panels.map((panel) => linesOf(panel).filter((line) => !off.has(line.name)));
+    const intervals = state.get(this.key("intervals")) !== "off";
+    const lines = panels.map((panel) => linesOf(panel, intervals).filter((line) => !off.has(line.name)));
     const nothing = element("p", { class: "soft" }, "Everything is switched off.");
     this.panels.replaceChildren(...(panels.length ? [] : [nothing]));
     this.panels.style.gridTemplateColumns = `repeat(${across}, minmax(0, 1fr))`;
@@ -196,7 +203,8 @@ class FigureView {
         "aria-label": `${panel.title}: ${panel.up.label} against ${panel.across.label}. Arrow keys read values, plus and minus zoom, 0 shows everything.`,
         on: { keydown: (event) => this.pressed(event, i) },
       });
-      place.append(element("h4", {}, panel.title));
+      // Above the axis and not along it: it is read without turning the head, and is never cut.
+      place.append(element("h4", {}, panel.title), element("p", { class: "up" }, panel.up.label));
       this.panels.append(place);
       return new PanelView(place, panel, lines[i], {
         width, height: panel.height || height, scales,

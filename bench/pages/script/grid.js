@@ -1,7 +1,5 @@
 // A table that is sorted, filtered, copied and saved.
 
-const FEW = 40;
-
 class GridView {
   constructor(spec) {
     this.spec = spec;
@@ -119,7 +117,7 @@ class GridView {
     if (document.activeElement !== this.words) this.words.value = state.get(this.key("words"));
     const rows = this.rows();
     const every = state.get(this.key("rows")) === "all";
-    const shown = every ? rows : rows.slice(0, FEW);
+    const shown = every ? rows : rows.slice(0, spec.few);
     this.body.replaceChildren(...shown.map((row) =>
       element("tr", this.standing(row), ...spec.columns.map((column) => element("td", { class: column.digits ? "number" : false }, this.cell(row, column))))));
     const { name, down } = this.sorting();
@@ -128,8 +126,8 @@ class GridView {
       else head.removeAttribute("aria-sort");
     });
     this.count.textContent = `${rows.length} of ${held.rows.length} rows`;
-    this.more.hidden = rows.length <= FEW;
-    this.more.textContent = every ? `show ${FEW} rows` : `show all ${rows.length} rows`;
+    this.more.hidden = rows.length <= spec.few;
+    this.more.textContent = every ? `show ${spec.few} rows` : `show all ${rows.length} rows`;
   }
 
   // What is shown, with all digits, as spreadsheets take it.

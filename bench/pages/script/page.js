@@ -5,7 +5,7 @@ root.classList.add("scripted");
 
 function addTheme() {
   const pick = element("select", { id: "theme", on: { change: () => state.set("theme", pick.value) } },
-    ...[["", "as the system"], ["light", "light"], ["dark", "dark"]].map(([value, text]) => element("option", { value }, text)));
+    ...[["", "system"], ["light", "light"], ["dark", "dark"]].map(([value, text]) => element("option", { value }, text)));
   document.querySelector("nav").append(element("label", { class: "theme" }, "theme ", pick));
   return pick;
 }

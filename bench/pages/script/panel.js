@@ -1,7 +1,7 @@
 // One pair of axes on the screen.
 
 // Series of a panel with their numbers; those on a logarithmic axis without what it cannot hold.
-function linesOf(panel) {
+function linesOf(panel, intervals) {
   const held = table(panel.table);
   const xs = held.values(panel.x);
   return panel.series.map((series) => {
@@ -11,8 +11,8 @@ function linesOf(panel) {
       ...series,
       xs: rows.map((row) => xs[row]),
       ys: pick(series.y),
-      low: pick(series.low),
-      high: pick(series.high),
+      low: intervals && pick(series.low),
+      high: intervals && pick(series.high),
       marks: panel.across.ticks,
     };
   });
@@ -62,9 +62,9 @@ class PanelView {
       stroke: ink("ink"),
       grid: { stroke: ink("line"), width: 1 },
       ticks: { stroke: ink("line"), width: 1, size: 5 },
-      font: '12px system-ui, "Segoe UI", Roboto, "Liberation Sans", Arial, sans-serif',
+      font: `${described.names.length && width < 500 ? 10 : 12}px system-ui, "Segoe UI", Roboto, "Liberation Sans", Arial, sans-serif`,
       labelFont: '13px system-ui, "Segoe UI", Roboto, "Liberation Sans", Arial, sans-serif',
-      label: described.label,
+      label: key === "x" ? described.label : undefined,
       labelSize: 22,
       filter: (_, splits) => splits,
       splits: (u, _, low, high) => ticks(described, scales[key], low, high, (key === "x" ? u.bbox.width : u.bbox.height) / devicePixelRatio, room),
@@ -93,7 +93,7 @@ class PanelView {
           bind: { dblclick: () => () => acts.reset() },
         },
         hooks: {
-          drawClear: [(u) => { drawSpans(u, panel.spans); lines.forEach((line) => drawBand(u, line)); lines.filter((line) => line.under).forEach((line) => drawMarks(u, line)); }],
+          drawClear: [(u) => { drawSpans(u, panel.spans); lines.forEach((line) => drawBand(u, line, lines.length)); lines.filter((line) => line.under).forEach((line) => drawMarks(u, line)); }],
           draw: [(u) => this.over(u)],
           setSelect: [(u) => this.selected(u)],
           setCursor: [(u) => this.show(u)],
@@ -167,7 +167,7 @@ class PanelView {
 
   head(x) {
     const { names, label } = this.panel.across;
-    return names.length ? names[x] : `${label}: ${readable(x, 5)}`;
+    return names.length ? names[x].replace("\n", ", ") : `${label}: ${readable(x, 5)}`;
   }
 
   show(u) {
