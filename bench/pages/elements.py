@@ -60,10 +60,11 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], marks: Sequence[s
     for row, mark in zip(rows, marks or [""] * len(rows), strict=True):
         cells = [f"<td{_of_class(k)}>{c}</td>" for c, k in zip(row, kinds, strict=True)]
         body.append(f"<tr{_of_class(mark)}>{''.join(cells)}</tr>")
-    # A wide table scrolls by itself: the page must not, or its text could not be read on a phone.
+    # A wide table scrolls by itself, by keys too: the page must not, or its text could not be read
+    # on a phone.
     return "\n".join(
         [
-            '<div class="scroll"><table>',
+            '<div class="scroll" tabindex="0"><table>',
             f"<thead><tr>{''.join(top)}</tr></thead>",
             "<tbody>",
             *(body or [""]),

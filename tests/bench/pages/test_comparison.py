@@ -1,0 +1,245 @@
+"""The page of a comparison: it says what the statistics support, shows the numbers of its tables,
+and holds whatever texts come.
+"""
+
+import csv
+import io
+import re
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bench.analysis.amortisation import seconds_table
+from bench.figures import comparison
+from bench.figures.style import taken
+from bench.pages.comparison.conclusion import conclusion, soonest, warnings
+from bench.pages.comparison.page import comparison_page
+from bench.pages.comparison.parts import again
+from bench.pages.comparison.results import Results
+from bench.pages.text import number
+from bench.report import tables
+from tests.bench.figures.made import BUDGET, LABELS, stored
+from tests.browser import WIDTHS, Opened
+
+TITLE = "A ball </title><script>alert(1)</script><b>bold</b>"
+TRACEBACK = 'Traceback:\n  File "mine.py", line 3, in tune\n    <b>x</b>\nValueError: no & more'
+
+
+def statuses(of):
+    """Two runs of the invented comparison have failed."""
+    frame = of.statuses.copy()
+    failed = frame["run"].isin(["random/in-0/0", "random/in-1/0"])
+    frame.loc[failed, "status"] = "crashed"
+    frame.loc[failed, "reason"] = TRACEBACK
+    return frame
+
+
+def results(whole=None, pictures=None, missing=0):
+    whole = whole or stored()
+    statistics = comparison.statistics_of(whole)
+    if pictures is None:
+        pictures = {}
+    environment = {"simgap": "0.1", "plugins": ["/a b/mine.py"], "packages": {"numpy": "2.0"}}
+    return Results(
+        whole, LABELS, statistics, tables(whole, statistics), pictures, environment,
+        "results/a b", 'title = "x"\n', missing,
+    )  # fmt: skip
+
+
+def many(targets):
+    """The invented comparison on so many targets, each ten times as good with tunenet."""
+    rng = np.random.default_rng(1)
+    whole = stored()
+    parts = []
+    for tuner, factor in (("random", 1.0), ("tunenet", 0.1)):
+        one = whole.runs[whole.runs["run"] == f"{tuner}/in-0/0"]
+        for i in range(targets):
+            names = {"run": f"{tuner}/in-{i}/0", "target": f"in-{i}"}
+            errors = factor * rng.uniform(0.5, 1.5) * 0.7 ** one["k"]
+            parts.append(
+                one.assign(**names, param_error=errors, param_abs_error=errors, stiff_error=errors)
+            )
+    runs = pd.concat(parts)
+    ends = pd.DataFrame({"run": runs["run"].unique(), "status": "done", "reason": ""})
+    ends["tuner"] = ends["run"].str.split("/").str[0]
+    return whole._replace(runs=runs, statuses=ends)
+
+
+@pytest.fixture(scope="module")
+def shown():
+    """A comparison that allows every figure, with failures and odd texts."""
+    whole = stored()
+    whole = whole._replace(
+        experiment=replace(whole.experiment, title=TITLE), statuses=statuses(whole)
+    )
+    # One figure stands for all: that each is drawn is tested beside the figures.
+    drawn = taken(comparison.figure(whole, LABELS, "runtime"))
+    return results(whole, dict.fromkeys(comparison.names(whole), drawn))
+
+
+@pytest.fixture(scope="module")
+def path(shown, tmp_path_factory):
+    file = tmp_path_factory.mktemp("comparison") / "report.html"
+    file.write_text(comparison_page(shown), encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def opened(browser, path):
+    with Opened(browser, path) as one:
+        yield one
+        assert one.complaints == []
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_everything_is_there_quietly_and_for_everybody(browser, path, width):
+    with Opened(browser, path, width=width) as one:
+        figures = one.page.locator("figure").evaluate_all("all => all.map(one => one.id)")
+        assert figures == [
+            "error", "distance", "misfit", "directions", "spectra", "runtime", "ert", "cost",
+            "amortisation",
+        ]  # fmt: skip
+        assert one.page.locator("canvas").count() == 2 + 2 + 2 + 2 + 2 + 2 + 2 + 3
+        assert one.overflow() <= 0
+        assert one.barriers() == []
+        assert one.complaints == []
+
+
+def test_the_first_screen_says_who_wins_and_shows_it(opened):
+    assert opened.text("h1") == TITLE
+    bottom = "document.querySelector('#error canvas').getBoundingClientRect().bottom"
+    assert opened.page.evaluate(bottom) < 1000
+    assert "tunenet ends with the smallest error after 12 simulations" in opened.text(".conclusion")
+    assert "2 of 12 runs failed (17 %): why." in opened.text("p.warning")
+
+
+def test_a_winner_is_called_better_only_where_the_test_says_so():
+    (sure,) = conclusion(results(many(12)))
+    assert "Targets in the training range (12 targets): <strong>tunenet</strong> ends" in sure
+    assert sure.endswith("It is better than 1 of 1 others (paired test, p &lt; 0.05).")
+    (few,) = conclusion(results(many(4)))
+    assert "No other can be told apart from it (paired test, p &lt; 0.05): 4 targets" in few
+    same = many(12)
+    values = same.runs[same.runs["tuner"] == "random"]["stiff_error"].to_numpy()
+    same.runs.loc[same.runs["tuner"] == "tunenet", "stiff_error"] = values
+    (equal,) = conclusion(results(same))
+    assert "No other can be told apart from it" in equal
+    assert "too few" not in equal
+
+
+def test_the_median_that_is_said_is_that_of_the_table():
+    whole = results(many(12))
+    (said,) = conclusion(whole)
+    table = whole.tables["table"]
+    line = table[(table["metric"] == "stiff_error") & (table["tuner"] == "tunenet")]
+    median = line[line["simulations"] == BUDGET]["median"].item()
+    assert f"median {number(median)} (95 % " in said
+    (soon,) = soonest(whole)
+    ert = whole.tables["ert"]
+    ert = ert[(ert["threshold"] == whole.statistics.level) & (ert["tuner"] == "tunenet")]
+    assert f"<strong>tunenet</strong>: {number(ert['ert'].item())} simulations expected" in soon
+    assert "after a training of 800" in soon
+
+
+def test_what_is_missing_or_failed_is_said():
+    assert list(warnings(results())) == []
+    (unfinished,) = warnings(results(missing=3))
+    assert unfinished == "Not finished: 3 planned runs are not made yet."
+
+
+@pytest.mark.parametrize("name", ["table", "ert", "pairs", "who_wins", "break_even"])
+def test_a_table_is_saved_as_it_lies_beside_the_page(opened, shown, name):
+    grids = {"table": "numbers", "ert": "times", "pairs": "against", "who_wins": "winners"}
+    grid = opened.page.locator(f"#{grids.get(name, 'even')}")
+    saved = opened.saved(grid.get_by_role("button", name="save as CSV").click)
+    assert saved == (f"{name}.csv", shown.tables[name].to_csv(index=False).encode())
+
+
+def test_a_chart_has_the_numbers_of_the_table(opened, shown):
+    button = opened.page.locator("#error").get_by_role("button", name="numbers as CSV")
+    _, content = opened.saved(button.click)
+    rows = list(csv.DictReader(io.StringIO(content.decode())))
+    table = shown.tables["table"].set_index(["tuner", "range", "metric", "simulations"])
+    compared = 0
+    for row in rows:
+        key = (row["tuner"], row["range"], row["metric"], int(row["simulations"]))
+        if key in table.index:
+            assert float(row["median"]) == pytest.approx(table.loc[key, "median"], rel=1e-6)
+            compared += 1
+    # two tuners, two ranges, seven numbers of simulations
+    assert compared == 2 * 2 * 7
+
+
+def test_the_cursor_shows_the_last_medians(opened, shown):
+    box = opened.page.locator("#error .u-over").first.bounding_box()
+    opened.page.mouse.move(box["x"] + 0.995 * box["width"], box["y"] + 0.5 * box["height"])
+    tip = opened.page.locator("#error .tip").first
+    tip.wait_for()
+    text = tip.inner_text().replace("\n", " ")
+    medians = shown.statistics.medians("param_abs_error", "in").groupby("tuner").last()
+    for tuner, line in medians.iterrows():
+        ends = f"{number(line['low'])} to {number(line['high'])}"
+        assert f"{tuner} {number(line['median'])} ({ends})" in text
+
+
+def test_a_tuner_that_is_switched_off_is_gone_from_tables_too(opened):
+    opened.page.locator("#error .key[data-name=random]").click()
+    off = opened.page.locator(".key[data-name=random][aria-pressed=false]").count()
+    assert off == opened.page.locator(".key[data-name=random]").count() > 5
+    cells = opened.page.locator("#numbers tbody td:first-child").all_inner_texts()
+    assert set(cells) == {"tunenet"}
+
+
+def test_errors_to_be_reached_are_chosen(opened, shown):
+    before = opened.page.locator("#cost canvas").first.screenshot()
+    pick = opened.page.locator("#cost").get_by_label("error reached")
+    # An error that nobody reached has no curves.
+    prices = shown.statistics.prices
+    reached = [v for v in prices if not seconds_table(prices[v]).empty]
+    levels = [f"{number(v)} [training widths]" for v in reached]
+    assert sorted(pick.locator("option").all_inner_texts()) == sorted(levels)
+    assert pick.input_value() == f"{number(shown.statistics.level)} [training widths]"
+    pick.select_option(levels[0] if levels[0] != pick.input_value() else levels[1])
+    assert opened.page.locator("#cost canvas").first.screenshot() != before
+
+
+def test_failures_stand_with_their_tracebacks(opened):
+    fold = opened.page.locator("#failures details")
+    assert fold.count() == 1
+    assert (
+        fold.locator("summary").inner_text() == "random: crashed in 2 runs — ValueError: no & more"
+    )
+    fold.locator("summary").click()
+    assert fold.locator("pre").inner_text() == TRACEBACK
+    assert opened.page.locator("#failures b").count() == 0
+
+
+def test_the_command_makes_it_again(opened, shown):
+    assert again(shown) == "simgap compare 'results/a b/experiment.toml' --plugin '/a b/mine.py'"
+    assert opened.text("#making pre") == again(shown)
+    opened.page.get_by_text("experiment.toml: the exact").click()
+    assert opened.page.locator("#making details pre").first.inner_text() == 'title = "x"'
+
+
+def test_without_a_script_and_on_paper_figures_stand(browser, path):
+    with Opened(browser, path, java_script_enabled=False) as one:
+        stills = one.page.locator("img.still")
+        assert [image.is_visible() for image in stills.all()] == [True] * 8
+        assert one.page.locator("#numbers tbody tr").count() == 2
+    with Opened(browser, path) as one:
+        one.page.emulate_media(media="print")
+        assert one.page.locator("img.still:visible").count() == 8
+        assert one.page.locator("canvas:visible").count() == 0
+
+
+def test_a_comparison_of_one_tuner_without_a_run_that_reached_anything_has_a_page():
+    whole = many(3)
+    alone = whole.runs[whole.runs["tuner"] == "random"].assign(stiff_error=5.0, param_error=5.0)
+    kept = whole.statuses[whole.statuses["tuner"] == "random"]
+    held = results(whole._replace(runs=alone, statuses=kept, costs={}, spectra=None))
+    html = comparison_page(held)
+    assert soonest(held) == []
+    assert re.search("<strong>random</strong> ends with the smallest error", html)
+    assert 'id="against"' not in html
