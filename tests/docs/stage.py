@@ -93,7 +93,7 @@ class Stage:
         return outside_code(
             text,
             lambda part: with_anchors(spaced(self.linked(part, path)), names),
-            lambda fence: formula(fence["text"]) if fence["language"] == "math" else fence[0],
+            code,
         )
 
     def linked(self, text, path, beside=()):
@@ -144,6 +144,14 @@ def with_anchors(text, names):
 def spaced(text):
     """A blank line before each list that follows a line of text: GitHub needs none."""
     return BEFORE_LIST.sub(r"\1\n\n", text)
+
+
+def code(fence):
+    """A fenced block: its name becomes its title, and mathematics is set."""
+    if fence["language"] == "math":
+        return formula(fence["text"])
+    title = f' title="{fence["name"]}"' if fence["name"] else ""
+    return f"```{fence['language']}{title}\n{fence['text']}```"
 
 
 def mathml(formula, display):
