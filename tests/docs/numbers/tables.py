@@ -5,7 +5,7 @@ from functools import cache
 
 import pandas as pd
 
-from tests.docs.pages import ROOT, quoted
+from tests.docs.pages import ROOT
 
 REFERENCE = ROOT / "results" / "reference"
 
@@ -35,12 +35,6 @@ def one(path, column, **where):
     return rows(path, **where)[column].item()
 
 
-def last(folder, column="median", **where):
-    """The same of a comparison, after the last simulation."""
-    table = rows(f"{folder}/table.csv", **where)
-    return table[table.simulations == table.simulations.max()][column].item()
-
-
 def errors(folder, tuner, kind, simulations, metric):
     """(mean, median) of an error over targets after so many simulations; a run that ended before
     counts with its last.
@@ -48,8 +42,3 @@ def errors(folder, tuner, kind, simulations, metric):
     table = rows(f"{folder}/table.csv", tuner=tuner, range=kind, metric=metric)
     row = table[table.simulations <= simulations].sort_values("simulations").iloc[-1]
     return row["mean"], row["median"]
-
-
-def named(cell):
-    """The one name that stands in a cell, quoted or not, without what is in brackets."""
-    return (quoted(cell) or [cell.partition(" (")[0]])[0]
