@@ -344,7 +344,18 @@ class System(ABC):
 
 
 Of = Literal[
-    "", "input", "input/s", "error", "reading", "reading/s", "drive", "level", "travel", "stop"
+    "",
+    "input",
+    "input/s",
+    "error",
+    "reading",
+    "reading/s",
+    "drive",
+    "level",
+    "travel",
+    "stop",
+    "give",
+    "rotor",
 ]
 """Whose unit a coefficient has, or what it is of."""
 
@@ -364,7 +375,8 @@ class Coefficient:
             of what is stored; ``stop`` is the stiffness of one that stands where coefficient
             ``place`` says;
             ``drive`` is a limit of the drive's force and ``travel`` a part of the way that it
-            goes, with units of their own.
+            goes, with units of their own; ``give`` is how far something yields to a force;
+            ``rotor`` is an inertia that a model file may state itself.
         least: what a fit may not go below, where that is not a matter of plausibility.
         most: what it may not exceed, likewise.
         tried: sizes from which a search for it begins, where evenly spread ones would be too many.
@@ -532,6 +544,23 @@ class State:
     v: Array
 
 
+@dataclass(frozen=True)
+class Element:
+    """What lies in series between a drive and what it carries, in many lanes.
+
+    Attributes:
+        stiffness: (L,) N/m or N m/rad of its spring; none where it is not above zero.
+        damping: (L,) share of the critical one of what is carried on that spring.
+        gap: (L,) m or rad between its flanks, where it has no spring.
+        drive: (L,) inertia of the drive besides what is stated, as a share of the joint's.
+    """
+
+    stiffness: Array
+    damping: Array
+    gap: Array
+    drive: Array
+
+
 class Hidden(Effect):
     """A force that hangs on more than the system's own motion: on a state that no sensor shows,
     and that goes on beside it as one more coordinate.
@@ -544,6 +573,13 @@ class Hidden(Effect):
     needs = "joint"
     fastest: ClassVar[float] = 0.0
     """rad/s with which it may swing, where that is not to be seen at rest."""
+    between: ClassVar[tuple[Coefficient, ...]] = ()
+    """Its numbers where both sides of it are known, as in a robot, if it is an element in series
+    between a drive and what that carries."""
+
+    def element(self, c: Array) -> Element:
+        """The element of these numbers (K, L), of those that `between` has."""
+        raise NotImplementedError
 
     def behind(self, c: Array) -> Array:
         """(L, 1) share of the joint's inertia that moves with the hidden coordinate, below 1."""

@@ -14,6 +14,11 @@ between,
   them and does not bounce
 
 The rest of the library acts on x, where the drive does.
+
+In a robot the model file states the inertia of the links, and as armature that of the drive. There
+the element between them has numbers of its own, those of `between`: how far it yields to a force
+(the inverse of its stiffness), or its gap. Where the file states no armature the drive's inertia is
+one more number, as a share of the joint's.
 """
 
 from __future__ import annotations
@@ -25,7 +30,7 @@ from typing import ClassVar
 import numpy as np
 
 from sims.base import Array
-from sims.system import Coefficient, Hidden, Moment, State
+from sims.system import Coefficient, Element, Hidden, Moment, State
 
 CONTACT = 150.0
 """rad/s with which two masses would swing on each other through closed flanks without damping: far
@@ -34,6 +39,8 @@ SOFT = 0.01
 """Share of the gap by which a flank is pressed in where half of its damping acts."""
 _MOST = 0.98
 """Share of the inertia behind a transmission at most."""
+_LEAST = 1e-12
+"""rad/(N m) or m/N; a compliance that stands for none."""
 _ELASTIC = "M. W. Spong, J. Dyn. Syst. Meas. Control 109(4), 310 (1987), doi:10.1115/1.3143860"
 _PLAY = "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
 _PURE = ("1", "1", "1")
@@ -57,6 +64,18 @@ _GAPPED = (
     Coefficient("gap", ("m", "m", "rad"), _GAP, of="travel"),
     Coefficient("share", _PURE, _SOME_SHARE, tried=(0.2, 0.5, 0.8)),
 )
+_GIVING = ("m/N", "m/N", "rad/(N*m)")
+_GIVE = ((0, 1e-3), (0, 1e-3), (0, 0.1))
+"""Plausible compliances, where nothing is known of what is carried."""
+_DRIVE = ((0.01, 1), (0.01, 1), (0.01, 1))
+"""Plausible inertias of a drive, as a share of the joint's."""
+_ROTOR = Coefficient("rotor", _PURE, _DRIVE, of="rotor", tried=(0.15,))
+_SPRING = (
+    Coefficient("compliance", _GIVING, _GIVE, of="give"),
+    Coefficient("damping", _PURE, _RATIO, tried=(0.05,)),
+    _ROTOR,
+)
+_FLANKS = (Coefficient("gap", ("m", "m", "rad"), _GAP, of="travel"), _ROTOR)
 
 
 class Carried(Hidden):
@@ -98,7 +117,11 @@ class Flexibility(Carried):
 
     name, noun = "joint.flexibility", "a flexible transmission"
     says = "what the drive carries hangs on it by a spring, and swings"
-    source, coefficients = _ELASTIC, _SPRUNG
+    source, coefficients, between = _ELASTIC, _SPRUNG, _SPRING
+
+    def element(self, c: Array) -> Element:
+        """A spring with a damper."""
+        return Element(1.0 / np.maximum(c[0], _LEAST), c[1], 0.0 * c[0], c[2])
 
     def hangs(self, c: Array, fall: Array) -> Array:
         """As far as its spring gives."""
@@ -115,7 +138,12 @@ class Play(Carried):
 
     name, noun = "joint.backlash", "play in the transmission"
     says = "there is a gap between the drive and what it carries, which knocks from flank to flank"
-    source, coefficients, share, fastest = _PLAY, _GAPPED, 1, CONTACT
+    source, coefficients, between = _PLAY, _GAPPED, _FLANKS
+    share, fastest = 1, CONTACT
+
+    def element(self, c: Array) -> Element:
+        """Two flanks."""
+        return Element(0.0 * c[0], 0.0 * c[0], np.maximum(c[0], 0.0), c[1])
 
     def pull(self, c: Array, moment: Moment, state: State) -> Array:
         """The flanks'; damped as far as they are pressed in, so that no force jumps."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sims.robot.forces import OVER_TIME
 from sims.robot.lanes import Places
 from sims.robot.native import FIELDS
+from sims.robot.series import is_series
 from sims.system import Acting, Effect
 
 Mask = NDArray[np.bool_]
@@ -17,12 +18,14 @@ Mask = NDArray[np.bool_]
 
 def is_native(effect: Effect) -> bool:
     """Whether the engine writes it into the model."""
-    return (effect.of or effect.name) in FIELDS and effect.hook in ("value", "force")
+    return is_series(effect) or (
+        (effect.of or effect.name) in FIELDS and effect.hook in ("value", "force")
+    )
 
 
 def derives(effect: Effect) -> bool:
     """Whether MuJoCo derives constants from what it changes."""
-    return is_native(effect) and FIELDS[effect.of or effect.name].derived
+    return is_native(effect) and (is_series(effect) or FIELDS[effect.of or effect.name].derived)
 
 
 def natives(acting: Acting) -> Acting:
@@ -32,7 +35,9 @@ def natives(acting: Acting) -> Acting:
 
 def is_asked(effect: Effect) -> bool:
     """Whether its force is known only when the robot is there."""
-    return effect.hook == "force" and not is_native(effect) and effect.of not in OVER_TIME
+    if effect.hook not in ("force", "hidden"):
+        return False
+    return not is_native(effect) and effect.of not in OVER_TIME
 
 
 def lanes_with(acting: Acting, count: int, which: Callable[[Effect], bool]) -> Mask:

@@ -5,6 +5,7 @@ every step, of all lanes at once.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,8 +13,10 @@ from sims.base import Array
 from sims.robot.lanes import Addresses, Mask
 from sims.robot.moment import RobotMoment
 from sims.robot.native import FIELDS
+from sims.robot.remembered import advanced
+from sims.robot.series import is_series
 from sims.robot.system import RobotSystem
-from sims.system import Acting, Force, Friction
+from sims.system import Acting, Force, Friction, Hidden, State
 
 OVER_TIME = frozenset({"force.bias", "force.periodic"})
 """Effects whose force hangs on nothing but time."""
@@ -95,6 +98,9 @@ class Forces:
         self.rubs: Mask = np.zeros((count, len(addresses.velocities)), dtype=bool)
         for effect, c in self._frictions:
             self.rubs[:, effect.coordinate] |= (c != 0).any(axis=0)[:, 0]
+        self._hidden = [(e, c) for e, c in acting if isinstance(e, Hidden) and not is_series(e)]
+        self._states: list[State] = []
+        self._last: RobotMoment | None = None
 
     def at(
         self, t: float, x: Array, v: Array, inputs: Mapping[str, Array], carried: Array
@@ -105,9 +111,28 @@ class Forces:
         force = np.zeros_like(x)
         for effect, c in self._forces:
             force += effect.force(c, moment)
+        if self._hidden:
+            force += self._remembered(moment)
         limit = np.zeros_like(x)
         for dry, c in self._frictions:
             joint = dry.coordinate
             assert joint is not None
             limit[:, joint] += dry.limit(c, moment)[:, 0]
         return force, limit
+
+    def _remembered(self, moment: RobotMoment) -> Array:
+        """(L, D) forces of effects with states, which go on to this instant."""
+        before, self._last = self._last, moment
+        total = np.zeros_like(moment.x)
+        for k, (effect, c) in enumerate(self._hidden):
+            if before is None:
+                self._states.append(effect.begin(c, moment))
+                ahead = self._states[k]
+            else:
+                step = float(moment.t[0, 0] - before.t[0, 0])
+                midway = replace(before, v=0.5 * (before.v + moment.v))
+                self._states[k] = advanced(effect, c, midway, self._states[k], step)
+                ahead = advanced(effect, c, moment, self._states[k], 0.5 * step)
+            force, _ = effect.act(c, moment, ahead)
+            total += np.where(c[0] > 0, force, 0.0)
+        return total

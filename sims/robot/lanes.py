@@ -19,6 +19,9 @@ from sims.base import Array
 from sims.robot.model import Robot
 from sims.robot.native import FIELDS, SOLIMP, lanes_spec, stiff_of
 from sims.robot.quiet import quiet
+from sims.robot.series import FIELDS as SERIES
+from sims.robot.series import hung, is_series
+from sims.robot.series import write as in_series
 from sims.system import Acting
 
 LANES = 64
@@ -38,10 +41,18 @@ class Addresses:
     Attributes:
         positions: (D,) in qpos.
         velocities: (D,) in qvel.
+
+    Args:
+        robot: whose.
+        series: which joints: those of the robot's file, or those put in series with them.
+        both: or those of the file, then those in series.
     """
 
-    def __init__(self, robot: Robot) -> None:
-        joints = [joint for joint in robot.joints if joint.single]
+    def __init__(self, robot: Robot, series: bool = False, both: bool = False) -> None:
+        singles = [joint for joint in robot.joints if joint.single]
+        own = [joint for joint in singles if joint.name not in robot.series]
+        second = [robot.joint(name) for name in robot.series]
+        joints = [*own, *second] if both else second if series else own
         self.positions: Places = np.array([j.position for j in joints], dtype=np.intp)
         self.velocities: Places = np.array([j.velocity for j in joints], dtype=np.intp)
 
@@ -77,7 +88,7 @@ def read_model(robot: Robot, derived: bool) -> Any:
 
     spec = lanes_spec(robot) if derived else robot.spec.copy()
     for joint in robot.joints:
-        if joint.single:
+        if joint.single and joint.name not in robot.series:
             spec.add_sensor(
                 name=DRIVE + joint.name,
                 type=mujoco.mjtSensor.mjSENS_JOINTACTFRC,
@@ -90,7 +101,8 @@ def read_model(robot: Robot, derived: bool) -> Any:
 
 def drives(model: Any, robot: Robot) -> dict[str, int]:
     """Where in its sensors' data a model of lanes has what actuators exert, by joint."""
-    singles = [joint.name for joint in robot.joints if joint.single]
+    own = [joint.name for joint in robot.joints if joint.single]
+    singles = [name for name in own if name not in robot.series]
     return {name: int(model.sensor(DRIVE + name).adr[0]) for name in singles}
 
 
@@ -111,6 +123,9 @@ class Bench:
     Attributes:
         fields: model fields of the lanes, (LANES, ...) by name, as they are.
         batch: the mujoco.batch.Batch.
+        places: addresses of the joints of the robot's file.
+        second: those of joints in series with them.
+        whole: all of these, in this order.
         drives: columns of the sensors' data that show what actuators exert, by joint.
 
     Args:
@@ -130,6 +145,8 @@ class Bench:
         self.robot = robot = stepped(robot, settings)
         self.derived = derived
         self.count = count
+        self.places, self.second = Addresses(robot), Addresses(robot, series=True)
+        self.whole = Addresses(robot, both=True)
         model = read_model(robot, derived)
         # A lane that fails must be NaN: MuJoCo would reset it, and it would pass for done.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -141,6 +158,7 @@ class Bench:
             if derived or not native.derived
             for field in native.fields
         }
+        names |= set(SERIES) if robot.series else set()
         self.fields: dict[str, Any] = {name: self.batch.expand(name) for name in sorted(names)}
         self._stated = {name: values[:1].copy() for name, values in self.fields.items()}
         self._changed: set[str] = set()
@@ -156,11 +174,15 @@ class Bench:
             self.fields[name][...] = self._stated[name]
         was_derived = any(self._derives(name) for name in self._changed)
         self._changed.clear()
-        derives = was_derived
+        derives = was_derived or bool(self.robot.series)
         for effect, c in acting:
-            native = FIELDS[effect.of or effect.name]
             if not c.any():
                 continue
+            if is_series(effect):
+                in_series(self.fields, self.robot, effect, c[:, :, 0])
+                self._changed.update(SERIES)
+                continue
+            native = FIELDS[effect.of or effect.name]
             native.write(self.fields, self.robot, effect.place, c[:, :, 0])
             self._changed.update(native.fields)
             derives = derives or native.derived
@@ -171,13 +193,33 @@ class Bench:
     def _derives(field: str) -> bool:
         return any(field in native.fields and native.derived for native in FIELDS.values())
 
-    def begin(self, positions: Array, velocities: Array, places: Addresses) -> None:
-        """Put the lanes at their initial states: (n, D) each, of the joints at these addresses."""
+    def begin(self, positions: Array, velocities: Array) -> tuple[Array, Array]:
+        """Put the lanes at their initial states, (n, D) each, of the file's joints; returns where
+        joints in series begin (n, H): where the links hang while their drives are held.
+        """
         self.batch.reset(stage=0)
         qpos, qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         n = len(positions)
-        qpos[:n, places.positions] = positions
-        qvel[:n, places.velocities] = velocities
+        qpos[:n, self.places.positions] = positions
+        qvel[:n, self.places.velocities] = velocities
+        second = self.second
+        begun = np.zeros((n, second.positions.size))
+        if begun.size:
+            passive, bias = self.batch.bind("qfrc_passive"), self.batch.bind("qfrc_bias")
+            self.batch.forward(self._ids(n))
+            pulls = (passive - bias)[:n, second.velocities].T
+            begun[:] = np.stack(hung(self.fields, self.robot, list(pulls)), axis=1)
+            qpos[:n, second.positions] = begun
+        return begun, np.zeros_like(begun)
+
+    def spread(self, forces: Array) -> Array:
+        """Generalised forces (..., nv) of the file's model as this one has them."""
+        own = np.setdiff1d(np.arange(self.model.nv), self.second.velocities)
+        if own.size == forces.shape[-1]:
+            return forces
+        result = np.zeros((*forces.shape[:-1], self.model.nv))
+        result[..., own] = forces
+        return result
 
     def settle(self, controls: Array) -> Array:
         """Let filters of actuators begin at their first controls (n, nu): they were on before;

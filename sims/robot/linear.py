@@ -15,6 +15,7 @@ from sims.robot.native import FIELDS
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
 from sims.robot.scales import scales
+from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
 from sims.robot.tangent import TOGETHER, Change, Motion, Tangent
 from sims.robot.work import Work
@@ -60,6 +61,8 @@ class Linear:
         nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.size))
         unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
         self.observed: Array = self._seen(nothing, unread, [()])[0]
+        # Numbers of the joints of the file among all: those in series stand behind them.
+        self._joints = len(simulator.addresses.positions)
 
     def _nominal(self) -> Motion:
         """The motion itself, with one step more than the run takes, whose beginning is its end."""
@@ -68,7 +71,7 @@ class Linear:
         given = simulator.controls(self._work, steps)
         more = ("qfrc_actuator", "qfrc_bias", "act")
         made = simulator.stepped(self._work, given, more)
-        dofs = simulator.addresses.velocities
+        dofs = simulator.wide(self._work.acting).whole.velocities
         sides = ("qfrc_actuator", "qfrc_bias")
         carried = np.stack([made.fields[name][0][:, dofs] for name in sides])
         act = made.fields["act"][0]
@@ -76,11 +79,11 @@ class Linear:
         data = made.fields["sensordata"][0] if self._names else np.zeros((steps, 0))
         self._readings = {name: data[:, simulator.column(name)] for name in self._names}
         return Motion(
-            x=made.x[0],
-            v=made.v[0],
+            x=np.concatenate([made.x[0], made.series[0][0]], axis=1),
+            v=np.concatenate([made.v[0], made.series[1][0]], axis=1),
             act=np.concatenate([first, act[:-1]]),
             controls=given.controls[0],
-            forces=given.forces[0],
+            forces=simulator.wide(self._work.acting).spread(given.forces[0]),
             instant=given.instant[0],
             inputs={name: u[0] for name, u in given.felt.items()},
             carried=carried,
@@ -90,15 +93,24 @@ class Linear:
     def _neighbourhood(self) -> Tangent:
         simulator = self._simulator
         outputs = [("sensordata", simulator.column(name)) for name in self._names]
+        bench = simulator.wide(self._work.acting)
+        sizes = scales(simulator.robot).force
+        # What is in series carries what its joint carries.
+        second = [self._joint(name) for name in bench.robot.series]
         return Tangent(
-            simulator.wide,
+            bench,
             simulator.robotic,
             self._motion,
             self._work.acting,
             outputs,
-            scales(simulator.robot).force,
-            simulator.addresses,
+            np.append(sizes, sizes[second]),
+            bench.whole,
         )
+
+    def _joint(self, second: str) -> int:
+        """The number of the joint with which one is in series."""
+        coordinates = self._simulator.system.coordinates
+        return coordinates.index(f"q.{second.rpartition('_')[0]}")
 
     def responses(self, added: Sequence[Added]) -> tuple[Array, int]:
         """(K, T, C): what each of these effects changes about the run's observations; and how many
@@ -109,6 +121,9 @@ class Linear:
         self._known.clear()
         result = np.zeros((len(added), *self.observed.shape))
         driven = self._driven(added)
+        apart = [i for i, (effect, _) in enumerate(added) if is_series(effect)]
+        if apart:
+            result[apart] = self._simulated([added[i] for i in apart]) - self.observed
         for begin in range(0, len(added), TOGETHER):
             part = range(begin, min(begin + TOGETHER, len(added)))
             changes: list[Change] = []
@@ -120,7 +135,7 @@ class Linear:
                 for one, k in parts:
                     if isinstance(one, Sensor) or not k.any():
                         continue
-                    if isinstance(one, Input):
+                    if isinstance(one, Input) or is_series(one):
                         continue
                     changes += self._changes(owner, one, k)
                 changes += [c._replace(owner=owner) for c in driven.get(number, ())]
@@ -128,9 +143,23 @@ class Linear:
             with np.errstate(all="ignore"):
                 states, readings = self._tangent.follow(changes, len(part))
                 seen = self._seen(states, readings, sensors)
-            result[part.start : part.stop] = seen - self.observed
+            own = np.setdiff1d(part, apart).astype(np.intp)
+            result[own] = (seen - self.observed)[own - part.start]
         looks = self._tangent.looks - before
-        return result, 1 + looks // len(self._motion.controls)
+        return result, 1 + len(apart) + looks // len(self._motion.controls)
+
+    def _simulated(self, added: Sequence[Added]) -> Array:
+        """(K, T, C) observations of the run with each of these effects beside its own: what has no
+        small size is simulated.
+        """
+        count, work = len(added), self._work
+        acting = [(e, np.repeat(c, count, axis=1)) for e, c in work.acting]
+        for lane, (effect, c) in enumerate(added):
+            own = np.zeros((len(c), count, 1))
+            own[:, lane, 0] = c
+            acting.append((effect, own))
+        lanes = np.repeat(work.x, count, axis=0), np.repeat(work.v, count, axis=0)
+        return self._simulator.observed(work._replace(acting=tuple(acting), x=lanes[0], v=lanes[1]))
 
     def begun(self) -> Array:
         """(2 D, T, C): what each initial position, then each velocity, changes, per unit."""
@@ -140,7 +169,8 @@ class Linear:
         small = 1e-4
         seen = self._seen(small * states, small * readings, [()] * len(states))
         result: Array = (seen - self.observed) / small
-        return result
+        half, own = len(result) // 2, self._joints
+        return np.concatenate([result[:own], result[half : half + own]])
 
     def _changes(self, owner: int, effect: Effect, c: Array) -> list[Change]:
         """What an effect that is neither of an input nor of a sensor changes in each step."""

@@ -122,6 +122,8 @@ class Robot:
         actuator_tables: actuators that a recording added, by name, as it states them.
         engine_table: step and integrator in place of the file's, as it states them.
         speeds: of joints, the fastest that a URDF allows, rad/s or m/s; an MJCF states none.
+        series: of joints that were put in series with others (`sims.robot.series`), by name, the
+            inertia about them, kg or kg m^2; no other joint is in this model alone.
     """
 
     path: Path
@@ -134,6 +136,7 @@ class Robot:
     actuator_tables: Mapping[str, Any] = field(default_factory=dict)
     engine_table: Mapping[str, Any] = field(default_factory=dict)
     speeds: Mapping[str, float] = field(default_factory=dict)
+    series: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def compiled(self) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -99,6 +99,20 @@ class RobotMoment(Moment):
     drives: dict[int, tuple[str, ...]] = field(default_factory=dict)
     servos: dict[int, str] = field(default_factory=dict)
     stiffness: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def only(self, lane: int) -> RobotMoment:
+        """One lane alone."""
+        own = slice(lane, lane + 1)
+        return replace(
+            self,
+            theta=self.theta[own],
+            t=self.t[own],
+            x=self.x[own],
+            v=self.v[own],
+            inputs={name: u[own] for name, u in self.inputs.items()},
+            carried=self.carried[:, own],
+            stiffness=self.stiffness[own],
+        )
 
     def of_joint(self, joint: int) -> JointMoment:
         """The instant as one joint sees it."""

@@ -24,10 +24,12 @@ from sims.system import (
     Effect,
     Force,
     Friction,
+    Hidden,
     Input,
     Kind,
     Moment,
     Sensor,
+    State,
     Value,
 )
 
@@ -38,7 +40,10 @@ ALONE = frozenset(
         "force.periodic",
         "force.ripple",
         "input.power",
+        "joint.backlash",
+        "joint.flexibility",
         "friction.direction",
+        "friction.hysteresis",
         "friction.load_direction",
         "friction.load_quadratic",
         "friction.position",
@@ -54,6 +59,8 @@ ENCODERS = frozenset({"sensor.slip"})
 """Effects on what counts a position, and on no other channel."""
 TYPICAL = {"hinge": 0.5, "slide": 5.0}
 """A force for which the plausible ranges of the library are meant: N m on a hinge, N on a slide."""
+SLOWEST = 15.0
+"""rad/s; what is carried swings no slower on a joint that gives."""
 _KINDS: Mapping[str, Kind] = {"hinge": "rotary", "slide": "linear"}
 WORDS = {
     "armature": "inertia.armature",
@@ -85,6 +92,7 @@ class Spot(NamedTuple):
         stated: what the file states, by name of the effect that changes it.
         words: how a sentence calls it.
         servo: whether it is an actuator that follows a set point of its position.
+        last: whether it is a joint, the last one of its body.
     """
 
     name: str
@@ -97,6 +105,7 @@ class Spot(NamedTuple):
     stated: Mapping[str, float]
     words: str
     servo: bool = False
+    last: bool = False
 
 
 def at_world(effect: type[Effect]) -> type[Effect]:
@@ -114,6 +123,10 @@ def at_place(effect: type[Effect], spot: Spot) -> type[Effect]:
         changed["force"] = _force_of(effect)
     elif issubclass(effect, Friction):
         changed["limit"] = _limit_of(effect)
+    elif issubclass(effect, Hidden):
+        changed["act"] = _act_of(effect)
+        declared = effect.between or effect.coefficients
+        coefficients = [_of_spot(effect, c, spot) for c in declared if not _has(spot, c)]
     return _made(effect, f"{effect.name}@{spot.name}", spot.name, coefficients, changed)
 
 
@@ -136,6 +149,25 @@ def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, Moment], Arr
         return effect.limit(self, c, alone)
 
     return limit
+
+
+def _has(spot: Spot, c: Coefficient) -> bool:
+    """Whether the file states what a coefficient is of."""
+    stated = spot.stated.get("inertia.armature", 0.0)
+    return c.of == "rotor" and stated > c.plausible[0][0] * spot.inertia
+
+
+def _act_of(effect: type[Hidden]) -> Callable[..., tuple[Array, Array]]:
+    def act(self: Hidden, c: Array, moment: Moment, state: State) -> tuple[Array, Array]:
+        """(L, D) along its joint, and the rate of its state."""
+        joint = cast(int, self.coordinate)
+        alone = cast(RobotMoment, moment).of_joint(joint)
+        result = np.zeros_like(moment.x)
+        force, rate = effect.act(self, c, alone, state)
+        result[:, joint] = force[:, 0]
+        return result, rate
+
+    return act
 
 
 def family(effect: type[Effect], members: Sequence[type[Effect]]) -> type[Effect]:
@@ -217,6 +249,8 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
         low, high = low / share, high / share
     if effect.name == "inertia.armature":
         high = 3.0 * spot.inertia
+    if c.of == "give":
+        high = 1.0 / (spot.inertia * SLOWEST**2)
     stated = spot.stated.get(effect.name) if effect.at == "joint" else None
     if stated is not None:
         # The difference may take away what the file states, and no more.
@@ -237,6 +271,8 @@ def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[S
     sizes = scales(robot)
     found: dict[str, list[Spot]] = {"joint": [], "actuator": [], "body": [], "channel": []}
     numbers: dict[str, int] = {}
+    bodies = robot.compiled.jnt_bodyid
+    lasts = {int(body): i for i, body in enumerate(bodies)}
     for number, joint in enumerate(j for j in robot.joints if j.single):
         numbers[joint.name] = number
         found["joint"].append(
@@ -250,6 +286,7 @@ def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[S
                 sizes.inertia[number],
                 _stated(robot, joint.velocity, joint.id),
                 f"joint {joint.name}",
+                last=lasts[int(bodies[joint.id])] == joint.id,
             )
         )
     for actuator in robot.actuators:
@@ -335,6 +372,9 @@ def _for_one(effect: type[Effect]) -> bool:
         return True
     # A force that asks for more than its own joint has no meaning at one of several.
     alone = effect.needs in ("", "guide", "input", "servo")
+    if issubclass(effect, Hidden):
+        # What has a part of the joint's inertia needs to say what it is between.
+        return bool(effect.between) or effect.behind is Hidden.behind
     return alone and issubclass(effect, Force | Friction)
 
 
@@ -344,6 +384,9 @@ def _acts_at(effect: type[Effect], spot: Spot, found: Mapping[str, Sequence[Spot
         return False
     if effect.at == "joint" and effect.needs == "input":
         return any(actuator.coordinate == spot.coordinate for actuator in found["actuator"])
+    if issubclass(effect, Hidden) and effect.between:
+        # Between what drives a joint and what it carries.
+        return spot.last and any(one.coordinate == spot.coordinate for one in found["actuator"])
     if effect.needs == "servo" and not spot.servo:
         return False
     # A set point has no power.

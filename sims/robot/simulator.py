@@ -8,7 +8,7 @@ readings are linear. What an actuator is given over a step is the mean of its co
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -16,16 +16,17 @@ import numpy as np
 
 from sims import effects as library
 from sims.base import Array, InputError, Scenario, unknown
-from sims.plan import make_runs
+from sims.plan import Runs, make_runs
 from sims.robot.acting import derives, filled, is_asked, lanes_with, natives, part_of
 from sims.robot.felt import INSTANT, SHARE
 from sims.robot.felt import felt as felt_over
 from sims.robot.forces import Forces, over_time
-from sims.robot.lanes import LANES, Addresses, Bench
+from sims.robot.lanes import LANES, Addresses, Bench, Mask, Places
 from sims.robot.model import Actuator, Robot
 from sims.robot.numerics import INTEGRATORS, Numerics, RobotEngine, own_numerics
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
+from sims.robot.series import Added, by_series, in_series, twice
 from sims.robot.system import RobotSystem, system_of
 from sims.robot.work import Given, Made, Start, Work, by_run, instants
 from sims.simulated import Simulated
@@ -62,7 +63,7 @@ class RobotSimulator(Simulated):
         self._freed: list[Effect] = [effect() for effect in freed]
         self.robotic = self.system()
         self.addresses = Addresses(self.robot)
-        self._benches: dict[tuple[bool, int], Bench] = {}
+        self._benches: dict[tuple[bool, int, Added], Bench] = {}
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
         if name not in (None, "mujoco"):
@@ -118,15 +119,29 @@ class RobotSimulator(Simulated):
         runs = make_runs(scenarios)
         commands = [self.run_inputs(s) for s in runs.distinct]
         _, x, v = self._known(scenarios, initial)
+        return self._lanes(acting, runs, commands, x, v)
+
+    def observed(self, work: Work) -> Array:
+        """Observations (n, T, C) of lanes of one run, whatever acts on each."""
+        runs = Runs((work.scenario,), np.zeros(len(work.x), dtype=np.intp))
+        return self._lanes(work.acting, runs, [work.commands], work.x, work.v)
+
+    def _lanes(
+        self,
+        acting: Acting,
+        runs: Runs,
+        commands: Sequence[Mapping[str, Array]],
+        x: Array,
+        v: Array,
+    ) -> Array:
+        """Observations (L, T, C) of lanes that begin at x and v (L, D)."""
         longest = max(s.times.size for s in runs.distinct)
-        result = np.full((len(theta), longest, len(self.channels)), np.nan)
-        derived = lanes_with(acting, len(theta), derives)
-        asked = lanes_with(acting, len(theta), is_asked)
+        result = np.full((len(x), longest, len(self.channels)), np.nan)
+        derived = lanes_with(acting, len(x), derives)
+        asked = lanes_with(acting, len(x), is_asked)
         # A lane whose numbers overflow is NaN in the end, and nothing is printed of it.
         with np.errstate(all="ignore"), quiet():
-            for kind in range(4):
-                of_kind = (derived == bool(kind & 1)) & (asked == bool(kind & 2))
-                lanes = np.flatnonzero(of_kind)
+            for series, kind, lanes in _alike(acting, derived, asked):
                 # Lanes of one run lie together: what they share is computed once.
                 lanes = lanes[np.argsort(runs.of[lanes], kind="stable")]
                 for part in np.array_split(lanes, max(-(-lanes.size // LANES), 1)):
@@ -140,16 +155,20 @@ class RobotSimulator(Simulated):
                         )
                         for run, own in by_run(runs, part)
                     ]
-                    done = self._simulate(
-                        works, part_of(acting, part), bool(kind & 1), bool(kind & 2)
-                    )
+                    bits = bool(kind & 1), bool(kind & 2)
+                    done = self._simulate(works, part_of(acting, part), *bits, series)
                     for (_, own), seen in zip(by_run(runs, part), done, strict=True):
                         result[own, : seen.shape[1]] = seen
         result += 0.0  # no zero is negative: whatever made it, it is the same zero
         return result
 
     def _simulate(
-        self, works: Sequence[Work], acting: Acting, derived: bool, asked: bool
+        self,
+        works: Sequence[Work],
+        acting: Acting,
+        derived: bool,
+        asked: bool,
+        series: Added = (),
     ) -> list[Array]:
         """Observations (n, T, C) of the lanes of each run, all stepped together.
 
@@ -158,6 +177,7 @@ class RobotSimulator(Simulated):
             acting: what acts on all of them.
             derived: whether constants of the model follow from what acts.
             asked: whether forces are asked for in every step.
+            series: what acts in series with joints.
         """
         if not works:
             return []
@@ -168,7 +188,7 @@ class RobotSimulator(Simulated):
         whole = Given.of(given)
         x = np.concatenate([work.x for work in works])
         v = np.concatenate([work.v for work in works])
-        made = self._stepped(Start(x, v, acting), whole, derived, asked)
+        made = self._stepped(Start(x, v, acting), whole, derived, asked, series=series)
         seen = []
         first = 0
         for work, size in zip(works, sizes, strict=True):
@@ -223,10 +243,10 @@ class RobotSimulator(Simulated):
         forces[:, :, dofs] += over_time(self.robotic, work.acting, begins, len(dofs), n)
         return Given(controls, forces, felt, given)
 
-    @property
-    def wide(self) -> Bench:
-        """Lanes for looking at many instants of one motion at once."""
-        return self._bench(True, WIDTH)
+    def wide(self, acting: Acting = ()) -> Bench:
+        """Lanes for looking at many instants of one motion at once, in which this acts."""
+        (series,) = by_series(acting, 1)
+        return self._bench(True, WIDTH, series)
 
     def stepped(self, work: Work, given: Given, more: Sequence[str] = ()) -> Made:
         """Step lanes of one run, whatever acts on them.
@@ -239,34 +259,48 @@ class RobotSimulator(Simulated):
         n = len(work.x)
         derived = bool(lanes_with(work.acting, n, derives).any())
         asked = bool(lanes_with(work.acting, n, is_asked).any())
-        return self._stepped(Start(work.x, work.v, work.acting), given, derived, asked, more)
+        (series,) = by_series(work.acting, n)
+        start = Start(work.x, work.v, work.acting)
+        return self._stepped(start, given, derived, asked, more, series)
 
     def _stepped(
-        self, start: Start, given: Given, derived: bool, asked: bool, more: Sequence[str] = ()
+        self,
+        start: Start,
+        given: Given,
+        derived: bool,
+        asked: bool,
+        more: Sequence[str] = (),
+        series: Added = (),
     ) -> Made:
         n = len(start.x)
         # A lane alone shall not set the constants of all others.
-        bench = self._bench(derived, 1 if n == 1 else LANES)
+        bench = self._bench(derived, 1 if n == 1 else LANES, series)
+        places, second = bench.places, bench.second
         bench.load(filled(natives(start.acting), n, bench.count))
-        bench.begin(start.x, start.v, self.addresses)
+        behind = bench.begin(start.x, start.v)
         begun = bench.settle(given.controls[:, 0])
         record = ["qpos", "qvel", *more]
         if self._feels():
             record.append("sensordata")
         record = list(dict.fromkeys(record))
         if asked:
-            stiffness = bench.stiffness(self.addresses)[:n]
-            asking = Forces(self.robotic, start.acting, n, self.addresses, stiffness)
-            done = bench.ask(given.controls, given.forces, given.felt, asking, self.step, record)
+            stiffness = bench.stiffness(places)[:n]
+            asking = Forces(self.robotic, start.acting, n, places, stiffness)
+            forces = bench.spread(given.forces)
+            done = bench.ask(given.controls, forces, given.felt, asking, self.step, record)
         else:
-            done = bench.run(given.controls, given.forces, record)
-        places = self.addresses
+            done = bench.run(given.controls, bench.spread(given.forces), record)
         x = np.concatenate([start.x[:, None], done["qpos"][:, :, places.positions]], axis=1)
         v = np.concatenate([start.v[:, None], done["qvel"][:, :, places.velocities]], axis=1)
         x[bench.failed] = np.nan
         if self._drives:
             self._as_given(done["sensordata"], bench, given)
-        return Made(x, v, done, begun, bench.failed)
+        after = done["qpos"][:, :, second.positions], done["qvel"][:, :, second.velocities]
+        hidden = [
+            np.concatenate([first[:, None], rest], axis=1)
+            for first, rest in zip(behind, after, strict=True)
+        ]
+        return Made(x, v, done, begun, bench.failed, (hidden[0], hidden[1]))
 
     def _as_given(self, readings: Array, bench: Bench, given: Given) -> None:
         """Let what actuators exert (n, S, k) be that of the command when each step begins, in place
@@ -297,12 +331,13 @@ class RobotSimulator(Simulated):
         effort = self.robot.joint(actuator.joint).effort or np.inf
         return max(gear * low, -effort), min(gear * high, effort)
 
-    def _bench(self, derived: bool, count: int) -> Bench:
-        key = derived, count
+    def _bench(self, derived: bool, count: int, series: Added = ()) -> Bench:
+        key = derived, count, series
         if key not in self._benches:
             engine = self.engine
             assert isinstance(engine, RobotEngine)
-            self._benches[key] = Bench(self.robot, derived, engine.numerics.settings(), count)
+            robot = in_series(self.robot, series) if series else self.robot
+            self._benches[key] = Bench(robot, derived, engine.numerics.settings(), count)
         return self._benches[key]
 
     def _shown(self, made: Made, work: Work, times: Array, steps: int) -> Array:
@@ -347,6 +382,21 @@ class RobotSimulator(Simulated):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_benches": {}}
+
+
+def _alike(acting: Acting, derived: Mask, asked: Mask) -> Iterator[tuple[Added, int, Places]]:
+    """Lanes that can go together: what acts in series with joints in them, the number of their
+    kind, and which they are.
+    """
+    for series, own in by_series(acting, len(derived)).items():
+        # Two in series at one joint have no motion: those lanes stay as they are, without numbers.
+        if twice(series):
+            continue
+        there = np.zeros(len(derived), dtype=bool)
+        there[own] = True
+        for kind in range(4):
+            of_kind = there & (derived == bool(kind & 1)) & (asked == bool(kind & 2))
+            yield series, kind, np.flatnonzero(of_kind)
 
 
 def robot_simulator(

@@ -32,8 +32,9 @@ from sims.robot.acting import is_asked, natives
 from sims.robot.forces import LOADED, moment_of
 from sims.robot.lanes import Addresses, Bench, Places
 from sims.robot.moment import RobotMoment
+from sims.robot.remembered import advanced, along, moved
 from sims.robot.system import RobotSystem
-from sims.system import Acting, Effect, Force, Friction
+from sims.system import Acting, Effect, Force, Friction, Hidden, State
 
 HELD = 0.004
 """Seconds over which quotients are held: a pose changes little within."""
@@ -157,6 +158,7 @@ class Tangent:
         self._asked = [(e, c) for e, c in acting if is_asked(e)]
         bench.load(_repeated(acting, bench.count))
         self._stiffness = bench.stiffness(places)[:1]
+        self._states = [self._gone(effect, c) for effect, c in self._asked]
         bench.batch.reset(stage=0)
         self._fresh = bench.batch.state.copy()
         self._base, self._read = self._advanced({}, acting)
@@ -259,9 +261,15 @@ class Tangent:
             self._bench.batch.forward(None if n == self._bench.count else np.arange(n))
             carried = np.stack([bind(name)[:n, places.velocities] for name in SIDES])
         moment = moment_of(self._system, t, x, v, inputs, carried, self._stiff(n))
-        for effect, c in self._asked:
+        for k, (effect, c) in enumerate(self._asked):
             own = np.repeat(c, n, axis=1)
-            if isinstance(effect, Friction):
+            if isinstance(effect, Hidden):
+                state = State(self._states[k].x[at], self._states[k].v[at])
+                state = moved(effect, own, moment, state, x - motion.x[at])
+                ahead = advanced(effect, own, moment, state, 0.5 * motion.step)
+                force, _ = effect.act(own, moment, ahead)
+                bind("qfrc_applied")[:n, places.velocities] += force
+            elif isinstance(effect, Friction):
                 assert effect.coordinate is not None
                 limit = np.maximum(effect.limit(own, moment)[:, 0], 0.0)
                 self._bench.rub(n, int(places.velocities[effect.coordinate]), limit)
@@ -339,9 +347,21 @@ class Tangent:
 
     def by_force(self, owner: int, effect: Effect, c: Array) -> list[Change]:
         """The changes that an effect's force makes, one for each joint that it acts on."""
-        force = _force(effect, np.repeat(c, self._steps, axis=1), self.moment)
+        own = np.repeat(c, self._steps, axis=1)
+        if isinstance(effect, Hidden):
+            state = self._gone(effect, c)
+            ahead = State(*(0.5 * (u[1:] + u[:-1]) for u in (state.x, state.v)))
+            force, _ = effect.act(own, self.moment, ahead)
+        else:
+            force = _force(effect, own, self.moment)
         joints = np.flatnonzero(np.abs(force).max(axis=0) > 0)
         return [Change(owner, joint=int(j), series=force[:, j]) for j in joints]
+
+    def _gone(self, effect: Effect, c: Array) -> State:
+        """States (S + 1, 1) of an effect along the motion, where it has any."""
+        if not isinstance(effect, Hidden):
+            return State(np.zeros((0, 1)), np.zeros((0, 1)))
+        return along(effect, c, self.moment, self._motion.step)
 
     @cached_property
     def moment(self) -> RobotMoment:

@@ -117,6 +117,7 @@ class Made(NamedTuple):
         fields: what MuJoCo's data had in each step, (n, S, ...) by name.
         begun: (n, na) activations at the beginning.
         failed: (n,) which lanes did.
+        series: positions and velocities (n, S + 1, H) of joints in series with others.
     """
 
     x: Array
@@ -124,8 +125,11 @@ class Made(NamedTuple):
     fields: Mapping[str, Array]
     begun: Array
     failed: Mask
+    series: tuple[Array, Array]
 
     def of(self, lanes: slice) -> Made:
         """Some of the lanes."""
         fields = {name: values[lanes] for name, values in self.fields.items()}
-        return Made(self.x[lanes], self.v[lanes], fields, self.begun[lanes], self.failed[lanes])
+        series = self.series[0][lanes], self.series[1][lanes]
+        rest = self.begun[lanes], self.failed[lanes], series
+        return Made(self.x[lanes], self.v[lanes], fields, *rest)

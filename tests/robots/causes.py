@@ -11,6 +11,7 @@ JOINT = (
     "inertia.armature", "force.bias", "force.ripple", "friction.direction",
     "friction.position", "friction.warming",
     "friction.load", "friction.load_direction", "friction.load_quadratic", "state.limit",
+    "friction.hysteresis", "joint.flexibility", "joint.backlash",
 )  # fmt: skip
 BODY = ("mass.scale", "mass.offset", "inertia.scale")
 BOTH = ("input.gain", "input.bias", "input.delay", "input.lag", "input.rate", "supply.sag")
@@ -18,13 +19,15 @@ MOTOR = ("input.deadband", "input.saturation", "input.power")
 SERVO = ("actuator.stiffness", "actuator.damping", "servo.deadband", "servo.derivative")
 CHANNEL = ("sensor.bias", "sensor.gain", "sensor.delay", "sensor.eccentricity", "sensor.slip")
 WORLD = ("gravity.tilt", "gravity.scale", "clock.skew")
-FOREIGN = ("elastic", "binding", "slip")
+STIFFEST = 10.0  # Hz, of a link on its elastic joint at strength 1/10
+FOREIGN = ("heated", "cogging", "binding", "slip")
 FAMILIES = ("friction.coulomb", "drag.linear")
 SIMPLER = {
     "friction.stribeck": "friction.coulomb", "friction.direction": "drag.linear",
     "input.power": "input.gain",
     "friction.load_direction": "friction.load", "friction.load_quadratic": "friction.load",
     "friction.position": "friction.coulomb", "friction.warming": "friction.coulomb",
+    "friction.hysteresis": "friction.coulomb",
 }  # fmt: skip
 SIGNED = (
     "force.bias", "mass.scale", "inertia.scale", "input.gain", "input.bias", "sensor.bias",
@@ -47,7 +50,7 @@ def effects(drive):
 
 def places(machine, effect):
     """Where an effect can be."""
-    if effect.startswith("friction.load"):
+    if effect.startswith(("friction.load", "joint.")):
         return [machine.joints[joint] for joint in machine.driven]
     if effect in JOINT:
         return list(machine.joints)
@@ -212,7 +215,30 @@ def _stop(place, setting, rng):
     return lambda s: (side * stiffness * s, stands, loss)
 
 
+def _hysteresis(place, setting, rng):
+    """Over a way that shows in the travel."""
+    typical = _at(setting, place)
+    way = float(np.clip(typical["travel"] * rng.uniform(0.02, 0.15), 0.01, 0.2))
+    return lambda s: (typical["force"] * s, way)
+
+
+def _flexible(place, setting, rng):
+    """A spring that grows softer: at strength 0.1 what is carried swings at 10 Hz on it."""
+    inertia = _at(setting, place)["inertia"]
+    ratio, rotor = float(rng.uniform(0.02, 0.1)), float(rng.uniform(0.1, 0.3))
+    return lambda s: (10.0 * s / (inertia * (2 * np.pi * STIFFEST) ** 2), ratio, rotor)
+
+
+def _play(place, setting, rng):
+    """A gap of up to a tenth of the travel."""
+    rotor = float(rng.uniform(0.1, 0.3))
+    return lambda s: (0.1 * _at(setting, place)["travel"] * s, rotor)
+
+
 SHAPES = {
+    "friction.hysteresis": _hysteresis,
+    "joint.flexibility": _flexible,
+    "joint.backlash": _play,
     "state.limit": _stop,
     "sensor.slip": _slip,
     "friction.direction": _direction,

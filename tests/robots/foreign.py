@@ -1,19 +1,19 @@
-"""Causes that the library does not have: an elastic joint, a binding range, a slipping encoder."""
+"""Causes that the library does not have: friction that another joint heats, teeth that lag, a
+binding range, a slipping encoder.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from tests.robots.plant import Binding, Elastic
-
-STIFFEST = 10.0  # Hz, of a link on its elastic joint at strength 1/10
+from tests.robots.plant import Binding, Cogging, Heated
 
 
 def drawn(cause, joint, setting, rng):
     """What is hidden, by strength: keyword arguments for `hidden` of a question.
 
     Args:
-        cause: elastic, binding or slip.
+        cause: of `causes.FOREIGN`.
         joint: its index.
         setting: of the recording.
         rng: draws its shape.
@@ -21,17 +21,20 @@ def drawn(cause, joint, setting, rng):
     return DRAWN[cause](joint, setting, rng)
 
 
-def _elastic(joint, setting, rng):
-    """A spring that grows softer, and a rotor of some share of what the joint moves."""
-    moved = float(setting.typical["inertia"][joint])
-    rotor, damped = float(rng.uniform(0.1, 0.3)) * moved, float(rng.uniform(0.02, 0.06))
+def _heated(joint, setting, rng):
+    """By the work of another joint, in a second or two; its heat is 1 at the usual power."""
+    others = [k for k in setting.machine.driven if k != joint]
+    other = int(rng.choice(others)) if others else joint
+    power = float(setting.typical["force"][other] * setting.typical["speed"][other])
+    force, time = float(setting.typical["force"][joint]), float(rng.uniform(0.5, 2.0))
+    return lambda strength: {"heated": (joint, other, 2 * force * strength, power * time, time)}
 
-    def cause(strength):
-        stiffness = moved * (2 * np.pi * STIFFEST) ** 2 * 0.1 / strength
-        damping = 2 * damped * float(np.sqrt(stiffness * moved))
-        return {"elastic": (joint, rotor * min(strength, 1.0), stiffness, damping)}
 
-    return cause
+def _cogging(joint, setting, rng):
+    """A few teeth over the travel."""
+    tooth = float(setting.typical["travel"][joint] / rng.uniform(3.0, 8.0))
+    force = float(setting.typical["force"][joint])
+    return lambda strength: {"cogging": (joint, 2 * force * strength, tooth)}
 
 
 def _binding(joint, setting, rng):
@@ -59,14 +62,17 @@ def _slip(joint, setting, rng):
     return cause
 
 
-DRAWN = {"elastic": _elastic, "binding": _binding, "slip": _slip}
+DRAWN = {"heated": _heated, "cogging": _cogging, "binding": _binding, "slip": _slip}
 
 
 def plant_of(effects):
     """What is foreign in the plant; None where nothing is."""
-    if "elastic" in effects:
-        joint, *rest = effects["elastic"]
-        return Elastic(int(joint), *rest)
+    if "heated" in effects:
+        joint, other, *rest = effects["heated"]
+        return Heated(int(joint), int(other), *rest)
+    if "cogging" in effects:
+        joint, *rest = effects["cogging"]
+        return Cogging(int(joint), *rest)
     if "binding" in effects:
         joint, *rest = effects["binding"]
         return Binding(int(joint), *rest)

@@ -33,13 +33,63 @@ class Binding:
 
 
 @dataclass(frozen=True)
+class Heated:
+    """Dry friction of a joint that grows with the work that another one's drive has done: a foreign
+    cause. Its heat h follows h' = |power| / `power` - h / `time`.
+    """
+
+    joint: int
+    other: int
+    force: float
+    power: float
+    time: float
+
+
+@dataclass(frozen=True)
+class Cogging:
+    """A ripple along a joint that lags by half a tooth, whichever way it goes: a foreign cause."""
+
+    joint: int
+    force: float
+    tooth: float
+
+    def caught(self, tooth, q):
+        """Where the teeth are, that follow the joint as if with play."""
+        return min(max(tooth, q[self.joint] - 0.5 * self.tooth), q[self.joint] + 0.5 * self.tooth)
+
+    def push(self, tooth, q):
+        return self.force * np.sin(2 * np.pi * self.caught(tooth, q) / self.tooth)
+
+
+@dataclass(frozen=True)
 class Elastic:
-    """A joint whose motor sits behind a spring: a foreign cause. The encoder is the motor's."""
+    """A joint whose motor sits behind a spring, or behind flanks with a gap between them. The
+    encoder is the motor's.
+    """
 
     joint: int
     rotor: float
     stiffness: float
     damping: float
+    gap: float = 0.0
+
+    @property
+    def fastest(self):
+        """rad/s at which the rotor swings on what passes the force on."""
+        return np.sqrt(self.stiffness / self.rotor) + self.damping / self.rotor
+
+    def through(self, apart, speed):
+        """What passes from the motor to the link; flanks push and never pull."""
+        beyond = apart - min(max(apart, -0.5 * self.gap), 0.5 * self.gap)
+        force = self.stiffness * beyond + self.damping * speed
+        if not self.gap:
+            return force
+        return max(force, 0.0) if beyond > 0 else min(force, 0.0) if beyond < 0 else 0.0
+
+    def rests(self, load):
+        """How far the link is ahead of the motor that is held, where `load` pulls at it."""
+        ahead = load / self.stiffness
+        return ahead + 0.5 * self.gap * np.sign(load) * (abs(load) > 1e-9)
 
 
 @dataclass
@@ -56,7 +106,8 @@ class Plant:
         uneven: (joint, least, sine, cosine, period) of dry friction over the joint.
         loads: (joint, motor, external, quadratic) of friction by what the drive carries.
         cold: (joint, dry, viscous, time) of friction that dies away.
-        binding, elastic: see there; None where there is none.
+        memory: (joint, force, way) of friction that builds up over a way (Dahl).
+        binding, elastic, heated, cogging: see there; None where there is none.
     """
 
     model: object
@@ -75,8 +126,11 @@ class Plant:
     uneven: list = field(default_factory=list)
     cold: list = field(default_factory=list)
     loads: list = field(default_factory=list)
+    memory: list = field(default_factory=list)
     binding: Binding | None = None
     elastic: Elastic | None = None
+    heated: Heated | None = None
+    cogging: Cogging | None = None
 
     @cached_property
     def aba(self):
@@ -111,11 +165,13 @@ class Plant:
         rubs = (self.coulomb > 0) | (self.extra > 0)
         if self.binding:
             rubs[self.binding.joint] = True
+        if self.heated:
+            rubs[self.heated.joint] = True
         for joint, *_ in self.uneven + self.cold + self.loads:
             rubs[joint] = True
         return rubs
 
-    def limit(self, t, q, v, drive=None):
+    def limit(self, t, q, v, drive=None, heat=0.0):
         """Largest dry friction of every joint, (N,); `drive` (N,) is asked for by `loads`."""
         limit = self.coulomb
         if self.stribeck:
@@ -123,6 +179,9 @@ class Plant:
         if self.binding:
             limit = limit.copy()
             limit[self.binding.joint] += self.binding.limit(q)
+        if self.heated:
+            limit = limit.copy()
+            limit[self.heated.joint] += self.heated.force * heat
         if self.uneven or self.cold or self.loads:
             limit = limit.copy()
         against = self.needed(q, v) if self.loads else None
@@ -193,7 +252,7 @@ def plant(machine: Machine, effects=None, foreign=None):
     Args:
         machine: as its file describes it.
         effects: coefficients by effect@place; what acts on signals is not looked at.
-        foreign: `Binding`, `Elastic` or None.
+        foreign: `Binding`, `Heated`, `Cogging` or None.
     """
     model = machine.model()
     count = model.nv
@@ -211,7 +270,8 @@ def plant(machine: Machine, effects=None, foreign=None):
         change(made, machine.index(place), c)
     made.data = made.model.createData()
     made.binding = foreign if isinstance(foreign, Binding) else None
-    made.elastic = foreign if isinstance(foreign, Elastic) else None
+    made.heated = foreign if isinstance(foreign, Heated) else None
+    made.cogging = foreign if isinstance(foreign, Cogging) else None
     return made
 
 
@@ -266,7 +326,40 @@ def _cold(plant, joint, c):
     plant.cold.append((joint, *c))
 
 
+FLANKS = 600.0  # rad/s on which what is carried swings on a flank, critically damped
+
+
+def _inertia(plant, joint):
+    """About a joint, all at zero, as the file states it."""
+    import pinocchio
+
+    model = plant.model
+    mass = pinocchio.crba(model, model.createData(), np.zeros(model.nq))
+    return float(mass[joint, joint])
+
+
+def _flexible(plant, joint, c):
+    compliance, ratio, rotor = c
+    moved = _inertia(plant, joint)
+    damping = 2 * ratio * np.sqrt(moved / compliance)
+    plant.elastic = Elastic(joint, rotor * moved, 1 / compliance, damping)
+
+
+def _play(plant, joint, c):
+    gap, rotor = c
+    moved = _inertia(plant, joint)
+    both = moved * rotor / (1 + rotor)
+    plant.elastic = Elastic(joint, rotor * moved, both * FLANKS**2, 2 * both * FLANKS, gap)
+
+
+def _memory(plant, joint, c):
+    plant.memory.append((joint, *c))
+
+
 FORCES = {
+    "joint.flexibility": _flexible,
+    "joint.backlash": _play,
+    "friction.hysteresis": _memory,
     "friction.coulomb": _adds("coulomb"),
     "friction.load": _load,
     "friction.load_direction": _by_side,

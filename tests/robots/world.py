@@ -31,7 +31,7 @@ class World:
     Args:
         machine: as its file describes it.
         effects: coefficients by effect@place.
-        foreign: `plant.Binding`, `plant.Elastic` or None.
+        foreign: of `plant.Binding`, `plant.Heated` or `plant.Cogging`, or None.
         step: the longest step, s.
     """
 
@@ -39,9 +39,8 @@ class World:
         self.machine, self.effects, self.step = machine, dict(effects or {}), step
         self.plant = plant(machine, self.effects, foreign)
         self.drives = Drives.of(machine, self.effects)
-        if foreign := self.plant.elastic:
-            swing = np.sqrt(foreign.stiffness / foreign.rotor)
-            self.step = min(step, 0.5 / swing)  # Runge-Kutta is stable up to 2.8
+        if soft := self.plant.elastic:
+            self.step = min(step, 0.7 / soft.fastest)  # Runge-Kutta is stable up to 2.8
         self.rubs = self.plant.rubs
         self.dry = bool(self.rubs.any())
 
@@ -59,15 +58,21 @@ class _Course:
         self.world, self.plant, self.drives = world, world.plant, world.drives
         self.signals = felt(world.machine, run.times, run.commands, world.effects)
         self.count, self.joints = self.plant.size, world.machine.driven
-        self.elastic = self.plant.elastic
+        self.elastic, self.cogging = self.plant.elastic, self.plant.cogging
         self.state = np.concatenate([run.q, run.v])
+        more = []
         if self.elastic:
             at = self.elastic.joint
-            # At rest the spring carries what the motor holds.
-            twist = -self._settled_force(run)[at] / self.elastic.stiffness
-            rotor = [run.q[at], run.v[at]]
-            self.state[at] = run.q[at] + twist
-            self.state = np.concatenate([self.state, rotor])
+            # Its motor was held, and the link hung on it.
+            load = -self.plant.needed(run.q, run.v)[at]
+            more = [run.q[at], run.v[at]]
+            self.state[at] = run.q[at] + self.elastic.rests(load)
+        # Behind positions and speeds the rotor's, then what friction remembers, then the heat.
+        self.memory = slice(2 * self.count + len(more), None)
+        more += [0.0] * len(self.plant.memory)
+        more += [0.0] if self.plant.heated else []
+        self.state = np.concatenate([self.state, more])
+        self.tooth = run.q[self.cogging.joint] if self.cogging else 0.0
         self.target, self.lagged = self._arrived(0.0), self._arrived(0.0)
         self.begin = 0.0
         self.lags = np.zeros(self.count)
@@ -75,12 +80,6 @@ class _Course:
             self.lags[joint] = self.signals[drive.name].lag
         self.dull = bool(self.lags.any())
         self.way, self.stuck = np.zeros(self.count), np.zeros(self.count, dtype=bool)
-
-    def _settled_force(self, run):
-        first = np.zeros(self.count)
-        for joint, drive in zip(self.joints, self.world.machine.drives, strict=True):
-            first[joint] = self.signals[drive.name].at(0.0)
-        return self.drives.forces(first, run.q, run.v)
 
     def through(self, instants):
         changes = np.concatenate([s.begins for s in self.signals.values()] + [instants])
@@ -101,8 +100,11 @@ class _Course:
     def _row(self):
         q, v = self.state[: self.count].copy(), self.state[self.count : 2 * self.count].copy()
         if self.elastic:
-            q[self.elastic.joint], v[self.elastic.joint] = self.state[-2:]
+            q[self.elastic.joint], v[self.elastic.joint] = self._rotor(self.state)
         return q, v, self.drives.forces(self._commands(self.begin), q, v)
+
+    def _rotor(self, state):
+        return state[2 * self.count : 2 * self.count + 2]
 
     def _arrived(self, t):
         values = np.zeros(self.count)
@@ -127,6 +129,8 @@ class _Course:
         steps = int(np.ceil((end - begin) / self.world.step - 1e-6))
         for now, after in pairwise(np.linspace(begin, end, steps + 1).tolist()):
             self._step(now, after)
+            if self.cogging:
+                self.tooth = self.cogging.caught(self.tooth, self.state)
 
     def _step(self, now, end):
         """From now to end, through whatever comes to rest or breaks loose between them."""
@@ -200,14 +204,16 @@ class _Course:
         if not self.stuck.any():
             return -1.0
         n = self.count
-        q, v = state[:n], state[n : 2 * n]
         need = np.abs(self._holding(t, state)[0])
-        limit = self._limit(t, q, v)[self.stuck]
+        limit = self._limit(t, state)[self.stuck]
         return float(np.max(need - limit * (1 + 1e-9)))
 
-    def _limit(self, t, q, v):
+    def _limit(self, t, state):
         """Largest dry friction of every joint, (N,)."""
+        q, v = state[: self.count], state[self.count : 2 * self.count]
         loaded = self.plant.loads
+        if self.plant.heated:
+            return self.plant.limit(t, q, v, heat=max(state[-1], 0.0))
         drive = self.drives.forces(self._commands(t), q, v) if loaded else None
         return self.plant.limit(t, q, v, drive)
 
@@ -216,7 +222,7 @@ class _Course:
         n = self.count
         q, v = self.state[:n], self.state[n : 2 * n]
         rubs = self.world.rubs
-        limit = self._limit(t, q, v)
+        limit = self._limit(t, self.state)
         resting = rubs & (v == 0.0)
         self.way = np.where(rubs & ~resting, np.sign(v), 0.0)
         self.stuck[:] = False
@@ -238,20 +244,23 @@ class _Course:
         """Of actuators, damping, springs and biases, without dry friction, (N,)."""
         n = self.count
         q, v = state[:n], state[n : 2 * n]
-        if not self.elastic:
-            return self.drives.forces(self._commands(t), q, v) + self.plant.passive(q, v)
-        return self._elastic_forces(t, state)[0]
+        if self.elastic:
+            return self._elastic_forces(t, state)[0]
+        force = self.drives.forces(self._commands(t), q, v) + self.plant.passive(q, v)
+        if self.cogging:
+            force[self.cogging.joint] += self.cogging.push(self.tooth, q)
+        for (joint, dry, _), w in zip(self.plant.memory, state[self.memory], strict=False):
+            force[joint] -= dry * w
+        return force
 
     def _elastic_forces(self, t, state):
         """On the arm, and on the rotor behind the spring; the file's damping is the motor's."""
         n, soft = self.count, self.elastic
         q, v = state[:n].copy(), state[n : 2 * n].copy()
         link = q[soft.joint], v[soft.joint]
-        q[soft.joint], v[soft.joint] = state[2 * n :]
+        q[soft.joint], v[soft.joint] = self._rotor(state)
         outer = self.drives.forces(self._commands(t), q, v) + self.plant.passive(q, v)
-        through = soft.stiffness * (q[soft.joint] - link[0]) + soft.damping * (
-            v[soft.joint] - link[1]
-        )
+        through = soft.through(q[soft.joint] - link[0], v[soft.joint] - link[1])
         rotor = outer[soft.joint] - through
         outer[soft.joint] = through
         return outer, rotor
@@ -260,7 +269,7 @@ class _Course:
         """Friction of the held joints, (S,), and everybody's accelerations, (N,)."""
         n = self.count
         q, v = state[:n], state[n : 2 * n]
-        force = self._force(t, state) - self.way * self._limit(t, q, v)
+        force = self._force(t, state) - self.way * self._limit(t, state)
         rest = force - self.plant.needed(q, v)
         mass, free = self.plant.inertia(q), ~self.stuck
         a = np.zeros(n)
@@ -276,12 +285,18 @@ class _Course:
         else:
             force = self._force(t, state)
             if self.world.dry:
-                force = force - self.way * self._limit(t, q, v)
+                force = force - self.way * self._limit(t, state)
             a = self.plant.accelerations(q, v, force)
-        if not self.elastic:
-            return np.concatenate([v, a])
-        rotor = self._elastic_forces(t, state)[1] / self.elastic.rotor
-        return np.concatenate([v, a, [state[-1], rotor]])
+        more = []
+        if self.elastic:
+            more += [self._rotor(state)[1], self._elastic_forces(t, state)[1] / self.elastic.rotor]
+        # Towards the way that it goes, over the way (Dahl): w' = v / d - |v / d| w.
+        for (joint, _, way), w in zip(self.plant.memory, state[self.memory], strict=False):
+            more.append((v[joint] - abs(v[joint]) * w) / way)
+        if hot := self.plant.heated:
+            drive = self.drives.forces(self._commands(t), q, v)[hot.other]
+            more.append(abs(drive * v[hot.other]) / hot.power - state[-1] / hot.time)
+        return np.concatenate([v, a, more])
 
     def _moved(self, now, h):
         """The state after a step of Runge and Kutta; what is held stays where it is."""

@@ -41,7 +41,9 @@ LEVELS = (0.15, 0.35, 0.6, 0.85, 0.95, 0.99)
 """Shares of the largest input at which limits, dead bands and plays are tried besides."""
 WAYS = (0.003, 0.01, 0.03, 0.1, 0.3)
 """The same of how far a run goes, for gaps."""
-LIMITED = ("drive", "input/s", "level", "travel", "stop")
+GIVES = (0.01, 0.09, 0.6)
+"""Shares of the largest plausible compliance of a joint."""
+LIMITED = ("drive", "input/s", "level", "travel", "stop", "give")
 """What a coefficient is a part of where no small size is like a large one: a limit's takes all
 away, and in a gap nothing is passed on.
 """
@@ -178,7 +180,7 @@ def _limits(world: World, name: str, group: int, shapes: Array | None) -> Iterat
     if not largest.any():
         return
     # A servo's error is largest for a moment after a jump, as a command's rate is.
-    seldom = {"input/s": RATES, "error": RATES, "travel": WAYS}
+    seldom = {"input/s": RATES, "error": RATES, "travel": WAYS, "give": GIVES}
     levels = seldom.get(world.effects[name].coefficients[0].of, LEVELS)
     sizes = [level * largest for level in levels]
     if shapes is not None:

@@ -121,7 +121,8 @@ class World:
         shown = [
             name
             for name, effect in usable.items()
-            if _shows(effect, recorded) and (effect.hook != "hidden" or engine in HIDING)
+            if _shows(effect, recorded)
+            and (effect.hook != "hidden" or kind.has_model or engine in HIDING)
         ]
         self.library = shown if candidates is None else list(candidates)
         self.simulator, self._fine = self._simulators()

@@ -19,5 +19,5 @@ def test_a_lane_alone_moves_as_among_many_and_pays_for_itself_alone(tmp_path):
     alone = np.concatenate([simulator.simulate(row[None], SCENARIO) for row in theta])
     np.testing.assert_array_equal(alone, together)
     assert np.ptp(together[:, -1], axis=0).min() > 1e-4
-    held = {count for _, count in simulator._benches}
+    held = {count for _, count, _ in simulator._benches}
     assert held == {1, 64}, "a batch of one, and the largest for twelve"
