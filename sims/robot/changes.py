@@ -12,11 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from sims import effects as library
 from sims.extended import Number
 from sims.robot.causes import Cause, one_by_one
 from sims.robot.commands import COMMANDS, order
 from sims.robot.model import Robot
 from sims.robot.native import FIELDS
+from sims.robot.series import element, in_series, is_series, name_of, with_flanks
+from sims.robot.series import state as state_element
 from sims.robot.stated import (
     ATTRIBUTES,
     CHOICES,
@@ -29,6 +32,7 @@ from sims.robot.stated import (
     fields,
     lacking,
 )
+from sims.system import Element as Transmission
 
 ROUNDS = 4
 """How often what moves along with a change is stated as it was."""
@@ -38,7 +42,13 @@ CLOSE = 1e-13
 
 KEPT = "as it was: it would move along with another change"
 
+KEYLESS = "keyframes are left out: they lack the coordinates of joints in series"
+
 _NOTES = {
+    "joint.flexibility": "joint.flexibility: the joint has a second one in series, whose position "
+    "begins at zero in the file; damping is a share of the critical one",
+    "joint.backlash": "joint.backlash: the joint has a second one in series, which begins in the "
+    "middle of its gap in the file",
     "friction.coulomb": "friction.coulomb: dry friction is stiff in the file (solreffriction, "
     "solimpfriction), or it would creep",
 }
@@ -50,6 +60,7 @@ class Applied:
     """A robot's model with causes in it.
 
     Attributes:
+        robot: it, with joints in series where causes put some.
         spec: the mujoco.MjSpec.
         model: that, compiled.
         wanted: what the compiled model is to say of every element.
@@ -58,6 +69,7 @@ class Applied:
         said: what it cannot hold, and how what it holds differs, one line each.
     """
 
+    robot: Robot
     spec: Any
     model: Any
     wanted: Fields
@@ -78,10 +90,15 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
         InputError: a place that the robot does not have.
         RuntimeError: the model does not take a change; a fault of the program.
     """
+    found = one_by_one(robot, causes)
+    said = []
+    if any(is_series(library.get(c.effect)) for c in found if c.effect in library.names()):
+        said += [KEYLESS] if robot.compiled.nkey else []
+        robot = _in_series(robot, found)
     wanted = fields(robot.compiled)
     comments: dict[Element, list[str]] = {}
-    held, said = [], []
-    for cause in sorted(one_by_one(robot, causes), key=order):
+    held = []
+    for cause in sorted(found, key=order):
         before = {name: values.copy() for name, values in wanted.items()}
         answer = _write(wanted, robot, cause)
         if answer and not answer.startswith("+"):
@@ -91,16 +108,39 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
         note = f"{cause.effect}: {answer[1:]}" if answer else _NOTES.get(cause.effect)
         if note and note not in said:
             said.append(note)
-        for statement in differing(robot.compiled, before, wanted, 0.0):
-            comments.setdefault(statement.element, []).append(cause.told(recording))
+        changed = [one.element for one in differing(robot.compiled, before, wanted, 0.0)]
+        if name_of(cause.place, cause.effect) in robot.series:
+            second = Element("joint", robot.joint(name_of(cause.place, cause.effect)).id)
+            changed += [] if second in changed else [second]
+        for one in changed:
+            comments.setdefault(one, []).append(cause.told(recording))
     spec, model = _compiled(robot, wanted)
-    return Applied(spec, model, wanted, comments, tuple(held), tuple(said))
+    return Applied(robot, spec, model, wanted, comments, tuple(held), tuple(said))
+
+
+def _in_series(robot: Robot, causes: Sequence[Cause]) -> Robot:
+    """The robot with the joints that some of its causes put in series with others."""
+    there = [c for c in causes if c.effect in library.names()]
+    there = [c for c in there if is_series(library.get(c.effect))]
+    added = tuple((c.place, c.effect) for c in there)
+    gaps = {
+        name_of(c.place, c.effect): float(_element(c).gap[0]) for c in there if _element(c).gap[0]
+    }
+    return with_flanks(in_series(robot, added), gaps)
+
+
+def _element(cause: Cause) -> Transmission:
+    numbers = {name: np.array([number.value]) for name, number in cause.numbers.items()}
+    return element(library.get(cause.effect), numbers)
 
 
 def _write(wanted: Fields, robot: Robot, cause: Cause) -> str | None:
     """Let a cause change the fields."""
     if cause.effect in FIELDS:
         FIELDS[cause.effect].write(wanted, robot, cause.place, cause.coefficients[:, None])
+        return None
+    if name_of(cause.place, cause.effect) in robot.series:
+        state_element(wanted, robot, cause.place, cause.effect, _element(cause))
         return None
     if cause.effect in COMMANDS:
         return COMMANDS[cause.effect](wanted, robot, cause)

@@ -5,7 +5,6 @@ every step, of all lanes at once.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -76,6 +75,7 @@ class Forces:
         count: how many lanes.
         addresses: of the joints.
         stiffness: (L, D) of their position servos.
+        step: seconds.
     """
 
     def __init__(
@@ -85,6 +85,7 @@ class Forces:
         count: int,
         addresses: Addresses,
         stiffness: Array | None = None,
+        step: float = 0.0,
     ) -> None:
         self._system = system
         self._stiffness = stiffness
@@ -100,7 +101,8 @@ class Forces:
             self.rubs[:, effect.coordinate] |= (c != 0).any(axis=0)[:, 0]
         self._hidden = [(e, c) for e, c in acting if isinstance(e, Hidden) and not is_series(e)]
         self._states: list[State] = []
-        self._last: RobotMoment | None = None
+        self._last: float | None = None
+        self._half = 0.5 * step
 
     def at(
         self, t: float, x: Array, v: Array, inputs: Mapping[str, Array], carried: Array
@@ -121,18 +123,17 @@ class Forces:
         return force, limit
 
     def _remembered(self, moment: RobotMoment) -> Array:
-        """(L, D) forces of effects with states, which go on to this instant."""
-        before, self._last = self._last, moment
+        """(L, D) forces of effects with states, which go from the middle of the last step to that
+        of this one.
+        """
+        now = float(moment.t[0, 0])
         total = np.zeros_like(moment.x)
         for k, (effect, c) in enumerate(self._hidden):
-            if before is None:
+            if self._last is None:
                 self._states.append(effect.begin(c, moment))
-                ahead = self._states[k]
-            else:
-                step = float(moment.t[0, 0] - before.t[0, 0])
-                midway = replace(before, v=0.5 * (before.v + moment.v))
-                self._states[k] = advanced(effect, c, midway, self._states[k], step)
-                ahead = advanced(effect, c, moment, self._states[k], 0.5 * step)
-            force, _ = effect.act(c, moment, ahead)
+            step = self._half if self._last is None else now - self._last
+            self._states[k] = advanced(effect, c, moment, self._states[k], step)
+            force, _ = effect.act(c, moment, self._states[k])
             total += np.where(c[0] > 0, force, 0.0)
+        self._last = now
         return total

@@ -214,9 +214,9 @@ class Bench:
 
     def spread(self, forces: Array) -> Array:
         """Generalised forces (..., nv) of the file's model as this one has them."""
-        own = np.setdiff1d(np.arange(self.model.nv), self.second.velocities)
-        if own.size == forces.shape[-1]:
+        if self.model.nv == forces.shape[-1]:
             return forces
+        own = np.setdiff1d(np.arange(self.model.nv), self.second.velocities)
         result = np.zeros((*forces.shape[:-1], self.model.nv))
         result[..., own] = forces
         return result

@@ -34,6 +34,7 @@ class Tag:
         renamed: its new name.
         before: comments that are to stand before it.
         within: elements, with their comments, that are to be its first.
+        after: elements that are to stand behind it.
         text: of another file, to stand in its place.
     """
 
@@ -48,13 +49,14 @@ class Tag:
     renamed: str = ""
     before: list[str] = field(default_factory=list)
     within: list[tuple[list[str], str]] = field(default_factory=list)
+    after: list[str] = field(default_factory=list)
     text: bytes | None = None
 
     @property
     def changed(self) -> bool:
         """Whether anything in it or below it changes."""
         own = self.new or self.removed or self.renamed or self.before or self.within
-        return bool(own) or any(child.changed for child in self.children)
+        return bool(own or self.after) or any(child.changed for child in self.children)
 
     def says(self, name: str) -> str | None:
         """The value of an attribute."""
@@ -162,7 +164,9 @@ class Markup:
         if tag.renamed:
             closing = closing.replace(tag.name.encode(), tag.renamed.encode(), 1)
         inside = self._written(tag.inside, tag.end, tag.children)
-        return b"".join([*comments, self._start(tag), self._first(tag, indent), inside, closing])
+        behind = [self._newline + indent + element.encode() for element in tag.after]
+        whole = [self._start(tag), self._first(tag, indent), inside, closing]
+        return b"".join([*comments, *whole, *behind])
 
     def _first(self, tag: Tag, indent: bytes) -> bytes:
         """Elements that are new, before all others."""

@@ -59,6 +59,8 @@ ENCODERS = frozenset({"sensor.slip"})
 """Effects on what counts a position, and on no other channel."""
 TYPICAL = {"hinge": 0.5, "slide": 5.0}
 """A force for which the plausible ranges of the library are meant: N m on a hinge, N on a slide."""
+SHAPES = 6
+"""Sizes tried of what shapes an effect with a state: each is followed through time."""
 SLOWEST = 15.0
 """rad/s; what is carried swings no slower on a joint that gives."""
 _KINDS: Mapping[str, Kind] = {"hinge": "rotary", "slide": "linear"}
@@ -126,7 +128,11 @@ def at_place(effect: type[Effect], spot: Spot) -> type[Effect]:
     elif issubclass(effect, Hidden):
         changed["act"] = _act_of(effect)
         declared = effect.between or effect.coefficients
-        coefficients = [_of_spot(effect, c, spot) for c in declared if not _has(spot, c)]
+        coefficients = [_tried(_of_spot(effect, c, spot)) for c in declared if not _has(spot, c)]
+        own = [f"{other}@{spot.name}" for other in effect.contains]
+        # What the drive weighs, where it gives nothing.
+        own += [f"inertia.armature@{spot.name}" for c in coefficients if c.of == "rotor"]
+        changed["contains"] = tuple(own)
     return _made(effect, f"{effect.name}@{spot.name}", spot.name, coefficients, changed)
 
 
@@ -155,6 +161,14 @@ def _has(spot: Spot, c: Coefficient) -> bool:
     """Whether the file states what a coefficient is of."""
     stated = spot.stated.get("inertia.armature", 0.0)
     return c.of == "rotor" and stated > c.plausible[0][0] * spot.inertia
+
+
+def _tried(c: Coefficient) -> Coefficient:
+    """With a few sizes from which a search begins, where it shapes an effect with a state."""
+    low, high = c.plausible[0]
+    if c.tried or low <= 0:
+        return c
+    return replace(c, tried=tuple(np.geomspace(low, high, SHAPES).tolist()))
 
 
 def _act_of(effect: type[Hidden]) -> Callable[..., tuple[Array, Array]]:

@@ -19,8 +19,6 @@ from sims.system import Hidden, Moment, State
 
 NUDGE = 1e-6
 """Of a state, by which its rate is differentiated."""
-STILL = 1e-3
-"""rad/s or m/s at which it is asked how a state changes with the position."""
 
 
 def advanced(effect: Hidden, c: Array, moment: Moment, state: State, step: float) -> State:
@@ -32,17 +30,6 @@ def advanced(effect: Hidden, c: Array, moment: Moment, state: State, step: float
     phi = np.where(near, 1.0 + 0.5 * z, np.expm1(z) / np.where(near, 1.0, z))
     v = state.v + step * phi * rate  # (1)
     return State(state.x + 0.5 * step * (state.v + v), v)
-
-
-def moved(effect: Hidden, c: Array, moment: RobotMoment, state: State, by: Array) -> State:
-    """Its state where the robot stands `by` (L, D) further on its way, as long as it goes on the
-    same way: a state that follows the way, and not the time.
-    """
-    way = np.where(moment.v < 0, -STILL, STILL)
-    slow = RobotMoment(**{**vars(moment), "v": way})
-    _, rate = effect.act(c, slow, state)
-    own = by[:, effect.coordinate, None] / way[:, effect.coordinate, None]
-    return State(state.x + state.v * own, state.v + rate * own)
 
 
 def along(effect: Hidden, c: Array, moment: RobotMoment, step: float) -> State:

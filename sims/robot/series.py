@@ -99,7 +99,8 @@ def in_series(robot: Robot, added: Added) -> Robot:
         play = effect.endswith("backlash")
         limited = mujoco.mjtLimited
         second.limited = limited.mjLIMITED_TRUE if play else limited.mjLIMITED_FALSE
-        second.range = (-1.0, 1.0)
+        if play:
+            second.range = (-1.0, 1.0)
         # Lanes have more; here it only has to compile.
         first.armature = max(first.armature, SLIGHT * inertias[name])
     # Poses that are kept lack the new coordinates.
@@ -144,10 +145,29 @@ def write(fields: Mapping[str, Any], robot: Robot, effect: Effect, c: Array) -> 
         effect: at its place.
         c: (K, L) its coefficients there.
     """
-    assert isinstance(effect, Hidden)
-    made = effect.element(_all(effect, c))
-    place = effect.place
-    second = robot.joint(name_of(place, effect.of))
+    numbers = dict(zip((one.name for one in effect.coefficients), c, strict=True))
+    state(fields, robot, effect.place, effect.of, element(type(effect), numbers))
+
+
+def element(kind: type[Effect], numbers: Mapping[str, Array]) -> Element:
+    """The element that an effect is by its coefficients (L,); those that a place lacks are zero."""
+    assert issubclass(kind, Hidden)
+    first = next(iter(numbers.values()))
+    values = [numbers.get(one.name, np.zeros_like(first)) for one in kind.between]
+    return kind().element(np.stack(values))
+
+
+def state(fields: Mapping[str, Any], robot: Robot, place: str, effect: str, made: Element) -> None:
+    """Write elements (L,) into fields of models.
+
+    Args:
+        fields: of the models.
+        robot: of `in_series`.
+        place: the joint with which they are in series.
+        effect: the name of what they are.
+        made: they.
+    """
+    second = robot.joint(name_of(place, effect))
     inertia = robot.series[second.name]
     dof = robot.joint(place).velocity
     stated = fields["dof_armature"][:, dof]
@@ -159,10 +179,31 @@ def write(fields: Mapping[str, Any], robot: Robot, effect: Effect, c: Array) -> 
     stiffness, damping = _stepped(made, inertia, drive, step, int(number) == RK4)
     fields["jnt_stiffness"][:, second.id] = stiffness
     fields["dof_damping"][:, second.velocity] = damping
-    half = 0.5 * made.gap
-    fields["jnt_range"][:, second.id] = np.stack([-half, half], axis=1)
-    fields["jnt_solref"][:, second.id] = 2.0 * step, 1.0
-    fields["jnt_solimp"][:, second.id] = HARD
+    if "jnt_range" in fields:
+        half = 0.5 * made.gap
+        fields["jnt_range"][:, second.id] = np.stack([-half, half], axis=1)
+        fields["jnt_solref"][:, second.id] = _hard(step)
+        fields["jnt_solimp"][:, second.id] = HARD
+
+
+def _hard(step: float) -> tuple[float, float]:
+    """`solref` of flanks: as stiff as a step bears."""
+    return 2.0 * step, 1.0
+
+
+def with_flanks(robot: Robot, gaps: Mapping[str, float]) -> Robot:
+    """The robot of `in_series` whose file is to state these gaps, by name of the second joint."""
+    spec = robot.spec.copy()
+    for joint in spec.joints:
+        if joint.name not in gaps:
+            continue
+        half = 0.5 * gaps[joint.name]
+        turns = robot.joint(joint.name).kind == "hinge" and spec.compiler.degree
+        half = float(np.rad2deg(half)) if turns else half
+        joint.range = (-half, half)
+        joint.solref_limit = _hard(float(robot.compiled.opt.timestep))
+        joint.solimp_limit = HARD
+    return replace(robot, spec=spec)
 
 
 def _stepped(
@@ -179,12 +220,6 @@ def _stepped(
         return stiffness, np.minimum(damping, RESOLVED / step / softened)
     # Where dampings are implicit so is a stiffness, by the backward rule: k (d + h d').
     return made.stiffness, damping + step * (made.stiffness - stiffness)
-
-
-def _all(effect: Hidden, c: Array) -> Array:
-    """(K, L) coefficients, zero of those that it lacks at its place."""
-    values = dict(zip((one.name for one in effect.coefficients), c, strict=True))
-    return np.stack([values.get(one.name, np.zeros_like(c[0])) for one in effect.between])
 
 
 def hung(fields: Mapping[str, Any], robot: Robot, loads: Sequence[Array]) -> list[Array]:

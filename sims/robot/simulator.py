@@ -285,7 +285,7 @@ class RobotSimulator(Simulated):
         record = list(dict.fromkeys(record))
         if asked:
             stiffness = bench.stiffness(places)[:n]
-            asking = Forces(self.robotic, start.acting, n, places, stiffness)
+            asking = Forces(self.robotic, start.acting, n, places, stiffness, self.step)
             forces = bench.spread(given.forces)
             done = bench.ask(given.controls, forces, given.felt, asking, self.step, record)
         else:

@@ -32,7 +32,7 @@ from sims.robot.acting import is_asked, natives
 from sims.robot.forces import LOADED, moment_of
 from sims.robot.lanes import Addresses, Bench, Places
 from sims.robot.moment import RobotMoment
-from sims.robot.remembered import advanced, along, moved
+from sims.robot.remembered import advanced, along
 from sims.robot.system import RobotSystem
 from sims.system import Acting, Effect, Force, Friction, Hidden, State
 
@@ -159,6 +159,7 @@ class Tangent:
         bench.load(_repeated(acting, bench.count))
         self._stiffness = bench.stiffness(places)[:1]
         self._states = [self._gone(effect, c) for effect, c in self._asked]
+        self._after: dict[int, State] = {}
         bench.batch.reset(stage=0)
         self._fresh = bench.batch.state.copy()
         self._base, self._read = self._advanced({}, acting)
@@ -168,7 +169,7 @@ class Tangent:
 
     @property
     def size(self) -> int:
-        """Numbers of a state: positions, velocities, activations."""
+        """Numbers of a state: positions, velocities, activations, what effects remember."""
         return int(self._base.shape[1])
 
     # -- one step from every instant that is looked at
@@ -186,6 +187,7 @@ class Tangent:
             parts = [bind("qpos")[:n, places.positions], bind("qvel")[:n, places.velocities]]
             if self._motion.act.shape[1]:
                 parts.append(bind("act")[:n])
+            parts += [state.v for state in self._after.values()]
             states.append(np.concatenate(parts, axis=1))
             readings.append(self._readings(n))
         return np.concatenate(states), np.concatenate(readings)
@@ -241,12 +243,15 @@ class Tangent:
             if na:
                 bind("act")[:n] = motion.act[at]
             for name, (k, size) in moved.items():
-                targets[name](k)[:n] += size
-            self._ask(at, n)
+                if name != "w":
+                    targets[name](k)[:n] += size
+            self._ask(at, n, dict([moved["w"]]) if "w" in moved else {})
             yield n, None if n == count else np.arange(n)
 
-    def _ask(self, at: Places, n: int) -> None:
-        """Add the forces of effects that hang on where the robot is, at the lanes' own states."""
+    def _ask(self, at: Places, n: int, remembered: Mapping[int, float]) -> None:
+        """Add the forces of effects that hang on where the robot is, at the lanes' own states; what
+        some of them remember is moved, by their numbers.
+        """
         if not self._asked:
             return
         bind, places = self._bench.batch.bind, self._places
@@ -264,9 +269,10 @@ class Tangent:
         for k, (effect, c) in enumerate(self._asked):
             own = np.repeat(c, n, axis=1)
             if isinstance(effect, Hidden):
-                state = State(self._states[k].x[at], self._states[k].v[at])
-                state = moved(effect, own, moment, state, x - motion.x[at])
+                known = self._states[k]
+                state = State(known.x[at], known.v[at] + remembered.get(k, 0.0))
                 ahead = advanced(effect, own, moment, state, 0.5 * motion.step)
+                self._after[k] = advanced(effect, own, moment, state, motion.step)
                 force, _ = effect.act(own, moment, ahead)
                 bind("qfrc_applied")[:n, places.velocities] += force
             elif isinstance(effect, Friction):
@@ -283,10 +289,13 @@ class Tangent:
     def _quotients(self) -> Quotients:
         size = self._motion.x.shape[1]
         na, nu = self._motion.act.shape[1], self._motion.controls.shape[1]
+        # What effects remember stands behind the activations.
+        remembered = list(self._after)
         moves: dict[str, list[tuple[str, int, float]]] = {
             "z": [("q", j, POSITION) for j in range(size)]
             + [("v", j, VELOCITY) for j in range(size)]
-            + [("a", j, CONTROL) for j in range(na)],
+            + [("a", j, CONTROL) for j in range(na)]
+            + [("w", k, CONTROL) for k in remembered],
             "f": [("f", j, SHARE * float(self._sizes[j])) for j in range(size)],
             "u": [("u", j, CONTROL) for j in range(nu)],
         }
@@ -299,7 +308,7 @@ class Tangent:
                 readings.append((reading - self._read) / by)
             rows = self._looks.size
             found[kind] = (
-                np.stack(states, axis=2) if states else np.zeros((rows, 2 * size + na, 0)),
+                np.stack(states, axis=2) if states else np.zeros((rows, self.size, 0)),
                 np.stack(readings, axis=2) if readings else np.zeros((rows, len(self._outputs), 0)),
             )
         return Quotients(*(found[k][i] for i in range(2) for k in ("z", "f", "u")))

@@ -15,10 +15,11 @@ from sims.extended import Number
 from sims.robot.causes import one_by_one
 from sims.robot.changes import CLOSE, KEPT, ROUNDS, Applied, apply
 from sims.robot.document import Document
-from sims.robot.markup import UnfitError, heading
+from sims.robot.markup import UnfitError, heading, numbers
 from sims.robot.mjcf_out import Writer
 from sims.robot.model import Robot
 from sims.robot.precise import saved, unlike
+from sims.robot.quiet import quiet
 from sims.robot.stated import Statement, lacking
 from sims.robot.urdf_out import UrdfWriter
 
@@ -64,14 +65,51 @@ def written(robot: Robot, causes: Causes, recording: str = "") -> Written:
             raise UnfitError("it is a URDF")
         if robot.actuator_tables:
             raise UnfitError("its actuators are the recording's")
-        text = Edit(robot, applied, recording, robot.path.read_bytes()).stated()
+        text = Edit(applied.robot, applied, recording, with_series(applied)).stated()
     except UnfitError as unfit:
         if robot.format == "mjcf":
             said.append(f"the MJCF is as MuJoCo writes it, not as {robot.path.name}: {unfit}")
         saving = saved(applied.spec, robot.path.resolve().parent)
-        text = Edit(robot, applied, recording, saving.encode()).stated()
+        text = Edit(applied.robot, applied, recording, saving.encode()).stated()
     urdf = _urdf(robot, causes, recording, said) if robot.format == "urdf" else None
     return Written(text, urdf, tuple(said), applied)
+
+
+def with_series(applied: Applied) -> bytes:
+    """The text of a robot's file, with the joints that are in series with its own."""
+    robot = applied.robot
+    text = robot.path.read_bytes()
+    if not robot.series:
+        return text
+    document = Document(text, robot.path)
+    tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
+    for second in (joint for joint in robot.spec.joints if joint.name in robot.series):
+        first = tags.get(second.name.rpartition("_")[0])
+        if first is None:
+            raise UnfitError(f"no joint of its text is in series with {second.name}")
+        first.after.append(_joint(second))
+    return document.written().encode()
+
+
+def _joint(second: Any) -> str:
+    """A joint in series as an element; whatever the file's defaults say is said of others."""
+    kind = "slide" if str(second.type).endswith("SLIDE") else "hinge"
+    plays = str(second.limited).endswith("TRUE")
+    attributes = {
+        "name": second.name,
+        "type": kind,
+        "axis": numbers(tuple(second.axis)),
+        "pos": numbers(tuple(second.pos)),
+        "limited": "true" if plays else "false",
+        "actuatorfrclimited": "false",
+    }
+    if plays:
+        attributes["range"] = numbers(tuple(second.range))
+        attributes["solreflimit"] = numbers(tuple(second.solref_limit))
+        attributes["solimplimit"] = numbers(tuple(second.solimp_limit))
+    attributes |= dict.fromkeys(("damping", "frictionloss", "armature", "stiffness"), "0")
+    said = " ".join(f'{name}="{value}"' for name, value in attributes.items())
+    return f"<joint {said}/>"
 
 
 def _urdf(robot: Robot, causes: Causes, recording: str, said: list[str]) -> str | None:
@@ -158,6 +196,7 @@ def compiled(text: str) -> Any:
     import mujoco
 
     try:
-        return mujoco.MjSpec.from_string(text).compile()
+        with quiet():
+            return mujoco.MjSpec.from_string(text).compile()
     except ValueError as error:
         raise UnfitError(f"MuJoCo refuses it: {' '.join(str(error).split())}") from None

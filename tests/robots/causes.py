@@ -27,7 +27,8 @@ SIMPLER = {
     "input.power": "input.gain",
     "friction.load_direction": "friction.load", "friction.load_quadratic": "friction.load",
     "friction.position": "friction.coulomb", "friction.warming": "friction.coulomb",
-    "friction.hysteresis": "friction.coulomb",
+    "friction.hysteresis": "friction.coulomb", "joint.flexibility": "inertia.armature",
+    "joint.backlash": "inertia.armature",
 }  # fmt: skip
 SIGNED = (
     "force.bias", "mass.scale", "inertia.scale", "input.gain", "input.bias", "sensor.bias",
@@ -222,16 +223,21 @@ def _hysteresis(place, setting, rng):
     return lambda s: (typical["force"] * s, way)
 
 
+def _rotor(rng):
+    """Of what a joint moves; no file states it, and a heavy one alone would show."""
+    return float(rng.uniform(0.015, 0.04))
+
+
 def _flexible(place, setting, rng):
     """A spring that grows softer: at strength 0.1 what is carried swings at 10 Hz on it."""
     inertia = _at(setting, place)["inertia"]
-    ratio, rotor = float(rng.uniform(0.02, 0.1)), float(rng.uniform(0.1, 0.3))
+    ratio, rotor = float(rng.uniform(0.02, 0.1)), _rotor(rng)
     return lambda s: (10.0 * s / (inertia * (2 * np.pi * STIFFEST) ** 2), ratio, rotor)
 
 
 def _play(place, setting, rng):
     """A gap of up to a tenth of the travel."""
-    rotor = float(rng.uniform(0.1, 0.3))
+    rotor = _rotor(rng)
     return lambda s: (0.1 * _at(setting, place)["travel"] * s, rotor)
 
 

@@ -6,7 +6,7 @@ import pytest
 from tests.robots import reference, robots
 from tests.robots.friction import held
 from tests.robots.machines import Drive, Machine
-from tests.robots.plant import Binding, Elastic
+from tests.robots.plant import Binding
 from tests.robots.world import Run, World
 
 pytest.importorskip("pinocchio", reason="pin has no wheel here")
@@ -184,9 +184,8 @@ def test_an_armature_slows_a_joint_by_what_it_adds():
 
 def test_an_elastic_joint_swings_at_the_frequency_of_two_masses_and_a_spring():
     """w^2 = k (1/J1 + 1/J2), about the common motion."""
-    soft = Elastic(0, 0.1, 20.0, 0.0)
     kick = np.where(STAMPS < 0.02, 10.0, 0.0)
-    world = World(roller(), foreign=soft)
+    world = World(roller(), {"joint.flexibility@axle": (1 / 20.0, 0.0, 0.25)})
     motion = world.move(Run(STAMPS, {"m_axle": kick}, np.zeros(1), np.zeros(1)), STAMPS)
     late = STAMPS > 0.5
     line = np.polyfit(STAMPS[late], motion.q[late, 0], 1)

@@ -203,7 +203,6 @@ class _Course:
         """By how much the worst of the held joints needs more than its friction; -1 with none."""
         if not self.stuck.any():
             return -1.0
-        n = self.count
         need = np.abs(self._holding(t, state)[0])
         limit = self._limit(t, state)[self.stuck]
         return float(np.max(need - limit * (1 + 1e-9)))

@@ -181,7 +181,11 @@ def _limits(world: World, name: str, group: int, shapes: Array | None) -> Iterat
         return
     # A servo's error is largest for a moment after a jump, as a command's rate is.
     seldom = {"input/s": RATES, "error": RATES, "travel": WAYS, "give": GIVES}
-    levels = seldom.get(world.effects[name].coefficients[0].of, LEVELS)
+    of = world.effects[name].coefficients[0].of
+    levels = seldom.get(of, LEVELS)
+    if of == "travel" and world.linear:
+        # A robot's lanes cost a hundred times as much.
+        levels = WAYS[1:4]
     sizes = [level * largest for level in levels]
     if shapes is not None:
         sizes = [np.append(size, shape) for shape in shapes for size in sizes]

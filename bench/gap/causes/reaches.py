@@ -40,7 +40,10 @@ def reach(world: World, name: str) -> Array:
     effect = world.effects[name]
     members = getattr(effect, "members", ()) or (effect,)
     of = effect.coefficients[0].of
-    if of in ("drive", "give") or (of == "level" and not _recorded(world, effect)):
+    if of == "give":
+        # What shapes it stands behind.
+        return np.array([parameters_of(world, name)[0].bounds[1]])
+    if of == "drive" or (of == "level" and not _recorded(world, effect)):
         # How large a force gets is not recorded: what is plausible has to do.
         return np.array([p.bounds[1] for p in parameters_of(world, name)])
     if of == "travel":

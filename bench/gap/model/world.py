@@ -84,6 +84,7 @@ class World:
             (`bench.gap.model.tangents`).
         derivatives: (R, T, C, s) by initial states, where they have been taken from a tangent.
         neighbourhoods: of runs of a robot, that were asked for last (`bench.gap.model.tangents`).
+        simulated: what effects without a tangent change about them, by name and coefficients.
         crew: who simulates and fits; this process alone, unless another is put here.
 
     Args:
@@ -152,6 +153,7 @@ class World:
         self.derivatives: Array | None = None
         self.correction: Array | None = None
         self.neighbourhoods: dict[tuple[int, bytes, bytes], Any] = {}
+        self.simulated: dict[tuple[str, bytes], Array] = {}
         self.simulations = 0
         self.watch = Watch()
         self.crew = Crew()

@@ -182,16 +182,19 @@ class _Shown:
 
     def shown(self, another: Mapping[str, float]) -> Shown:
         """Of each coefficient that scales, at the shape that shows best."""
-        best: dict[tuple[str, int], int] = {}
-        for k, probe in enumerate(self.found.probes):
-            key = probe.effect, probe.place
-            if not probe.fixed and (key not in best or self.powers[k] > self.powers[best[key]]):
-                best[key] = k
+        shapes: dict[tuple[str, int], list[int]] = {}
+        for k in np.argsort(-self.powers, kind="stable").tolist():
+            probe = self.found.probes[k]
+            if not probe.fixed:
+                shapes.setdefault((probe.effect, probe.place), []).append(k)
+        best = {key: places[0] for key, places in shapes.items()}
         limits = dict.fromkeys(probe.effect for probe in self.found.probes if probe.fixed)
         reaches = {}
-        for (name, place), k in best.items():
-            if name not in limits and not self._told_already(name, k, best):
-                reaches[name, self._coefficient(name, place)] = self._proportional(k)
+        for (name, place), places in shapes.items():
+            # At the shape that shows best a richer law may be the simpler one that it contains.
+            own = [k for k in places if not self._told_already(name, k, best)]
+            if name not in limits and own:
+                reaches[name, self._coefficient(name, place)] = self._proportional(own[0])
         for name in limits:
             reaches[name, self._coefficient(name, 0)] = self._limit(name)
         return Shown(self.free, self.covariance, reaches, another)
