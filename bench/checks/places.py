@@ -11,7 +11,7 @@ import numpy as np
 from bench.checks.arm import OBSERVED, arm, placed, scenario
 from bench.checks.base import CheckError, NotApplicable, require, same_bits
 from sims.base import Array, InputError
-from sims.system import Effect, Force, Friction, Sensor, Value
+from sims.system import Effect, Force, Friction, Hidden, Sensor, State, Value
 
 NOWHERE = NotApplicable("a robot has no place for it")
 _SHARES = (0.3, 0.9)
@@ -156,7 +156,9 @@ def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
 
     if effect.of in FIELDS and isinstance(effect, Value | Force | Friction):
         return _written(effect, c, kind)
-    if isinstance(effect, Force | Friction):
+    if isinstance(effect, Hidden) and effect.between:
+        return _put_in_series(effect, c, kind)
+    if isinstance(effect, Force | Friction | Hidden):
         return _pushed(effect, c, kind)
     return (effect.signal,) if c.any() else ()
 
@@ -182,7 +184,22 @@ def _written(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
     return tuple(changes)
 
 
-def _pushed(effect: Force | Friction, c: Array, kind: type) -> tuple[object, ...]:
+def _put_in_series(effect: Hidden, c: Array, kind: type) -> tuple[object, ...]:
+    """Numbers of the joint in series with its own that it writes, by the joint's number."""
+    from sims.robot import series
+
+    if not c.any():
+        return ()
+    robot = series.in_series(kind.robot, ((effect.place, effect.of),))  # type: ignore[attr-defined]
+    model = robot.compiled
+    fields = {name: np.repeat(np.array(getattr(model, name))[None], 2, 0) for name in series.FIELDS}
+    before = {name: values.copy() for name, values in fields.items()}
+    series.write(fields, robot, effect, c[:, :, 0])
+    changed = [name for name, values in fields.items() if (values != before[name]).any()]
+    return tuple((name, effect.place) for name in changed)
+
+
+def _pushed(effect: Force | Friction | Hidden, c: Array, kind: type) -> tuple[object, ...]:
     """Coordinates along which it pushes or rubs."""
     from sims.robot.forces import moment_of
 
@@ -194,7 +211,10 @@ def _pushed(effect: Force | Friction, c: Array, kind: type) -> tuple[object, ...
     moment = moment_of(system, np.full((2, 1), 0.4), x, 1.0 - x, inputs, carried, stiffness)
     if isinstance(effect, Friction):
         return (effect.coordinate,) if np.any(effect.limit(c, moment)) else ()
-    force = effect.force(c, moment)
+    if isinstance(effect, Hidden):
+        force, _ = effect.act(c, moment, State(np.full((2, 1), 0.1), np.full((2, 1), 0.5)))
+    else:
+        force = effect.force(c, moment)
     return tuple(int(joint) for joint in np.unique(np.nonzero(force)[1]))
 
 

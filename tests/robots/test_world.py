@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
+from sims.base import Scenario
+from sims.robot.reading import read
+from sims.robot.simulator import robot_simulator
 from tests.robots import reference, robots
 from tests.robots.friction import held
 from tests.robots.machines import Drive, Machine
-from tests.robots.plant import Binding
-from tests.robots.world import Run, World
+from tests.robots.plant import Binding, Cogging, Heated
+from tests.robots.world import Run, World, _Course
 
 pytest.importorskip("pinocchio", reason="pin has no wheel here")
 STAMPS = np.arange(401) / 100
@@ -193,6 +196,86 @@ def test_an_elastic_joint_swings_at_the_frequency_of_two_masses_and_a_spring():
     turns = STAMPS[late][1:][np.diff(np.sign(swing)) != 0]
     expected = np.sqrt(20.0 * (1 / 0.1 + 1 / 0.4))
     assert np.pi / np.mean(np.diff(turns)) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_gap_is_passed_alone_and_a_flank_takes_the_link_along():
+    """A tenth of the roller's inertia is the motor's: it goes ten times as fast as both would."""
+    gap, pull = 0.02, np.full(STAMPS.size, 0.1)
+    world = World(roller(), {"joint.backlash@axle": (gap, 0.1)})
+    motion = world.move(Run(STAMPS, {"m_axle": pull}, np.zeros(1), np.zeros(1)), STAMPS)
+    meets = np.sqrt(2 * 0.04 * gap / 2 / 0.1)
+    alone = meets > STAMPS
+    np.testing.assert_allclose(motion.q[alone, 0], 0.5 * 0.1 / 0.04 * STAMPS[alone] ** 2, atol=1e-9)
+    later, speed = STAMPS[-1] - meets, 0.1 * meets / 0.44
+    expected = gap / 2 + speed * later + 0.5 * 0.1 / 0.44 * later**2
+    assert motion.q[-1, 0] == pytest.approx(expected, rel=1e-2)
+
+
+def test_friction_that_remembers_takes_its_energy_over_its_way():
+    """J v^2 / 2 = u x - F (x - d (1 - exp(-x / d)))."""
+    dry, way, pull = 0.3, 0.1, np.full(STAMPS.size, 0.4)
+    world = World(roller(), {"friction.hysteresis@axle": (dry, way)})
+    motion = world.move(Run(STAMPS, {"m_axle": pull}, np.zeros(1), np.zeros(1)), STAMPS)
+    q, v = motion.q[:, 0], motion.v[:, 0]
+    work = 0.4 * q - dry * (q - way * (1 - np.exp(-q / way)))
+    np.testing.assert_allclose(0.5 * 0.4 * v**2, work, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("effect", "c", "close"),
+    [
+        ("joint.flexibility", (0.02, 0.05, 0.15), 2e-3),
+        ("joint.backlash", (0.01, 0.15), 0.03),
+        ("friction.hysteresis", (0.02, 0.03), 3e-3),
+    ],
+)
+def test_the_library_moves_as_this_world_does(effect, c, close, tmp_path):
+    """An arm of two joints, the second one's drive on a spring, with play, or rubbing with memory:
+    by how much motions differ, as a share of what the effect changes.
+    """
+    machine = robots.machine("arm2-motor", np.random.default_rng(5))
+    run = driven(machine, 0.5, stamps=np.arange(101) / 100)
+    name = f"{effect}@{machine.joints[1]}"
+    bare, hidden = (World(machine, of).move(run, run.times).q for of in ({}, {name: c}))
+    (tmp_path / "robot.urdf").write_text(machine.urdf)
+    motors = {
+        d.name: {"joint": d.joint, "kind": d.kind, "force_range": [-d.force, d.force]}
+        for d in machine.drives
+    }
+    engine = {"timestep": machine.step, "integrator": machine.integrator}
+    kind = robot_simulator(read(tmp_path / "robot.urdf", actuators=motors, engine=engine))
+    simulator = kind(observe=[f"q.{joint}" for joint in machine.joints], effects=[name])
+    initial = {f"q.{joint}": q for joint, q in zip(machine.joints, run.q, strict=True)}
+    inputs = {f"u.{motor}": u for motor, u in run.commands.items()}
+    seen = simulator.simulate(np.array([c]), Scenario(run.times, initial, inputs))[0]
+    assert np.sqrt(np.mean((hidden - bare) ** 2)) > 1e-3
+    assert np.linalg.norm(seen - hidden) < close * np.linalg.norm(hidden - bare)
+
+
+def test_a_joint_is_rubbed_by_what_another_ones_drive_has_done():
+    """Its friction is the heat of that one, which comes with the work and goes in its time."""
+    machine = robots.machine("arm2-motor", np.random.default_rng(1))
+    world = World(machine, foreign=Heated(1, 0, 0.5, 0.2, 1.0))
+    run = driven(machine, 0.5, stamps=np.arange(101) / 100)
+    motion, bare = world.move(run, run.times), World(machine).move(run, run.times)
+    apart = np.abs(motion.q - bare.q).max(axis=1)
+    assert 100 * apart[3] < apart[-1], "it begins cold"
+    power = np.abs(motion.force[:, 0] * motion.v[:, 0])
+    heat = np.zeros(power.size)
+    for k, step in enumerate(np.diff(run.times)):
+        middle = 0.5 * (power[k] + power[k + 1]) / 0.2
+        heat[k + 1] = heat[k] + step * (middle - (heat[k] + 0.5 * step * middle))
+    course = _Course(world, run)
+    course.through(run.times)
+    assert course.state[-1] == pytest.approx(heat[-1], rel=0.05)
+
+
+def test_teeth_follow_a_joint_half_a_tooth_behind():
+    teeth = Cogging(0, 0.3, 0.4)
+    assert teeth.caught(0.0, [0.1]) == 0.0
+    assert teeth.caught(0.0, [1.0]) == pytest.approx(0.8)
+    assert teeth.caught(0.8, [0.5]) == pytest.approx(0.7)
+    assert teeth.push(0.8, [1.0]) == pytest.approx(0.3 * np.sin(2 * np.pi * 2.0))
 
 
 def test_a_binding_range_rubs_only_where_it_is():
