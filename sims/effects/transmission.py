@@ -91,6 +91,15 @@ class Carried(Hidden):
         """As the coefficient says."""
         return np.clip(c[self.share], 0.0, _MOST)
 
+    def element(self, c: Array) -> Element:
+        """A spring with a damper where it is told how far that gives, else two flanks."""
+        numbers = {one.name: values for one, values in zip(self.between, c, strict=True)}
+        none = np.zeros_like(c[0])
+        gives = numbers.get("compliance")
+        stiffness = none if gives is None else 1.0 / np.maximum(gives, _LEAST)
+        gap = np.maximum(numbers.get("gap", none), 0.0)
+        return Element(stiffness, numbers.get("damping", none), gap, numbers["rotor"])
+
     def begin(self, c: Array, moment: Moment) -> State:
         """Going along with the drive, as far away as the weight draws it."""
         away = self.hangs(c, _fall(moment, moment.primary))
@@ -119,10 +128,6 @@ class Flexibility(Carried):
     says = "what the drive carries hangs on it by a spring, and swings"
     source, coefficients, between = _ELASTIC, _SPRUNG, _SPRING
 
-    def element(self, c: Array) -> Element:
-        """A spring with a damper."""
-        return Element(1.0 / np.maximum(c[0], _LEAST), c[1], 0.0 * c[0], c[2])
-
     def hangs(self, c: Array, fall: Array) -> Array:
         """As far as its spring gives."""
         return fall / (c[1] * c[1])
@@ -140,10 +145,6 @@ class Play(Carried):
     says = "there is a gap between the drive and what it carries, which knocks from flank to flank"
     source, coefficients, between = _PLAY, _GAPPED, _FLANKS
     share, fastest = 1, CONTACT
-
-    def element(self, c: Array) -> Element:
-        """Two flanks."""
-        return Element(0.0 * c[0], 0.0 * c[0], np.maximum(c[0], 0.0), c[1])
 
     def pull(self, c: Array, moment: Moment, state: State) -> Array:
         """The flanks'; damped as far as they are pressed in, so that no force jumps."""
