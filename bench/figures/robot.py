@@ -130,6 +130,24 @@ def robot_figure(
     return figure
 
 
+def joints_in(
+    figure: Figure, robot: Robot, positions: Mapping[str, float]
+) -> list[tuple[str, float, float]]:
+    """Where the joints are in the figure at that pose: shares of its width and height, from above
+    left.
+    """
+    data = posed(robot, dict(positions))
+    seen_from = view(robot, data)
+    axis = figure.axes[0]
+    found = []
+    for joint in robot.joints:
+        point = seen_from.seen(data.xanchor[joint.id][None])[0]
+        pixels = axis.transData.transform(point)
+        across, up = (pixels / figure.bbox.size).tolist()
+        found.append((joint.name, across, 1.0 - up))
+    return found
+
+
 def _shaped(robot: Robot) -> bool:
     """Whether there is anything to render: a file whose meshes are absent has no shapes."""
     model = robot.compiled

@@ -152,6 +152,11 @@ def look(place: int) -> Look:
     return Look(colour, _DARK[colour], dashes, _MARKERS[place % len(_MARKERS)])
 
 
+def drawn(colour: str, dashes: tuple[float, ...] = (), marker: str = "") -> Look:
+    """The look of what has a colour of the palette by what it is."""
+    return Look(colour, _DARK[colour], dashes, marker)
+
+
 class Styles:
     """Colour, marker and line of each tuner: fixed by its place in the experiment, listed by its
     final error.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,6 @@ from bench.gap.report.account import closes, cut, interval
 from bench.gap.report.agreement import HEAD, rows
 from bench.gap.report.changes import changes
 from bench.gap.report.page import page
-from bench.gap.report.pictures import Printed
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, estimated, joined, percent
 from bench.gap.robot_files import RobotFiles, robot_files
@@ -99,7 +98,7 @@ class Explanation:
         for name, figure in figures.items():
             contents[folder / f"{name}.png"] = figure.png
             contents[folder / f"{name}.pdf"] = figure.pdf
-        contents[folder / "report.html"] = self._page(figures, for_print=True)
+        contents[folder / "report.html"] = page(self._told, figures, folder)
         # All is drawn before the first file is made: what fails until here leaves no trace.
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -128,10 +127,6 @@ class Explanation:
     def _json(self) -> str:
         return json.dumps(self.answer.document(), indent=1, allow_nan=False) + "\n"
 
-    def _page(self, figures: Mapping[str, Printed], for_print: bool) -> str:
-        drawn = {name: figure.png for name, figure in figures.items()}
-        return page(self._told, drawn, for_print)
-
     def __repr__(self) -> str:
         lines = [f"{self.verdict}: {self.story.title}", self._causes_in_words(), self._gain()]
         lines.append(cut(self.story))
@@ -151,8 +146,8 @@ class Explanation:
 
     def _repr_html_(self) -> str:
         """The report for a notebook's cell, in a frame of its own so that its styles stay there."""
-        # Nothing lies beside a cell: no file is named for print.
-        return framed(self._page(pictures.printed(self.story), for_print=False))
+        # Nothing lies beside a cell: no file is named.
+        return framed(page(self._told, pictures.printed(self.story)))
 
 
 def csv_text(head: Sequence[str], found: Iterable[Sequence[object]]) -> str:

@@ -21,6 +21,12 @@ from bench.gap.verdict import Verdict
 from sims.base import Array
 from sims.extended import Number as Estimate
 
+TRACKED = {"u", "v", "radius_px"}
+"""Columns that tell the recording of a tracked film."""
+PNG = b"\x89PNG\r\n\x1a\n"
+"""How a file of that kind begins."""
+MOST_PICTURE = 1_000_000
+"""Bytes of the picture of a track that a page takes in."""
 BORDER = 1e-6
 """Share of its range within which a parameter is at the border."""
 
@@ -69,7 +75,22 @@ class Teller:
             show.robot_of(world),
             fixable=self._fixable(),
             apart=self._apart(),
+            track=self._track(),
+            logs=max(1, len({run.log for run in recording.runs})),
         )
+
+    def _track(self) -> bytes:
+        """The picture that tracking a film has put beside its recording; nothing of others."""
+        recording = self.assessor.recording
+        path = recording.path.with_suffix(".png")
+        if not recording.extra.keys() >= TRACKED:
+            return b""
+        try:
+            with path.open("rb") as file:
+                picture = file.read(MOST_PICTURE + 1)
+        except OSError:
+            return b""
+        return picture if picture.startswith(PNG) and len(picture) <= MOST_PICTURE else b""
 
     def _apart(self) -> Apart:
         """What runs, logs and loads say by themselves, of the base model and of what was found."""

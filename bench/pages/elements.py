@@ -64,6 +64,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], marks: Sequence[s
     # on a phone.
     return "\n".join(
         [
+            # By keyboard it scrolls once it has the focus.
             '<div class="scroll" tabindex="0"><table>',
             f"<thead><tr>{''.join(top)}</tr></thead>",
             "<tbody>",
@@ -100,11 +101,14 @@ def bar(kind: str, share: float) -> str:
 
 
 def framed(html: str) -> str:
-    """A page as an element of another one: neither's styles reach the other, and no script runs."""
+    """A page as an element of another one: neither's styles nor scripts reach the other, and of
+    scripts none runs but the page's own, by its policy.
+    """
     # Quotes too: a bare one would end the attribute, and the rest would be the cell's markup.
     source = escape(html, quote=True)
     style = "width: 100%; height: 46rem; border: 0"
-    return f'<iframe title="report" sandbox="" style="{style}" srcdoc="{source}"></iframe>'
+    allowed = "allow-scripts allow-downloads"
+    return f'<iframe title="report" sandbox="{allowed}" style="{style}" srcdoc="{source}"></iframe>'
 
 
 def _of_class(kind: str) -> str:

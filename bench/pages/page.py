@@ -88,7 +88,14 @@ class Page:
             f'<div class="live"></div>\n{still}\n{caption}\n</figure>'
         )
 
-    def picture(self, name: str, static: Static, caption: str, tables: Sequence[str] = ()) -> str:
+    def picture(
+        self,
+        name: str,
+        static: Static,
+        caption: str,
+        tables: Sequence[str] = (),
+        spots: Sequence[tuple[str, float, float]] = (),
+    ) -> str:
         """A figure that is the same on the screen and on paper, with its files to take away.
 
         Args:
@@ -96,10 +103,11 @@ class Page:
             static: the figure.
             caption: how to read it; safe HTML.
             tables: of the page, with its numbers.
+            spots: names that light up, and where: shares of width and height from above left.
         """
         of = f' data-tables="{safe(" ".join(tables))}"' if tables else ""
         return (
-            f'<figure class="picture" id="{name}"{of}>\n{_still(static)}\n'
+            f'<figure class="picture" id="{name}"{of}>\n{_still(static, spots)}\n'
             f"<figcaption>{caption}</figcaption>\n</figure>"
         )
 
@@ -167,7 +175,7 @@ def _policy(script: str) -> str:
     )
 
 
-def _still(static: Static) -> str:
+def _still(static: Static, spots: Sequence[tuple[str, float, float]] = ()) -> str:
     """The printed figure, and what can be taken away without a script."""
     svg = b64encode(static.svg).decode("ascii")
     pdf = b64encode(static.pdf).decode("ascii")
@@ -177,7 +185,10 @@ def _still(static: Static) -> str:
         f'alt="{safe(static.alternative, 1000)}">'
     )
     link = f'<a href="data:application/pdf;base64,{pdf}" download="{file}.pdf">PDF</a>'
-    return f'{image}\n<p class="files">{link}</p>'
+    for name, across, down in spots:
+        style = f"left:{100 * across:.2f}%;top:{100 * down:.2f}%"
+        image += f'<span class="spot" data-lights="{safe(name, 60)}" style="{style}"></span>'
+    return f'<div class="pictured">{image}</div>\n<p class="files">{link}</p>'
 
 
 def _script(name: str) -> str:

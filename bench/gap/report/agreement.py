@@ -13,7 +13,7 @@ from bench.gap.measure import Z95
 from bench.gap.report.missing import missing
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, estimate, joined, number, probability, sentence, with_unit
-from bench.pages.elements import heading, paragraph, safe, table
+from bench.pages.elements import paragraph, safe, table
 
 MOST = 12
 """Rows of the table, those that agree least first."""
@@ -134,7 +134,6 @@ def agreement(story: Story) -> Iterator[str]:
     after = sorted(story.apart.after, key=lambda one: one.chance)
     if not after:
         return
-    yield heading("Which number to trust")
     yield paragraph(" ".join(safe(text, 1000) for text in told(story)))
     heads = ("number", "joint fit, 95 %", "for another run, 95 %", "by", "chance", "each apart")
     rows = []

@@ -9,7 +9,7 @@ import numpy as np
 from bench.gap.identify import Number
 from bench.gap.report.story import Story
 from bench.gap.report.words import joined, number
-from bench.pages.elements import code, heading, paragraph, safe, table
+from bench.pages.elements import code, paragraph, safe, table
 
 MOST = 12
 """Causes of one kind that are named."""
@@ -21,7 +21,6 @@ def fixable(story: Story) -> Iterator[str]:
     numbers = story.fixable
     if not numbers:
         return
-    yield heading("What this recording can fix")
     yield paragraph(safe(counted(numbers)))
     free = [one for one in numbers if one.free]
     if free:

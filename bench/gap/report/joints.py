@@ -15,7 +15,7 @@ from bench.gap.report.panels import AFTER, BEFORE, changed, label
 from bench.gap.report.places import marks
 from bench.gap.report.shots import Shot, kept
 from bench.gap.report.story import Story
-from bench.gap.report.words import number
+from bench.gap.report.words import FAMILY, clean, number
 from sims.base import Array
 
 if TYPE_CHECKING:
@@ -232,19 +232,31 @@ def _one_scale(
         panel.set_ylim(-most, most)
 
 
+def joint_of(story: Story, kind: str, place: str) -> str:
+    """The joint that a place belongs to: a channel's, an actuator's, a body's; empty where there is
+    none, or no robot.
+    """
+    robot = story.robot
+    if kind == "joint":
+        return "" if place == FAMILY else clean(place, 40)
+    if kind == "channel":
+        quantity, _, name = place.partition(".")
+        # A sensor has a row of its own.
+        return clean(name if quantity in QUANTITIES and name else place, 40)
+    if robot is None:
+        return ""
+    if kind == "actuator":
+        return next((clean(a.joint or "", 40) for a in robot.actuators if a.name == place), "")
+    if kind == "body":
+        of = {body.id for body in robot.bodies if body.name == place}
+        moved = [j.name for j in robot.joints if int(robot.compiled.jnt_bodyid[j.id]) in of]
+        return clean(moved[0], 40) if moved else ""
+    return ""
+
+
 def _joints_of_marks(story: Story) -> set[str]:
     """Joints of the channels, actuators and bodies that the verdict names."""
-    robot = story.robot
-    found = set()
-    for mark in marks(story):
-        if mark.kind == "channel":
-            found |= {mark.name.partition(".")[2]}
-        if mark.kind == "actuator" and robot is not None:
-            found |= {a.joint or "" for a in robot.actuators if a.name == mark.name}
-        if mark.kind == "body" and robot is not None:
-            of = {body.id for body in robot.bodies if body.name == mark.name}
-            found |= {j.name for j in robot.joints if int(robot.compiled.jnt_bodyid[j.id]) in of}
-    return found
+    return {joint_of(story, mark.kind, mark.name) for mark in marks(story)}
 
 
 def _finish(figure: Figure, axes: Any, story: Story, shot: Shot, rows: Sequence[Row]) -> None:

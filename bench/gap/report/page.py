@@ -1,7 +1,7 @@
-"""The page of an explanation: one file, readable without a network or scripts, in the light, in the
-dark and in print.
+"""The page of an explanation: one file without a network, to work with, and readable without
+scripts and in print.
 
-Ten seconds come first: what is wrong, the gain, the run that shows it. Every text from a file or
+Ten seconds come first: what is wrong, the gain, what to do next. Every text from a file or
 plugin passes `safe`.
 """
 
@@ -10,25 +10,46 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from math import isfinite
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bench.gap.report.account import closes, effort, following, headline, heldout_unit, interval
+from bench.gap.report.advice import advice
 from bench.gap.report.agreement import agreement
+from bench.gap.report.evidence import (
+    CANDIDATES,
+    FOLLOWS,
+    PLACES,
+    candidates_grid,
+    candidates_table,
+    follows_chart,
+    follows_table,
+    places_grid,
+    places_table,
+)
 from bench.gap.report.fixable import fixable
-from bench.gap.report.joints import by_joint
+from bench.gap.report.joints import by_joint, joint_of
+from bench.gap.report.motion import TABLE as MOTION
+from bench.gap.report.motion import motion, motion_chart
+from bench.gap.report.pictures import Printed
 from bench.gap.report.places import has_places, marks
 from bench.gap.report.sections import (
-    candidates,
-    changes,
+    channels,
     numbers,
+    parameters,
     reading,
     remains,
-    where,
+    sets,
     why,
     worst_first,
 )
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, joined, name_of, number, percent, pretty, with_unit
+from bench.pages.chart import Static
 from bench.pages.elements import bar, code, figure, paragraph, safe, strong
+from bench.pages.page import Page
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _STYLE = Path(__file__).with_name("page.css")
 _BADGES = {
@@ -60,12 +81,18 @@ _CAPTIONS = {
         "floor, the grey bar what noise without memory gives by chance. Right: the variables that "
         "the residual follows most."
     ),
+    "track": (
+        "The ball's track in the film, as simgap track has written it beside the recording; what "
+        "is explained are the heights that it gives."
+    ),
     "candidates": (
         "Left: evidence for each candidate, with the probability p of as much by chance. Right: "
         "what each gains on held-out runs."
     ),
 }
 """Under the figures."""
+_TRACK = "The scene of the film with the ball's track over it, its height and radius over time."
+"""What the picture of a track shows."""
 _JOINTS = (
     "A row for each joint; those that the verdict names are blue, behind a pointer. Left: "
     "measured and simulated. Right: what is measured less what is simulated, in units of the "
@@ -80,42 +107,38 @@ _FEW = 5
 """Places and candidates that are read aloud in place of a figure."""
 
 
-def page(story: Story, drawn: Mapping[str, bytes], for_print: bool = True) -> str:
+def page(story: Story, drawn: Mapping[str, Printed], folder: Path | None = None) -> str:
     """The page as HTML.
 
     Args:
         story: what is told.
-        drawn: the figures as PNG, by name.
-        for_print: name the PDF that lies beside the page under each figure.
+        drawn: the figures by name; what is not drawn is left out.
+        folder: that the page is written to with the other files; None where it stands alone.
     """
-    pictures = {name: _picture(story, name, png, for_print) for name, png in drawn.items()}
-    parts = [
-        *_head(story),
-        *_opening(story),
-        pictures.get("robot", ""),
-        pictures.get("overview", ""),
-        *fixable(story),
-        *why(story),
-        *where(story, pictures.get("where", "")),
-        *candidates(story, pictures.get("candidates", "")),
-        *numbers(story),
-        *agreement(story),
-        *changes(story),
-        *remains(story),
-        *reading(),
-        f"</main>\n{_footer(story)}\n</body>\n</html>\n",
-    ]
-    # A figure that was not drawn leaves no empty line.
-    return "\n".join(part for part in parts if part)
-
-
-def _head(story: Story) -> Iterator[str]:
-    """All up to where the page's own words begin; the styles are within: it stays one file."""
-    yield '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">'
-    yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
-    yield f"<title>{safe(headline(story), 120)} {safe(story.title, 80)}</title>"
-    styles = _STYLE.read_text(encoding="utf-8")
-    yield f"<style>\n{styles}</style>\n</head>\n<body>\n<main>"
+    style = _STYLE.read_text(encoding="utf-8")
+    made = Page(f"{headline(story)} {clean(story.title, 80)}", _foot(story), style)
+    frames = {
+        CANDIDATES: candidates_table(story),
+        PLACES: places_table(story),
+        FOLLOWS: follows_table(story),
+    }
+    for name, frame in frames.items():
+        if len(frame):
+            made.table(name, frame)
+    stills = {name: _still(story, name, figure) for name, figure in drawn.items()}
+    made.add(*_opening(story))
+    made.section("next", "What to do next", *advice(story, folder))
+    made.section("run", "Run by run", *_runs(made, story, stills, drawn))
+    made.section("fixable", "What this recording can fix", *fixable(story))
+    made.section("why", "Why", *why(story))
+    made.section("gap", "Where the gap is", *_where(made, story, stills, frames))
+    made.section("causes", "What could be the cause", *_candidates(made, story, stills, frames))
+    made.section("numbers", "What was found, in numbers", *numbers(story))
+    made.section("parameters", "The simulator's own parameters", *parameters(story))
+    made.section("trust", "Which number to trust", *agreement(story))
+    made.section("remains", "What remains", *remains(story))
+    made.section("reading", "How to read this", *reading())
+    return made.html()
 
 
 def _opening(story: Story) -> Iterator[str]:
@@ -163,13 +186,76 @@ def _gain(story: Story) -> Iterator[str]:
     yield "</section>"
 
 
-def _picture(story: Story, name: str, png: bytes, for_print: bool) -> str:
-    caption = _JOINTS if name == "overview" and by_joint(story) else _CAPTIONS.get(name, "")
-    if name == "candidates" and has_places(story):
-        caption += _PLACED
-    if for_print:
-        caption += f" <span>For print: {safe(name)}.pdf</span>"
-    return figure(png, safe(_alternative(story, name), 700), caption)
+def _still(story: Story, name: str, figure: Printed) -> Static:
+    return Static(figure.svg, figure.pdf, _alternative(story, name), name)
+
+
+def _runs(
+    made: Page, story: Story, stills: Mapping[str, Static], drawn: Mapping[str, Printed]
+) -> Iterator[str]:
+    """What was measured and simulated, with the robot or the film's track beside it."""
+    shown = motion(story)
+    made.table(MOTION, shown.frame)
+    printed = _JOINTS if by_joint(story) else _CAPTIONS["overview"]
+    chart = made.chart(motion_chart(story, shown, stills.get("overview"), printed))
+    beside = [*_robot(made, story, drawn), *_film(story)]
+    if not beside:
+        yield chart
+        return
+    aside = "\n".join(beside)
+    yield f'<div class="beside"><aside>\n{aside}\n</aside>\n{chart}</div>'
+
+
+def _robot(made: Page, story: Story, drawn: Mapping[str, Printed]) -> Iterator[str]:
+    """The robot, and a list of the places that the verdict names."""
+    if "robot" not in drawn:
+        return
+    robot = drawn["robot"]
+    still = _still(story, "robot", robot)
+    yield made.picture("robot", still, _CAPTIONS["robot"], spots=robot.spots)
+    items = []
+    for mark in marks(story):
+        lights = safe(joint_of(story, mark.kind, mark.name), 60)
+        says = f"{mark.kind} {clean(mark.name, 40)}: {clean(mark.says, 80)}"
+        items.append(f'<li data-lights="{lights}">{safe(says)}</li>')
+    if items:
+        yield paragraph("The places that the verdict names:", "soft")
+        yield f"<ul>{''.join(items)}</ul>"
+
+
+def _film(story: Story) -> Iterator[str]:
+    """The picture of the track, of a recording from a film."""
+    if story.track:
+        yield figure(story.track, _TRACK, _CAPTIONS["track"])
+
+
+def _where(
+    made: Page, story: Story, stills: Mapping[str, Static], frames: Mapping[str, pd.DataFrame]
+) -> Iterator[str]:
+    """Where the gap is, in units of the noise and of each channel."""
+    if "where" in stills:
+        tables = [PLACES] * bool(story.places) + [FOLLOWS] * bool(story.profiles)
+        yield made.picture("where-picture", stills["where"], _CAPTIONS["where"], tables)
+    if story.profiles:
+        yield made.chart(follows_chart(story))
+    if story.places:
+        note = "RMS of the residual in units of the noise; 1 is the noise floor."
+        yield paragraph(note, "soft") + made.grid(places_grid(frames[PLACES]))
+    yield from channels(story)
+
+
+def _candidates(
+    made: Page, story: Story, stills: Mapping[str, Static], frames: Mapping[str, pd.DataFrame]
+) -> Iterator[str]:
+    """The candidates with their evidence, and what cannot be told apart."""
+    yield from sets(story)
+    if "candidates" in stills:
+        caption = _CAPTIONS["candidates"] + (_PLACED if has_places(story) else "")
+        yield made.picture("candidates-picture", stills["candidates"], caption, [CANDIDATES])
+    if not story.verdict.candidates:
+        yield paragraph("No candidate was tried.")
+    else:
+        yield made.grid(candidates_grid(frames[CANDIDATES]))
 
 
 def _alternative(story: Story, name: str) -> str:
@@ -192,10 +278,9 @@ def _alternative(story: Story, name: str) -> str:
     return f"Scores of the candidates, the best: {'; '.join(scores)}."
 
 
-def _footer(story: Story) -> str:
+def _foot(story: Story) -> str:
     all_units = [pretty(c.unit) or "1" for c in story.channels]
     # Of a robot's many channels each unit is said once.
     units = safe(joined(list(dict.fromkeys(all_units)) if by_joint(story) else all_units), 100)
     recording = f"Recording: {code(safe(story.path, 300))} (channels in {units})."
-    made = f"{safe(effort(story))} Made by simgap explain."
-    return f'<footer class="soft">\n{paragraph(f"{recording} {made}")}\n</footer>'
+    return f"{recording} {safe(effort(story))} Made by simgap explain."

@@ -1,8 +1,8 @@
 """The figures of an explanation: the run with the largest gap, where the gap is, the candidates.
 
 Made for print and for grey: before is dashed with open squares, after solid with filled circles,
-beside their colours. Each figure is written as PNG and PDF. Texts from files are never read as
-mathematics.
+beside their colours. Each figure is written as PNG and PDF, and as SVG for the page. Texts from
+files are never read as mathematics.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.figures import style
-from bench.figures.robot import robot_figure
+from bench.figures.robot import joints_in, robot_figure
 from bench.figures.style import BAND, ZERO, blank
 from bench.gap.report.joints import by_joint, joints_figure
 from bench.gap.report.panels import (
@@ -88,10 +88,14 @@ def figure(story: Story, name: str) -> Figure:
 
 
 class Printed(NamedTuple):
-    """One figure as the bytes of its two files."""
+    """One figure as the bytes of its files; of a robot's where its joints are: names with shares of
+    its width and height from above left.
+    """
 
     png: bytes
     pdf: bytes
+    svg: bytes
+    spots: tuple[tuple[str, float, float], ...] = ()
 
 
 def printed(story: Story) -> dict[str, Printed]:
@@ -99,7 +103,11 @@ def printed(story: Story) -> dict[str, Printed]:
     with _styled():
         # Within the settings: text is laid out once more when a figure is written.
         figures = {name: figure(story, name) for name in names(story)}
-        return {n: Printed(*style.printed(f, DPI)) for n, f in figures.items()}
+        made = {n: Printed(*style.printed(f, DPI), style.svg(f)) for n, f in figures.items()}
+        if story.robot is not None and "robot" in made:
+            where = tuple(joints_in(figures["robot"], story.robot, pose(story, worst(story))))
+            made["robot"] = made["robot"]._replace(spots=where)
+        return made
 
 
 @contextmanager
@@ -133,7 +141,7 @@ def _robot(story: Story) -> Figure:
     """The robot in the run that is shown, bent as far as it is there."""
     if story.robot is None:
         raise InputError(f"{story.path}: no robot was recorded")
-    return robot_figure(story.robot, pose(story, worst(story)), marks(story), _WIDTHS[1])
+    return robot_figure(story.robot, pose(story, worst(story)), marks(story))
 
 
 def _overview(story: Story) -> Figure:

@@ -1,5 +1,5 @@
-"""Sections of the page below what one sees first: why, where, candidates, numbers, what remains,
-how to read it.
+"""Sections of the page below what one sees first: why, channels, sets, numbers, what remains, how
+to read it.
 """
 
 from __future__ import annotations
@@ -9,32 +9,22 @@ from math import isfinite
 
 import numpy as np
 
-from bench.gap.report.account import absorbed, experiment, rms, shift
-from bench.gap.report.places import has_places, of_set, values_of, without_place
-from bench.gap.report.ranking import entries, standing
+from bench.gap.report.account import absorbed, rms, shift
+from bench.gap.report.places import of_set, values_of, without_place
 from bench.gap.report.story import Place, Side, Story, Tuned
 from bench.gap.report.words import (
-    FAMILY,
     estimate,
     joined,
-    name_of,
     noun,
     number,
-    parted,
     probability,
     sentence,
     with_unit,
 )
-from bench.gap.verdict import Candidate, Cause
-from bench.pages.elements import code, folded, heading, listed, paragraph, safe, strong, table
+from bench.gap.verdict import Cause
+from bench.pages.elements import listed, paragraph, safe, strong, table
 from sims.base import Array
 
-MOST_CANDIDATES = 25
-"""Effects at places in the table of candidates; all of them stand in the fold below it."""
-MOST_ELSEWHERE = 4
-"""Other places of an effect that are named in its row."""
-MOST_ROWS = 40
-"""Rows of a table of places; of more, the worst are shown."""
 _LEFT = {
     "partial": "Structure that no known cause explains",
     "unknown": "Structure that no known cause explains",
@@ -65,36 +55,7 @@ _DRAWN = 180.0
 def why(story: Story) -> Iterator[str]:
     """Why the verdict is what it is."""
     if story.why:
-        yield heading("Why")
         yield listed(safe(sentence(text)) for text in story.why)
-
-
-def where(story: Story, picture: str) -> Iterator[str]:
-    """Where the gap is, in units of the noise and of each channel."""
-    yield heading("Where the gap is")
-    yield picture
-    worst = worst_first(story.places)[:MOST_ROWS]
-    # In their own order, runs first: the table is for looking one up.
-    shown = [place for place in story.places if place in worst]
-    if shown:
-        count = len(story.places)
-        some = f" The {len(shown)} worst of {count}." if len(shown) < count else ""
-        note = f"RMS of the residual in units of the noise; 1 is the noise floor.{some}"
-        yield paragraph(note, "soft")
-        yield _places(shown, bool(story.verdict.causes))
-    yield from _channels(story)
-
-
-def _places(places: Sequence[Place], extended: bool) -> str:
-    heads = ["part of the data", "-samples"]
-    heads += ["-RMS before", "-RMS after"] if extended else ["-RMS"]
-    rows = []
-    for p in places:
-        row = [safe(f"{p.kind} {p.label}", 80), str(p.samples), f"{p.before:.2f}"]
-        if extended:
-            row.append(f"{p.after:.2f}")
-        rows.append(row)
-    return table(heads, rows)
 
 
 def worst_first(places: Sequence[Place]) -> list[Place]:
@@ -102,7 +63,7 @@ def worst_first(places: Sequence[Place]) -> list[Place]:
     return sorted((p for p in places if isfinite(p.before)), key=lambda p: -p.before)
 
 
-def _channels(story: Story) -> Iterator[str]:
+def channels(story: Story) -> Iterator[str]:
     """The channels with their noise and their errors in their own units."""
     extended = bool(story.verdict.causes)
     whens = (" before", " after") if extended else ("",)
@@ -134,70 +95,12 @@ def errors_of(side: Side) -> Array:
     return errors
 
 
-def candidates(story: Story, picture: str) -> Iterator[str]:
-    """The candidates with their evidence, what cannot be told apart, and what to do next."""
-    yield heading("What could be the cause")
+def sets(story: Story) -> Iterator[str]:
+    """The causes that cannot be told apart, set by set."""
     for cause in story.verdict.causes:
         if cause.alternatives:
             members = safe(_set(story, cause), 1000)
-            yield paragraph(f"{strong('Not to be told apart:')} {members}")
-    if proposed := experiment(story):
-        yield paragraph(f"{strong('Next experiment:')} {safe(proposed, 1000)}")
-    yield picture
-    if not story.verdict.candidates:
-        yield paragraph("No candidate was tried.")
-    elif has_places(story):
-        yield _by_effect(story)
-        count = len(story.verdict.candidates)
-        yield folded(f"All {count} candidates, place by place", _ranking(story))
-    else:
-        yield _ranking(story)
-
-
-def _by_effect(story: Story) -> str:
-    """A row for each effect where it explains most, and what it scores elsewhere."""
-    heads = ["candidate", "name", "-score", "-p", "-gain on held-out runs", "standing", "elsewhere"]
-    rows = []
-    marks = []
-    there = entries(story)
-    for entry in there[:MOST_CANDIDATES]:
-        row, mark = _candidate(story, entry.best)
-        others = [
-            f"{_elsewhere(c)} {number(c.score) if c.score >= 1 else '<1'}" for c in entry.elsewhere
-        ]
-        more = f" and {len(others) - MOST_ELSEWHERE} more" * (len(others) > MOST_ELSEWHERE)
-        rows.append([*row, safe(", ".join(others[:MOST_ELSEWHERE]) + more)])
-        marks.append(mark)
-    return table(heads, rows, marks)
-
-
-def _elsewhere(c: Candidate) -> str:
-    """The place of a candidate, in a list of places."""
-    _, place = parted(c.effect)
-    return "all" if place == FAMILY else place
-
-
-def _ranking(story: Story) -> str:
-    heads = ["candidate", "name", "-score", "-p", "-gain on held-out runs", "standing"]
-    rows = []
-    marks = []
-    for c in story.verdict.candidates:
-        row, mark = _candidate(story, c)
-        rows.append(row)
-        marks.append(mark)
-    return table(heads, rows, marks)
-
-
-def _candidate(story: Story, c: Candidate) -> tuple[list[str], str]:
-    """A candidate's row, and its mark."""
-    rank = standing(story, c.effect)
-    row = [safe(name_of(c.effect)), code(safe(c.effect, 80)), number(c.score)]
-    # The column's head says p already.
-    row.append(probability(c.p_value).removeprefix("p = ").removeprefix("p "))
-    row.append(number(c.heldout_gain))
-    # Where nothing is found, nothing made the others needless.
-    row.append(rank if story.verdict.causes else "not convincing")
-    return row, "" if rank == "not needed" else "found"
+            yield paragraph(f"{strong('Not to be told apart:')} {members}", "set")
 
 
 def _set(story: Story, cause: Cause) -> str:
@@ -217,7 +120,7 @@ def _set(story: Story, cause: Cause) -> str:
 
 
 def numbers(story: Story) -> Iterator[str]:
-    """What was found in numbers, and how the parameters move."""
+    """What was found in numbers."""
     rows = []
     for cause in story.verdict.causes:
         what = [safe(noun(cause.effect)), safe(without_place(cause.says))]
@@ -226,14 +129,13 @@ def numbers(story: Story) -> Iterator[str]:
             rows.append([*what, safe(name, 60), safe(value), chance])
     if rows:
         heads = ["cause", "what it does", "coefficient", "value (95 % interval)", "by chance"]
-        yield heading("What was found, in numbers")
         yield table(heads, rows)
-    if story.parameters:
-        yield heading("The simulator's own parameters")
-        yield from _parameters(story)
 
 
-def _parameters(story: Story) -> Iterator[str]:
+def parameters(story: Story) -> Iterator[str]:
+    """How the simulator's own parameters move."""
+    if not story.parameters:
+        return
     extended = bool(story.verdict.causes)
     # Where nothing was found nothing could have been absorbed.
     bent = [p for p in story.parameters if p.touched and absorbed(p)]
@@ -287,32 +189,8 @@ def _intervals(p: Tuned) -> str:
     return f'<svg viewBox="0 0 200 30" role="img" aria-label="{label}">{"".join(shapes)}</svg>'
 
 
-def changes(story: Story) -> Iterator[str]:
-    """The lines of the robot's model file to change, before and after."""
-    # What is to be known of a file in which nothing changes is of no use.
-    if not story.changes and not (story.unwritten and story.verdict.causes):
-        return
-    yield heading("What to change in the model file")
-    lines = []
-    for change in story.changes:
-        lines.append(f'<span class="soft">{safe(change.element, 120)}</span>')
-        # One blank line between elements, and none within.
-        lines += [f'<del class="line">− {safe(change.before, 2000)}</del>'] * bool(change.before)
-        lines += [f'<ins class="line">+ {safe(change.after, 2000)}</ins>'] * bool(change.after)
-        lines += [f'<span class="soft">  {safe(change.comment, 600)}</span>'] * bool(change.comment)
-        lines.append("")
-    if lines:
-        yield f'<pre class="scroll">{chr(10).join(lines[:-1])}</pre>'
-    if story.unwritten:
-        yield paragraph(
-            "What is to be known of it, and what it cannot say (extended.toml has all):"
-        )
-        yield listed(safe(sentence(text)) for text in story.unwritten)
-
-
 def remains(story: Story) -> Iterator[str]:
     """What is left unexplained."""
-    yield heading("What remains")
     if story.remains:
         yield listed(safe(sentence(text)) for text in story.remains)
         return
@@ -326,7 +204,7 @@ def remains(story: Story) -> Iterator[str]:
 
 def reading() -> Iterator[str]:
     """The words of the page."""
-    yield f"{heading('How to read this')}\n<dl>"
+    yield "<dl>"
     for word, meaning in _READING.items():
         yield f"<dt>{word}</dt><dd>{meaning}</dd>"
     yield "</dl>"

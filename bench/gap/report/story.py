@@ -141,6 +141,8 @@ class Story:
         unwritten: what its model file cannot hold, and what is to be known of it, a sentence each.
         fixable: what the recording can say of each number and cause; empty where nobody knows.
         apart: what runs, logs and loads say of the numbers by themselves.
+        track: the picture of a film's track (PNG), of a recording that was tracked; empty for none.
+        logs: recordings that are explained together.
     """
 
     title: str
@@ -160,3 +162,5 @@ class Story:
     unwritten: tuple[str, ...] = ()
     fixable: tuple[Number, ...] = ()
     apart: Apart = field(default_factory=Apart)
+    track: bytes = b""
+    logs: int = 1

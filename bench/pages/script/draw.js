@@ -94,7 +94,8 @@ function drawMarks(u, line) {
   if (!points && (line.draw === "bars" || line.xs.length > MARKED)) return;
   const { colour, marker } = styled(line.look);
   if (!marker && !points) return;
-  const size = (line.xs.length > MARKED ? 2 : 4) * devicePixelRatio;
+  // Beneath lines many small ones are ground; upon them each is read.
+  const size = (line.xs.length > MARKED ? 2 : line.under && line.xs.length > 100 ? 2.6 : 4) * devicePixelRatio;
   const wanted = points ? null : new Set(line.marks);
   // Along a smooth curve a few are enough to tell it from the others.
   const every = wanted && !wanted.size && line.xs.length > 16 ? Math.ceil(line.xs.length / 8) : 1;

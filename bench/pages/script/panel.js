@@ -82,7 +82,7 @@ class PanelView {
         },
         axes: [
           { ...axis("x", panel.across, 56), size: panel.across.names.length ? 46 : 34 },
-          { ...axis("y", panel.up, 30), size: 58 },
+          { ...axis("y", panel.up, height < 220 ? 18 : 30), size: 58 },
         ],
         series: [{}, ...lines.map((line) => this.drawn(line))],
         cursor: {

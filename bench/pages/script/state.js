@@ -25,7 +25,11 @@ const state = {
     else this.chosen.set(key, value);
     const parts = [...this.chosen].map((pair) => pair.map(encodeURIComponent).join("="));
     const address = `${location.pathname}${location.search}${parts.length ? `#${parts.join("&")}` : ""}`;
-    history.replaceState(null, "", address);
+    try {
+      history.replaceState(null, "", address);
+    } catch {
+      // Within a frame a page has no address of its own: the view lasts as long as the page.
+    }
     for (const listener of this.listeners) listener(key);
   },
 

@@ -76,15 +76,18 @@ def test_shown_in_a_notebook_it_is_the_report_in_a_frame(named):
     page = unescape(re.search('srcdoc="([^"]*)"', html)[1])
     assert page.startswith("<!DOCTYPE html>")
     assert "90 % of the gap closed" in page
-    pictures = re.findall('src="data:image/png;base64,([^"]+)"', page)
+    pictures = re.findall('src="data:image/svg.xml;base64,([^"]+)"', page)
     assert len(pictures) == 3
-    assert all(b64decode(picture).startswith(b"\x89PNG") for picture in pictures)
+    assert all(b64decode(picture).startswith(b"<?xml") for picture in pictures)
 
 
 def test_its_report_is_that_of_the_folder_but_for_the_files_beside_it(named, tmp_path):
     page = unescape(re.search('srcdoc="([^"]*)"', named._repr_html_())[1])
     written = named.write(tmp_path)[-1].read_text(encoding="utf-8")
-    assert re.sub(" <span>For print: [a-z]+.pdf</span>", "", written) == page
+    # A command that names a file of the folder is in the folder's page alone.
+    command = r'<p>How far [^<]*</p>\n<pre class="copied" tabindex="0">simgap score [^<]*</pre>\n'
+    assert len(re.findall(command, written)) == 1
+    assert re.sub(command, "", written) == page
 
 
 def test_each_figure_can_be_had_by_name(named):

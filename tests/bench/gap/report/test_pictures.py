@@ -26,9 +26,11 @@ def named():
     return printed(story())
 
 
-def test_each_figure_is_there_in_both_formats_and_shows_something(named):
+def test_each_figure_is_there_in_every_format_and_shows_something(named):
     assert list(named) == NAMES
-    for png, pdf in named.values():
+    for png, pdf, svg, spots in named.values():
+        assert svg.startswith(b"<?xml")
+        assert spots == ()
         assert pdf.startswith(b"%PDF-")
         assert len(pdf) > 5_000
         image = pixels(png)
@@ -54,8 +56,7 @@ def test_figures_are_the_same_again(named):
 
 
 def test_a_page_with_its_figures_stays_small(named):
-    drawn = {name: figure.png for name, figure in named.items()}
-    assert 100_000 < len(page(story(), drawn).encode()) < 2_000_000
+    assert 100_000 < len(page(story(), named).encode()) < 2_000_000
 
 
 def test_any_text_can_be_a_label():

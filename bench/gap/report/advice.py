@@ -1,0 +1,132 @@
+"""What to do next: the experiment that would tell more, the numbers to trust, the lines of the
+model file to change, and the commands.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from html import escape
+from pathlib import Path
+
+from bench.gap.report.account import coefficients, experiment
+from bench.gap.report.agreement import told
+from bench.gap.report.story import Story
+from bench.gap.report.words import clean, noun, sentence
+from bench.pages.elements import folded, listed, paragraph, safe, strong
+
+FEW_LINES = 12
+"""Changes of a model file that stand open; more are behind a click."""
+_OTHER, _LOGS = "OTHER.csv", "LOGS.csv"
+"""Words that a reader replaces."""
+
+
+def advice(story: Story, folder: Path | None) -> Iterator[str]:
+    """The section's parts, in the order in which one would act.
+
+    Args:
+        story: what is told.
+        folder: that the explanation is written to; None for a notebook's.
+    """
+    yield from _experiment(story)
+    yield from _numbers(story)
+    yield from changes(story)
+    yield from _models(story, folder)
+    yield from _further(story)
+
+
+def _experiment(story: Story) -> Iterator[str]:
+    proposed = experiment(story)
+    if proposed:
+        yield paragraph(f"{strong('Next experiment:')} {safe(proposed, 1000)}")
+    if proposed or story.verdict.verdict == "ambiguous":
+        yield paragraph(
+            "Commands that would settle it, planned for this system, and both logs explained:"
+        )
+        yield command("simgap", "design", _recording(story), "--out", "next.csv")
+        yield command("simgap", "explain", _recording(story), "next.csv")
+
+
+def _numbers(story: Story) -> Iterator[str]:
+    """The numbers of what was found, each with its interval, and whether all runs agree on them."""
+    if not story.verdict.causes:
+        return
+    found = [
+        f"{safe(sentence(noun(cause.effect))[:-1], 200)}: {safe(coefficients(cause), 1000)}"
+        for cause in story.verdict.causes
+    ]
+    trust = [safe(text, 1000) for text in told(story)]
+    yield paragraph(strong("Numbers to trust (95 % interval):"))
+    yield listed([*found, *trust])
+
+
+def changes(story: Story) -> Iterator[str]:
+    """The lines of the robot's model file to change, before and after."""
+    # What is to be known of a file in which nothing changes is of no use.
+    if not story.changes and not (story.unwritten and story.verdict.causes):
+        return
+    head = strong("What to change in the model file") + " (extended.xml has it done):"
+    lines = []
+    for change in story.changes:
+        lines.append(f'<span class="soft">{safe(change.element, 120)}</span>')
+        # One blank line between elements, and none within.
+        lines += [f'<del class="line">− {safe(change.before, 2000)}</del>'] * bool(change.before)
+        lines += [f'<ins class="line">+ {safe(change.after, 2000)}</ins>'] * bool(change.after)
+        lines += [f'<span class="soft">  {safe(change.comment, 600)}</span>'] * bool(change.comment)
+        lines.append("")
+    if lines:
+        text = f'<pre class="changes" tabindex="0">{chr(10).join(lines[:-1])}</pre>'
+        many = len(story.changes) > FEW_LINES
+        yield paragraph(head)
+        yield folded(f"All {len(story.changes)} changes", text) if many else text
+    if story.unwritten:
+        yield paragraph(
+            "What is to be known of it, and what it cannot say (extended.toml has all):"
+        )
+        yield listed(safe(sentence(text)) for text in story.unwritten)
+
+
+def _models(story: Story, folder: Path | None) -> Iterator[str]:
+    """How the extended simulator is held against another recording, and used."""
+    if folder is None:
+        return
+    model = folder / "extended.toml"
+    extended = bool(story.verdict.causes)
+    what = "the extended simulator" if extended else "the simulator with what was tuned"
+    yield paragraph(f"How far {what} errs on another recording:")
+    yield command("simgap", "score", model, _OTHER)
+
+
+def _further(story: Story) -> Iterator[str]:
+    """What the verdict leaves to do."""
+    verdict = story.verdict.verdict
+    if verdict == "adequate":
+        yield paragraph(
+            "Nothing has to be changed. A recording that would narrow the numbers further is "
+            "planned by"
+        )
+        yield command("simgap", "design", _recording(story), "--out", "next.csv")
+    elif story.verdict.cut is not None:
+        yield paragraph("The search was ended early; to the end it goes with")
+        yield command("simgap", "explain", _recording(story))
+    elif verdict in ("partial", "unknown"):
+        yield paragraph(
+            "If you have an idea what remains, write it as an effect of your own (simgap's "
+            "docs/extending.md) and have it tried with the others:"
+        )
+        yield command("simgap", "explain", _recording(story), "--plugin", "my_effect.py")
+    elif verdict == "unidentifiable":
+        yield paragraph("Which numbers a recording can fix, asked before any fit:")
+        yield command("simgap", "inspect", _recording(story), "--check")
+
+
+def _recording(story: Story) -> str:
+    """The recording's path; of several logs a word in their place."""
+    return str(story.path) if story.logs == 1 else _LOGS
+
+
+def command(*words: object) -> str:
+    """A command to copy: its words quoted for a shell."""
+    # A line break or an escape sequence in a path must not reach a terminal as such.
+    texts = [shlex.quote(clean(word, 500)) for word in words]
+    return f'<pre class="copied" tabindex="0">{escape(" ".join(texts))}</pre>'

@@ -1,0 +1,300 @@
+"""What was measured and simulated, run by run and channel by channel: as a table of the page and as
+a chart with one time axis for all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import ceil, floor, log10
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.figures.style import BLACK, BLUE, VERMILION, Look, drawn
+from bench.gap.report.account import sides
+from bench.gap.report.joints import QUANTITIES, by_joint, rows_of
+from bench.gap.report.panels import changed
+from bench.gap.report.shots import worst
+from bench.gap.report.story import Side, Story
+from bench.gap.report.words import clean, labelled, number, pretty
+from bench.pages.chart import Axis, Chart, Panel, Series, Span, Static, Tell
+from sims.base import Array
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TABLE = "motion"
+"""Name of the table, and of the chart."""
+MOST_ROWS = 30_000
+"""Samples of the page, over all runs and channels: the file stays below 3 MB."""
+LEAST_ROWS = 500
+"""Samples of one channel in one run at least; where that is too much, runs are left out."""
+MOST_AT_FIRST = 8
+"""Channels that are switched on at first, those with the largest gap."""
+DIGITS = 100.0
+"""Measured and simulated are written to such a part of the noise."""
+MEASURED = drawn(BLACK, (), "o")
+BEFORE = drawn(VERMILION, (5.0, 2.0))
+AFTER = drawn(BLUE)
+_LEAST = 3.0
+"""Noises to either side that a panel of residuals shows: noise must fill no panel."""
+_TALL, _LOW, _ROW = 250, 190, 190
+"""Pixels: of a motion and its residual one below the other, and of both side by side."""
+
+
+class Drawn(NamedTuple):
+    """A run that the page shows.
+
+    Attributes:
+        side: that it is of.
+        row: in it.
+        says: its name, use and gap, for the control.
+        gap: RMS of its residual before, in noises.
+    """
+
+    side: Side
+    row: int
+    says: str
+    gap: float
+
+
+class Motion(NamedTuple):
+    """The table, the runs and channels in the chart's order, and what was left out.
+
+    Attributes:
+        frame: a row for each sample that is shown, as texts.
+        runs: worst first, that of the printed figure before all.
+        stretches: into which the longest run was cut, of each of which the extremes are shown; 0
+            where all samples are.
+        longest: samples of the longest run.
+        absent: runs that are not shown.
+    """
+
+    frame: pd.DataFrame
+    runs: tuple[Drawn, ...]
+    stretches: int
+    longest: int
+    absent: int
+
+
+def motion(story: Story, most: int = MOST_ROWS) -> Motion:
+    """The samples to show, at most about so many."""
+    import pandas as pd
+
+    runs = _runs(story)
+    count = len(story.channels)
+    shown = runs[: max(1, most // (LEAST_ROWS * count))]
+    each = max(LEAST_ROWS, most // (len(shown) * count))
+    parts = [_rows(story, run, c, each) for run in shown for c in range(count)]
+    names = ["run", "channel", "t", "measured", "before"] + ["after"] * changed(story)
+    names += ["residual_before"] + ["residual_after"] * changed(story)
+    columns = [[cell for part in parts for cell in part[i]] for i in range(len(names))]
+    frame = pd.DataFrame(dict(zip(names, columns, strict=True)), dtype=str)
+    longest = max(len(run.side.times[run.row]) for run in shown)
+    cut = _stretches(story, each) if longest > each else 0
+    return Motion(frame, tuple(shown), cut, longest, len(runs) - len(shown))
+
+
+def _runs(story: Story) -> list[Drawn]:
+    """All runs, worst first; that of the printed figure before all."""
+    sigma = np.array([c.sigma for c in story.channels])
+    first = worst(story)
+    found = []
+    for side in sides(story):
+        squares = np.square((side.observed - side.before) / sigma)
+        use = ", held out" if side is story.held_out else ""
+        for row, name in enumerate(side.names):
+            there = squares[row][np.isfinite(squares[row])]
+            gap = float(np.sqrt(there.mean())) if there.size else 0.0
+            says = f"{clean(name, 40)}{use}: {number(gap, 2)} noises"
+            found.append(Drawn(side, row, says, gap))
+    shot = (id(first.side), first.row)
+    return sorted(found, key=lambda run: ((id(run.side), run.row) != shot, -run.gap))
+
+
+def _stretches(story: Story, most: int) -> int:
+    """Stretches of a long run: of each the extremes of two or three signals are kept."""
+    return max(1, most // (6 if changed(story) else 4))
+
+
+def extremes(signals: Sequence[Array], stretches: int) -> NDArray[np.intp]:
+    """Places, in order, at which any of the signals is least or largest within a stretch; the first
+    and the last sample too.
+
+    Args:
+        signals: (T,) each, NaN where missing.
+        stretches: how many, as equal as may be.
+    """
+    size = len(signals[0])
+    edges = np.linspace(0, size, stretches + 1).astype(int)[:-1]
+    long = np.diff([*edges, size]).max()
+    # A stretch a row, filled up with what is neither least nor largest.
+    places = np.minimum(edges[:, None] + np.arange(long), size - 1)
+    own = places < np.append(edges[1:], size)[:, None]
+    rows = np.arange(len(edges))
+    chosen = [np.array([0, size - 1])]
+    for signal in signals:
+        for sign in (1.0, -1.0):
+            values = np.where(own & np.isfinite(signal[places]), sign * signal[places], -np.inf)
+            chosen.append(places[rows, values.argmax(axis=1)])
+    return np.unique(np.concatenate(chosen))
+
+
+def _rows(story: Story, run: Drawn, c: int, most: int) -> list[list[str]]:
+    """The cells of a channel of a run, column by column."""
+    side, channel = run.side, story.channels[c]
+    times = side.times[run.row]
+    whiches = ("before", "after") if changed(story) else ("before",)
+    observed = side.observed[run.row, : len(times), c]
+    simulated = [getattr(side, which)[run.row, : len(times), c] for which in whiches]
+    residuals = [(observed - one) / channel.sigma for one in simulated]
+    kept = np.arange(len(times))
+    if len(times) > most:
+        kept = extremes([observed, *residuals], _stretches(story, most))
+    digits = int(np.clip(ceil(log10(DIGITS / channel.sigma)), 0, 15)) if channel.sigma > 0 else 9
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    # A thousandth of a step: stamps that jitter are told from those that do not.
+    fine = int(np.clip(3 - floor(log10(step)), 0, 9)) if step > 0 else 6
+    count = len(kept)
+    texts = [[clean(side.names[run.row], 80)] * count, [clean(channel.name, 80)] * count]
+    texts.append(_written(times[kept], fine))
+    texts += [_written(values[kept], digits) for values in (observed, *simulated)]
+    return texts + [_written(values[kept], 2) for values in residuals]
+
+
+def _written(values: Array, digits: int) -> list[str]:
+    """Numbers with so many decimals and no more than they need; empty where there is none."""
+    texts = [f"{value:.{digits}f}" if np.isfinite(value) else "" for value in values.tolist()]
+    return [text.rstrip("0").rstrip(".") if "." in text else text for text in texts]
+
+
+def motion_chart(story: Story, shown: Motion, static: Static | None, printed: str) -> Chart:
+    """The chart of the table.
+
+    Args:
+        story: what is told.
+        shown: its table.
+        static: the printed figure.
+        printed: how to read that; safe HTML.
+    """
+    panels: list[Panel] = []
+    places = _places(story)
+    wide = len(places) > 2 or by_joint(story)
+    for run in shown.runs:
+        for facets, c in places:
+            panels += _pair(story, run, c, {"run": run.says, **facets}, wide)
+    sides = ("Left", "Right") if wide else ("Above", "Below")
+    caption = [
+        f"{sides[0]}: measured (dots) and simulated. {sides[1]}: the residual, measured less "
+        "simulated, in units of the noise σ; in the grey band 95 % of the noise would lie. All "
+        "panels have one time axis: drag across to zoom in, double-click for the whole."
+    ]
+    if shown.stretches:
+        caption.append(
+            f"Of runs of up to {shown.longest} samples not all are shown here: of each of "
+            f"{shown.stretches} stretches those at which what was measured, or a residual, is "
+            "least or largest. Each is a sample of the recording."
+        )
+    if shown.absent:
+        caption.append(f"{shown.absent} more runs, which fit better, are not shown.")
+    toggles = ("joint", "quantity") if by_joint(story) else ("channel",)
+    return Chart(
+        TABLE,
+        "Measured and simulated",
+        f'<span class="alive">{" ".join(caption)}</span><span class="paper">{printed}</span>',
+        tuple(panels),
+        static,
+        columns=2 if wide else 1,
+        along=True,
+        toggles=toggles,
+        off={toggles[0]: _off(story, places, toggles[0])},
+        lights=toggles[0],
+    )
+
+
+def _places(story: Story) -> list[tuple[dict[str, str], int]]:
+    """What each channel is switched by, joint by joint for a robot."""
+    if not by_joint(story):
+        return [({"channel": clean(c.name, 40)}, i) for i, c in enumerate(story.channels)]
+    found = []
+    for row in rows_of(story):
+        for quantity, c in row.channels.items():
+            own = story.channels[c].name.partition(".")[0] in QUANTITIES
+            what = QUANTITIES[quantity] if own else "sensor"
+            found.append(({"joint": clean(row.name, 40), "quantity": what}, c))
+    return found
+
+
+def _off(
+    story: Story, places: Sequence[tuple[dict[str, str], int]], toggle: str
+) -> tuple[str, ...]:
+    """Of very many channels those that fit well are switched off at first."""
+    if len(places) <= MOST_AT_FIRST:
+        return ()
+    gaps: dict[str, float] = {}
+    counts: dict[str, int] = {}
+    by_name = {place.label: place.before for place in story.places if place.kind == "channel"}
+    for facets, c in places:
+        name = facets[toggle]
+        gaps[name] = max(gaps.get(name, 0.0), by_name.get(story.channels[c].name, 0.0))
+        counts[name] = counts.get(name, 0) + 1
+    left = MOST_AT_FIRST
+    on: set[str] = set()
+    for name in sorted(gaps, key=lambda one: -gaps[one]):
+        if not on or counts[name] <= left:
+            on.add(name)
+            left -= counts[name]
+    return tuple(name for name in gaps if name not in on)
+
+
+def _pair(
+    story: Story, run: Drawn, c: int, facets: dict[str, str], wide: bool
+) -> tuple[Panel, Panel]:
+    """A channel's motion, and its residual."""
+    channel = story.channels[c]
+    where = {"run": clean(run.side.names[run.row], 80), "channel": clean(channel.name, 80)}
+    extended = changed(story)
+    series = [Series("measured", "measured", MEASURED, where, draw="points", under=True)]
+    left = [Series("simulated before", "residual_before", BEFORE, where)]
+    if extended:
+        series.append(Series("simulated after", "after", AFTER, where))
+        left.insert(0, Series("simulated after", "residual_after", AFTER, where))
+    series.append(Series("simulated before", "before", BEFORE, where))
+    across = Axis("time [s]", scales=("linear",))
+    name = clean(channel.name, 40)
+    # Of a robot's joints one scale shows at a glance where the gap is.
+    of = facets.get("quantity", name)
+    residual = Axis(f"residual of {of} [σ]", scales=("linear",), holds=(-_LEAST, _LEAST))
+    up = Axis(labelled(channel.name, channel.unit, 24), scales=("linear",))
+    band = (Span(-2.0, 2.0, "±2σ: 95 % of the noise", along="y"),)
+    tells = _tells(pretty(channel.unit), channel.sigma, extended)
+    heights = (_ROW, _ROW) if wide else (_TALL, _LOW)
+    above = Panel(name, TABLE, "t", tuple(series), across, up, facets, (), (), tells, heights[0])
+    below = Panel(
+        f"{name}: residual",
+        TABLE,
+        "t",
+        tuple(left),
+        across,
+        residual,
+        facets,
+        spans=band,
+        tells=tells,
+        height=heights[1],
+    )
+    return above, below
+
+
+def _tells(unit: str, sigma: float, extended: bool) -> tuple[Tell, ...]:
+    """What stands at the cursor: signals in their unit, residuals in noises and in their unit."""
+
+    def residual(says: str, y: str, look: Look) -> Tell:
+        return Tell(says, y, "σ", look, sigma, unit)
+
+    tells = [Tell("measured", "measured", unit, MEASURED), Tell("before", "before", unit, BEFORE)]
+    tells += [Tell("after", "after", unit, AFTER)] * extended
+    tells.append(residual("residual before", "residual_before", BEFORE))
+    if extended:
+        tells.append(residual("residual after", "residual_after", AFTER))
+    return tuple(tells)
