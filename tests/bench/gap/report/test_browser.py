@@ -229,6 +229,7 @@ def test_a_joint_lights_up_in_its_curves_its_picture_and_the_tables(robot):
     shown = [head for head in heads(robot) if "wrist_2" in head]
     assert lit == shown
     page.locator("#candidates-table").get_by_label("shown").select_option("")
+    page.locator("#candidates-table").get_by_label("search").fill("wrist_3")
     page.locator("#candidates-table tbody tr", has_text="@wrist_3").first.hover()
     assert page.locator("#robot .spot.lit").get_attribute("data-lights") == "wrist_3"
     # Joints stand where the picture has them: from the base to the tip of an arm, all within it.
@@ -282,7 +283,7 @@ def test_on_paper_and_without_a_script_figures_are_printed_ones(browser, simple,
         for place in ("#robot", "#motion", "#where-picture", "#candidates-picture"):
             assert one.page.locator(f"{place} img.still").is_visible()
         assert not one.page.locator("#follows").is_visible()
-        assert one.page.locator("#candidates-table tbody tr").count() > 10
+        assert one.page.locator("#candidates-table tbody tr").count() > 5
         assert one.page.locator("pre.changes ins").is_visible()
 
 
