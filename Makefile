@@ -9,6 +9,7 @@
 # make chaos     100 kills at random moments; what is resumed must equal what was never disturbed (about 10 minutes)
 # make malformed twelve thousand malformed files, folders and arguments to every command (about 5 minutes; KINDS="films weights")
 # make mutants   two hundred wrong changes, each of which a test must notice (about 10 minutes; ONLY="budget noise", JOBS=4)
+# make wheel     the wheel, in an empty environment of PYTHON (WITHOUT=torch,pybullet where pip would compile or fetch gigabytes)
 # make reference the comparison of results/reference/comparison again, below results/ (about 10 minutes)
 # make multi     the comparison of results/reference/multi again, below results/ (about 15 minutes; TUNERS=a,b,... for others)
 PYTHON ?= python3
@@ -16,7 +17,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: compare explain robot test check exam benchmark chaos malformed mutants reference multi docs install
+.PHONY: compare explain robot test check exam benchmark chaos malformed mutants reference multi wheel docs install
 install: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml
@@ -93,3 +94,6 @@ docs: $(STAMP)
 
 exam: $(STAMP)
 	$(BIN)/python -m tests.exam $(QUICK)
+
+wheel: $(STAMP)
+	$(BIN)/python -m tests.wheel $(if $(WITHOUT),--without $(WITHOUT)) $(PYTHON)

@@ -30,6 +30,7 @@ from bench.commands.compare import add_compare
 from bench.commands.completion import add_completion
 from bench.commands.datasheet import add_datasheet
 from bench.commands.design import add_design
+from bench.commands.diff import add_diff
 from bench.commands.explain import add_explain, add_score
 from bench.commands.film import add_film, add_track
 from bench.commands.importing import add_import
@@ -50,6 +51,7 @@ COMMANDS = (
         add_verify,
         "see whether a comparison, an explanation or an archive of one is what it says",
     ),
+    ("diff", add_diff, "two comparisons or two explanations: what changed, and significantly?"),
     ("bundle", add_bundle, "pack a comparison or an explanation as one archive that verifies"),
     ("check", add_check, "run the conformance suite on a tuner, a simulator or an effect"),
     ("plot", add_plot, "write table and figures of a comparison again, or of several together"),

@@ -46,9 +46,8 @@ def log_errors(curves: Curves) -> pd.DataFrame:
         mine = curves.of(tuner=tuner)
         names, groups = mine.by_target()
         errors = mean_over_seeds(mine.final(), groups)
-        logs = np.log(np.maximum(errors, LEAST))
         # A failure in one seed makes the target's mean infinite: it counts as failed.
-        columns[tuner] = pd.Series(np.where(np.isinf(errors), _WORST, logs), index=names)
+        columns[tuner] = pd.Series(logarithms(errors), index=names)
     return pd.DataFrame(columns)
 
 
@@ -64,7 +63,7 @@ def pairs(curves: Curves) -> pd.DataFrame:
     for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
         logs = log_errors(curves.of(experiment=str(experiment), range=str(kind)))
         lines = [
-            (experiment, kind, a, b, *_compared(logs[a].to_numpy(), logs[b].to_numpy()))
+            (experiment, kind, a, b, *compared(logs[a].to_numpy(), logs[b].to_numpy()))
             for a, b in itertools.combinations(logs.columns, 2)
         ]
         # A single tuner makes no pair.
@@ -86,10 +85,20 @@ def holm(p: Array) -> Array:
     return corrected
 
 
-def _compared(a: Array, b: Array) -> tuple[int, float, float, float, float]:
+def logarithms(errors: Array) -> Array:
+    """(n,) logarithms of errors (n,); of an infinite one, as of a run that failed, what is worse
+    than any error.
+    """
+    logs: Array = np.where(np.isinf(errors), _WORST, np.log(np.maximum(errors, LEAST)))
+    return logs
+
+
+def compared(a: Array, b: Array) -> tuple[int, float, float, float, float]:
+    """Targets, share on which a is better, effect, ratio of errors and p-value (Wilcoxon's
+    signed-rank test), of logarithms of errors a and b (n,) on the same targets.
+    """
     from scipy.stats import rankdata, wilcoxon
 
-    """Targets, share on which a is better, effect, ratio of errors and p-value."""
     there = ~(np.isnan(a) | np.isnan(b))
     difference = a[there] - b[there]
     wins = (difference < 0) + 0.5 * (difference == 0)

@@ -143,6 +143,12 @@ def bundle(ask, place, explained, log, **_):
 
 
 @case
+def diff(ask, run, explained, **_):
+    yield ask("diff", run, run)
+    yield ask("diff", explained, explained)
+
+
+@case
 def plot(ask, place, run, **_):
     yield ask("plot", run, *PLUGIN)
     found = ask("plot", run, run, *PLUGIN, "--out", place / "across")

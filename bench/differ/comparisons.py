@@ -1,0 +1,335 @@
+"""Two comparisons side by side: which tuners' errors differ, and whether that is more than chance.
+
+Errors are compared target by target where both runs met the same targets (the same truth and start;
+names alone say nothing, since every salt draws its own), each target by the mean over the seeds
+that both have: Wilcoxon's signed-rank test of the logarithms. Else the targets are two samples: the
+test of H. B. Mann, D. R. Whitney, Ann. Math. Stat. 18, 50, 1947. Holm's correction is over all
+lines.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.analysis.curves import Curves, Rows, primary
+from bench.analysis.paired import compared, holm, logarithms
+from bench.differ.change import ALPHA, aligned, changes, number, of_machine, said, side
+from bench.report import NEEDED
+from bench.store.folder import Stored, read
+from bench.store.made import environment
+from bench.store.status import FAILURES
+from sims.base import Array, InputError
+
+MOMENTS = (3, 10)
+"""Numbers of simulations at which errors are compared, beside the last that both have."""
+_TARGET = ("true_", "recommendation_")
+"""Columns by which a target is known: its truth, and where its runs begin."""
+
+
+@dataclass(frozen=True)
+class Side:
+    """One of two comparisons."""
+
+    folder: Path
+    stored: Stored
+    curves: Curves
+    targets: pd.DataFrame
+
+    def cells(self, kind: str, tuner: str, k: int) -> pd.Series[float]:
+        """Errors of a tuner after k simulations by (target, seed); infinite where the run
+        failed and has come to its end.
+        """
+        part = self.curves.of(range=kind, tuner=tuner)
+        last = k >= part.values.shape[1] - 1
+        errors = part.values[:, k]
+        lost = np.isnan(errors) | (part.failed & last)
+        index = pd.MultiIndex.from_frame(part.keys[["target", "seed"]])
+        return pd.Series(np.where(lost, np.inf, errors), index=index)
+
+
+def opened(folder: Path, metric: str | None = None) -> Side:
+    """One of two comparisons; by the error that decides where no metric is named.
+
+    Raises:
+        InputError: it is no comparison, or holds no runs, or none with the metric.
+    """
+    stored = read(folder, [*NEEDED, *_target_columns(folder)])
+    if stored.runs.empty:
+        raise InputError(f"{folder}: holds no runs")
+    name = metric or primary(stored.runs).metric
+    if name not in stored.runs or stored.runs[name].isna().all():
+        raise InputError(f"{folder}: has no {name}, by which the other is decided")
+    runs = stored.runs[stored.runs[name].notna()]
+    curves = Rows(runs, stored.statuses, stored.experiment.budget).curves(name)
+    columns = [c for c in runs if str(c).startswith(_TARGET)]
+    targets = stored.runs[stored.runs["k"] == 0].groupby("target")[columns].first()
+    return Side(folder, stored, curves, targets)
+
+
+def _target_columns(folder: Path) -> list[str]:
+    from pyarrow import parquet
+
+    path = folder / "runs.parquet"
+    # Whoever reads the folder says what is wrong with it.
+    if not path.is_file():
+        return []
+    try:
+        return [n for n in parquet.read_schema(path).names if n.startswith(_TARGET)]
+    except (OSError, ValueError):
+        return []
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What differs between two comparisons.
+
+    Attributes:
+        a: the first, from which changes are counted.
+        b: the second.
+        metric: the deciding error.
+    """
+
+    a: Side
+    b: Side
+    metric: str
+
+    @cached_property
+    def errors(self) -> pd.DataFrame:
+        """A line a range, tuner and number of simulations, columns as in the schema ``diff``."""
+        lines = list(self._lines())
+        if not lines:
+            return pd.DataFrame()
+        frame = pd.DataFrame(lines)
+        there = frame["p_value"].notna().to_numpy()
+        frame["p_holm"] = np.nan
+        frame.loc[there, "p_holm"] = holm(frame.loc[there, "p_value"].to_numpy(dtype=float))
+        frame["significant"] = frame["p_holm"] < ALPHA
+        return frame
+
+    def _lines(self) -> Iterator[dict[str, Any]]:
+        ranges = set(self.b.curves.keys["range"])
+        budget = min(side.stored.experiment.budget for side in (self.a, self.b))
+        moments = sorted({k for k in MOMENTS if k < budget} | {budget})
+        for kind in dict.fromkeys(self.a.curves.keys["range"]):
+            if kind not in ranges:
+                continue
+            mine, other = (s.curves.of(range=str(kind)).tuners() for s in (self.a, self.b))
+            for tuner in (t for t in mine if t in other):
+                for k in moments:
+                    yield self._line(str(kind), tuner, k)
+
+    def _line(self, kind: str, tuner: str, k: int) -> dict[str, Any]:
+        a, b = (side.cells(kind, tuner, k) for side in (self.a, self.b))
+        shared = self.shared
+        both = [key for key in a.index if key in b.index and key[0] in shared]
+        paired = bool(both)
+        if paired:
+            a, b = a[both], b[both]
+        by_target = [each.groupby(level="target").mean() for each in (a, b)]
+        first, second = (logarithms(np.asarray(each, dtype=np.float64)) for each in by_target)
+        if paired:
+            count, _, _, ratio, p = compared(second, first)
+        else:
+            count, ratio, p = min(len(first), len(second)), *_unpaired(first, second)
+        medians = [float(each.median()) for each in by_target]
+        return {
+            "range": kind,
+            "tuner": tuner,
+            "simulations": k,
+            "metric": self.metric,
+            "median_a": medians[0],
+            "median_b": medians[1],
+            "ratio": ratio,
+            "targets": count,
+            "paired": paired,
+            "p_value": p,
+            "failures_a": int(np.isinf(a).sum()),
+            "failures_b": int(np.isinf(b).sum()),
+        }
+
+    @cached_property
+    def shared(self) -> set[str]:
+        """Targets that both have met: of the same truth, and with the same start."""
+        a, b = self.a.targets, self.b.targets
+        if list(a.columns) != list(b.columns):
+            return set()
+        names = [name for name in a.index if name in b.index]
+        same = np.isclose(
+            a.loc[names].to_numpy(dtype=float),
+            b.loc[names].to_numpy(dtype=float),
+            rtol=1e-9,
+            atol=0.0,
+            equal_nan=True,
+        )
+        return {name for name, alike in zip(names, same.all(axis=1), strict=True) if alike}
+
+    @cached_property
+    def statuses(self) -> list[dict[str, Any]]:
+        """How many runs of a tuner ended how, where that differs."""
+        counts = [
+            Counter(zip(s.stored.statuses["tuner"], s.stored.statuses["status"], strict=True))
+            for s in (self.a, self.b)
+        ]
+        return [
+            {"tuner": tuner, "status": status, "a": counts[0][key], "b": counts[1][key]}
+            for key in sorted({*counts[0], *counts[1]})
+            if counts[0][key] != counts[1][key]
+            for tuner, status in [key]
+        ]
+
+    @cached_property
+    def only(self) -> dict[str, list[str]]:
+        """Tuners that one of them has alone."""
+        mine, other = (s.curves.tuners() for s in (self.a, self.b))
+        return {
+            "a": [t for t in mine if t not in other],
+            "b": [t for t in other if t not in mine],
+        }
+
+    @property
+    def changed(self) -> bool:
+        """Whether an error differs significantly, or another share of the runs fails."""
+        return bool(len(self._significant())) or any(a != b for a, b in self._failing())
+
+    @property
+    def worse(self) -> bool:
+        """Whether an error has grown significantly, or a larger share of the runs fails."""
+        found = self._significant()
+        grown = bool(len(found) and (found["ratio"] > 1).any())
+        return grown or any(b > a for a, b in self._failing())
+
+    def _significant(self) -> pd.DataFrame:
+        return self.errors[self.errors["significant"]] if len(self.errors) else self.errors
+
+    def _failing(self) -> Iterator[tuple[float, float]]:
+        """The share of runs that failed, of each tuner that both have."""
+        frames = [s.stored.statuses for s in (self.a, self.b)]
+        for tuner in self.a.curves.tuners():
+            if tuner not in self.only["a"]:
+                mine = [f.loc[f["tuner"] == tuner, "status"].isin(FAILURES).mean() for f in frames]
+                yield float(mine[0]), float(mine[1])
+
+    def _telling(self) -> Iterator[str]:
+        """Statuses in words: failures, and the others where as many runs were made."""
+        runs = [s.stored.statuses["tuner"].value_counts() for s in (self.a, self.b)]
+        for each in self.statuses:
+            tuner = each["tuner"]
+            if each["status"] in FAILURES or runs[0].get(tuner) == runs[1].get(tuner):
+                yield f"{tuner}: {each['status']} {each['a']} -> {each['b']}"
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """What to know before believing it."""
+        notes = []
+        found = self.errors
+        if not len(found):
+            return ["no range and tuner is in both"]
+        if not found["paired"].any():
+            notes.append("no target is in both (each salt draws its own): not paired")
+        elif not found["paired"].all():
+            notes.append("some lines are not paired: their targets are not in both")
+        least = min(_least(n, p) for n, p in zip(found["targets"], found["paired"], strict=True))
+        if least * len(found) > ALPHA:
+            notes.append(
+                f"no difference could be significant: with {found['targets'].max()} targets a "
+                f"p-value is at least {least:.2g}, and {len(found)} lines are compared"
+            )
+        return notes
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        experiments = [s.stored.experiment for s in (self.a, self.b)]
+        environments = [environment(s.folder) for s in (self.a, self.b)]
+        sides = [
+            side(s.folder, e.name, told)
+            for s, e, told in zip((self.a, self.b), experiments, environments, strict=True)
+        ]
+        return {
+            "kind": "comparison",
+            "changed": self.changed,
+            "worse": self.worse,
+            "a": sides[0],
+            "b": sides[1],
+            "errors": self.errors.to_dict("records"),
+            "statuses": self.statuses,
+            "only": self.only,
+            "configuration": changes(*(each.document() for each in experiments)),
+            "environment": changes(*map(of_machine, environments)),
+            "notes": self.notes,
+        }
+
+    def lines(self) -> Iterator[str]:
+        """A short account."""
+        document = self.document()
+        head = ("range", "tuner", "", "simulations", "a", "b", "b / a", "targets", "p (Holm)")
+        yield f"{self.metric}, median over targets; p of a difference, corrected for all lines"
+        rows = [head]
+        lines: list[dict[str, Any]] = document["errors"]
+        last = max((each["simulations"] for each in lines), default=0)
+        shown = [each for each in lines if each["significant"] or each["simulations"] == last]
+        for each in shown:
+            mark = "" if not each["significant"] else "WORSE" if each["ratio"] > 1 else "better"
+            rows.append(
+                (
+                    each["range"],
+                    each["tuner"],
+                    mark,
+                    str(each["simulations"]),
+                    number(each["median_a"]),
+                    number(each["median_b"]),
+                    number(each["ratio"]),
+                    f"{each['targets']}{'' if each['paired'] else ' not paired'}",
+                    number(each["p_holm"]),
+                )
+            )
+        yield from aligned(rows)
+        if len(lines) > len(shown):
+            yield f"({len(lines) - len(shown)} more lines differ by chance at most; --json has all)"
+        yield from self._telling()
+        for name, tuners in self.only.items():
+            if tuners:
+                yield f"in {name} alone: {', '.join(tuners)}"
+        for what in ("configuration", "environment"):
+            if document[what]:
+                yield f"{what}, a -> b"
+                yield from said(document[what])
+        yield from (f"note: {note}" for note in self.notes)
+        yield "something has changed" if self.changed else "nothing has changed significantly"
+
+    def table(self) -> pd.DataFrame:
+        """For a CSV file."""
+        return self.errors
+
+
+def _unpaired(a: Array, b: Array) -> tuple[float, float]:
+    """Ratio of the medians of b over a, and Mann and Whitney's p-value."""
+    from scipy.stats import mannwhitneyu
+
+    ratio = float(np.exp(np.clip(np.median(b) - np.median(a), -700, 700)))
+    return ratio, float(mannwhitneyu(a, b).pvalue)
+
+
+def _least(targets: int, paired: bool) -> float:
+    """The least p-value that so many targets allow."""
+    from math import comb
+
+    return 2.0 / 2**targets if paired else 2.0 / comb(2 * targets, targets)
+
+
+def compare(a: Path, b: Path) -> Compared:
+    """Two comparisons side by side.
+
+    Raises:
+        InputError: one is none, or has nothing that the other could be compared with.
+    """
+    first = opened(a)
+    metric = primary(first.stored.runs).metric
+    return Compared(first, opened(b, metric), metric)

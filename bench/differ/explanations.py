@@ -1,0 +1,277 @@
+"""Two explanations side by side: verdict, causes, numbers, and whether a number has moved by more
+than both intervals allow.
+
+Half of a 95 % interval is 1.96 standard errors; the difference of two numbers has the root of both
+squares summed, if the two explanations are of different recordings. Of the same recording they are
+not independent, and the difference is known better than that: what is called significant is so all
+the more. Holm's correction is over all numbers.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.analysis.paired import holm
+from bench.differ.change import ALPHA, aligned, changes, number, of_machine, said, side
+from bench.gap.verdict import Verdict
+from bench.schemas import faults
+from bench.store.made import environment
+from sims.base import InputError
+from sims.extended import Number
+from sims.files import first_line
+from sims.user_toml import read_toml
+
+VERDICT, EXTENDED = "verdict.json", "extended.toml"
+_STRONGEST = 5
+"""Candidates of either that are compared."""
+_HELD_OUT = ("rmse_base", "rmse_extended", "noise_floor", "gap_closed", "low", "high")
+_SIGMAS = 1.96
+"""Half the width of a 95 % interval, in standard errors."""
+
+
+@dataclass(frozen=True)
+class Side:
+    """One of two explanations."""
+
+    folder: Path
+    verdict: Verdict
+    title: str
+    environment: Mapping[str, Any]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What was asked, of what, and by which versions on what machine."""
+        made = self.environment
+        recordings = {each["file"]: each["sha256"] for each in made.get("recordings", [])}
+        asked = {"system": self.verdict.system, "engine": self.verdict.engine}
+        return {
+            **asked,
+            "settings": made.get("settings", {}),
+            "recordings": recordings,
+            **of_machine(made),
+        }
+
+    def place(self, effect: str) -> str:
+        """Whether an effect is a cause, an alternative to one, or neither."""
+        if any(cause.effect == effect for cause in self.verdict.causes):
+            return "cause"
+        if any(effect in cause.alternatives for cause in self.verdict.causes):
+            return "alternative"
+        return "no"
+
+
+def opened(folder: Path) -> Side:
+    """One of two explanations.
+
+    Raises:
+        InputError: it is none, or damaged.
+    """
+    path = folder / VERDICT
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        wrong = faults(document, "verdict")
+        verdict = Verdict.of(document) if not wrong else None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        wrong, verdict = [first_line(error)], None
+    if verdict is None:
+        raise InputError(f"{path}: expected a verdict of simgap explain; {wrong[0]}")
+    title = str(read_toml(folder / EXTENDED).get("title", ""))
+    return Side(folder, verdict, title, environment(folder))
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What differs between two explanations."""
+
+    a: Side
+    b: Side
+
+    @cached_property
+    def causes(self) -> list[dict[str, Any]]:
+        """Every effect that either names, with its place in both."""
+        named = [
+            effect
+            for each in (self.a, self.b)
+            for cause in each.verdict.causes
+            for effect in (cause.effect, *cause.alternatives)
+        ]
+        return [
+            {"effect": effect, "in_a": self.a.place(effect), "in_b": self.b.place(effect)}
+            for effect in dict.fromkeys(named)
+        ]
+
+    @cached_property
+    def numbers(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        """Coefficients and parameters that both have, or one alone, with their intervals."""
+        coefficients = _beside(_coefficients(self.a), _coefficients(self.b))
+        parameters = _beside(self.a.verdict.parameters, self.b.verdict.parameters)
+        rows = [*coefficients, *parameters]
+        p = np.array([_p_value(row) for row in rows])
+        there = np.isfinite(p)
+        corrected = np.full(len(p), np.nan)
+        corrected[there] = holm(p[there])
+        for row, value in zip(rows, corrected, strict=True):
+            row["significant"] = bool(value < ALPHA) if np.isfinite(value) else None
+        return coefficients, parameters
+
+    @property
+    def changed(self) -> bool:
+        """Whether verdict or causes differ, or a number does significantly."""
+        other = self.a.verdict.verdict != self.b.verdict.verdict
+        moved = any(row["significant"] for rows in self.numbers for row in rows)
+        causes = any("cause" in pair and len(set(pair)) > 1 for pair in self._places())
+        return other or moved or causes
+
+    def _places(self) -> list[tuple[str, str]]:
+        return [(each["in_a"], each["in_b"]) for each in self.causes]
+
+    @property
+    def worse(self) -> bool:
+        """Nobody can say of two explanations which is the worse.
+
+        Raises:
+            InputError: always.
+        """
+        raise InputError("--fail-on worse: is for comparisons; of explanations take change")
+
+    def _held_out(self) -> list[dict[str, Any]]:
+        sides = [each.verdict.heldout for each in (self.a, self.b)]
+        return [
+            {"name": name, "a": getattr(sides[0], name, None), "b": getattr(sides[1], name, None)}
+            for name in _HELD_OUT
+        ]
+
+    def _candidates(self) -> list[dict[str, Any]]:
+        """The strongest of either, with score and rank in both."""
+        ranked = [
+            {c.effect: (rank, c.score) for rank, c in enumerate(each.verdict.candidates, 1)}
+            for each in (self.a, self.b)
+        ]
+        names = [e for each in ranked for e, (rank, _) in each.items() if rank <= _STRONGEST]
+        rows = []
+        for name in dict.fromkeys(names):
+            (rank_a, score_a), (rank_b, score_b) = (each.get(name, (None, None)) for each in ranked)
+            scores = {"score_a": score_a, "score_b": score_b}
+            rows.append({"effect": name, **scores, "rank_a": rank_a, "rank_b": rank_b})
+        return rows
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """What to know before believing it."""
+        notes = []
+        if not (self.a.environment and self.b.environment):
+            notes.append("of an older explanation settings and versions are not known")
+        units = [each.verdict.heldout.unit for each in (self.a, self.b) if each.verdict.heldout]
+        if len(set(units)) > 1:
+            notes.append(f"held-out errors are in {units[0]} and in {units[1]}")
+        if self.a.verdict.system != self.b.verdict.system:
+            notes.append(f"of two systems: {self.a.verdict.system} and {self.b.verdict.system}")
+        return notes
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        coefficients, parameters = self.numbers
+        sides = [side(each.folder, each.title, each.environment) for each in (self.a, self.b)]
+        return {
+            "kind": "explanation",
+            "changed": self.changed,
+            "a": sides[0],
+            "b": sides[1],
+            "verdict": {"a": self.a.verdict.verdict, "b": self.b.verdict.verdict},
+            "causes": self.causes,
+            "coefficients": coefficients,
+            "parameters": parameters,
+            "heldout": self._held_out(),
+            "candidates": self._candidates(),
+            "settings": changes(self.a.settings, self.b.settings),
+            "notes": self.notes,
+        }
+
+    def lines(self) -> Iterator[str]:
+        """A short account."""
+        document = self.document()
+        words = document["verdict"]
+        same = words["a"] == words["b"]
+        yield f"verdict: {words['a']}" + ("" if same else f" -> {words['b']}")
+        for cause in self.causes:
+            here, there = cause["in_a"], cause["in_b"]
+            told = f"{here} in both" if here == there else f"{here} -> {there}"
+            yield f"{'cause' if 'cause' in (here, there) else '     '} {cause['effect']}: {told}"
+        rows = [("number", "unit", "", "a", "95 %", "b", "95 %")]
+        for row in (*document["coefficients"], *document["parameters"]):
+            mark = "MOVED" if row["significant"] else ""
+            cells = [number(row["a"]), _interval(row, "a"), number(row["b"]), _interval(row, "b")]
+            rows.append((row["name"], row["unit"], mark, *cells))
+        yield from aligned(rows)
+        for row in document["heldout"]:
+            if row["a"] is not None or row["b"] is not None:
+                yield f"held-out {row['name']}: {number(row['a'])} -> {number(row['b'])}"
+        for row in document["candidates"]:
+            if row["rank_a"] != row["rank_b"]:
+                ranks = f"{row['rank_a'] or 'none'} -> {row['rank_b'] or 'none'}"
+                yield f"candidate {row['effect']}: rank {ranks}"
+        if document["settings"]:
+            yield "settings, a -> b"
+            yield from said(document["settings"])
+        yield from (f"note: {note}" for note in self.notes)
+        yield "something has changed" if self.changed else "nothing has changed significantly"
+
+    def table(self) -> pd.DataFrame:
+        """For a CSV file."""
+        coefficients, parameters = self.numbers
+        held_out = [{**row, "name": f"heldout {row['name']}"} for row in self._held_out()]
+        return pd.DataFrame([*coefficients, *parameters, *held_out])
+
+
+def _coefficients(each: Side) -> dict[str, Number]:
+    return {
+        f"{cause.effect} {name}": value
+        for cause in each.verdict.causes
+        for name, value in cause.coefficients.items()
+    }
+
+
+def _beside(a: Mapping[str, Number], b: Mapping[str, Number]) -> list[dict[str, Any]]:
+    rows = []
+    for name in dict.fromkeys([*a, *b]):
+        first, second = a.get(name), b.get(name)
+        either = first or second
+        assert either is not None
+        row: dict[str, Any] = {"name": name, "unit": either.unit}
+        for mark, each in (("a", first), ("b", second)):
+            row |= {
+                mark: each.value if each else None,
+                f"low_{mark}": each.low if each else None,
+                f"high_{mark}": each.high if each else None,
+            }
+        rows.append(row)
+    return rows
+
+
+def _p_value(row: Mapping[str, Any]) -> float:
+    """Of the difference being none; NaN where an interval is open or a number missing."""
+    ends = [row[key] for key in ("low_a", "high_a", "low_b", "high_b", "a", "b")]
+    if any(end is None for end in ends):
+        return math.nan
+    errors = [(row[f"high_{m}"] - row[f"low_{m}"]) / (2 * _SIGMAS) for m in ("a", "b")]
+    spread = math.hypot(*errors)
+    difference = abs(row["a"] - row["b"])
+    if spread == 0:
+        return 1.0 if difference == 0 else 0.0
+    return math.erfc(difference / spread / math.sqrt(2))
+
+
+def _interval(row: Mapping[str, Any], mark: str) -> str:
+    low, high = row[f"low_{mark}"], row[f"high_{mark}"]
+    return "" if row[mark] is None else f"{number(low)} to {number(high)}"
