@@ -17,12 +17,27 @@ from time import perf_counter
 from tests.wheel.wheel import build, environment, faults, requirements
 
 
-def steps(simgap):
-    """By what each shows: a command, and how it must end."""
+SMALL = """simulator = "pendulum"
+observe = ["q"]
+tuners = ["random", "nelder_mead"]
+targets = 2
+budget = 4
+[settings]
+engine = "batch"
+[initial]
+q = [0.5, 1.0]
+[sampling]
+rate = 50.0
+samples = 50
+"""
+"""An experiment that needs no engine but simgap's own."""
+
+
+def steps():
+    """Commands, each of which must end well."""
     log, told = "swing.csv", "told"
     hidden = ["--effect", "drag.linear=4e-4", "--noise", "q=0.01", "--observe", "q"]
     simulated = ["simulate", "pendulum", *hidden, "--runs", "2", "--seconds", "2", "--rate", "50"]
-    small = ["--tuners", "random,nelder_mead", "--targets", "2", "--budget", "4", "--jobs", "1"]
     return [
         ["--version"],
         ["list", "tuners"],
@@ -30,7 +45,9 @@ def steps(simgap):
         ["info"],
         ["schema", "verdict"],
         ["completion", "bash"],
-        ["compare", "arm-swing", *small, "--out", "run"],
+        ["compare", "small.toml", "--jobs", "1", "--out", "run"],
+        ["plot", "run", "--behind", "run"],
+        ["diff", "run", "run", "--fail-on", "change"],
         ["verify", "run"],
         ["bundle", "run"],
         ["verify", "run.zip"],
@@ -55,8 +72,9 @@ def used(python, wheel, without, place):
     print(f"{python}: installed in {perf_counter() - begun:.0f} s", flush=True)
     away = place / "away"
     away.mkdir()
+    (away / "small.toml").write_text(SMALL)
     wrong = []
-    for step in steps("simgap"):
+    for step in steps():
         begun = perf_counter()
         done = subprocess.run(
             [str(own.parent / "simgap"), *step],
