@@ -16,7 +16,6 @@ from time import perf_counter
 
 from tests.wheel.wheel import build, environment, faults, requirements
 
-
 SMALL = """simulator = "pendulum"
 observe = ["q"]
 tuners = ["random", "nelder_mead"]
