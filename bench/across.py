@@ -4,7 +4,7 @@ each.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,9 +20,10 @@ from bench.analysis.runtimes import ert_table, solved
 from bench.analysis.statistics import Statistics
 from bench.figures import runtimes
 from bench.figures.comparison import statistics_of
-from bench.figures.style import Styles, mark, save
+from bench.figures.style import Pictures, Styles, keep, mark, taken
+from bench.pages.comparison.together import Several, together_page
 from bench.problem.experiment import Entry, Experiment
-from bench.report import NEEDED
+from bench.report import NEEDED, REPORT
 from bench.store.folder import read
 from sims.base import Array, InputError
 from sims.files import write
@@ -68,18 +69,23 @@ def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> Ac
     together = read_together(folders)
     out.mkdir(parents=True, exist_ok=True)
     files = []
-    for name, text in together.tables().items():
+    frames = together.frames()
+    for name, frame in frames.items():
         files.append(out / f"{name}.csv")
-        write(files[-1], text)
+        write(files[-1], frame.to_csv(index=False))
     means = together.ranked.mean().sort_values().round(2)
     count = len(together.ranked)
     say(f"mean rank over {count} problems (1 is best)\n{means.to_string()}")
     if not together.comparable:
         say(f"no critical-difference diagram: it needs {PROBLEMS} problems and {_TUNERS} tuners")
-    for name, figure in together.figures().items():
-        drawn = save(figure, out / "figures" / name)
+    pictures = {name: taken(figure) for name, figure in together.figures().items()}
+    for name, picture in pictures.items():
+        drawn = keep(out / "figures" / name, picture.png, picture.pdf)
         say(f"figure  {drawn[0]}")
         files += drawn
+    files.append(out / REPORT)
+    write(files[-1], together_page(together.several(frames, pictures, folders, out)))
+    say(f"report  {files[-1]}")
     return Across(together, files)
 
 
@@ -139,22 +145,45 @@ class Together:
         """Friedman's p-value, and Nemenyi's of each pair of tuners; only where `comparable`."""
         return nemenyi(self.ranked)
 
-    def tables(self) -> dict[str, str]:
-        """ert, pairs, ranks, and nemenyi where `comparable`: CSV by name."""
+    def frames(self) -> dict[str, pd.DataFrame]:
+        """The tables ert, pairs, ranks, and nemenyi where `comparable`, by name."""
         ert, paired = [], []
         for part in self.parts:
             curves, levels = part.statistics.curves, part.statistics.levels
             times = ert_table(curves, levels, part.experiment.budget)
             ert.append(marked(times, part.experiment))
             paired.append(marked(pairs(curves), part.experiment))
-        texts = {
-            "ert": pd.concat(ert).to_csv(index=False),
-            "pairs": pd.concat(paired).to_csv(index=False),
-            "ranks": self._squared(self.ranked).to_csv(index_label="problem"),
+        frames = {
+            "ert": pd.concat(ert),
+            "pairs": pd.concat(paired),
+            "ranks": self._squared(self.ranked).reset_index(names="problem"),
         }
         if self.comparable:
-            texts["nemenyi"] = self._squared(self.tests[1]).to_csv(index_label="tuner")
-        return texts
+            frames["nemenyi"] = self._squared(self.tests[1]).reset_index(names="tuner")
+        return frames
+
+    def several(
+        self,
+        frames: Mapping[str, pd.DataFrame],
+        pictures: Mapping[str, Pictures],
+        folders: Sequence[Path],
+        out: Path,
+    ) -> Several:
+        """What the page in `out` is made from."""
+        friedman, p_values = self.tests if self.comparable else (float("nan"), None)
+        parts = [(part.experiment, part.statistics) for part in self.parts]
+        return Several(
+            parts,
+            self.tuners,
+            self.ranked,
+            p_values,
+            friedman,
+            self._shares(),
+            frames,
+            pictures,
+            [str(folder) for folder in folders],
+            str(out),
+        )
 
     @property
     def trusted(self) -> bool:

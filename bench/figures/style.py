@@ -145,11 +145,17 @@ class Look(NamedTuple):
     marker: str = ""
 
 
+def _marker(place: int) -> str:
+    """The marker at a place: each round of colours meets other ones."""
+    rounds = place // len(_COLOURS)
+    return _MARKERS[(place + 3 * rounds) % len(_MARKERS)]
+
+
 def look(place: int) -> Look:
     """The look of what stands at a place of a list, apart from its neighbours in grey too."""
     colour, line = _COLOURS[place % len(_COLOURS)], _LINES[place % len(_LINES)]
     dashes = _DASHES[line] if isinstance(line, str) else tuple(map(float, line[1]))
-    return Look(colour, _DARK[colour], dashes, _MARKERS[place % len(_MARKERS)])
+    return Look(colour, _DARK[colour], dashes, _marker(place))
 
 
 def drawn(colour: str, dashes: tuple[float, ...] = (), marker: str = "") -> Look:
@@ -190,7 +196,7 @@ class Styles:
         i = self._places[tuner]
         return {
             "color": _COLOURS[i % len(_COLOURS)],
-            "marker": _MARKERS[i % len(_MARKERS)],
+            "marker": _marker(i),
             "linestyle": _LINES[i % len(_LINES)],
             "linewidth": 1.6,
             "label": tuner,
@@ -210,7 +216,7 @@ class Styles:
         i = self._places[tuner] if tuner in self._places else taken + others.index(tuner)
         return {
             "color": BEHIND[self.behind.index(reference)],
-            "marker": _MARKERS[i % len(_MARKERS)],
+            "marker": _marker(i),
             "markerfacecolor": "white",
             "markersize": 3.5,
             "linestyle": _LINES[i % len(_LINES)],

@@ -6,13 +6,23 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from bench.figures.style import BLACK, BLUE, GREY, SLOPE, SOFT, VERMILION, blank, mark, save
+from bench.figures.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    SLOPE,
+    SOFT,
+    VERMILION,
+    Pictures,
+    blank,
+    mark,
+    taken,
+)
 from bench.problem.experiment import Experiment
 from bench.shot.deal import Deal
 from bench.shot.settings import Settings
@@ -40,23 +50,19 @@ _BELOW = 0.12
 
 
 def draw(
-    folder: Path,
     experiment: Experiment,
     settings: Settings,
     dealt: Sequence[Deal],
     kept: Mapping[str, Any],
     rows: pd.DataFrame,
     lines: pd.DataFrame,
-) -> list[Path]:
-    """Draw all into `folder`/figures; returns the PNG files."""
+) -> dict[str, Pictures]:
+    """All figures by name, as they are printed."""
     figures = {"success": success_figure(experiment, lines), "off": off_figure(settings, rows)}
     chosen = examples(dealt, kept, rows)
     if chosen:
         figures["shots"] = shots_figure(settings, chosen, kept)
-    return [
-        save(mark(figure, experiment.trusted), folder / "figures" / name)[0]
-        for name, figure in figures.items()
-    ]
+    return {name: taken(mark(figure, experiment.trusted)) for name, figure in figures.items()}
 
 
 def group_of(method: str) -> str:

@@ -9,10 +9,13 @@ from typing import Protocol
 import pandas as pd
 
 from bench.analysis.marks import marked
+from bench.figures import style
 from bench.problem.experiment import Experiment
+from bench.report import REPORT
 from bench.shot.animation import animate
 from bench.shot.deal import Deal
 from bench.shot.kept import read
+from bench.shot.page import shot_page
 from bench.shot.pictures import draw, examples
 from bench.shot.settings import Settings
 from bench.shot.table import NO_SHOT, table, text
@@ -85,7 +88,12 @@ def finish(study: Shots, say: Callable[[str], None]) -> int:
     statuses = marked(_statuses(rows, study.skipped), study.experiment)
     for name, frame in (("table", lines), ("shots", rows), ("status", statuses)):
         write(folder / f"{name}.csv", frame.to_csv(index=False, float_format="%.6g"))
-    figures = draw(folder, study.experiment, study.settings, study.deals, kept, rows, lines)
+    pictures = draw(study.experiment, study.settings, study.deals, kept, rows, lines)
+    figures = [
+        style.keep(folder / "figures" / name, picture.png, picture.pdf)[0]
+        for name, picture in pictures.items()
+    ]
+    write(folder / REPORT, shot_page(study.experiment, str(folder), lines, rows, pictures))
     for example in examples(study.deals, kept, rows)[:1]:
         figures.append(animate(folder, study.settings, example, kept, study.experiment.trusted))
     # Every new folder has one for a journal, which a bounce shot does not keep.
@@ -98,6 +106,7 @@ def finish(study: Shots, say: Callable[[str], None]) -> int:
     say(f"\ntable   {folder / 'table.csv'}\nshots   {folder / 'shots.csv'}")
     for figure in figures:
         say(f"figure  {figure}")
+    say(f"report  {folder / REPORT}")
     return int(failed["status"].isin(_FAILED).sum())
 
 
