@@ -1,9 +1,9 @@
 """What the page of a comparison costs: seconds, bytes, and how soon it answers, beside cocopp's.
 Run: `python -m tests.benchmarks.pages`.
 
-Prints one JSON line a measurement; seconds are the processor's, but for those of the browser. cocopp (`pip install cocopp`) is measured where it is installed,
-on as many runs of the same lengths: 24 functions of one dimension, 15 instances each, two
-algorithms.
+Prints one JSON line a measurement; seconds are the processor's, but for those of the browser.
+cocopp (`pip install cocopp six`) is measured where it is installed, on as many runs of the same
+lengths: 24 functions, 15 instances each, two algorithms.
 """
 
 from __future__ import annotations
