@@ -55,6 +55,12 @@ class Statistics:
         """All rows of a range."""
         return self.all_runs[self.all_runs["range"] == kind]
 
+    @cached_property
+    def targets(self) -> dict[str, int]:
+        """Targets of each range of which there are runs."""
+        counts = self.all_runs.groupby("range", sort=False)["target"].nunique()
+        return {str(kind): int(count) for kind, count in counts.items()}
+
     def medians(self, metric: str, kind: str) -> pd.DataFrame:
         """Medians of a metric against simulations in a range, of the runs that have it; see
         `bench.analysis.medians.median_curves`.

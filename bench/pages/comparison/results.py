@@ -59,8 +59,7 @@ class Results:
     @property
     def ranges(self) -> list[str]:
         """Ranges of which there are runs, in the experiment's order."""
-        there = set(self.stored.runs["range"])
-        return [kind for kind in self.experiment.ranges if kind in there]
+        return [kind for kind in self.experiment.ranges if kind in self.statistics.targets]
 
     @cached_property
     def style(self) -> Styles:
@@ -74,7 +73,7 @@ class Results:
 
     def count(self, kind: str) -> int:
         """Targets of a range; of a recording, starting points."""
-        return int(self.statistics.of(kind)["target"].nunique())
+        return self.statistics.targets[kind]
 
     def label(self, metric: str) -> str:
         """What an error is called on an axis."""

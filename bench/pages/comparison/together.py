@@ -167,7 +167,7 @@ def _errors(several: Several, page: Page) -> str:
                 for name, drawn in several.looks()
                 if name in there
             )
-            count = statistics.of(str(kind))["target"].nunique()
+            count = statistics.targets[str(kind)]
             title = f"{experiment.title or experiment.name}. {TITLES[str(kind)]} ({count})"
             up = Axis(_LABELS[metric], "log")
             facets = {"problem": problem}
