@@ -1,7 +1,7 @@
 """Studies: what an experiment asks for, made in a folder.
 
-Comparisons and bounce shots are two kinds of one contract, and this is the one place that tells
-which is which.
+Comparisons, bounce shots and studies of a missing effect are kinds of one contract, and this is the
+one place that tells which is which.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def begin_all(
     jobs: int = 2,
     salt: str | None = None,
 ) -> list[Study]:
-    """Begin the study, or the studies where the experiment sweeps over values.
+    """Begin the study, or the studies where the experiment sweeps over values or names others.
 
     Args:
         experiment: what is asked for.
@@ -137,7 +137,8 @@ def begin_all(
     wanted = expand(experiment)
     if len(wanted) == 1:
         return [begin(wanted[0], plugins, folder, jobs, salt)]
-    if salt is None and not experiment.salt:
+    # Experiments of their own have salts of their own: one that is complete gives away no other's.
+    if salt is None and not experiment.salt and not experiment.experiments:
         salt = fresh()
     parent = free_folder(experiment, folder)
     begun: list[Study] = []
@@ -163,6 +164,22 @@ def parts_of(folder: Path) -> list[Path]:
     return inside or [folder]
 
 
+def conclude(folder: Path, say: Say) -> None:
+    """Write and say what the studies in a folder come to together, where they are such as that can
+    be said of.
+
+    Args:
+        folder: as `begin_all` was given it.
+        say: prints a line.
+    """
+    parts = parts_of(folder)
+    experiments = [configuration(part).experiment for part in parts]
+    if len(parts) > 1 and all(experiment.calibration for experiment in experiments):
+        from bench.misspecified.report import conclude
+
+        conclude(folder, parts, say)
+
+
 def resume(folder: Path, plugins: Sequence[str] = ()) -> Study:
     """Take up the study in a folder; see `Study.resume`."""
     return _kind_in(folder).resume(folder, plugins)
@@ -184,6 +201,10 @@ def kind_of(experiment: Experiment) -> type[Study]:
         from bench.shot.study import BounceShotStudy
 
         return BounceShotStudy
+    if experiment.calibration:
+        from bench.misspecified.study import MisspecifiedStudy
+
+        return MisspecifiedStudy
     from bench.compare import Comparison
 
     return Comparison

@@ -102,6 +102,9 @@ def verify(
         raise InputError(f"{folder}: not finished, and its salt not revealed; resume it first")
     if experiment.shot:
         raise InputError(f"{folder}: expected a comparison, found a bounce shot")
+    if experiment.calibration:
+        remedy = f"name one of the two in it: {folder / 'plain'} or {folder / 'extended'}"
+        raise InputError(f"{folder}: expected a comparison, found a study of two; {remedy}")
     checks: list[str] = []
 
     def note(line: str) -> None:

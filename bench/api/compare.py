@@ -5,13 +5,14 @@ figures.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench import study
 from bench.figures import comparison
+from bench.misspecified.calibration import MODELS
 from bench.problem.asked import asked
 from bench.problem.experiment import Experiment, load
 from bench.problem.problem import Problem
@@ -24,7 +25,14 @@ from bench.runs.survey import admit
 from bench.store.csvs import Csv
 from bench.store.folder import Stored, read
 from bench.store.reference import find
-from bench.store.schema import SHOT_STATUS, SHOT_TABLE, SHOTS
+from bench.store.schema import (
+    MISSPECIFIED_RANKING,
+    MISSPECIFIED_RANKS,
+    MISSPECIFIED_TABLE,
+    SHOT_STATUS,
+    SHOT_TABLE,
+    SHOTS,
+)
 from methods.base import Tuner
 from sims.base import InputError, unknown
 
@@ -36,6 +44,12 @@ if TYPE_CHECKING:
 
 _OF_SHOTS = {"status": SHOT_STATUS, "shots": SHOTS, "table": SHOT_TABLE}
 """Columns of the tables of a bounce shot."""
+_OF_TWO = {
+    "table": MISSPECIFIED_TABLE,
+    "ranks": MISSPECIFIED_RANKS,
+    "ranking": MISSPECIFIED_RANKING,
+}
+"""Columns of the tables of a study of a missing effect."""
 _ROWS = 200
 """Rows of a table that a notebook shows."""
 
@@ -108,6 +122,8 @@ def compare(
     )
     if chosen.sweep:
         raise InputError(f"experiment {chosen.name} sweeps over values: use simgap.sweep")
+    if chosen.experiments:
+        raise InputError(f"experiment {chosen.name} names several: use simgap.sweep")
     folder = None if out is None else Path(out)
     check_comparison(chosen, folder, jobs, cluster is not None, force)
     pool = _cluster(cluster)
@@ -126,13 +142,14 @@ def sweep(
     progress: Progress | None = None,
     force: bool = False,
 ) -> list[Compared]:
-    """Run every experiment that one with a ``[sweep]`` stands for, one after another.
+    """Run every experiment that one with a ``[sweep]`` or ``experiments`` stands for, one by one.
 
     Args:
         experiment: its name, the path of its TOML file, or itself.
         jobs: as in `compare`.
         trust: as in `compare`.
-        salt: as in `compare`; one for all, so that they meet the same targets.
+        salt: as in `compare`; one for all that a sweep stands for, so that they meet the same
+            targets.
         out: folder in which each gets its own, named as the experiment is.
         plugins: as in `compare`.
         progress: told of every step.
@@ -149,7 +166,10 @@ def sweep(
     folder = None if out is None else Path(out)
     check_comparison(chosen, folder, jobs, force=force)
     begun = study.begin_all(chosen, files, folder, jobs, salt)
-    return [_made(one, jobs, progress, None) for one in begun]
+    made = [_made(one, jobs, progress, None) for one in begun]
+    if len(begun) > 1:
+        study.conclude(begun[0].folder.parent, _unsaid)
+    return made
 
 
 def wanted(
@@ -265,7 +285,7 @@ class Compared:
     """A comparison that has been made, read from its folder.
 
     Args:
-        folder: of a comparison or a bounce shot, finished or not.
+        folder: of a comparison, a bounce shot or a study of a missing effect, finished or not.
 
     Attributes:
         folder: where everything lies.
@@ -292,19 +312,39 @@ class Compared:
             problem.close()
 
     def _csv(self, name: str) -> pd.DataFrame:
-        """A table of a bounce shot, as it was written."""
+        """A table of a bounce shot or of a study of two comparisons, as it was written."""
         remedy = f"simgap plot {self.folder} writes it again"
         path = self.folder / f"{name}.csv"
-        table: pd.DataFrame = Csv(path, _OF_SHOTS[name], remedy).table.to_pandas()
+        columns = (_OF_SHOTS if self.experiment.shot else _OF_TWO)[name]
+        table: pd.DataFrame = Csv(path, columns, remedy).table.to_pandas()
         return table
+
+    @property
+    def _in_files(self) -> bool:
+        """Whether tables and figures are such as no comparison has."""
+        return bool(self.experiment.shot or self.experiment.calibration)
+
+    def _both(self, rows: Callable[[Stored], pd.DataFrame]) -> pd.DataFrame:
+        """Rows of both comparisons of a study of two, the simulator's name in front."""
+        import pandas as pd
+
+        parts = []
+        for model in MODELS:
+            part = rows(read(self.folder / model)).copy()
+            part.insert(0, "model", model)
+            parts.append(part)
+        return pd.concat(parts, ignore_index=True)
 
     @cached_property
     def tables(self) -> dict[str, pd.DataFrame]:
         """The tables by name: table, ert, pairs, break_even, who_wins; of a bounce shot table and
-        shots; see docs/results-films.md.
+        shots (docs/results-films.md), of a study of a missing effect table, ranks and ranking
+        (docs/misspecified.md).
         """
         if self.experiment.shot:
             return {name: self._csv(name) for name in ("table", "shots")}
+        if self.experiment.calibration:
+            return {name: self._csv(name) for name in _OF_TWO}
         return tables(self._stored)
 
     @property
@@ -315,17 +355,23 @@ class Compared:
     @property
     def runs(self) -> pd.DataFrame:
         """A row for each simulation, as runs.parquet; of a bounce shot a row for each shot."""
+        if self.experiment.calibration:
+            return self._both(lambda stored: stored.runs)
         return self.tables["shots"] if self.experiment.shot else self._stored.runs
 
     @property
     def statuses(self) -> pd.DataFrame:
         """A row for each run, how it ended and why, as status.csv."""
+        if self.experiment.calibration:
+            return self._both(lambda stored: stored.statuses)
         return self._csv("status") if self.experiment.shot else self._stored.statuses
 
     @property
     def figures(self) -> list[str]:
-        """Names of the figures that there are; those of a bounce shot are files in its folder."""
-        return [] if self.experiment.shot else comparison.names(self._stored)
+        """Names of the figures that there are; those of a bounce shot and of a study of a missing
+        effect are files in its folder.
+        """
+        return [] if self._in_files else comparison.names(self._stored)
 
     def figure(self, name: str = "error", behind: str | Sequence[str] = ()) -> Figure:
         """One of the figures, made anew; a notebook shows it inline.
@@ -338,8 +384,9 @@ class Compared:
         Raises:
             InputError: there is none of that name, or a reference cannot be drawn behind it.
         """
-        if self.experiment.shot:
-            raise InputError(f"figures of a bounce shot are files: {self.folder / 'figures'}")
+        if self._in_files:
+            what = "a bounce shot" if self.experiment.shot else "a study of two comparisons"
+            raise InputError(f"figures of {what} are files: {self.folder / 'figures'}")
         asked = [behind] if isinstance(behind, str) else behind
         references = [find(one) for one in asked]
         return comparison.figure(self._stored, self._labels, name, behind=references)
@@ -347,7 +394,7 @@ class Compared:
     def summary(self) -> pd.DataFrame:
         """The last mean error of each tuner, the best first, with how many runs failed."""
         table = self.table
-        if self.experiment.shot:
+        if self._in_files:
             return table
         last = table[table["simulations"] == table["simulations"].max()]
         first = last[last["metric"] == last["metric"].iloc[0]]

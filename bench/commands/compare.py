@@ -160,6 +160,8 @@ def _begun(options: argparse.Namespace) -> list[Study]:
 
 
 def _compare(options: argparse.Namespace, say: Say) -> Answer:
+    from bench.study import conclude
+
     # First of all: a scheduler that does not answer leaves no folder behind.
     pool = cluster_pool(options.cluster)
     studies = _begun(options)
@@ -170,6 +172,8 @@ def _compare(options: argparse.Namespace, say: Say) -> Answer:
         answers.append(_made(study, pool, options, say))
         if answers[-1].code == INTERRUPTED:
             break
+    if len(studies) > 1:
+        conclude(studies[0].folder.parent, say)
     return Answer(
         {"comparisons": [answer.document for answer in answers]},
         max(answer.code for answer in answers),

@@ -44,7 +44,7 @@ def results(table: Path) -> list[Document]:
     import pandas as pd
 
     lines = pd.read_csv(table, keep_default_na=False, na_values=[""]).astype(object)
-    if "metric" in lines:
+    if "simulations" in lines and "metric" in lines:
         lines = lines.groupby(["tuner", "range", "metric"], sort=False, dropna=False).tail(1)
     rows = lines.where(lines.notna(), None).to_dict("records")
     return [{str(name): value for name, value in row.items()} for row in rows]

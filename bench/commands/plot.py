@@ -61,16 +61,18 @@ def _plot(options: argparse.Namespace, say: Say) -> Answer:
     from bench.compare import Comparison
 
     for folder in options.runs:
-        if not isinstance(opened(folder), Comparison):
-            raise InputError(f"{folder}: expected the folder of a comparison, found a bounce shot")
+        if not isinstance(study := opened(folder), Comparison):
+            shot = study.configuration.experiment.shot
+            found = "a bounce shot" if shot else "a study of two comparisons"
+            raise InputError(f"{folder}: expected the folder of a comparison, found {found}")
     document = across(options.runs, options.out, say).document()
     return Answer({**document, "behind": _each_before(options.runs, references, options.out, say)})
 
 
 def _again(folder: Path, references: Sequence[Reference], say: Say) -> Answer:
-    """Report a study, or those of a sweep, again."""
+    """Report a study, or those of a sweep or of a file that names several, again."""
     from bench.commands.outcome import outcome
-    from bench.study import opened, parts_of
+    from bench.study import conclude, opened, parts_of
 
     comparisons = []
     for part in parts_of(folder):
@@ -78,6 +80,7 @@ def _again(folder: Path, references: Sequence[Reference], say: Say) -> Answer:
         failed = study.finish(say)
         behind = _before(part, references, part, say)
         comparisons.append({**outcome(study), "failed": failed, "behind": behind})
+    conclude(folder, say)
     return Answer({"comparisons": comparisons})
 
 

@@ -87,6 +87,24 @@ class Source:
 
 
 @dataclass(frozen=True)
+class Calibration:
+    """A recording of the targets' world, with parameters of its own, from which explain extends the
+    simulator that is tuned.
+
+    Attributes:
+        runs: in it.
+        held_out: of them, on which explain measures what a cause brings.
+        initial: initial states where they are others than the targets'.
+        inputs: input signals where they are others than the targets'.
+    """
+
+    runs: int = 6
+    held_out: int = 2
+    initial: Mapping[str, Drawn] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Experiment:
     """One comparison.
 
@@ -130,6 +148,8 @@ class Experiment:
             there are several parameters (`bench.problem.identifiability`): two simulations a
             parameter and target, beside all budgets.
         recording: the measured data, for range real.
+        calibration: where tuners are compared twice, in the simulator as it is and in the one that
+            explain extends from such a recording (`bench.misspecified`).
         shot: where the experiment is a bounce shot, its scene (`bench.shot.settings`); targets are
             then shots a ball.
         isolation: run: every run of a tuner has a fresh process; tuner: all runs of a tuner with
@@ -142,6 +162,8 @@ class Experiment:
         salt_sha256: of the secret salt, from the beginning; a folder of results has it.
         sweep: lists of values by key; the file stands for an experiment ``NAME[budget=10]`` for
             each combination of them. A key within a table is joined by dots, as ``noise.x``.
+        experiments: others, by name or file, which it stands for: each with the targets, seeds,
+            budgets, limits and tuners of this one.
         tuners: a list of registered names, and of tables with ``tuner`` and, where two entries have
             the same, a ``label``; or a table for each by its label.
     """
@@ -175,12 +197,14 @@ class Experiment:
     held_out: HeldOut | None = None
     identifiability: bool = True
     recording: Source | None = None
+    calibration: Calibration | None = None
     shot: Mapping[str, Any] = field(default_factory=dict)
     isolation: str = "run"
     trusted: bool = False
     salt: str = ""
     salt_sha256: str = ""
     sweep: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
+    experiments: tuple[str, ...] = ()
     tuners: tuple[Entry, ...] = ()
 
     def __post_init__(self) -> None:
@@ -210,6 +234,17 @@ class Experiment:
         if self.held_out and (self.recording or self.held_out.scenarios < 1):
             wanted = "simulated targets and scenarios of at least 1"
             raise InputError(f"{who}: [held_out] needs {wanted}")
+        self._check_calibration(who)
+
+    def _check_calibration(self, who: str) -> None:
+        """Refuse a calibration of which nothing could be learned."""
+        if self.calibration is None:
+            return
+        runs, held_out = self.calibration.runs, self.calibration.held_out
+        if not 0 <= held_out < runs:
+            raise fault(who, "calibration.held_out", f"fewer than the {runs} runs", held_out)
+        if self.recording or self.shot:
+            raise InputError(f"{who}: [calibration] needs simulated targets, and no shot")
 
     def _check_words(self, who: str) -> None:
         """Refuse texts that no figure, table or path could hold."""
@@ -219,6 +254,8 @@ class Experiment:
         text(who, "model", self.model, most=WORDS)
         for word in self.free:
             text(who, "free", word, most=NAME)
+        for word in self.experiments:
+            text(who, "experiments", word)
         text(who, "tags", ", ".join(self.tags), most=WORDS)
         for entry in self.tuners:
             text(who, "tuners: label", entry.label, most=NAME)
@@ -233,10 +270,12 @@ class Experiment:
             if finite(who, f"noise.{name}", sigma) < 0:
                 raise fault(who, f"noise.{name}", "at least 0", sigma)
         held = self.held_out.initial if self.held_out else {}
+        calibrated = self.calibration.initial if self.calibration else {}
         for where, given in (
             ("initial", self.initial),
             ("constants", self.constants),
             ("held_out.initial", held),
+            ("calibration.initial", calibrated),
         ):
             for name, value in given.items():
                 for end in value if isinstance(value, tuple) else (value,):
@@ -246,8 +285,9 @@ class Experiment:
         """The whole configuration as TOML tables; `parse` of it gives an equal experiment."""
         document = {key: value for key, value in asdict(self).items() if value is not None}
         del document["name"]
-        if not self.sweep:
-            del document["sweep"]  # what is run never has one
+        for several in ("sweep", "experiments"):
+            if not document[several]:
+                del document[several]  # what is run never has one
         document["tuners"] = {entry.label: entry.table() for entry in self.tuners}
         return document
 
@@ -347,7 +387,9 @@ def parse(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
             raise fault(path, "simulator", "letters, digits and _ . + - for a robot", called)
     elif fields.get("free") or fields.get("actuators"):
         raise InputError(f'{path}: free and actuators are of a robot: expected model = "FILE"')
-    if not fields.get("simulator"):
+    if fields.get("experiments"):
+        fields["experiments"] = tuple(_beside(each, path) for each in fields["experiments"])
+    elif not fields.get("simulator"):
         raise InputError(f'{path}: expected simulator = "NAME" or model = "FILE", found none')
     # Known here only: neither a worker nor a folder of results knows where this file lay.
     if "recording" in fields:
@@ -364,13 +406,49 @@ def expand(experiment: Experiment) -> list[Experiment]:
     """The experiments that a file stands for: one for each combination of the values it sweeps
     over, named ``NAME[budget=10]``; itself where it sweeps over nothing.
 
-    All meet the same targets: the seeds of targets depend on the file's name alone.
+    All meet the same targets: the seeds of targets depend on the file's name alone. Of a file that
+    names other experiments it is these, with what it says of their numbers and tuners.
     """
+    if experiment.experiments:
+        return [
+            expanded for name in experiment.experiments for expanded in _as_in(experiment, name)
+        ]
     return _expanded(experiment, Path(f"{experiment.name}.toml"))
 
 
+OF_ALL = (
+    "targets",
+    "seeds",
+    "budget",
+    "training_budget",
+    "timeout",
+    "memory",
+    "isolation",
+    "trusted",
+    "salt",
+    "tuners",
+)
+"""Keys of a file that names other experiments which hold for all of them."""
+
+
+def _as_in(together: Experiment, name: str) -> list[Experiment]:
+    """An experiment that another one names, with the numbers and tuners of that."""
+    one = load(name)
+    if one.experiments:
+        raise InputError(f"experiment {together.name}: {name} names experiments itself")
+    # A tuner of the one may have options there that the other knows nothing of.
+    given = {key: getattr(together, key) for key in OF_ALL if key != "tuners" or together.tuners}
+    return expand(one.chosen(**given))
+
+
+def _beside(name: str, experiment: Path) -> str:
+    """The name of an experiment, or the path of its file, absolute where that lies beside."""
+    file = experiment.parent / name
+    return str(file.resolve()) if name.endswith(".toml") and is_there(file) else name
+
+
 def _expanded(experiment: Experiment, path: Path) -> list[Experiment]:
-    if not experiment.sweep:
+    if not experiment.sweep or experiment.experiments:
         return [experiment]
     document = experiment.document()
     del document["sweep"]

@@ -52,6 +52,9 @@ class Problem:
             swept = ", ".join(experiment.sweep)
             remedy = "run those that bench.problem.experiment.expand gives"
             raise InputError(f"experiment {experiment.name}: sweeps over {swept}; {remedy}")
+        if experiment.experiments:
+            named = ", ".join(experiment.experiments)
+            raise InputError(f"experiment {experiment.name}: names {named}; run these")
         self.experiment = experiment = completed(experiment)
         self.simulated = 0
         self.salt = experiment.salt if salt is None else salt

@@ -16,6 +16,7 @@ from bench.problem.robots import kind_of
 from bench.problem.targets import SealedTarget
 from bench.registry import SkippedError, tuners
 from bench.runs.sources import (
+    EXPLAIN_ROOMS,
     SHOT_ROOMS,
     digest,
     effect_sources,
@@ -44,10 +45,12 @@ NOT_OF_A_RUN = {
     "identifiability": "is found beside the runs, which know nothing of it",
     "recording": "where it lies; what it holds is hashed",
     "model": "where it lies; what it holds is hashed",
+    "calibration": "what it comes to is in the settings of what is tuned",
     "shot": "what is done with a tuned model afterwards",
     "salt": "which targets there are; their scenarios and observations are hashed",
     "salt_sha256": "which targets there are; their scenarios and observations are hashed",
     "sweep": "what is run sweeps over nothing; it has values of its own",
+    "experiments": "what is run names no others",
     "tuners": "who else runs; each run's id has its own tuner with its options",
 }
 """Keys of an experiment that change no run by themselves, each with the reason; all others do."""
@@ -65,10 +68,17 @@ def fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str
         "recording": digest(recording_digest(experiment)),
         **({"model file": digest(source(kind_of(experiment)))} if experiment.model else {}),
         "plugins": plugin_files(plugins),
-        "code": rooms(SHOT_ROOMS if experiment.shot else ()),
+        "code": rooms(_rooms(experiment)),
         "package versions": versions(),
         "simulator and tuners": digest(_classes(experiment)),
     }
+
+
+def _rooms(experiment: Experiment) -> tuple[str, ...]:
+    """Folders whose code makes its results, where there are more than those of a comparison."""
+    if experiment.shot:
+        return SHOT_ROOMS
+    return EXPLAIN_ROOMS if experiment.calibration else ()
 
 
 def _classes(experiment: Experiment) -> list[str]:

@@ -33,6 +33,8 @@ ROOMS = ("methods", "sims", "bench/problem", "bench/runs", "bench/sealing")
 """Folders whose code makes runs: methods, worlds, and what drives and scores them."""
 SHOT_ROOMS = (*ROOMS, "bench/shot", "bench/gap", "bench/recordings")
 """Those whose code makes the shots of a bounce shot: its drops, films and explanations too."""
+EXPLAIN_ROOMS = (*ROOMS, "bench/misspecified", "bench/gap", "bench/recordings")
+"""Those whose code makes a simulator that explain extended, and the runs in it."""
 PACKAGES = (
     "av",
     "botorch",

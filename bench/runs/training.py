@@ -114,8 +114,10 @@ NOT_OF_A_TRAINING = {
     "salt_sha256": "targets are met after the training",
     "recording": "where it lies; what it holds is hashed",
     "model": "where it lies; what it holds is hashed",
+    "calibration": "what it comes to is in the settings of what is tuned",
     "shot": "what is done with a tuned model afterwards",
     "sweep": "what is run sweeps over nothing; it has values of its own",
+    "experiments": "what is run names no others",
     "tuners": "who else trains; the key has its own tuner with its options",
 }
 """Keys of an experiment that change no trained weights, each with the reason; all others do."""

@@ -177,6 +177,49 @@ TABLE: Columns = (
 )
 """table.csv of a comparison."""
 
+_MODEL = Column("model", str, words=("plain", "extended"))
+MISSPECIFIED_TABLE: Columns = (
+    Column("experiment", str),
+    _MODEL,
+    Column("tuner", str),
+    Column("metric", str, words=("bias", "absolute_error", "param_error", "heldout_error")),
+    Column("parameter", str, empty=Empty.MAY),
+    Column("unit", str),
+    *(Column(name, float, empty=Empty.MAY) for name in ("mean", "low", "high")),
+    _count("targets"),
+    _count("runs"),
+    _count("failures"),
+    _TRUSTED,
+)
+"""table.csv of a study of a missing effect; an error of no one parameter has no name of one."""
+
+_RANKED = Column("metric", str, words=("param_error", "heldout_error"))
+MISSPECIFIED_RANKS: Columns = (
+    Column("experiment", str),
+    _RANKED,
+    Column("tuner", str),
+    *(_size(name) for name in ("plain", "extended")),
+    _TRUSTED,
+)
+"""ranks.csv of a study of a missing effect: mean rank over targets in each simulator."""
+
+MISSPECIFIED_RANKING: Columns = (
+    Column("experiment", str),
+    _RANKED,
+    _count("tuners"),
+    _count("targets"),
+    *(
+        Column(name, float, empty=Empty.MAY, low=-1.0, high=1.0)
+        for name in ("tau", "low", "high", "tau_of_halves")
+    ),
+    *(
+        _size(name, Empty.MAY, high=1.0)
+        for name in ("p_value", "friedman_plain", "friedman_extended")
+    ),
+    _TRUSTED,
+)
+"""ranking.csv of a study of a missing effect: whether the simulators rank tuners alike."""
+
 MODEL: Columns = (
     Column("method", str),
     _size("restitution", Empty.MAY),

@@ -1,0 +1,141 @@
+"""The recording of the targets' world that explain gets, and the experiments before and after it.
+
+Nothing of the targets goes into the recording: its parameters, initial states, inputs and noise are
+drawn from streams of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.problem import targets
+from bench.problem.experiment import Calibration, Experiment
+from bench.problem.problem import Problem
+from bench.problem.robots import find_model
+from bench.problem.salt import Streams
+from bench.registry import simulators
+from sims import effects as library
+from sims import extended as extending
+from sims.base import Array, InputError, Scenario, Simulator
+from sims.extended import Extended
+from sims.recording.description import ModelFile
+from sims.recording.recording import Recording, Run
+from sims.recording.write import write_recording
+from sims.simulated import Simulated
+
+PLAIN, EXTENDED = "plain", "extended"
+"""The simulators in which tuners are compared: as it is, and as explain extended it."""
+MODELS = (PLAIN, EXTENDED)
+
+
+def record(experiment: Experiment, salt: str, path: Path) -> Array:
+    """Write the recording; returns the parameters (p,) of the world that made it."""
+    problem = Problem(experiment, salt)
+    wanted = experiment.calibration or Calibration()
+    streams = Streams(salt, experiment.name, "calibration", 0)
+    inside = problem.cube.training
+    point = streams.of("truth").uniform(inside[0], inside[1], size=problem.cube.dim)
+    theta = problem.cube.physical(point[None])[:, : len(problem.world.parameters)]
+    initial = {**experiment.initial, **wanted.initial}
+    inputs = {**experiment.inputs, **wanted.inputs}
+    runs = []
+    for number in range(wanted.runs):
+        scene = targets.scenario(experiment, streams.held_out(number), initial, inputs)
+        clean = problem.world.simulate(theta, scene)[0]
+        rng = Streams(salt, experiment.name, "calibration", 1 + number).of("noise")
+        seen = clean + problem.noise * rng.standard_normal(clean.shape)
+        runs.append(_run(problem, number, scene, seen, number >= wanted.runs - wanted.held_out))
+    kind = type(problem.simulator)
+    model = None
+    if experiment.model:
+        model = ModelFile(
+            find_model(experiment.model, experiment.name),
+            dict(experiment.actuators),
+            {},
+            experiment.free,
+        )
+    noise = {c.name: float(s) for c, s in zip(problem.channels, problem.noise, strict=True) if s}
+    constants = problem.simulator.constant_values
+    title = f"{experiment.name}, calibration"
+    write_recording(
+        path,
+        Recording(path, kind.name, title, constants, noise, tuple(runs), model=model),
+        kind,
+        digits=9,
+    )
+    problem.close()
+    made: Array = theta[0]
+    return made
+
+
+def _run(problem: Problem, number: int, scene: Scenario, seen: Array, held_out: bool) -> Run:
+    names = [channel.name for channel in problem.channels]
+    channels = dict(zip(names, np.ascontiguousarray(seen.T), strict=True))
+    return Run(str(number + 1), scene.times, channels, scene.inputs, scene.constants, {}, held_out)
+
+
+def explained(recording: Path, experiment: Experiment, jobs: int) -> Extended:
+    """Have explain extend the simulator from the recording, and write its answer beside it."""
+    from bench.gap.explain import explain  # it brings all of explain along
+    from bench.gap.model.watch import Watch
+
+    found = explain([recording], free=experiment.free, watch=Watch(), jobs=max(jobs, 1))
+    found.write(recording.parent / "explain")
+    return found.extended
+
+
+def extension(file: Path) -> Extended:
+    """The extended simulator in a file that explain wrote.
+
+    Raises:
+        InputError: it cannot be used.
+    """
+    return extending.opened(file, simulators.get)[0]
+
+
+def coefficients(extended: Extended, kind: type[Simulator]) -> dict[str, list[float]]:
+    """The coefficients of an extended simulator by effect, in the effect's order.
+
+    Raises:
+        InputError: the simulator is of a kind that takes no effects.
+    """
+    if not issubclass(kind, Simulated):
+        raise InputError(f"simulator {kind.name} takes no effects, and cannot be extended")
+    found = {}
+    for name, numbers in extended.effects.items():
+        there = library.find(name, kind.system).on(kind.system)
+        found[name] = [numbers[c.name].value if c.name in numbers else 0.0 for c in there]
+    return found
+
+
+def before(experiment: Experiment) -> Experiment:
+    """The comparison in the simulator as it is."""
+    return _part(experiment, PLAIN, experiment.settings)
+
+
+def after(experiment: Experiment, effects: dict[str, list[float]]) -> Experiment:
+    """The comparison in the extended simulator: what is tuned stays, and the effects that it lacked
+    act as explain fitted them.
+    """
+    settings = dict(experiment.settings)
+    # What is tuned already goes on being tuned: explain fitted its own value of that too.
+    tuned = {*settings.get("effects", ()), *(p for p in experiment.parameters)}
+    added = {name: values for name, values in effects.items() if name not in tuned}
+    settings["fixed"] = {**settings.get("fixed", {}), **added}
+    return _part(experiment, EXTENDED, settings)
+
+
+def _part(experiment: Experiment, model: str, settings: Mapping[str, Any]) -> Experiment:
+    return replace(
+        experiment,
+        name=f"{experiment.name}-{model}",
+        title=f"{experiment.title or experiment.name} ({model})",
+        same_targets_as=experiment.name,
+        settings=settings,
+        calibration=None,
+    )

@@ -1,0 +1,236 @@
+"""What came of a study: signed and absolute errors of parameters, prediction of unseen runs, and
+how the tuners rank, in the simulator as it is and in the extended one.
+
+A target's value is the mean over its seeds; means and intervals are over targets (95 % percentile
+bootstrap). Errors of parameters are in training widths. A run that failed has no error of its
+parameters here, counts among the failures, and ranks last on its target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bench.analysis.curves import Rows
+from bench.analysis.paired import PROBLEMS, nemenyi
+from bench.analysis.rankings import agreement, mean_ranks, tau
+from bench.analysis.table import interval
+from bench.misspecified.calibration import EXTENDED, MODELS, PLAIN
+from bench.problem.experiment import Experiment
+from bench.problem.problem import Problem
+from bench.store.folder import read
+from sims.base import Array, Parameter
+
+BIAS, ABSOLUTE, PARAMETERS, PREDICTION = "bias", "absolute_error", "param_error", "heldout_error"
+"""Of one parameter: mean signed and mean absolute error; of all: their mean absolute error; of
+unseen runs: RMSE in the error channel."""
+RANKED = (PARAMETERS, PREDICTION)
+"""By which tuners are ranked."""
+COLUMNS = [
+    "experiment",
+    "model",
+    "tuner",
+    "metric",
+    "parameter",
+    "unit",
+    "mean",
+    "low",
+    "high",
+    "targets",
+    "runs",
+    "failures",
+]
+RANK_COLUMNS = ["experiment", "metric", "tuner", *MODELS]
+RANKING_COLUMNS = [
+    "experiment",
+    "metric",
+    "tuners",
+    "targets",
+    "tau",
+    "low",
+    "high",
+    "tau_of_halves",
+    "p_value",
+    "friedman_plain",
+    "friedman_extended",
+]
+WIDTHS = "training widths"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The last recommendations of all runs of a study.
+
+    Attributes:
+        experiment: that was studied.
+        unit: of the error channel.
+        channel: its name.
+        parameters: tuned.
+        errors: a row a model, tuner and target: for each parameter the signed error in training
+            widths, named as it is; `PARAMETERS` and `PREDICTION`; runs and failures.
+    """
+
+    experiment: Experiment
+    unit: str
+    channel: str
+    parameters: tuple[Parameter, ...]
+    errors: pd.DataFrame
+
+    @property
+    def name(self) -> str:
+        """Of the system, for tables and figures."""
+        return self.experiment.name.removeprefix("misspecified-")
+
+    def tuners(self) -> list[str]:
+        """Labels in the order of the experiment, of those that ran in both simulators."""
+        ran = [set(self.errors[self.errors["model"] == model]["tuner"]) for model in MODELS]
+        return [e.label for e in self.experiment.tuners if all(e.label in each for each in ran)]
+
+    def matrix(
+        self, model: str, metric: str, tuners: Sequence[str], targets: Sequence[str]
+    ) -> Array:
+        """(targets, tuners) of a metric in one of the simulators."""
+        part = self.errors[self.errors["model"] == model]
+        table = part.pivot(index="target", columns="tuner", values=metric)
+        values: Array = table.reindex(index=list(targets), columns=list(tuners)).to_numpy()
+        return values
+
+    def targets(self) -> list[str]:
+        """Names of those that were met in both simulators by all tuners."""
+        counts = self.errors.groupby("target").size()
+        whole = len(MODELS) * len(self.tuners())
+        return sorted(str(name) for name in counts[counts >= whole].index)
+
+
+def outcome(folder: Path, experiment: Experiment) -> Outcome:
+    """What the runs in a study's folder delivered.
+
+    Raises:
+        InputError: a comparison in it is missing, unfinished or damaged.
+    """
+    problem = Problem(experiment)
+    parameters, widths = problem.cube.parameters, problem.cube.training_widths()
+    channel = problem.channels[problem.error_channel]
+    problem.close()
+    parts = [_last(folder / model, model, parameters, widths) for model in MODELS]
+    errors = pd.concat(parts, ignore_index=True)
+    return Outcome(experiment, channel.unit, channel.name, parameters, errors)
+
+
+def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Array) -> pd.DataFrame:
+    """Rows of `Outcome.errors` of one of the comparisons."""
+    stored = read(folder)
+    rows = Rows(stored.runs, stored.statuses, stored.experiment.budget)
+    frame = rows.keys[["tuner", "target"]].copy()
+    for parameter, width in zip(parameters, widths, strict=True):
+        named = (f"recommendation_{parameter.name}", f"true_{parameter.name}")
+        recommended, true = (rows.curves(column).values[:, -1] for column in named)
+        frame[parameter.name] = np.where(rows.failed, np.nan, (recommended - true) / width)
+    names = [parameter.name for parameter in parameters]
+    frame[PARAMETERS] = frame[names].abs().mean(axis=1, skipna=False)
+    for name in names:  # of the absolute value the mean over seeds is taken apart
+        frame[f"|{name}|"] = frame[name].abs()
+    frame[PREDICTION] = np.where(rows.failed, np.nan, rows.curves(PREDICTION).values[:, -1])
+    frame["runs"], frame["failures"] = 1, rows.failed.astype(int)
+    sums = {"runs": "sum", "failures": "sum"}
+    means = {c: "mean" for c in frame.columns if c not in ("tuner", "target", *sums)}
+    grouped = frame.groupby(["tuner", "target"], sort=False, as_index=False).agg({**means, **sums})
+    # A target on which a seed failed counts as failed: its other seeds are the easier ones.
+    grouped.loc[grouped["failures"] > 0, list(means)] = np.nan
+    grouped.insert(0, "model", model)
+    return grouped
+
+
+def table(one: Outcome) -> pd.DataFrame:
+    """Means with intervals, columns as `COLUMNS`."""
+    lines = []
+    for (model, tuner), part in one.errors.groupby(["model", "tuner"], sort=False):
+        wanted = [
+            (metric, p.name, WIDTHS, column)
+            for p in one.parameters
+            for metric, column in ((BIAS, p.name), (ABSOLUTE, f"|{p.name}|"))
+        ]
+        wanted += [(PARAMETERS, "", WIDTHS, PARAMETERS), (PREDICTION, "", one.unit, PREDICTION)]
+        counts = len(part), int(part["runs"].sum()), int(part["failures"].sum())
+        for metric, parameter, unit, column in wanted:
+            values = part[column].to_numpy(dtype=np.float64)
+            values = values[np.isfinite(values)][:, None]
+            names = (one.experiment.name, str(model), str(tuner))
+            low, high = interval(values, np.mean, *names, metric, parameter)
+            mean = float(values.mean()) if len(values) else np.nan
+            key = (one.experiment.name, model, tuner, metric, parameter, unit)
+            lines.append((*key, mean, low[0], high[0], *counts))
+    return pd.DataFrame(lines, columns=COLUMNS)
+
+
+def ranks(one: Outcome) -> pd.DataFrame:
+    """Mean rank over targets of each tuner in both simulators, columns as `RANK_COLUMNS`."""
+    tuners, targets = one.tuners(), one.targets()
+    lines = []
+    for metric in RANKED:
+        both = [mean_ranks(one.matrix(model, metric, tuners, targets)) for model in MODELS]
+        lines += [(one.experiment.name, metric, t, *r) for t, *r in zip(tuners, *both, strict=True)]
+    return pd.DataFrame(lines, columns=RANK_COLUMNS)
+
+
+def ranking(one: Outcome) -> pd.DataFrame:
+    """Whether the tuners rank alike in both simulators, columns as `RANKING_COLUMNS`."""
+    tuners, targets = one.tuners(), one.targets()
+    lines = []
+    for metric in RANKED:
+        plain, extended = (one.matrix(model, metric, tuners, targets) for model in MODELS)
+        alike = agreement(plain, extended, one.experiment.name, metric)
+        friedman = [_friedman(errors) for errors in (plain, extended)]
+        numbers = (alike.tau, alike.low, alike.high, alike.halves, alike.p_value, *friedman)
+        lines.append((one.experiment.name, metric, len(tuners), len(targets), *numbers))
+    return pd.DataFrame(lines, columns=RANKING_COLUMNS)
+
+
+def _friedman(errors: Array) -> float:
+    """Friedman's p-value over targets, that all tuners are alike; NaN of too few."""
+    from scipy.stats import friedmanchisquare
+
+    targets, tuners = errors.shape
+    if targets < PROBLEMS or tuners < 3:
+        return float("nan")
+    worst = np.where(np.isfinite(errors), errors, np.inf)
+    return float(friedmanchisquare(*np.log(np.maximum(worst, 1e-12)).round(9).T).pvalue)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """The mean ranks of tuners over several systems, by one metric.
+
+    Attributes:
+        ranked: by model, a row a system, a column a tuner: ranks of the mean ranks, 1 best.
+        tau: between the two simulators' mean ranks over systems.
+        friedman: p-value by model; NaN for too few systems.
+        apart: pairs of tuners that Nemenyi's test tells apart (p < 0.05) by model.
+    """
+
+    ranked: Mapping[str, pd.DataFrame]
+    tau: float
+    friedman: Mapping[str, float]
+    apart: Mapping[str, int]
+
+
+def joint(ranked: pd.DataFrame, metric: str) -> Joint:
+    """Ranks over systems, of rows as `ranks` gives them for several."""
+    part = ranked[ranked["metric"] == metric]
+    tables, friedman, apart = {}, {}, {}
+    for model in MODELS:
+        wide = part.pivot(index="experiment", columns="tuner", values=model)
+        wide = wide[list(dict.fromkeys(part["tuner"]))].dropna(axis="columns")
+        tables[model] = wide.rank(axis=1)
+        friedman[model], apart[model] = float("nan"), 0
+        if len(wide) >= PROBLEMS and wide.shape[1] >= 3:
+            friedman[model], p_values = nemenyi(tables[model])
+            upper = np.triu(p_values.to_numpy(), k=1)
+            apart[model] = int(((upper > 0) & (upper < 0.05)).sum())
+    tuners = [t for t in tables[PLAIN] if t in tables[EXTENDED]]
+    means = [tables[model][tuners].mean().to_numpy() for model in MODELS]
+    return Joint(tables, tau(*means), friedman, apart)
