@@ -14,7 +14,7 @@ from sims.user_toml import entries, fault, hints_of
 @dataclass(frozen=True)
 class Entry:
     """One tuner of a comparison: its registered name, options, and seeds or budget where they
-    differ.
+    differ; `randomised` where it trains over the experiment's ``[nuisance]``.
     """
 
     label: str
@@ -22,11 +22,14 @@ class Entry:
     options: Mapping[str, Any] = field(default_factory=dict)
     seeds: int | None = None
     budget: int | None = None
+    randomised: bool = False
 
     def table(self) -> dict[str, Any]:
         """The entry as the table ``[tuners.LABEL]``."""
         given = {key: value for key, value in asdict(self).items() if value is not None}
         del given["label"]
+        if not self.randomised:
+            del given["randomised"]
         return given
 
 

@@ -138,6 +138,9 @@ class Experiment:
         constants: constants other than the simulator's defaults: a number, or [low, high] for
             uniform between in each scenario, known to whoever simulates it.
         parameters: changes to parameters' nominal, bounds, training range.
+        nuisance: effects that the simulator has not and the world may have, by coefficient, each
+            with the range from which it is drawn while a tuner trains whose entry says
+            ``randomised = true`` (`bench.problem.nuisance`).
         initial: initial state: a number, or [low, high] for uniform between.
         inputs: input signals by name, as `simgap simulate` writes them, e.g. ``sine:2:0.5``
             (`bench.problem.signals`).
@@ -191,6 +194,7 @@ class Experiment:
     world: Mapping[str, Any] = field(default_factory=dict)
     constants: Mapping[str, Drawn] = field(default_factory=dict)
     parameters: Mapping[str, Change] = field(default_factory=dict)
+    nuisance: Mapping[str, Pair] = field(default_factory=dict)
     initial: Mapping[str, Drawn] = field(default_factory=dict)
     inputs: Mapping[str, str] = field(default_factory=dict)
     sampling: Sampling = field(default_factory=Sampling)
@@ -217,6 +221,10 @@ class Experiment:
             raise fault(who, "training_budget", "at least 0", self.training_budget)
         self._check_words(who)
         self._check_numbers(who)
+        for entry in self.tuners:
+            if entry.randomised and not self.nuisance and not self.experiments:
+                wanted = "a [nuisance] table of effects to train over"
+                raise InputError(f"{who}: tuner {entry.label} is randomised: expected {wanted}")
         if self.memory < 0 or not self.timeout > 0:  # so that NaN is refused too
             raise InputError(f"{who}: expected timeout > 0 and memory >= 0")
         if self.memory > _MOST_MEMORY or _LONGEST < self.timeout < math.inf:
@@ -285,9 +293,10 @@ class Experiment:
         """The whole configuration as TOML tables; `parse` of it gives an equal experiment."""
         document = {key: value for key, value in asdict(self).items() if value is not None}
         del document["name"]
-        for several in ("sweep", "experiments"):
-            if not document[several]:
-                del document[several]  # what is run never has one
+        # What is run never has the first two, and few have the last.
+        for rare in ("sweep", "experiments", "nuisance"):
+            if not document[rare]:
+                del document[rare]
         document["tuners"] = {entry.label: entry.table() for entry in self.tuners}
         return document
 

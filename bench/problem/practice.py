@@ -35,11 +35,27 @@ class Ground(Protocol):
         """Observations (n, T, C) of points (n, dim) of the unit cube."""
 
 
-class Practice:
-    """The practice ground of learned tuners; see `methods.base.Practice`."""
+class Disturbed(Protocol):
+    """Simulates with what the simulator may lack, as `bench.problem.nuisance.Nuisance` does."""
 
-    def __init__(self, problem: Ground, budget: int) -> None:
+    def simulate(
+        self, rng: np.random.Generator, points: Array, scenarios: tuple[Scenario, ...]
+    ) -> Array:
+        """Observations (n, T, C) of points (n, dim) of the unit cube."""
+
+
+class Practice:
+    """The practice ground of learned tuners; see `methods.base.Practice`.
+
+    Args:
+        problem: what is practised on.
+        budget: simulations allowed.
+        nuisance: simulates in its place, for training over effects that the world may have.
+    """
+
+    def __init__(self, problem: Ground, budget: int, nuisance: Disturbed | None = None) -> None:
         self._problem = problem
+        self._nuisance = nuisance
         self.dim = problem.cube.dim
         self.training = problem.cube.training
         self.scale = problem.scale
@@ -71,4 +87,6 @@ class Practice:
         self.used = asked
         scenarios = self._problem.scenarios(rng)
         self.scene = self._problem.scene(scenarios)
+        if self._nuisance is not None:
+            return self._nuisance.simulate(rng, points, scenarios)
         return self._problem.simulate(points, scenarios)

@@ -51,6 +51,7 @@ NOT_OF_A_RUN = {
     "salt_sha256": "which targets there are; their scenarios and observations are hashed",
     "sweep": "what is run sweeps over nothing; it has values of its own",
     "experiments": "what is run names no others",
+    "nuisance": "matters to entries that are randomised alone, and is hashed with them",
     "tuners": "who else runs; each run's id has its own tuner with its options",
 }
 """Keys of an experiment that change no run by themselves, each with the reason; all others do."""
@@ -154,8 +155,9 @@ class Identities:
         if entry.label not in self._entries:
             kind = tuners.get(entry.tuner)
             training = self._experiment.training_budget if kind.learned else 0
+            over = [dict(self._experiment.nuisance)] if entry.randomised else []
             self._entries[entry.label] = digest(
-                entry.tuner, dict(entry.options), training, source(kind)
+                entry.tuner, dict(entry.options), training, source(kind), *over
             )
         if target.name not in self._targets:
             self._targets[target.name] = _target(target)

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.problem.experiment import Entry, Experiment
+from bench.problem.nuisance import Nuisance
 from bench.problem.practice import Practice
 from bench.problem.problem import Problem
 from bench.problem.robots import kind_of
@@ -118,6 +119,7 @@ NOT_OF_A_TRAINING = {
     "shot": "what is done with a tuned model afterwards",
     "sweep": "what is run sweeps over nothing; it has values of its own",
     "experiments": "what is run names no others",
+    "nuisance": "matters to entries that are randomised alone, and is hashed with them",
     "tuners": "who else trains; the key has its own tuner with its options",
 }
 """Keys of an experiment that change no trained weights, each with the reason; all others do."""
@@ -141,6 +143,7 @@ def key(experiment: Experiment, entry: Entry, seed: int) -> str:
         rooms(),
         versions(),
         device(),
+        *([dict(experiment.nuisance)] if entry.randomised else []),
         length=16,
     )
     return f"{entry.tuner}-{experiment.simulator}-{seed}-{hashed}"
@@ -217,11 +220,14 @@ def _train(
         experiment.name, "fit", tuners.get(entry.tuner).trains_as or entry.tuner, seed
     )
     learn = _learned_here if lesson.tuned is None else _learned_apart
-    practice = _Repeated(problem, experiment.training_budget, before)
+    rough = Nuisance(problem) if entry.randomised else None
+    practice = _Repeated(problem, experiment.training_budget, before, rough)
     started = perf_counter()
     state = learn(lesson, practice, stream, watch)
     seconds = perf_counter() - started
     problem.close()
+    if rough is not None:
+        rough.close()
     # Beside the tensors, so that a file that was renamed or exchanged is noticed.
     about = {
         _COUNTS: np.array([practice.used, seconds]),
@@ -236,8 +242,10 @@ class _Repeated(Practice):
     have itself killed would else learn from the budget several times.
     """
 
-    def __init__(self, problem: Problem, budget: int, before: list[str]) -> None:
-        super().__init__(problem, budget)
+    def __init__(
+        self, problem: Problem, budget: int, before: list[str], nuisance: Nuisance | None = None
+    ) -> None:
+        super().__init__(problem, budget, nuisance)
         self._before, self._place = before, 0
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
