@@ -93,7 +93,8 @@ class Nuisance:
 
 def _effect(name: str) -> str:
     """The effect of a coefficient, which is called after it or is one of several."""
-    return name if name.partition("@")[0] in library.names() else name.rpartition(".")[0]
+    whole, several = name.partition("@")[0], name.rpartition(".")[0]
+    return several if whole not in library.names() and several in library.names() else name
 
 
 def _in_order(
