@@ -63,7 +63,7 @@ def bias(systems: Sequence[System], table: pd.DataFrame) -> Figure:
         parameter = _most_biased(lines)
         _compared(panel, one, lines[lines["parameter"] == parameter])
         panel.axvline(0.0, color=ZERO, linewidth=0.8)
-        panel.set_title(f"{one.name}: {parameter}\nlacks {_missing(one)}", fontsize=9)
+        panel.set_title(f"{one.name}: {parameter}\n{_lacks(one)}", fontsize=9)
         panel.set_xlabel("mean signed error [training widths]", fontsize=8)
     caption = (
         "The parameter that least squares gets most wrong in the simulator as it is. Point: mean "
@@ -80,7 +80,7 @@ def prediction(systems: Sequence[System], table: pd.DataFrame) -> Figure:
         mine = table["experiment"] == one.experiment.name
         _compared(panel, one, table[mine & (table["metric"] == "heldout_error")])
         panel.set_xscale("log")
-        panel.set_title(f"{one.name}\nlacks {_missing(one)}", fontsize=9)
+        panel.set_title(f"{one.name}\n{_lacks(one)}", fontsize=9)
         panel.set_xlabel(f"RMSE of {one.channel} in unseen runs [{one.unit}]", fontsize=8)
     caption = (
         f"Point: mean over {_targets(systems)} of the error of the tuned simulator in runs that no "
@@ -171,14 +171,14 @@ def _slope(panel: Axes, one: System, ranks: pd.DataFrame) -> None:
     panel.set_xlim(-0.25, 1.25)
 
 
-def _missing(one: System) -> str:
+def _lacks(one: System) -> str:
     names = list(one.experiment.world.get("fixed", {}))
-    return ", ".join(names) or "nothing"
+    return f"lacks {', '.join(names) or 'nothing'}; {len(one.targets())} targets"
 
 
 def _targets(systems: Sequence[System]) -> str:
     counts = sorted({len(one.targets()) for one in systems})
-    many = "to".join(f" {count} " for count in dict.fromkeys((counts[0], counts[-1]))).strip()
+    many = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
     return f"{many} targets"
 
 

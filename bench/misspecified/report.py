@@ -16,8 +16,7 @@ from bench.misspecified import scores
 from bench.misspecified.calibration import EXTENDED, MODELS, PLAIN
 from bench.problem.experiment import Experiment
 from bench.report import failure_lines, tables
-from bench.store.folder import CONFIGURATION, Configuration, configuration, read
-from bench.store.segments import FOLDER
+from bench.store.folder import Configuration, configuration, read
 from bench.store.status import FAILURES
 from sims.files import write
 
@@ -37,30 +36,28 @@ def finish(study: Studied, say: Say) -> int:
     """Write and say what a study came to; how many runs failed."""
     folder, experiment = study.folder, study.configuration.experiment
     failed = _comparisons(folder, say)
-    if not is_complete(folder):
-        say(f"{experiment.name}: the two comparisons are not complete, and not compared yet")
+    one = scores.outcome(folder, experiment) if has_both(folder) else None
+    if one is None or not one.targets():
+        say(f"{experiment.name}: no target has been met in both simulators yet")
         return failed
-    one = scores.outcome(folder, experiment)
     _written(folder, [one], say, whole=False)
     return failed
 
 
 def conclude(folder: Path, parts: Sequence[Path], say: Say) -> None:
     """Write and say what several studies come to together, in the folder that holds them."""
-    done = [part for part in parts if is_complete(part)]
-    if len(done) < 2:
+    there = [part for part in parts if has_both(part)]
+    outcomes = [scores.outcome(part, configuration(part).experiment) for part in there]
+    outcomes = [one for one in outcomes if one.targets()]
+    if len(outcomes) < 2:
         return
-    outcomes = [scores.outcome(part, configuration(part).experiment) for part in done]
     say(f"\ntogether, {len(outcomes)} systems")
     _written(folder, outcomes, say, whole=True)
 
 
-def is_complete(folder: Path) -> bool:
-    """Whether both comparisons of a study are finished."""
-    return all(
-        (folder / model / CONFIGURATION).is_file() and not (folder / model / FOLDER).exists()
-        for model in MODELS
-    )
+def has_both(folder: Path) -> bool:
+    """Whether there are runs of both comparisons of a study."""
+    return all((folder / model / "runs.parquet").is_file() for model in MODELS)
 
 
 def _comparisons(folder: Path, say: Say) -> int:

@@ -87,8 +87,8 @@ class Outcome:
 
     def tuners(self) -> list[str]:
         """Labels in the order of the experiment, of those that ran in both simulators."""
-        ran = [set(self.errors[self.errors["model"] == model]["tuner"]) for model in MODELS]
-        return [e.label for e in self.experiment.tuners if all(e.label in each for each in ran)]
+        ran = set(self.errors["tuner"])
+        return [e.label for e in self.experiment.tuners if e.label in ran]
 
     def matrix(
         self, model: str, metric: str, tuners: Sequence[str], targets: Sequence[str]
@@ -101,9 +101,7 @@ class Outcome:
 
     def targets(self) -> list[str]:
         """Names of those that were met in both simulators by all tuners."""
-        counts = self.errors.groupby("target").size()
-        whole = len(MODELS) * len(self.tuners())
-        return sorted(str(name) for name in counts[counts >= whole].index)
+        return sorted({str(name) for name in self.errors["target"]})
 
 
 def outcome(folder: Path, experiment: Experiment) -> Outcome:
@@ -117,8 +115,21 @@ def outcome(folder: Path, experiment: Experiment) -> Outcome:
     channel = problem.channels[problem.error_channel]
     problem.close()
     parts = [_last(folder / model, model, parameters, widths) for model in MODELS]
-    errors = pd.concat(parts, ignore_index=True)
+    errors = _whole(pd.concat(parts, ignore_index=True))
     return Outcome(experiment, channel.unit, channel.name, parameters, errors)
+
+
+def _whole(errors: pd.DataFrame) -> pd.DataFrame:
+    """The rows of targets that every tuner met in both simulators with all of its seeds: of a study
+    that was interrupted the others would compare different targets.
+    """
+    asked = errors.groupby(["model", "tuner"])["runs"].transform("max")
+    # A tuner that could not be used in one simulator is compared in neither.
+    used = set.intersection(*(set(part["tuner"]) for _, part in errors.groupby("model")))
+    there = errors[(errors["runs"] == asked) & errors["tuner"].isin(used)]
+    met = there.groupby("target").size()
+    whole = set(met[met == len(MODELS) * len(used)].index)
+    return there[there["target"].isin(whole)].reset_index(drop=True)
 
 
 def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Array) -> pd.DataFrame:

@@ -249,3 +249,16 @@ def test_a_calibration_that_cannot_be_is_refused(tmp_path, change, message):
     document = {"simulator": "ball", "tuners": ["random"], **change}
     with pytest.raises(InputError, match=message):
         parse("x", document, tmp_path / "x.toml")
+
+
+def test_targets_that_not_all_have_met_are_left_out(folder):
+    one = scores.outcome(folder, small()).errors
+    lacking = one.drop(one.index[(one["target"] == "in-001") & (one["model"] == "extended")][0])
+    assert set(scores._whole(one)["target"]) == {"in-000", "in-001", "in-002"}
+    left = scores._whole(lacking)
+    assert set(left["target"]) == {"in-000", "in-002"}
+    assert len(left) == 2 * 2 * 2
+    # A seed that is missing is a target that is not met.
+    seeds = one.assign(runs=3)
+    seeds.loc[seeds.index[0], "runs"] = 2
+    assert set(scores._whole(seeds)["target"]) == {"in-001", "in-002"}

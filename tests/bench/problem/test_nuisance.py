@@ -71,7 +71,7 @@ def test_weights_and_runs_of_the_randomised_are_others_and_of_the_plain_the_same
 def test_what_it_cannot_train_over_is_refused():
     with pytest.raises(InputError, match=r"tunenet-randomised is randomised: expected a \[nuis"):
         replace(SHOT, nuisance={}, tuners=(RANDOMISED,))
-    with pytest.raises(InputError, match="nuisance: .*'drag.cubic'"):
+    with pytest.raises(InputError, match=r"nuisance: .*'drag.cubic'"):
         Nuisance(Problem(replace(SHOT, nuisance={"drag.cubic": (0.0, 1.0)})))
-    with pytest.raises(InputError, match="expected one of wind.drag, wind.x, .*found wind.up"):
+    with pytest.raises(InputError, match=r"expected one of wind.drag, wind.x, .*found wind.up"):
         Nuisance(Problem(replace(load("ball-drop"), nuisance={"wind.up": (0.0, 1.0)})))
