@@ -1,11 +1,11 @@
-"""Learned tuners where the world has an effect that the simulator lacks: trained in the simulator as
-it is, and over effects that the world may have; and whether intervals that a conformal calibration
-gives them cover the truth.
+"""Learned tuners where the world has an effect that the simulator lacks: trained in the simulator
+as it is, and over effects that the world may have; and whether intervals that a conformal
+calibration gives them cover the truth.
 
-Split-conformal intervals (H. Papadopoulos et al., ECML 2002; J. Lei et al., JASA 113, 2018,
-arXiv 1604.04173): on n simulations that the training has not seen, the size of the error in each
-parameter is sorted; the ceil((n + 1) 0.9)-th smallest is the interval's half width. It covers 90 % of
-the targets that come from where these simulations come from.
+Split-conformal intervals (H. Papadopoulos et al., ECML 2002; J. Lei et al., JASA 113, 2018, arXiv
+1604.04173): on n simulations that the training has not seen, the size of the error in each
+parameter is sorted; the ceil((n + 1) 0.9)-th smallest is the interval's half width. It covers 90 %
+of the targets that come from where these simulations come from.
 
 python -m tests.benchmarks.randomised results/reference/misspecified/learned.csv ball servo shot
 """

@@ -60,7 +60,7 @@ def test_published_setting_of_ball_drop():
         ),
         (
             {"tuners": {"random": {"option": {}}}},
-            "'option'; there are: budget, options, seeds, tuner",
+            "'option'; there are: budget, options, randomised, seeds, tuner",
         ),
         ({"simulator": ""}, "expected simulator"),
     ],
@@ -112,7 +112,10 @@ def test_tuners_may_be_a_list_of_names_and_of_tables_that_name_one():
         ([{"seeds": 1}], r"tuners\[0\]: expected a table with tuner = \"NAME\", found"),
         (["random", "random"], "tuners: random stands twice; give one of them a label"),
         ([{"tuner": "random", "budget": 0}], r"tuners\[0\].budget: expected at least 1, found 0"),
-        ([{"tuner": "random", "option": {}}], "'option'; there are: budget, options, seeds, tuner"),
+        (
+            [{"tuner": "random", "option": {}}],
+            "'option'; there are: budget, options, randomised, seeds, tuner",
+        ),
     ],
 )
 def test_faults_in_a_list_of_tuners_are_one_line(tuners, message):
