@@ -130,7 +130,7 @@ def bases(folder: Path) -> dict[str, Path]:
                 comparison.results.kept.close()
             else:
                 comparison.make(jobs=0)
-                with patch("bench.report._drawn", return_value=[]):
+                with patch("bench.report._drawn", return_value={}):
                     comparison.finish(lambda _: None)
     path = folder / "learned.toml"
     path.write_bytes(toml(LEARNED))

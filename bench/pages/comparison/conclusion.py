@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.analysis.medians import FLOOR
 from bench.analysis.paired import log_errors
 from bench.pages.comparison.results import RANGES, Results
 from bench.pages.elements import safe, strong
@@ -60,13 +61,18 @@ def _least(results: Results, kind: str, winner: str) -> str:
         return f"{strong(safe(winner))} ends with the smallest median error."
     last = line.iloc[-1]
     interval = ""
-    if np.isfinite(last["low"]):
-        interval = f" (95 % {number(last['low'])} to {number(last['high'])})"
+    if np.isfinite(last["low"]) and last["high"] > FLOOR:
+        interval = f" (95 % {_at(last['low'])} to {_at(last['high'])})"
     after = int(last["simulations"])
     return (
         f"{strong(safe(winner))} ends with the smallest error after {after} simulations: "
-        f"{safe(results.label(metric))}, median {number(last['median'])}{interval}."
+        f"{safe(results.label(metric))}, median {_at(last['median'])}{interval}."
     )
+
+
+def _at(error: float) -> str:
+    """An error of a curve, which ends where rounding in the observation begins."""
+    return number(error) if error > FLOOR else f"at most {number(FLOOR)}"
 
 
 def _against(results: Results, kind: str, winner: str) -> str:

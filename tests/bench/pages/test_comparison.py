@@ -136,6 +136,10 @@ def test_the_median_that_is_said_is_that_of_the_table():
     line = table[(table["metric"] == "stiff_error") & (table["tuner"] == "tunenet")]
     median = line[line["simulations"] == BUDGET]["median"].item()
     assert f"median {number(median)} (95 % " in said
+    exact = many(12)
+    exact.runs.loc[exact.runs["tuner"] == "tunenet", "stiff_error"] = 1e-13
+    (least,) = conclusion(results(exact))
+    assert "median at most 1×10⁻⁹." in least
     (soon,) = soonest(whole)
     ert = whole.tables["ert"]
     ert = ert[(ert["threshold"] == whole.statistics.level) & (ert["tuner"] == "tunenet")]
