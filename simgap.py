@@ -30,8 +30,9 @@ _WHERE = {
     "bench.checks": ("parametrize",),
     "bench.gap.explanation": ("Explanation",),
     "bench.gap.sheet.sheet": ("DataSheet",),
+    "bench.diagnoser": ("Answer", "Case", "Diagnoser", "Lesson", "Named"),
     "bench.problem.experiment": ("Experiment",),
-    "bench.registry": ("effects", "load_plugins", "simulators", "tuners"),
+    "bench.registry": ("diagnosers", "effects", "load_plugins", "simulators", "tuners"),
     "methods.base": (
         "Ask",
         "BudgetExceededError",

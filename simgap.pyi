@@ -8,10 +8,11 @@ from bench.api.design import NextRecording, design
 from bench.api.explain import explain, score
 from bench.api.recordings import import_logs, read_recording, simulate
 from bench.checks import parametrize
+from bench.diagnoser import Answer, Case, Diagnoser, Lesson, Named
 from bench.gap.explanation import Explanation
 from bench.gap.sheet.sheet import DataSheet
 from bench.problem.experiment import Experiment
-from bench.registry import effects, load_plugins, simulators, tuners
+from bench.registry import diagnosers, effects, load_plugins, simulators, tuners
 from methods.base import (
     Ask,
     BudgetExceededError,
@@ -52,16 +53,19 @@ from sims.system import (
 )
 
 __all__ = [
+    "Answer",
     "Array",
     "Ask",
     "BudgetExceededError",
     "BulletWorld",
+    "Case",
     "Channel",
     "Coefficient",
     "Compared",
     "Constant",
     "Contact",
     "DataSheet",
+    "Diagnoser",
     "Effect",
     "Evaluation",
     "Experiment",
@@ -72,8 +76,10 @@ __all__ = [
     "Hidden",
     "Input",
     "InputError",
+    "Lesson",
     "Level",
     "Moment",
+    "Named",
     "NextRecording",
     "OwnSimulator",
     "Parameter",
@@ -94,6 +100,7 @@ __all__ = [
     "compare",
     "datasheet",
     "design",
+    "diagnosers",
     "effects",
     "explain",
     "from_callback",

@@ -53,7 +53,7 @@ COMMANDS = (
     ),
     ("diff", add_diff, "two comparisons or two explanations: what changed, and significantly?"),
     ("bundle", add_bundle, "pack a comparison or an explanation as one archive that verifies"),
-    ("check", add_check, "run the conformance suite on a tuner, a simulator or an effect"),
+    ("check", add_check, "run the conformance suite on a tuner, simulator, effect or diagnoser"),
     ("plot", add_plot, "write table and figures of a comparison again, or of several together"),
     ("simulate", add_simulate, "write a recording of a simulated system, its truth apart"),
     ("import", add_import, "describe a robot's logs as they lie, so that every command reads them"),
@@ -67,7 +67,7 @@ COMMANDS = (
     (
         "list",
         add_list,
-        "list tuners, simulators, systems, effects, experiments, references or schemas",
+        "list tuners, simulators, systems, effects, diagnosers, experiments, references or schemas",
     ),
     ("schema", add_schema, "print the JSON schema of what a command prints with --json"),
     ("info", add_info, "versions, engines, platform and paths, for a report of a fault"),

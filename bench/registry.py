@@ -1,8 +1,8 @@
-"""Finds tuners, simulators and effects: the project's own, installed plugins' and those of
-`--plugin FILE`.
+"""Finds tuners, simulators, effects and diagnosers: the project's own, installed plugins' and those
+of `--plugin FILE`.
 
 All come in the same way (`sims.registry.Registry`), through the entry-point groups `simgap.tuners`,
-`simgap.simulators` and `simgap.effects`.
+`simgap.simulators`, `simgap.effects` and `simgap.diagnosers`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from bench.diagnoser import Diagnoser
 from methods.base import Tuner
 from sims.base import InputError, Simulator
 from sims.effects import registry as effects
@@ -25,6 +26,7 @@ __all__ = [
     "REGISTRIES",
     "Registry",
     "SkippedError",
+    "diagnosers",
     "effects",
     "load_plugins",
     "simulators",
@@ -38,7 +40,13 @@ simulators: Registry[Simulator] = Registry(
     Simulator,  # type: ignore[type-abstract]
 )
 
-REGISTRIES: tuple[Registry[Any], ...] = (tuners, simulators, effects)
+diagnosers: Registry[Diagnoser] = Registry(
+    "diagnoser",
+    "simgap.diagnosers",
+    Diagnoser,  # type: ignore[type-abstract]
+)
+
+REGISTRIES: tuple[Registry[Any], ...] = (tuners, simulators, effects, diagnosers)
 """Of each kind of part, in the order in which a plugin's class is tried."""
 
 
@@ -67,7 +75,7 @@ def robot(
 
 
 def load_plugins(paths: Iterable[str | Path]) -> None:
-    """Register every tuner, simulator and effect that is defined in the files, once.
+    """Register every tuner, simulator, effect and diagnoser that is defined in the files, once.
 
     A file ending in .toml is an extended simulator as `simgap explain` writes it, loaded after what
     it may extend.
@@ -96,7 +104,9 @@ def _load(path: Path) -> None:
         return
     parts = _parts(_run(path))
     if not parts:
-        raise InputError(f"plugin {path}: defines neither a Tuner nor a Simulator nor an Effect")
+        raise InputError(
+            f"plugin {path}: defines neither a Tuner nor a Simulator nor an Effect nor a Diagnoser"
+        )
     for registry, part in parts:
         registry.register(part, path)
 

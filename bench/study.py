@@ -1,7 +1,7 @@
 """Studies: what an experiment asks for, made in a folder.
 
-Comparisons, bounce shots and studies of a missing effect are kinds of one contract, and this is the
-one place that tells which is which.
+Comparisons of tuners and of diagnosers, bounce shots and studies of a missing effect are kinds of
+one contract, and this is the one place that tells which is which.
 """
 
 from __future__ import annotations
@@ -205,6 +205,10 @@ def kind_of(experiment: Experiment) -> type[Study]:
         from bench.misspecified.study import MisspecifiedStudy
 
         return MisspecifiedStudy
+    if experiment.diagnosis:
+        from bench.diagnosis.study import DiagnosisStudy
+
+        return DiagnosisStudy
     from bench.compare import Comparison
 
     return Comparison

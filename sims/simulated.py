@@ -30,6 +30,7 @@ from sims.system import (
     Signal,
     System,
 )
+from sims.tally import TALLY
 from sims.user_toml import shown
 
 BEYOND = 1e6
@@ -160,6 +161,7 @@ class Simulated(Simulator):
             raise InputError(f"theta must have shape {expected}, found {theta.shape}")
         if not len(theta):
             return np.empty((0, 0, len(self.channels)))
+        TALLY.count(len(theta))
         return self._simulated(theta, scenarios, initial or {})
 
     def _simulated(

@@ -5,7 +5,7 @@ figures.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +17,7 @@ from bench.problem.asked import asked
 from bench.problem.experiment import Experiment, load
 from bench.problem.problem import Problem
 from bench.problem.robots import completed
+from bench.registry import diagnosers
 from bench.registry import tuners as registered
 from bench.report import tables
 from bench.runs.runner import Progress
@@ -260,6 +261,8 @@ def choose(
         InputError: no such experiment or tuner.
     """
     whole = experiment if isinstance(experiment, Experiment) else load(str(experiment))
+    if whole.diagnosis:
+        return _choose_diagnosers(whole, labels, changes)
     whole = whole.chosen(**changes)
     if seeds:
         whole = whole.with_seeds(seeds)
@@ -270,6 +273,23 @@ def choose(
         if label not in known:
             raise unknown("tuner", label, sorted(known))
     return whole.with_tuners(labels)
+
+
+def _choose_diagnosers(
+    whole: Experiment, labels: Sequence[str] | None, changes: Mapping[str, float | None]
+) -> Experiment:
+    """A comparison of diagnosers with changes: its targets are questions."""
+    sample = changes.get("targets")
+    table = dict(whole.diagnosis)
+    if sample is not None:
+        table["sample"] = sample
+    if labels is not None:
+        for label in labels:
+            if label not in diagnosers.names():
+                raise unknown("diagnoser", label, diagnosers.names())
+        table["diagnosers"] = list(labels)
+    rest = {name: value for name, value in changes.items() if name != "targets"}
+    return whole.chosen(diagnosis=table, **rest)
 
 
 def _label(tuner: str | type[Tuner]) -> str:

@@ -1,4 +1,4 @@
-"""Conformance suites for tuners, simulators and effects: to register is to be tested.
+"""Conformance suites for tuners, simulators, effects and diagnosers: to register is to be tested.
 
 Each check is a function that raises `CheckError` when its subject does not conform, saying what was
 expected, what was found and where to look; it returns `NotApplicable` where there was nothing to
@@ -7,12 +7,14 @@ check. The suites run over everything registered in this project's tests; author
 """
 
 from bench.checks.base import CheckError, NotApplicable
+from bench.checks.diagnosers import DIAGNOSER_CHECKS
 from bench.checks.effects import EFFECT_CHECKS
 from bench.checks.simulators import SIMULATOR_CHECKS
 from bench.checks.suites import parametrize
 from bench.checks.tuners import TUNER_CHECKS
 
 __all__ = [
+    "DIAGNOSER_CHECKS",
     "EFFECT_CHECKS",
     "SIMULATOR_CHECKS",
     "TUNER_CHECKS",

@@ -1,4 +1,5 @@
-"""What `simgap check NAME` does: the conformance suite on a tuner, a simulator or an effect, each
+"""What `simgap check NAME` does: the conformance suite on a tuner, a simulator, an effect or a
+diagnoser, each
 check isolated.
 """
 
@@ -63,7 +64,7 @@ class Checked(NamedTuple):
 
 
 def kind_of(name: str) -> str:
-    """Whether `name` is a tuner, a simulator or an effect.
+    """Whether `name` is a tuner, a simulator, an effect or a diagnoser.
 
     Raises:
         InputError: it is none.
@@ -72,7 +73,7 @@ def kind_of(name: str) -> str:
         if name in registry.names():
             return registry.kind
     names = [name for registry in REGISTRIES for name in registry.names()]
-    raise unknown("tuner, simulator or effect", name, names)
+    raise unknown("tuner, simulator, effect or diagnoser", name, names)
 
 
 def _subject(kind: str, name: str) -> Any:
@@ -96,7 +97,7 @@ def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> Checke
     """Make every check and say how each ends.
 
     Args:
-        name: registered name of a tuner, simulator or effect.
+        name: registered name of a tuner, simulator, effect or diagnoser.
         plugins: plugin files; loaded in this process already.
         say: prints a line.
 

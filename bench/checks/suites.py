@@ -7,9 +7,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from bench.checks.base import NotApplicable
+from bench.checks.diagnosers import DIAGNOSER_CHECKS
 from bench.checks.effects import EFFECT_CHECKS
 from bench.checks.simulators import SIMULATOR_CHECKS
 from bench.checks.tuners import TUNER_CHECKS
+from bench.diagnoser import Diagnoser
 from methods.base import Tuner
 from sims.base import InputError, Simulator
 from sims.system import Effect
@@ -24,20 +26,28 @@ SUITES: dict[str, tuple[Check, ...]] = {
     "tuner": TUNER_CHECKS,
     "simulator": SIMULATOR_CHECKS,
     "effect": EFFECT_CHECKS,
+    "diagnoser": DIAGNOSER_CHECKS,
 }
-_BASES: dict[str, type] = {"tuner": Tuner, "simulator": Simulator, "effect": Effect}
+_BASES: dict[str, type] = {
+    "tuner": Tuner,
+    "simulator": Simulator,
+    "effect": Effect,
+    "diagnoser": Diagnoser,
+}
 
 
 def suite_of(subject: type) -> tuple[Check, ...]:
     """The checks for a class.
 
     Raises:
-        InputError: it is neither a tuner, a simulator nor an effect.
+        InputError: it is neither a tuner, a simulator, an effect nor a diagnoser.
     """
     for kind, base in _BASES.items():
         if inspect.isclass(subject) and issubclass(subject, base):
             return SUITES[kind]
-    raise InputError(f"expected a subclass of Tuner, Simulator or Effect, found {subject!r:.80}")
+    raise InputError(
+        f"expected a subclass of Tuner, Simulator, Effect or Diagnoser, found {subject!r:.80}"
+    )
 
 
 def parametrize(*subjects: type) -> pytest.MarkDecorator:
@@ -51,7 +61,7 @@ def parametrize(*subjects: type) -> pytest.MarkDecorator:
     `known_failures` is expected to fail, and a failure if it passes.
 
     Raises:
-        InputError: a subject is neither a tuner, a simulator nor an effect.
+        InputError: a subject is neither a tuner, a simulator, an effect nor a diagnoser.
     """
     import pytest
 

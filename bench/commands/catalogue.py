@@ -9,7 +9,9 @@ from bench.commands.index import PARTS
 
 
 def lines(what: str) -> list[str]:
-    """The lines for tuners, simulators, systems, effects, experiments, references or schemas."""
+    """The lines for tuners, simulators, systems, effects, diagnosers, experiments, references or
+    schemas.
+    """
     return told(what, PARTS[what]())
 
 

@@ -52,9 +52,18 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
         help="numbers of its model file to tune, as damping@* or mass@forearm",
     )
     compare.add_argument(
-        "--tuners", metavar="A,B,...", help="only these tuners, by label or registered name"
+        "--tuners",
+        "--diagnosers",
+        dest="tuners",
+        metavar="A,B,...",
+        help="only these tuners, by label or registered name; or only these diagnosers",
     )
-    compare.add_argument("--targets", type=positive, metavar="N", help="targets in each range")
+    compare.add_argument(
+        "--targets",
+        type=positive,
+        metavar="N",
+        help="targets in each range; of diagnosers: so many questions, drawn at random",
+    )
     compare.add_argument(
         "--seeds", type=positive, metavar="N", help="seeds of each tuner that uses chance"
     )
@@ -79,7 +88,7 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
         type=place,
         help="folder to write (default: a new one below results/)",
     )
-    add_plugin(compare, "tuners")
+    add_plugin(compare, "tuners or diagnosers")
     compare.add_argument(
         "--resume", metavar="DIR", type=place, help="finish what is missing in this folder instead"
     )
@@ -104,6 +113,8 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
     )
     compare.add_argument(
         "--salt",
+        "--secret",
+        dest="salt",
         metavar="TEXT",
         help="draw the targets from this, which is kept secret until the end; `public` gives the "
         "published ones (default: a fresh one)",

@@ -1,5 +1,5 @@
 """What there is, as documents: commands with their options, tuners, simulators, systems, effects,
-experiments and schemas. `simgap list` prints them, in words or as they are.
+diagnosers, experiments and schemas. `simgap list` prints them, in words or as they are.
 """
 
 from __future__ import annotations
@@ -165,6 +165,16 @@ def _acting(effect: Any) -> Document:
     }
 
 
+def diagnosers() -> list[Document]:
+    """Every diagnoser: whether it learns, and what it needs."""
+    from bench.registry import diagnosers as registry
+
+    def told(kind: Any) -> Document:
+        return {"learned": bool(kind.learned), "requires": list(kind.requires)}
+
+    return [_part(registry, name, told) for name in registry.names()]
+
+
 def experiments() -> list[Document]:
     """Every experiment that comes with the project."""
     from bench.problem import experiment
@@ -233,6 +243,7 @@ PARTS: dict[str, Callable[[], list[Document]]] = {
     "simulators": simulators,
     "systems": systems,
     "effects": effects,
+    "diagnosers": diagnosers,
     "experiments": experiments,
     "references": references,
     "schemas": schemas,

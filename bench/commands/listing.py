@@ -8,8 +8,8 @@ from bench.commands.answer import Answer, Say, text
 from bench.commands.options import add_model, add_plugin
 
 _LISTS = (
-    "tuners", "simulators", "systems", "effects", "experiments", "references", "schemas",
-    "commands", "places",
+    "tuners", "simulators", "systems", "effects", "diagnosers", "experiments", "references",
+    "schemas", "commands", "places",
 )  # fmt: skip
 
 

@@ -37,7 +37,7 @@ def files(folder: Path) -> list[Path]:
 
 def results(table: Path) -> list[Document]:
     """The last line of each tuner, range and metric in a table, with its columns; all of a bounce
-    shot's; none where there is no table.
+    shot's and of diagnosers'; none where there is no table.
     """
     if not table.is_file():
         return []

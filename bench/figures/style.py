@@ -110,6 +110,22 @@ _LONG = re.compile(rb"\b[1-9]\d*\.\d{3,}\b")
 _DASHES: dict[Any, tuple[float, ...]] = {"-": (), "--": (3.7, 1.6), "-.": (6.4, 1.6, 1.0, 1.6)}
 """Matplotlib's named lines, in widths of the line."""
 
+
+def colour(place: int) -> str:
+    """Of the tuner or diagnoser at this place."""
+    return _COLOURS[place % len(_COLOURS)]
+
+
+def marker(place: int) -> str:
+    """Likewise."""
+    return _marker(place)
+
+
+def line(place: int) -> Any:
+    """Likewise, its style."""
+    return _LINES[place % len(_LINES)]
+
+
 DPI = 160
 """Dots an inch of the PNG files."""
 

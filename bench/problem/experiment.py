@@ -155,6 +155,9 @@ class Experiment:
             explain extends from such a recording (`bench.misspecified`).
         shot: where the experiment is a bounce shot, its scene (`bench.shot.settings`); targets are
             then shots a ball.
+        diagnosis: where the experiment compares diagnosers, what is asked of whom
+            (`bench.diagnosis.settings`); `budget`, `timeout` and `memory` are then those of an
+            answer, and there are no tuners.
         isolation: run: every run of a tuner has a fresh process; tuner: all runs of a tuner with
             one seed that a worker makes share one.
         trusted: tuners run in the harness's own processes, where nothing is out of their reach;
@@ -203,6 +206,7 @@ class Experiment:
     recording: Source | None = None
     calibration: Calibration | None = None
     shot: Mapping[str, Any] = field(default_factory=dict)
+    diagnosis: Mapping[str, Any] = field(default_factory=dict)
     isolation: str = "run"
     trusted: bool = False
     salt: str = ""
@@ -294,7 +298,7 @@ class Experiment:
         document = {key: value for key, value in asdict(self).items() if value is not None}
         del document["name"]
         # What is run never has the first two, and few have the last.
-        for rare in ("sweep", "experiments", "nuisance"):
+        for rare in ("sweep", "experiments", "nuisance", "diagnosis"):
             if not document[rare]:
                 del document[rare]
         document["tuners"] = {entry.label: entry.table() for entry in self.tuners}
@@ -398,7 +402,7 @@ def parse(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
         raise InputError(f'{path}: free and actuators are of a robot: expected model = "FILE"')
     if fields.get("experiments"):
         fields["experiments"] = tuple(_beside(each, path) for each in fields["experiments"])
-    elif not fields.get("simulator"):
+    elif not fields.get("simulator") and not fields.get("diagnosis"):
         raise InputError(f'{path}: expected simulator = "NAME" or model = "FILE", found none')
     # Known here only: neither a worker nor a folder of results knows where this file lay.
     if "recording" in fields:

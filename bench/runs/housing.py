@@ -25,8 +25,8 @@ from sims.base import InputError
 Result = TypeVar("Result")
 
 _KNOWN = (
-    "botorch", "cma", "gpytorch", "linear_operator", "methods", "nlopt", "numpy", "pandas", "sbi",
-    "scipy", "skopt", "sklearn", "torch",
+    "bench", "botorch", "cma", "gpytorch", "linear_operator", "methods", "nlopt", "numpy", "pandas",
+    "pysindy", "sbi", "scipy", "sims", "skopt", "sklearn", "statsmodels", "torch",
 )  # fmt: skip
 """Packages that may be loaded ahead of a run: simgap's own and those that it requires. What else a
 plugin imports is imported anew in each run: it could remember what an earlier one has seen.

@@ -47,6 +47,7 @@ NOT_OF_A_RUN = {
     "model": "where it lies; what it holds is hashed",
     "calibration": "what it comes to is in the settings of what is tuned",
     "shot": "what is done with a tuned model afterwards",
+    "diagnosis": "who diagnoses what, where nothing is tuned",
     "salt": "which targets there are; their scenarios and observations are hashed",
     "salt_sha256": "which targets there are; their scenarios and observations are hashed",
     "sweep": "what is run sweeps over nothing; it has values of its own",

@@ -55,7 +55,7 @@ PACKAGES = (
 """Packages that compute; another version of one may give other numbers."""
 _PLUGIN = "simgap_plugin_"
 """How the modules of plugin files are called (`bench.registry`)."""
-_GROUPS = ("simgap.tuners", "simgap.simulators", "simgap.effects")
+_GROUPS = ("simgap.tuners", "simgap.simulators", "simgap.effects", "simgap.diagnosers")
 """The entry points by which installed plugins register."""
 
 

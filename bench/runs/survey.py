@@ -12,8 +12,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, ClassVar
 
+from bench.diagnoser import Answer, Case, Diagnoser
 from bench.problem.experiment import Entry, Experiment
-from bench.registry import REGISTRIES, load_plugins, tuners
+from bench.registry import REGISTRIES, diagnosers, load_plugins, tuners
 from bench.runs.housing import housed, nursery, tuned_of, undisturbed
 from bench.runs.sources import digest, named_effects, source
 from bench.sealing.ended import EndedError
@@ -21,14 +22,16 @@ from bench.sealing.seals import Reach
 from bench.sealing.wire import Channel, printable
 from methods.base import Tuner
 from sims.base import InputError
-from sims.registry import SkippedError
+from sims.registry import Registry, SkippedError
 
 _PATIENCE = 120.0
 """Seconds that loading a plugin may take."""
 _ANSWER = 1 << 20
 """Bytes that may be said of what it holds."""
-_OWN = "methods."
-"""The package of the project's own tuners, which are of the harness's making."""
+_OWN = ("methods.", "bench.")
+"""The packages of the project's own tuners and diagnosers, which are of the harness's making."""
+_METHODS = ("tuner", "diagnoser")
+"""Parts that are compared, and whose code never runs where truths are."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +42,13 @@ class Plugin:
         path: of the file.
         loaded: whether its code runs in the harness's processes.
         tuners: what is known of its tuners where it does not: fields of `Announced`.
+        diagnosers: likewise, of its diagnosers.
     """
 
     path: str
     loaded: bool = True
     tuners: tuple[dict[str, Any], ...] = ()
+    diagnosers: tuple[dict[str, Any], ...] = ()
 
 
 class Announced(Tuner):
@@ -69,6 +74,31 @@ def announced(known: dict[str, Any]) -> type[Announced]:
     return made
 
 
+class AnnouncedDiagnoser(Diagnoser):
+    """A diagnoser whose code is not in this process; what is known of it."""
+
+    module: ClassVar[str] = ""
+    source_digest: ClassVar[str] = ""
+
+    def diagnose(self, case: Case) -> Answer:
+        """Nobody asks it here."""
+        raise NotImplementedError
+
+
+def announced_diagnoser(known: dict[str, Any]) -> type[AnnouncedDiagnoser]:
+    """The class that stands for a diagnoser."""
+    fields: dict[str, Any] = {
+        "name": str(known["name"]),
+        "learned": known["learned"] is True,
+        "module": str(known["module"]),
+        "source_digest": str(known["source"]),
+        "__doc__": str(known["says"]),
+        "__module__": __name__,
+    }
+    made: type[AnnouncedDiagnoser] = type(fields["name"], (AnnouncedDiagnoser,), fields)
+    return made
+
+
 def enter(plugins: Iterable[Plugin]) -> None:
     """Make plugins known to this process: their code, or what is known of them.
 
@@ -80,6 +110,10 @@ def enter(plugins: Iterable[Plugin]) -> None:
     for plugin in plugins:
         for known in plugin.tuners:
             tuners.announce(announced(known), Path(plugin.path) if plugin.path else None)
+        for known in plugin.diagnosers:
+            diagnosers.announce(
+                announced_diagnoser(known), Path(plugin.path) if plugin.path else None
+            )
 
 
 _admitted: dict[str, Plugin] = {}
@@ -205,13 +239,13 @@ def survey(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]:
         if path.endswith(".toml"):
             found.append(Plugin(path))
             continue
-        parts = _asked({"file": path, "tuner": ""}, path)
-        worlds = {part["name"] for part in parts if part["kind"] != "tuner"}
+        parts = _asked({"file": path, "kind": "", "name": ""}, path)
+        worlds = {part["name"] for part in parts if part["kind"] not in _METHODS}
         for part in parts:
-            if part["name"] in wanted and part["kind"] != "tuner":
+            if part["name"] in wanted and part["kind"] not in _METHODS:
                 _refuse_taken(part["kind"], part["name"], path, claimed)
-        known = tuple(part for part in parts if part["kind"] == "tuner")
-        found.append(Plugin(path, bool(worlds & wanted), known))
+        methods = [tuple(p for p in parts if p["kind"] == kind) for kind in _METHODS]
+        found.append(Plugin(path, bool(worlds & wanted), *methods))
     return found
 
 
@@ -231,23 +265,23 @@ def _refuse_taken(kind: str, name: str, path: str, claimed: dict[tuple[str, str]
         raise InputError(f"plugin {path}: {kind} '{name}' is in {other} too; give one another name")
 
 
-def installed(name: str) -> Plugin:
-    """What is known of a tuner that another package has installed.
+def installed(name: str, kind: str = "tuner") -> Plugin:
+    """What is known of a tuner or diagnoser that another package has installed.
 
     Raises:
         SkippedError: it cannot be used here.
         InputError: it cannot even be looked at.
     """
-    known = _asked({"file": "", "tuner": name}, name)
+    known = _asked({"file": "", "kind": kind, "name": name}, name)
     if known and "skipped" in known[0]:
-        raise SkippedError("tuner", name, known[0]["skipped"])
-    return Plugin("", False, tuple(known))
+        raise SkippedError(kind, name, known[0]["skipped"])
+    return Plugin("", False, *(tuple(known) if kind == k else () for k in _METHODS))
 
 
-def foreign(name: str) -> bool:
-    """Whether a registered tuner is another package's, and its code not in this process."""
-    place = tuners.entry(name)
-    known = tuners.place(name) is not None or place is None
+def foreign(name: str, registry: Registry[Any] = tuners) -> bool:
+    """Whether a registered part is another package's, and its code not in this process."""
+    place = registry.entry(name)
+    known = registry.place(name) is not None or place is None
     return not known and not str(place).startswith(_OWN)
 
 
@@ -301,7 +335,7 @@ def describe(channel: Channel, _reach: Reach, held: list[str]) -> None:
     channel.send_document(b"R", held)
     question = channel.receive().document()
     try:
-        answer: Any = _parts(question["file"]) if question["file"] else [_one(question["tuner"])]
+        answer: Any = _parts(question["file"]) if question["file"] else [_one(question)]
     except InputError as error:
         answer = {"fault": str(error)}
     channel.send_document(b"K", answer)
@@ -324,28 +358,32 @@ def _parts(file: str) -> list[dict[str, Any]]:
     ]
 
 
-def _one(name: str) -> dict[str, Any]:
-    """An installed tuner."""
+def _one(question: dict[str, str]) -> dict[str, Any]:
+    """An installed tuner or diagnoser."""
+    kind, name = question["kind"], question["name"]
     try:
-        return _told("tuner", tuners.get(name))
+        return _told(kind, _REGISTRY_OF[kind].get(name))
     except SkippedError as error:
-        return {"kind": "tuner", "name": name, "skipped": error.reason}
+        return {"kind": kind, "name": name, "skipped": error.reason}
+
+
+_REGISTRY_OF: dict[str, Registry[Any]] = {"tuner": tuners, "diagnoser": diagnosers}
 
 
 def _told(kind: str, part: Any) -> dict[str, Any]:
     known = {"kind": kind, "name": part.name, "says": (part.__doc__ or "").split("\n\n")[0]}
-    if kind != "tuner":
+    if kind not in _METHODS:
         return known
     try:
         return {
             **known,
             "module": part.__module__,
-            "stochastic": part.stochastic,
+            "stochastic": getattr(part, "stochastic", True),
             "learned": part.learned,
-            "trains_as": part.trains_as,
+            "trains_as": getattr(part, "trains_as", ""),
             "source": source(part),
-            # A package may be missing for the tuner and not for its file.
-            "name": tuners.get(part.name).name,
+            # A package may be missing for the part and not for its file.
+            "name": _REGISTRY_OF[kind].get(part.name).name,
         }
     except SkippedError as error:
         return {**known, "skipped": error.reason}

@@ -117,6 +117,7 @@ NOT_OF_A_TRAINING = {
     "model": "where it lies; what it holds is hashed",
     "calibration": "what it comes to is in the settings of what is tuned",
     "shot": "what is done with a tuned model afterwards",
+    "diagnosis": "who diagnoses what, where nothing is tuned",
     "sweep": "what is run sweeps over nothing; it has values of its own",
     "experiments": "what is run names no others",
     "nuisance": "matters to entries that are randomised alone, and is hashed with them",

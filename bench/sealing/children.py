@@ -21,6 +21,7 @@ from bench.sealing.ended import EndedError, KilledError, how_it_ended
 from bench.sealing.seals import ROOT, readable
 from bench.sealing.wire import TEXT_LIMIT, Channel, FoulError, GoneError, Message
 from methods.base import Array
+from sims.engines.compiled import kept as compiled
 
 _START = (
     "import sys; sys.path[:] = {path!r}; from bench.sealing.nursery import main; main({descriptor})"
@@ -149,6 +150,8 @@ def _environment(folder: str) -> dict[str, str]:
     told = {name: os.environ[name] for name in kept if name in os.environ}
     # Without them a library would compute in another way, and sums would end in other digits.
     told |= {name: value for name, value in os.environ.items() if name.startswith(_NUMERICAL)}
+    # Compiled steps are loaded from where they are kept, before anything is shut off.
+    told["SIMGAP_COMPILED"] = "off" if compiled.is_off() else str(compiled.folder())
     one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return {**one, **told, "HOME": folder, "TMPDIR": folder, "PYTHONDONTWRITEBYTECODE": "1"}
 

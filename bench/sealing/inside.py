@@ -79,11 +79,12 @@ def _served(channel: Channel, message: Message, tuner: Tuner | None) -> Tuner | 
     return tuner
 
 
-def found(wanted: dict[str, Any]) -> type[Tuner]:
-    """The class of a tuner.
+def found(wanted: dict[str, Any], base: type[Any] = Tuner) -> type[Any]:
+    """The class of a tuner, or of another plugin.
 
     Args:
-        wanted: ``name`` of the tuner, and the ``file`` or the ``module`` that it is in.
+        wanted: ``name`` of it, and the ``file`` or the ``module`` that it is in.
+        base: what it is derived from.
 
     Raises:
         ImportError: it is not there any more.
@@ -92,9 +93,15 @@ def found(wanted: dict[str, Any]) -> type[Tuner]:
         _of_file(wanted["file"]) if wanted["file"] else importlib.import_module(wanted["module"])
     )
     for value in vars(module).values():
-        if inspect.isclass(value) and issubclass(value, Tuner) and value.name == wanted["name"]:
+        if (
+            inspect.isclass(value)
+            and issubclass(value, base)
+            and getattr(value, "name", "") == wanted["name"]
+        ):
             return value
-    raise ImportError(f"{wanted['file'] or wanted['module']} has no tuner {wanted['name']}")
+    raise ImportError(
+        f"{wanted['file'] or wanted['module']} has no {base.__name__.lower()} {wanted['name']}"
+    )
 
 
 def _of_file(path: str) -> Any:

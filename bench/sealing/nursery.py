@@ -29,7 +29,11 @@ from bench.sealing.wire import Channel
 _LENGTH = struct.Struct("<I")
 _PATIENCE = 1.0
 """Seconds in which who has closed its pipe must be gone."""
-SERVICES = ("bench.sealing.inside:serve", "bench.runs.survey:describe")
+SERVICES = (
+    "bench.sealing.inside:serve",
+    "bench.runs.survey:describe",
+    "bench.diagnosis.inside:serve",
+)
 """What a child may be for: a function that gets its channel."""
 
 

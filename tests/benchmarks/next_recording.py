@@ -30,12 +30,12 @@ from pathlib import Path
 import numpy as np
 
 import simgap
+from bench.diagnosis.worlds.items import realise, same_class, setting_of
+from bench.diagnosis.worlds.world import SIMULATORS, simulated, solved
 from sims.base import Scenario
 from sims.recording.recording import Recording, Run
 from sims.recording.write import write_recording
-from tests.exam.items import realise, same_class, setting_of
 from tests.exam.questions import sheet
-from tests.exam.worlds import SIMULATORS, simulated, solved
 
 SECONDS = 4.0
 SLIPPED = 0.01  # of what a state should begin with, and that in m and rad: nobody sets it exactly

@@ -2,8 +2,14 @@
 
 import pytest
 
-from bench.checks import EFFECT_CHECKS, SIMULATOR_CHECKS, TUNER_CHECKS, CheckError
-from bench.registry import SkippedError, simulators, tuners
+from bench.checks import (
+    DIAGNOSER_CHECKS,
+    EFFECT_CHECKS,
+    SIMULATOR_CHECKS,
+    TUNER_CHECKS,
+    CheckError,
+)
+from bench.registry import SkippedError, diagnosers, simulators, tuners
 from sims import effects
 
 
@@ -41,3 +47,11 @@ def test_simulator(name, check):
 @pytest.mark.parametrize("name", effects.names())
 def test_effect(name, check):
     made(check, effects.get(name))
+
+
+@pytest.mark.parametrize("name", diagnosers.names())
+def test_diagnoser(name):
+    """All checks of one in one process: they share what they look at."""
+    kind = subject(diagnosers, name)
+    for check in DIAGNOSER_CHECKS:
+        check(kind)

@@ -26,10 +26,16 @@ GROUPS = {
         "The contract of an [effect](../../sims/effects/README.md), by hook.",
         "Effect Coefficient Force Friction Contact Input Sensor Level Hidden State Moment Signal",
     ),
+    "For diagnosers": (
+        "The contract of a [diagnoser](../diagnosers.md).",
+        "Diagnoser Case Answer Named Lesson",
+    ),
     "Faults": ("What is the user's to mend.", "InputError"),
 }
 """Headings of the page: a sentence, and the names below it."""
-UNDOCUMENTED = {"Array", "Steps", "__version__", "main", "tuners", "simulators", "effects"}
+UNDOCUMENTED = {"Array", "Steps", "__version__", "main", "tuners", "simulators", "effects"} | {
+    "diagnosers"
+}
 """Aliases and objects, which docs/python.md has in its tables."""
 
 

@@ -10,10 +10,10 @@ import time
 import traceback
 from dataclasses import asdict
 
-from tests.exam import rivals, sizing
-from tests.exam.items import Item, realise, setting_of
+from bench.diagnosis.marks import Mark, marked
+from bench.diagnosis.worlds import rivals, sizing
+from bench.diagnosis.worlds.items import Item, realise, setting_of
 from tests.exam.questions import Question
-from tests.exam.score import Mark, marked
 
 MOST_RIVALS = 6
 EXPLAIN = "bench.gap.explain:explain"

@@ -9,9 +9,9 @@ import argparse
 import sys
 from pathlib import Path
 
+from bench.diagnosis.worlds.items import KINDS, SYSTEMS, draw, realise
+from bench.diagnosis.worlds.world import FOREIGN, SIMULATORS
 from sims import effects as library
-from tests.exam.items import KINDS, SYSTEMS, draw, realise
-from tests.exam.worlds import FOREIGN, SIMULATORS
 
 
 def candidates(kind, system):

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.diagnosis.worlds import world
+from bench.diagnosis.worlds.items import SMALL, SYSTEMS, draw
+from bench.diagnosis.worlds.world import FOREIGN, SIMULATORS
 from sims import effects as library
-from tests.exam.items import SMALL, SYSTEMS, draw
-from tests.exam.worlds import FOREIGN, SIMULATORS
 
 CLEAN, EACH, DOUBLE, EACH_FOREIGN = 105, 4, 15, 4  # of each system, effect, system, foreign cause
 ATTEMPTS = 8  # drawings of one question, if the drawn sensors cannot show what it hides
@@ -110,8 +111,9 @@ def _size(offset, system, name, index):
 
 def digest():
     """Of the code that draws; items drawn by the same code need not be drawn again."""
-    here, text = Path(__file__).parent, hashlib.sha256()
+    here, text = Path(world.__file__).parent, hashlib.sha256()
     for module in (
+        "base",
         "items",
         "settings",
         "shapes",
@@ -119,7 +121,7 @@ def digest():
         "rivals",
         "joints",
         "flights",
-        "worlds",
+        "world",
     ):
         text.update((here / f"{module}.py").read_bytes())
     return text.hexdigest()[:16]

@@ -129,7 +129,7 @@ def page(summary):
     for title, kind, key in BREAKDOWNS:
         lines += _breakdown(title, summary[kind].get(key, {}))
     lines += _breakdown("Intervals that hold the truth", _coverage(summary["coverage"]))
-    lines += ["## Outcomes", "", "What each means stands in `tests/exam/score.py`.", ""]
+    lines += ["## Outcomes", "", "What each means stands in `bench/diagnosis/marks.py`.", ""]
     for kind, outcomes in summary["outcomes"].items():
         lines.append(
             f"- {kind}: " + ", ".join(f"{count} {name}" for name, count in sorted(outcomes.items()))

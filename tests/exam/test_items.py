@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from sims.base import Scenario
-from sims.recording.recording import read_recording
-from tests.exam import rivals, shapes, sizing
-from tests.exam.items import (
+from bench.diagnosis.worlds import rivals, shapes, sizing
+from bench.diagnosis.worlds.items import (
     APART,
     EQUIVALENT,
     Item,
@@ -22,9 +20,11 @@ from tests.exam.items import (
     realise,
     setting_of,
 )
+from bench.diagnosis.worlds.settings import Noise, setting
+from bench.diagnosis.worlds.world import SIMULATORS, World, constants_of, simulated, solved
+from sims.base import Scenario
+from sims.recording.recording import read_recording
 from tests.exam.questions import Question, quick, sheet
-from tests.exam.settings import Noise, setting
-from tests.exam.worlds import SIMULATORS, World, constants_of, simulated, solved
 
 
 def refitted(item):

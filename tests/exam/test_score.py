@@ -4,11 +4,11 @@ import json
 
 import pytest
 
+from bench.diagnosis.marks import marked
+from bench.diagnosis.worlds.items import Item
 from tests.exam import answers
 from tests.exam.__main__ import main
-from tests.exam.items import Item
 from tests.exam.questions import Question
-from tests.exam.score import marked
 from tests.exam.stubs import ADEQUATE
 from tests.exam.summary import share
 

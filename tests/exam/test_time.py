@@ -4,9 +4,9 @@ what is hidden besides.
 
 import pytest
 
+from bench.diagnosis.worlds import joints
+from bench.diagnosis.worlds.items import realise
 from bench.gap.explain import explain
-from tests.exam import joints
-from tests.exam.items import realise
 from tests.exam.questions import sheet
 
 EARLY = {"input.hold", "input.delay"}

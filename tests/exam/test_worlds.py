@@ -5,10 +5,17 @@ forms.
 import numpy as np
 import pytest
 
+from bench.diagnosis.worlds.settings import wave
+from bench.diagnosis.worlds.world import (
+    CHANNELS,
+    SIMULATORS,
+    World,
+    constants_of,
+    simulated,
+    solved,
+)
 from sims import effects as library
 from sims.base import Scenario
-from tests.exam.settings import wave
-from tests.exam.worlds import CHANNELS, SIMULATORS, World, constants_of, simulated, solved
 
 TIMES = np.arange(300) / 100
 SLIPPED = 0.705  # between two samples

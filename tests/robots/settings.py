@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tests.exam.settings import Noise
+from bench.diagnosis.worlds.settings import Noise
 from tests.robots import commands, reference, robots
 from tests.robots.machines import Machine
 from tests.robots.sensing import NOISES

@@ -9,7 +9,7 @@ import tomllib
 
 pytest.importorskip("pinocchio", reason="pin has no wheel here")
 
-from tests.exam.settings import Noise
+from bench.diagnosis.worlds.settings import Noise
 from tests.robots import causes, foreign, items, questions, recording, sizing
 from tests.robots.equivalence import Rivals
 from tests.robots.score import SAME

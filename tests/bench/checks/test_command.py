@@ -94,7 +94,7 @@ def test_unknown_name_is_one_line(capsys):
     assert main(["check", "cma_ess"]) == 2
     error = capsys.readouterr().err
     assert error.startswith(
-        "simgap: unknown tuner, simulator or effect 'cma_ess'; "
+        "simgap: unknown tuner, simulator, effect or diagnoser 'cma_ess'; "
         "there are: actuator.damping, actuator.limit, actuator.stiffness, arm, backlash, ball"
     )
     assert error.count("\n") == 1

@@ -7,16 +7,21 @@ the exam is about.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import copysign, cos, exp, hypot, inf, pi, sin, tanh
+from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-TOLERANCES = {"rtol": 1e-8, "atol": 1e-10}
+from bench.diagnosis.worlds.base import Effects, World
+from sims.base import Array, Scenario
+
+TOLERANCES: dict[str, Any] = {"rtol": 1e-8, "atol": 1e-10}
 SHORT = 0.011  # seconds: up to here a method of fifth order is cheaper than one of eighth
 # Share of its half width over which a region's borders are soft: the solver keeps its order.
 EDGE = 0.05
@@ -26,6 +31,8 @@ STRAIGHT = 10  # parts of an interval in which a command that goes straight is h
 NOT_LINEAR = ("input.deadband", "input.saturation", "backlash", "input.rate", "input.power")
 
 Law = Callable[[float, float, float], float]
+Weight = Callable[[float], float]
+Moved = tuple[float, Array, Any]
 
 
 @dataclass(frozen=True)
@@ -40,16 +47,18 @@ class Piece:
     target: float
     lag: float
 
-    def at(self, t):
+    def at(self, t: float) -> float:
+        """The felt input at an instant of it."""
         return self.target + (
             (self.start - self.target) * exp((self.begin - t) / self.lag) if self.lag > 0 else 0.0
         )
 
-    def cut(self, begin, end):
+    def cut(self, begin: float, end: float) -> Piece:
+        """A part of it."""
         return Piece(begin, end, self.at(begin), self.target, self.lag)
 
 
-def felt(scenario, effects, until) -> list[Piece]:
+def felt(scenario: Scenario, effects: Effects, until: float) -> list[Piece]:
     """The first input as the plant feels it, from 0 to `until`; a lag comes behind whatever is not
     linear.
     """
@@ -81,7 +90,7 @@ def felt(scenario, effects, until) -> list[Piece]:
     return pieces
 
 
-def _straight(levels, edges, share):
+def _straight(levels: Array, edges: Array, share: float) -> tuple[Array, Array]:
     """Levels in so many parts of each interval that they go straight, as far as `share` says."""
     parts = (np.arange(STRAIGHT) + 0.5) / STRAIGHT
     fine = levels[:-1, None] + share * np.diff(levels)[:, None] * parts
@@ -89,7 +98,7 @@ def _straight(levels, edges, share):
     return np.append(fine.ravel(), levels[-1]), np.append(begins.ravel(), edges[-1])
 
 
-def _slewed(levels, edges, most):
+def _slewed(levels: Array, edges: Array, most: float) -> tuple[Array, Array]:
     """Levels in short parts of time that follow no faster than `most` a second."""
     ends = [*edges[1:].tolist(), edges[-1] + 1.0]
     values, begins, state = [], [], float(levels[0])
@@ -110,7 +119,7 @@ def _slewed(levels, edges, most):
     return np.array(values), np.array(begins)
 
 
-def _play(levels, width):
+def _play(levels: Array, width: float) -> Array:
     result, state = [], levels[0]
     for level in levels:
         if abs(level - state) > width / 2:
@@ -119,7 +128,7 @@ def _play(levels, width):
     return np.array(result)
 
 
-STEPWISE = {
+STEPWISE: dict[str, Callable[..., Array]] = {
     "input.gain": lambda u, c: u * (1 + c),
     "input.bias": lambda u, c: u + c,
     "input.deadband": lambda u, c: np.sign(u) * np.maximum(np.abs(u) - c, 0.0),
@@ -134,24 +143,25 @@ class Joint:
     laws that rub.
     """
 
-    def __init__(self, world, number):
+    def __init__(self, world: World, number: int) -> None:
         k, p = world.constants, world.parameters
-        self.piece, self.latched = None, number % 2 == 0
+        self.weight: Weight
+        self.sideways: Weight
+        self.latched = number % 2 == 0
         if world.system == "pendulum":
             arm = k["mass"] * k["length"]
             self.inertia, gravity = p["inertia"], k["gravity"]
-            self.weight, self.sideways = (
-                (lambda x: -arm * gravity * sin(x)),
-                (lambda x: arm * cos(x)),
-            )
+            self.weight = lambda x: -arm * gravity * sin(x)
+            self.sideways = lambda x: arm * cos(x)
         else:
             self.inertia, gravity = p["mass"], 9.80665
-            self.weight, self.sideways = (lambda x: 0.0), (lambda x: self.inertia)
+            self.weight = lambda x: 0.0
+            self.sideways = lambda x: self.inertia
         self.gravity = gravity
         acting = {**world.effects, **world.foreign}
         self.forces = [FORCES[name](self, list(c)) for name, c in acting.items() if name in FORCES]
         self.limits = [LIMITS[name](self, list(c)) for name, c in acting.items() if name in LIMITS]
-        self.breaks = []
+        self.breaks: list[float] = []
         if "gust" in acting:
             push, lasting, *begins = acting["gust"]
             begin = begins[number]
@@ -161,15 +171,16 @@ class Joint:
             )
         self.restless = bool({"force.periodic", "input.lag", "friction.warming"} & set(acting))
         whole, gravity_of_all = self.inertia, self.weight
-        self.behind = [
+        self.behind: list[Any] = [
             BEHIND[name](whole, gravity_of_all, *c) for name, c in acting.items() if name in BEHIND
         ]
         self.inertia = whole - sum(part.inertia for part in self.behind)
 
-    def enter(self, piece):
+    def enter(self, piece: Piece) -> None:
+        """Take up a stretch of the input."""
         self.piece, self.middle = piece, 0.5 * (piece.begin + piece.end)
 
-    def pull(self, t, x, v, *z):
+    def pull(self, t: float, x: float, v: float, *z: float) -> float:
         """All but dry friction; z is the state of what is behind."""
         total = self.piece.at(t) + self.weight(x)
         for force in self.forces:
@@ -178,60 +189,72 @@ class Joint:
             total += part.force(x, v, *own)
         return total
 
-    def rates(self, x, v, *z):
+    def rates(self, x: float, v: float, *z: float) -> list[float]:
         """Of the state of what is behind."""
         parts = zip(self.behind, batched(z), strict=True)
         return [rate for part, own in parts for rate in part.rates(x, v, *own)]
 
-    def limit(self, t, x, v):
+    def limit(self, t: float, x: float, v: float) -> float:
         """The largest dry friction."""
         return sum(limit(t, x, v) for limit in self.limits)
 
 
-def batched(z):
+def batched(z: Sequence[float]) -> list[tuple[float, float]]:
     """In pairs."""
     return list(zip(z[::2], z[1::2], strict=True))
 
 
-class Load:
+class Load(ABC):
     """A mass behind the one that the sensor shows: `share` of the inertia and of the weight."""
 
-    def __init__(self, inertia, weight, share):
+    def __init__(self, inertia: float, weight: Weight, share: float) -> None:
         self.whole, self.inertia, self.weight = inertia, share * inertia, weight
         self.share = share
 
-    def force(self, x, v, y, w):
+    @abstractmethod
+    def between(self, x: float, v: float, y: float, w: float) -> float:
+        """Acceleration of the load by the first mass."""
+
+    def force(self, x: float, v: float, y: float, w: float) -> float:
+        """On the first mass."""
         return -self.inertia * self.between(x, v, y, w) - self.share * self.weight(x)
 
-    def rates(self, x, v, y, w):
+    def rates(self, x: float, v: float, y: float, w: float) -> tuple[float, float]:
+        """Of its own state."""
         return w, self.between(x, v, y, w) + self.weight(y) / self.whole
 
 
 class Sprung(Load):
     """On a spring that swings with `frequency` rad/s where the first mass is held."""
 
-    def __init__(self, inertia, weight, share, frequency, ratio):
+    def __init__(
+        self, inertia: float, weight: Weight, share: float, frequency: float, ratio: float
+    ) -> None:
         super().__init__(inertia, weight, share)
         self.frequency, self.ratio = frequency, ratio
 
-    def begin(self, x, v):
+    def begin(self, x: float, v: float) -> tuple[float, float]:
+        """Its own state to begin with."""
         return x + self.weight(x) / self.whole / self.frequency**2, v
 
-    def between(self, x, v, y, w):
+    def between(self, x: float, v: float, y: float, w: float) -> float:
+        """See `Load`."""
         return self.frequency**2 * (x - y) + 2 * self.ratio * self.frequency * (v - w)
 
 
 class Loose(Load):
     """Behind a gap with flanks that take every knock and never pull."""
 
-    def __init__(self, inertia, weight, gap, share):
+    def __init__(self, inertia: float, weight: Weight, gap: float, share: float) -> None:
         super().__init__(inertia, weight, share)
         self.gap = gap
 
-    def begin(self, x, v):
+    def begin(self, x: float, v: float) -> tuple[float, float]:
+        """Its own state to begin with."""
         return x, v
 
-    def between(self, x, v, y, w):
+    def between(self, x: float, v: float, y: float, w: float) -> float:
+        """See `Load`."""
         over = abs(x - y) - self.gap / 2
         if over <= 0:
             return 0.0
@@ -246,24 +269,31 @@ class Yielding:
 
     inertia = 0.0
 
-    def __init__(self, inertia, weight, limit, deflection):
+    def __init__(self, inertia: float, weight: Weight, limit: float, deflection: float) -> None:
         self.most, self.deflection = limit, deflection
 
-    def begin(self, x, v):
+    def begin(self, x: float, v: float) -> tuple[float, float]:
+        """Its own state to begin with."""
         return 0.0, 0.0
 
-    def force(self, x, v, _, strain):
+    def force(self, x: float, v: float, _: float, strain: float) -> float:
+        """On the mass."""
         return -self.most * strain
 
-    def rates(self, x, v, _, strain):
+    def rates(self, x: float, v: float, _: float, strain: float) -> tuple[float, float]:
+        """Of its own state."""
         speed = min(abs(v) / self.deflection, 400.0)
         return 0.0, speed * (copysign(1.0, v) - strain)
 
 
-BEHIND = {"joint.flexibility": Sprung, "joint.backlash": Loose, "friction.hysteresis": Yielding}
+BEHIND: dict[str, Callable[..., Any]] = {
+    "joint.flexibility": Sprung,
+    "joint.backlash": Loose,
+    "friction.hysteresis": Yielding,
+}
 
 
-def _wave(c, cycles):
+def _wave(c: Sequence[float], cycles: float) -> float:
     return c[0] * sin(2 * pi * cycles) + c[1] * cos(2 * pi * cycles)
 
 
@@ -312,26 +342,27 @@ LIMITS: dict[str, Callable[[Joint, list[float]], Law]] = {
 FOREIGN = ("patch", "gust", "ageing", "latch")
 
 
-def through(drive, against):
+def through(drive: float, against: float) -> float:
     """What gears transmit from one side to the other; nothing where both pull the same way."""
     return min(abs(drive), abs(against)) if drive * against > 0 else 0.0
 
 
-def stopped(x, v, stiffness, place, loss):
+def stopped(x: float, v: float, stiffness: float, place: float, loss: float) -> float:
     """The force of an end stop away from it: Hertz's contact, stated at a depth of 0.01."""
     side = copysign(1.0, stiffness)
     depth = max(side * (x - place), 0.0)
-    return abs(stiffness) * depth**1.5 / 0.1 * max(1.0 + loss * side * v, 0.0)
+    push: float = depth**1.5
+    return abs(stiffness) * push / 0.1 * max(1.0 + loss * side * v, 0.0)
 
 
-def inside(x, centre, half):
+def inside(x: float, centre: float, half: float) -> float:
     """1 inside a region, 0 outside, its borders soft; the integral over x is the region's width."""
     return 0.5 * (
         tanh((x - centre + half) / (EDGE * half)) - tanh((x - centre - half) / (EDGE * half))
     )
 
 
-def move(world, scenario, number, instants):
+def move(world: World, scenario: Scenario, number: int, instants: Array) -> Array:
     """Positions and velocities (T, 2) of run `number` at increasing instants (T,) >= 0."""
     joint, until = Joint(world, number), float(instants[-1])
     names = ("q", "qd") if world.system == "pendulum" else ("x", "v")
@@ -352,7 +383,7 @@ def move(world, scenario, number, instants):
     return out
 
 
-def _through(joint, state, instants, out):
+def _through(joint: Joint, state: Array, instants: Array, out: Array) -> Array:
     """To the end of the joint's piece of input, standstill by standstill."""
     now, end = joint.piece.begin, joint.piece.end
     for _ in range(10_000):
@@ -366,7 +397,7 @@ def _through(joint, state, instants, out):
     raise RuntimeError("it never gets through: too many standstills")
 
 
-def _glide(joint, now, state: np.ndarray) -> tuple[float, np.ndarray, Callable | None]:
+def _glide(joint: Joint, now: float, state: Array) -> Moved:
     """Until the next standstill, breaking loose or the piece's end: when, the state there, the
     motion (None: none).
     """
@@ -378,43 +409,50 @@ def _glide(joint, now, state: np.ndarray) -> tuple[float, np.ndarray, Callable |
             return _held(joint, now, state) if z else (_loose(joint, now, x), state, None)
         way = copysign(1.0, pull)
 
-    def rate(t, y):
+    def rate(t: float, y: Array) -> list[float]:
         rubbing = way * joint.limit(t, *y[:2]) if joint.limits else 0.0
         return [y[1], (joint.pull(t, *y) - rubbing) / joint.inertia, *joint.rates(*y)]
 
-    def turns(t, y):
-        return way * y[1]
+    def turns(t: float, y: Array) -> float:
+        return float(way * y[1])
 
-    turns.terminal, turns.direction = True, -1
-    events, first = (turns, min(0.01, end - now)) if joint.limits else (None, min(0.02, end - now))
-    settings = {"dense_output": True, "max_step": 0.05, "first_step": first, **TOLERANCES}
-    method = "RK45" if end - now < SHORT else "DOP853"
+    stops: Any = turns
+    stops.terminal, stops.direction = True, -1
+    events, first = (stops, min(0.01, end - now)) if joint.limits else (None, min(0.02, end - now))
+    settings: dict[str, Any] = {
+        "dense_output": True,
+        "max_step": 0.05,
+        "first_step": first,
+        **TOLERANCES,
+    }
+    method: Any = "RK45" if end - now < SHORT else "DOP853"
     solved = solve_ivp(rate, (now, end), state, method, events=events, **settings)
     if not solved.success:
         raise RuntimeError(solved.message)
     after = solved.y[:, -1].copy()
-    if joint.limits and solved.t_events[0].size:
+    if joint.limits and solved.t_events is not None and solved.t_events[0].size:
         after[1] = 0.0
     return float(solved.t[-1]), after, solved.sol
 
 
-def _held(joint, now, state):
+def _held(joint: Joint, now: float, state: Array) -> Moved:
     """Held by dry friction while what is behind moves on: until it breaks loose."""
     end = joint.piece.end
 
-    def rate(t, y):
+    def rate(t: float, y: Array) -> list[float]:
         return [0.0, 0.0, *joint.rates(*y)]
 
-    def excess(t, y):
+    def excess(t: float, y: Array) -> float:
         return abs(joint.pull(t, *y)) - joint.limit(t, *y[:2]) * (1 + 1e-9)
 
-    excess.terminal, excess.direction = True, 1
-    settings = {"dense_output": True, "max_step": 0.01, **TOLERANCES}
-    solved = solve_ivp(rate, (now, end), state, "RK45", events=excess, **settings)
+    stops: Any = excess
+    stops.terminal, stops.direction = True, 1
+    settings: dict[str, Any] = {"dense_output": True, "max_step": 0.01, **TOLERANCES}
+    solved = solve_ivp(rate, (now, end), state, "RK45", events=stops, **settings)
     return float(solved.t[-1]), solved.y[:, -1].copy(), solved.sol
 
 
-def _loose(joint, now, x):
+def _loose(joint: Joint, now: float, x: float) -> float:
     """When what pulls exceeds friction, else the piece's end; within a piece only some forces
     change by themselves.
     """
@@ -422,7 +460,7 @@ def _loose(joint, now, x):
     if not joint.restless:
         return end
 
-    def excess(t):
+    def excess(t: float) -> float:
         return abs(joint.pull(t, x, 0.0)) - joint.limit(t, x, 0.0)
 
     grid: Sequence[float] = np.linspace(now, end, max(3, int(500 * (end - now)))).tolist()

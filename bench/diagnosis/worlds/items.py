@@ -1,4 +1,4 @@
-"""The exam's questions: recordings of independent simulators in which a cause is hidden, drawn from
+"""Questions: recordings of independent simulators in which a cause is hidden, drawn from
 a seed.
 
 `draw` chooses what is hidden and how strongly, `realise` writes the recording and, apart from it,
@@ -8,18 +8,22 @@ the truth. Whatever is drawn follows from the item's name; an item is a recipe, 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from bench.diagnosis.worlds import rivals, shapes, sizing
+from bench.diagnosis.worlds.settings import ANY, Circumstances, Setting
+from bench.diagnosis.worlds.settings import setting as drawn_setting
+from bench.diagnosis.worlds.world import FOREIGN, SIMULATORS, simulated, solved
 from sims import effects as library
+from sims.base import Array
 from sims.recording.recording import Recording, Run
 from sims.recording.write import write_recording
-from tests.exam import rivals, shapes, sizing
-from tests.exam.settings import setting as drawn_setting
-from tests.exam.worlds import FOREIGN, SIMULATORS, simulated, solved
 
 SYSTEMS = ("ball", "pendulum", "slider")
 KINDS = ("clean", "single", "double", "foreign")
@@ -82,6 +86,7 @@ class Item:
         beyond: what is left of the gap, in units of the noise, with the best other answer: of a
             foreign cause the best effect of the library, of two effects one of them, of an effect
             in `SIMPLER` those.
+        asked: circumstances that were asked for.
     """
 
     name: str
@@ -100,18 +105,21 @@ class Item:
     seed: int
     parameters: dict[str, float] = field(default_factory=dict)
     beyond: float | None = None
+    asked: Circumstances = ANY
 
-    def json(self):
+    def json(self) -> dict[str, Any]:
+        """As plain values."""
         return asdict(self)
 
     @classmethod
-    def of(cls, document):
+    def of(cls, document: Mapping[str, Any]) -> Item:
         """An item from its JSON."""
         effects = {name: tuple(c) for name, c in document["effects"].items()}
-        return cls(**{**document, "effects": effects, "channels": tuple(document["channels"])})
+        given = {**document, "effects": effects, "channels": tuple(document["channels"])}
+        return cls(**{**given, "asked": Circumstances(*document.get("asked", ()))})
 
 
-def same_class(system, driven, effect):
+def same_class(system: str, driven: bool, effect: str) -> frozenset[str]:
     """The effect and all that are equivalent to it."""
     classes = (
         names for *where, names in EQUIVALENT if where == [system, driven] and effect in names
@@ -119,7 +127,14 @@ def same_class(system, driven, effect):
     return frozenset({effect}).union(*classes)
 
 
-def draw(kind, system, seed, effect=None, size=None):
+def draw(
+    kind: str,
+    system: str,
+    seed: int,
+    effect: str | None = None,
+    size: float | None = None,
+    wanted_so: Circumstances = ANY,
+) -> Item | None:
     """An item, or None where the drawn sensors cannot show the effect at the drawn size (within
     `shapes.LARGEST`).
 
@@ -129,6 +144,7 @@ def draw(kind, system, seed, effect=None, size=None):
         seed: everything else follows from it.
         effect: what to hide (of two, the first); drawn where it is not given.
         size: the wanted size; drawn where it is not given.
+        wanted_so: circumstances that are not to be drawn.
     """
     asked = effect or "any"
     name = "-".join(
@@ -137,18 +153,19 @@ def draw(kind, system, seed, effect=None, size=None):
             system,
             *([asked] if kind != "clean" else []),
             *([f"{size:g}"] if size else []),
+            *(str(part) for part in wanted_so if part is not None),
             str(seed),
         ]
     )
     rng = _rng(name, "cause")
     hidden = _hidden(kind, system, effect, rng)
-    setting = _setting(name, system, hidden)
+    setting = _setting(name, system, hidden, wanted_so)
     item = Item(
         name, system, kind, {}, 0.0, setting.noise.kind, setting.noise.stated, setting.rate,
         setting.seconds,
         len(setting.scenarios), str(rng.choice(["scipy", "mujoco"])), setting.driven,
         setting.channels, seed,
-        setting.parameters,
+        setting.parameters, asked=wanted_so,
     )  # fmt: skip
     wanted = size or float(
         np.exp(rng.uniform(np.log(3.0 if kind in ("double", "foreign") else 1.0), np.log(10.0)))
@@ -160,26 +177,30 @@ def draw(kind, system, seed, effect=None, size=None):
     )
 
 
-def held_out_of(item):
+def held_out_of(item: Item) -> int:
     """How many of the last runs are marked held_out."""
     return max(1, item.runs // 3)
 
 
-def _rng(name, purpose):
+def _rng(name: str, purpose: str) -> np.random.Generator:
     return np.random.default_rng(list(f"{name} {purpose}".encode()))
 
 
 @lru_cache(maxsize=16)
-def _setting(name, system, hidden):
-    return drawn_setting(system, _rng(name, "setting"), hidden)
+def _setting(
+    name: str, system: str, hidden: tuple[str, ...], asked: Circumstances = ANY
+) -> Setting:
+    return drawn_setting(system, _rng(name, "setting"), hidden, asked=asked)
 
 
-def setting_of(item):
+def setting_of(item: Item) -> Setting:
     """The circumstances in which an item was drawn."""
-    return _setting(item.name, item.system, tuple(item.effects))
+    return _setting(item.name, item.system, tuple(item.effects), item.asked)
 
 
-def _hidden(kind, system, effect, rng):
+def _hidden(
+    kind: str, system: str, effect: str | None, rng: np.random.Generator
+) -> tuple[str, ...]:
     if kind == "clean":
         return ()
     names = (
@@ -194,11 +215,15 @@ def _hidden(kind, system, effect, rng):
     return first, str(rng.choice([n for n in names if n not in alike]))
 
 
-def _clean(item, setting, hidden, wanted, rng):
+def _clean(
+    item: Item, setting: Setting, hidden: tuple[str, ...], wanted: float, rng: np.random.Generator
+) -> Item | None:
     return item
 
 
-def _single(item, setting, hidden, wanted, rng):
+def _single(
+    item: Item, setting: Setting, hidden: tuple[str, ...], wanted: float, rng: np.random.Generator
+) -> Item | None:
     (name,) = hidden
     c = coefficients(name, setting, wanted, rng)
     if c is None:
@@ -212,7 +237,9 @@ def _single(item, setting, hidden, wanted, rng):
     return replace(item, effects={name: c}, size=wanted, beyond=beyond)
 
 
-def coefficients(name, setting, wanted, rng):
+def coefficients(
+    name: str, setting: Setting, wanted: float, rng: np.random.Generator
+) -> tuple[float, ...] | None:
     """Coefficients of one effect at which the gap has the wanted size; None if there are none."""
     of = shapes.shape(name, setting, rng)
     left = sizing.gap(
@@ -222,14 +249,16 @@ def coefficients(name, setting, wanted, rng):
     return None if strength is None else of(strength)
 
 
-def _double(item, setting, hidden, wanted, rng):
+def _double(
+    item: Item, setting: Setting, hidden: tuple[str, ...], wanted: float, rng: np.random.Generator
+) -> Item | None:
     """Two effects, each of the wanted size alone; neither may look like a stronger form of the
     other.
     """
     found = {name: coefficients(name, setting, wanted, rng) for name in hidden}
-    if None in found.values():
+    effects = _in_order({name: c for name, c in found.items() if c is not None})
+    if len(effects) < len(found):
         return None
-    effects = _in_order(found)
     observed = sizing.observed_by_batch(setting, effects)
     if not np.isfinite(observed).all():
         return None
@@ -237,17 +266,19 @@ def _double(item, setting, hidden, wanted, rng):
     return replace(item, effects=effects, size=wanted, beyond=beyond) if beyond >= APART else None
 
 
-def _in_order(effects):
+def _in_order(effects: dict[str, tuple[float, ...]]) -> dict[str, tuple[float, ...]]:
     """A lag of the input comes last: what is not linear acts on what is commanded."""
     return dict(sorted(effects.items(), key=lambda pair: pair[0] == "input.lag"))
 
 
-def _foreign(item, setting, hidden, wanted, rng):
+def _foreign(
+    item: Item, setting: Setting, hidden: tuple[str, ...], wanted: float, rng: np.random.Generator
+) -> Item | None:
     """A cause that the library does not have, and of which it explains only a part."""
     (name,) = hidden
     of = shapes.foreign(name, setting, rng)
 
-    def observed(strength):
+    def observed(strength: float) -> Array:
         world = setting.world(foreign={name: of(strength)})
         return np.array(
             [solved(world, s, setting.channels, i) for i, s in enumerate(setting.scenarios)]
@@ -261,7 +292,7 @@ def _foreign(item, setting, hidden, wanted, rng):
     return hides if beyond >= APART else None
 
 
-def realise(item, folder, truth=True):
+def realise(item: Item, folder: str | Path, truth: bool = True) -> Path:
     """Write NAME.csv and NAME.toml, and beside them the truth as NAME.truth.json if wanted; the
     path of the first.
     """
@@ -277,14 +308,14 @@ def realise(item, folder, truth=True):
     write_recording(
         path,
         Recording(path, item.system, "", constants, noise, runs),
-        system(),
+        system,
         digits=9,
         beside=beside,
     )
     return path
 
 
-def _runs(item, setting):
+def _runs(item: Item, setting: Setting) -> tuple[Run, ...]:
     rng, held_out = _rng(item.name, "noise"), held_out_of(item)
     hidden = {"foreign": item.effects} if item.kind == "foreign" else {"effects": item.effects}
     world, runs = setting.world(**hidden), []

@@ -7,14 +7,19 @@ library's tables.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
+from bench.diagnosis.worlds.settings import MOST_RUNS, Setting
+from bench.diagnosis.worlds.sizing import observed_by_batch
+from bench.diagnosis.worlds.world import SIMULATORS
 from sims import effects as library
-from tests.exam.settings import MOST_RUNS
-from tests.exam.sizing import observed_by_batch
-from tests.exam.worlds import SIMULATORS
+from sims.base import Array
 
-SIGNED = (
+Shape = Callable[[float], tuple[float, ...]]
+"""From strength to coefficients."""
+SIGNED: tuple[str, ...] = (
     "force.bias",
     "gravity.scale",
     "input.gain",
@@ -27,7 +32,7 @@ SIGNED += ("clock.skew", "spring.cubic", "restitution.speed")
 LARGEST = 2.0  # beyond twice the plausible range nothing is asked
 
 
-def shape(name, setting, rng):
+def shape(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
     """The coefficients of an effect of the library by its strength."""
     kind = SIMULATORS[setting.system].system.kind
     far = max(abs(bound) for bound in library.get(name).coefficients[0].range(kind))
@@ -37,18 +42,18 @@ def shape(name, setting, rng):
     return lambda s: (sign * far * s,)
 
 
-def largest(name):
+def largest(name: str) -> float:
     """The largest strength that is asked."""
     return {"input.saturation": 0.97, "input.hold": 1.0}.get(name, LARGEST)
 
 
-def _direction(far, setting, rng, *behind):
+def _direction(far: float, setting: Setting, rng: np.random.Generator, *behind: float) -> Shape:
     angle = rng.uniform(0, 2 * np.pi)
     along, across = far * float(np.cos(angle)), far * float(np.sin(angle))
     return lambda s: (along * s, across * s, *behind)
 
 
-def _level(far, setting, rng):
+def _level(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """Along x, and along y where there is one."""
     if setting.system == "ball":
         return _direction(far, setting, rng)
@@ -56,20 +61,20 @@ def _level(far, setting, rng):
     return lambda s: (sign * far * s,)
 
 
-def _ripple(far, setting, rng):
+def _ripple(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """A period that the motion passes several times."""
     travel = np.median(_ranges(setting))
     period = min(travel / rng.uniform(2.0, 8.0), 1.0 if setting.system == "slider" else 6.28)
     return _direction(far, setting, rng, float(period))
 
 
-def _periodic(far, setting, rng):
+def _periodic(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """A few periods in a run at least."""
     low, high = 1.5 / setting.seconds, 4.0
     return _direction(far, setting, rng, float(np.exp(rng.uniform(np.log(low), np.log(high)))))
 
 
-def _wind(far, setting, rng):
+def _wind(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     if setting.system == "slider":
         speed = float(rng.choice([-1, 1]) * rng.uniform(0.3, 2.0))
         return lambda s: (far * s, speed)
@@ -77,46 +82,46 @@ def _wind(far, setting, rng):
     return lambda s: (far * s, float(speed * np.cos(angle)), float(speed * np.sin(angle)))
 
 
-def _stribeck(far, setting, rng):
+def _stribeck(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """An extra larger than the rest, at speeds that the motion has for a good while."""
     extra, typical = rng.uniform(2.0, 6.0), np.median(np.abs(_speeds(setting)))
     speed = float(np.clip(typical * rng.uniform(0.15, 0.5), 0.02, 2.0))
     return lambda s: (far * s, extra * far * s, speed)
 
 
-def _saturation(far, setting, rng):
+def _saturation(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """A limit below the input's peak: at strength 0 at the peak, at 1 at nothing."""
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     return lambda s: (float(peak * (1 - s)),)
 
 
-def _one_way(far, setting, rng):
+def _one_way(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """Several times as much one way as the other."""
     shares = [1.0, float(rng.uniform(0.0, 0.3))]
     rng.shuffle(shares)
     return lambda s: (far * shares[0] * s, far * shares[1] * s)
 
 
-def _power(far, setting, rng):
+def _power(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """Up to the square and beyond; at the input's peak it does what the input alone would."""
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     return lambda s: (float(peak**-s - 1), s)
 
 
-def _rate(far, setting, rng):
+def _rate(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """A jump of the input's peak takes from no time at all to most of a second."""
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     return lambda s: (float(peak / (0.8 * s)),)
 
 
-def _quadratic(far, setting, rng):
+def _quadratic(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """At the forces that act the square makes as much as the load itself, or more."""
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     square = float(far * rng.uniform(2.0, 6.0) / peak)
     return lambda s: (0.5 * far * s, square * s)
 
 
-def _uneven(far, setting, rng):
+def _uneven(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """A wave of most of the mean, that the motion passes once to four times."""
     travel = float(np.median(_ranges(setting)))
     low, high = (0.2, 5.0) if setting.system == "slider" else (0.5, 6.2832)
@@ -126,20 +131,20 @@ def _uneven(far, setting, rng):
     return lambda s: (far * (1 - share) * s, sine * s, cosine * s, period)
 
 
-def _warming(far, setting, rng):
+def _warming(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """It is gone by the end of a run, or half of it is; the rest is viscous."""
     time = float(setting.seconds * rng.uniform(0.2, 0.8))
     viscous = float(far * rng.uniform(0.0, 1.0) / np.median(np.abs(_speeds(setting))))
     return lambda s: (far * s, viscous * s, max(time, 0.5))
 
 
-def _slip(far, setting, rng):
+def _slip(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """Once in every run, at an instant well within it."""
     sign, instant = float(rng.choice([-1, 1])), float(rng.uniform(0.15, 0.85) * setting.seconds)
     return lambda s: (sign * far * s, instant)
 
 
-def _flexibility(far, setting, rng):
+def _flexibility(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """A load that swings from a few times a run to a fifth of the sampling rate."""
     low, high = 2 * np.pi * 4 / setting.seconds, 2 * np.pi * min(0.2 * setting.rate, 40.0)
     frequency = float(np.exp(rng.uniform(np.log(low), np.log(high))))
@@ -147,20 +152,20 @@ def _flexibility(far, setting, rng):
     return lambda s: (min(far * s, 0.95), float(np.clip(frequency, 6, 300)), ratio)
 
 
-def _play(far, setting, rng):
+def _play(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """A gap that is a part of the way that it goes."""
     share, travel = float(rng.uniform(0.2, 0.8)), float(np.median(_ranges(setting)))
     return lambda s: (0.3 * travel * s, share)
 
 
-def _hysteresis(far, setting, rng):
+def _hysteresis(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """Surfaces that give way over a few hundredths of the way that it goes."""
     travel = float(np.median(_ranges(setting)))
     deflection = float(travel * np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
     return lambda s: (far * s, deflection)
 
 
-def _stop(far, setting, rng):
+def _stop(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
     """At an end of where it would go, above or below."""
     side, within = float(rng.choice([-1, 1])), float(rng.uniform(0.05, 0.2))
     place = float(np.quantile(np.concatenate(_bare(setting)), 1 - within if side > 0 else within))
@@ -168,7 +173,7 @@ def _stop(far, setting, rng):
     return lambda s: (side * far * s, place, loss)
 
 
-SHAPES = {
+SHAPES: dict[str, Callable[..., Shape]] = {
     "state.limit": _stop,
     "sensor.slip": _slip,
     "friction.hysteresis": _hysteresis,
@@ -192,30 +197,30 @@ SHAPES = {
 }
 
 
-def _bare(setting):
+def _bare(setting: Setting) -> list[Array]:
     """Noiseless motion of every run with nothing hidden, (T,) of the first channel."""
     return list(observed_by_batch(setting, {})[:, :, 0])
 
 
-def _ranges(setting):
+def _ranges(setting: Setting) -> list[float]:
     return [np.ptp(path) for path in _bare(setting)]
 
 
-def _speeds(setting):
+def _speeds(setting: Setting) -> Array:
     return np.concatenate([np.diff(path) for path in _bare(setting)]) * setting.rate
 
 
-def foreign(name, setting, rng):
+def foreign(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
     """The numbers of a foreign cause by its strength; see `tests.exam.worlds`."""
     return FOREIGN[(setting.system == "ball", name)](setting, rng)
 
 
-def _begins(setting, lasting, rng):
+def _begins(setting: Setting, lasting: float, rng: np.random.Generator) -> list[float]:
     """A beginning within each run, held-out ones too, not the same in any two."""
     return [float(rng.uniform(0.1, 0.9) * (setting.seconds - lasting)) for _ in range(MOST_RUNS)]
 
 
-def _patch(setting, rng):
+def _patch(setting: Setting, rng: np.random.Generator) -> Shape:
     """Somewhere well within where it moves; about as wide as a fifth of that."""
     low, high = np.quantile(np.concatenate(_bare(setting)), [0.1, 0.9])
     half = float((high - low) * rng.uniform(0.07, 0.15))
@@ -223,36 +228,36 @@ def _patch(setting, rng):
     return lambda s: (_force(setting) * s, centre, half)
 
 
-def _force(setting):
+def _force(setting: Setting) -> float:
     return 0.5 if setting.system == "pendulum" else 5.0
 
 
-def _gust(setting, rng):
+def _gust(setting: Setting, rng: np.random.Generator) -> Shape:
     lasting, sign = float(rng.uniform(0.1, 0.3)), float(rng.choice([-1, 1]))
     begins = _begins(setting, lasting, rng)
     return lambda s: (sign * _force(setting) * s, lasting, *begins)
 
 
-def _ageing(setting, rng):
+def _ageing(setting: Setting, rng: np.random.Generator) -> Shape:
     far = (0.1 if setting.system == "pendulum" else 5.0) / setting.seconds
     return lambda s: (far * s,)
 
 
-def _latch(setting, rng):
+def _latch(setting: Setting, rng: np.random.Generator) -> Shape:
     """In every other run; met by the motion in most, for a small part of the time."""
     place = float(np.quantile(np.concatenate(_bare(setting)), rng.uniform(0.7, 0.85)))
     far = 10.0 if setting.system == "pendulum" else 2000.0
     return lambda s: (far * s, place)
 
 
-def _updraft(setting, rng):
+def _updraft(setting: Setting, rng: np.random.Generator) -> Shape:
     where = np.concatenate(_bare(setting))
     half = float(rng.uniform(0.3, 0.8))
     centre = float(rng.uniform(*np.quantile(where, [0.1, 0.9])))
     return lambda s: (10.0 * s, centre, half)
 
 
-def _ball_gust(setting, rng):
+def _ball_gust(setting: Setting, rng: np.random.Generator) -> Shape:
     lasting, angle = float(rng.uniform(0.1, 0.4)), rng.uniform(0, 2 * np.pi)
     begins = _begins(setting, lasting, rng)
     return lambda s: (
@@ -263,18 +268,18 @@ def _ball_gust(setting, rng):
     )
 
 
-def _wear(setting, rng):
+def _wear(setting: Setting, rng: np.random.Generator) -> Shape:
     sign = float(rng.choice([-1, 1]))
     return lambda s: (sign * s / setting.seconds,)
 
 
-def _layer(setting, rng):
+def _layer(setting: Setting, rng: np.random.Generator) -> Shape:
     """Above most of the bounces, below most of the drops."""
     height = float(min(s.initial["z"] for s in setting.scenarios) * rng.uniform(0.55, 0.8))
     return lambda s: (2.0 * s, height)
 
 
-FOREIGN = {
+FOREIGN: dict[tuple[bool, str], Callable[..., Shape]] = {
     (False, "patch"): _patch,
     (False, "gust"): _gust,
     (False, "ageing"): _ageing,

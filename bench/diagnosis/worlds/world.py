@@ -1,5 +1,5 @@
-"""Worlds for the exam: one run of ball, pendulum or slider with any effect of the library, or with
-a foreign cause.
+"""Worlds of the questions: one run of ball, pendulum or slider with any effect of the library, or
+with a foreign cause.
 
 Solved with scipy, or simulated by MuJoCo; never by the engine that `explain` itself uses. What the
 numbers of an effect mean stands in sims/effects/README.md; the foreign causes are told here, where
@@ -19,49 +19,45 @@ the library has nothing like them:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from math import exp
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bench.diagnosis.worlds import flights, joints
+from bench.diagnosis.worlds.base import Effects, World
 from sims import effects as library
 from sims.ball.simulator import Ball
+from sims.base import Array, Scenario
 from sims.pendulum.simulator import Pendulum
+from sims.simulated import Simulated
 from sims.slider.simulator import Slider
-from tests.exam import flights, joints
 
-SIMULATORS = {"ball": Ball, "pendulum": Pendulum, "slider": Slider}
+__all__ = [
+    "CHANNELS",
+    "FOREIGN",
+    "SIMULATORS",
+    "Effects",
+    "World",
+    "constants_of",
+    "simulated",
+    "solved",
+]
+
+SIMULATORS: dict[str, type[Simulated]] = {"ball": Ball, "pendulum": Pendulum, "slider": Slider}
 FOREIGN = {"ball": flights.FOREIGN, "pendulum": joints.FOREIGN, "slider": joints.FOREIGN}
 CHANNELS = {"ball": ("x", "y", "z"), "pendulum": ("q", "qd"), "slider": ("x", "v")}
 FINE = 5e-4  # seconds: a lagging sensor is followed in steps no longer than this
 MUJOCO_STEP = 1e-3  # seconds: at MuJoCo's default step its error would be a tenth of the noise
 
 
-@dataclass(frozen=True)
-class World:
-    """What there really is.
-
-    Attributes:
-        system: its name.
-        parameters, constants: numbers by name.
-        effects: coefficients of effects of the library, in the order in which a signal passes them.
-        foreign: numbers of causes that the library does not have.
-    """
-
-    system: str
-    parameters: Mapping[str, float]
-    constants: Mapping[str, float]
-    effects: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    foreign: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-
-
-def constants_of(system, **changed):
+def constants_of(system: str, **changed: float) -> dict[str, float]:
     """The system's constants by name, some changed."""
     return {c.name: c.value for c in SIMULATORS[system].constants} | changed
 
 
-def solved(world, scenario, channels, number=0):
+def solved(world: World, scenario: Scenario, channels: Sequence[str], number: int = 0) -> Array:
     """What noiseless sensors record of a run, (T, C), by scipy; `number` is the run's place in the
     recording.
     """
@@ -99,7 +95,7 @@ def solved(world, scenario, channels, number=0):
     return observed[rows]
 
 
-def simulated(world, scenario, channels):
+def simulated(world: World, scenario: Scenario, channels: Sequence[str]) -> Array:
     """The same by MuJoCo, which knows no foreign causes; where one coordinate is not all that
     moves, by the engine that knows more.
     """
@@ -109,21 +105,21 @@ def simulated(world, scenario, channels):
     effects = {name: list(c) for name, c in world.effects.items()}
     kind = SIMULATORS[world.system]
     simulator = kind(world.constants, channels, engine=engine, fixed=effects, time_step=step)
+    theta = np.array([[world.parameters[p.name] for p in kind.system.parameters]])
     try:
-        return simulator.simulate(
-            np.array([[world.parameters[p.name] for p in kind.system.parameters]]), scenario
-        )[0]
+        observed: Array = simulator.simulate(theta, scenario)[0]
+        return observed
     finally:
         simulator.close()
 
 
-def _read_at(system, channels):
+def _read_at(system: str, channels: Sequence[str]) -> int:
     """The column that gain, bias and drift act on."""
     preferred = {"ball": ("z", "x", "y"), "pendulum": ("q", "qd"), "slider": ("x", "v")}[system]
     return next(channels.index(name) for name in preferred if name in channels)
 
 
-def _refined(instants):
+def _refined(instants: Array) -> tuple[Array, NDArray[np.intp]]:
     """A grid from 0 through all instants, and where they stand in it."""
     grid, rows = [0.0], []
     for instant in instants.tolist():
@@ -134,8 +130,8 @@ def _refined(instants):
     return np.array(grid), np.array(rows)
 
 
-def _lagged(values, grid, lag):
-    """y' = (x - y) / lag from y = x, for x straight between the grid's points."""
+def _lagged(values: Array, grid: Array, lag: float) -> Array:
+    """Y' = (x - y) / lag from y = x, for x straight between the grid's points."""
     result, y = values.copy(), values[0].copy()
     for k, h in enumerate(np.diff(grid).tolist()):
         slope = (values[k + 1] - values[k]) / h

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from math import cos, hypot, pi, sin, sqrt, tanh
+from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from tests.exam.joints import TOLERANCES, inside
+from bench.diagnosis.worlds.base import World
+from bench.diagnosis.worlds.joints import TOLERANCES, inside
+from sims.base import Array, Scenario
 
 AT_REST = 1e-5  # m/s: slower rebounds are none
 FOREIGN = ("updraft", "gust", "wear", "layer")
+Acceleration = tuple[float, float, float]
 STATES = ("x", "y", "z", "vx", "vy", "vz")
 
 
 class Air:
     """Everything that accelerates a ball in flight."""
 
-    def __init__(self, world, number):
+    def __init__(self, world: World, number: int) -> None:
         self.g, self.acting = world.constants["gravity"], {**world.effects, **world.foreign}
         self.laws = [(LAWS[name], c) for name, c in self.acting.items() if name in LAWS]
         self.gust = None
@@ -26,7 +31,7 @@ class Air:
             self.gust = along, up, begins[number], begins[number] + lasting
         self.breaks = list(self.gust[2:]) if self.gust else []
 
-    def at(self, t, y, middle):
+    def at(self, t: float, y: Any, middle: float) -> Acceleration:
         """Acceleration in state y; `middle` is an instant within the stretch between two breaks
         that is integrated.
         """
@@ -39,25 +44,45 @@ class Air:
         return ax, ay, az
 
 
-def _drag(c, u, v, w, speed=1.0):
+def _drag(c: float, u: float, v: float, w: float, speed: float = 1.0) -> Acceleration:
     return -c * speed * u, -c * speed * v, -c * speed * w
 
 
-def _wind(c, g, t, x, y, z, u, v, w):
+def _wind(
+    c: Sequence[float],
+    g: float,
+    t: float,
+    x: float,
+    y: float,
+    z: float,
+    u: float,
+    v: float,
+    w: float,
+) -> Acceleration:
     u, v = u - c[1], v - c[2]
     return _drag(c[0], u, v, w, sqrt(u * u + v * v + w * w))
 
 
-def _periodic(c, g, t, *state):
+def _periodic(c: Sequence[float], g: float, t: float, *state: float) -> Acceleration:
     return 0.0, 0.0, c[0] * sin(2 * pi * c[2] * t) + c[1] * cos(2 * pi * c[2] * t)
 
 
-def _layer(c, g, t, x, y, z, u, v, w):
+def _layer(
+    c: Sequence[float],
+    g: float,
+    t: float,
+    x: float,
+    y: float,
+    z: float,
+    u: float,
+    v: float,
+    w: float,
+) -> Acceleration:
     share = 0.5 * (1 + tanh((z - c[1]) / 0.02))
     return _drag(c[0] * share, u, v, w, sqrt(u * u + v * v + w * w))
 
 
-LAWS = {
+LAWS: dict[str, Callable[..., Acceleration]] = {
     "drag.linear": lambda c, g, t, x, y, z, u, v, w: _drag(c[0], u, v, w),
     "drag.quadratic": lambda c, g, t, x, y, z, u, v, w: _drag(
         c[0], u, v, w, sqrt(u * u + v * v + w * w)
@@ -77,7 +102,7 @@ LAWS = {
 }
 
 
-def move(world, scenario, number, instants):
+def move(world: World, scenario: Scenario, number: int, instants: Array) -> Array:
     """Positions and velocities (T, 6) of run `number` at increasing instants (T,) >= 0."""
     air, until = Air(world, number), float(instants[-1])
     state = np.array([scenario.initial[name] for name in STATES])
@@ -104,26 +129,31 @@ def move(world, scenario, number, instants):
     return out
 
 
-def _fly(air, now, end, state, floor, resting):
+def _fly(air: Air, now: float, end: float, state: Array, floor: float | None, resting: bool) -> Any:
     middle = 0.5 * (now + end)
 
-    def rate(t, y):
+    def rate(t: float, y: Array) -> tuple[float, ...]:
         ax, ay, az = air.at(t, y.tolist(), middle)
         return (y[3], y[4], y[5], ax, ay, max(az, 0.0) if resting else az)
 
-    def meets(t, y):
-        return y[2] - floor
+    def meets(t: float, y: Array) -> float:
+        return float(y[2] - floor)
 
-    meets.terminal, meets.direction = True, -1
-    events = None if floor is None else meets
-    settings = {"dense_output": True, "first_step": min(0.02, end - now), **TOLERANCES}
+    stops: Any = meets
+    stops.terminal, stops.direction = True, -1
+    events = None if floor is None else stops
+    settings: dict[str, Any] = {
+        "dense_output": True,
+        "first_step": min(0.02, end - now),
+        **TOLERANCES,
+    }
     solved = solve_ivp(rate, (now, end), state, "DOP853", events=events, **settings)
     if not solved.success:
         raise RuntimeError(solved.message)
     return solved
 
 
-def _bounce(world, t, state):
+def _bounce(world: World, t: float, state: Array) -> tuple[Array, bool]:
     """The state after an impact, and whether the ball stays down."""
     speed, e = -state[5], world.parameters["restitution"]
     if "restitution.speed" in world.effects:

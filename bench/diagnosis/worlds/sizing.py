@@ -6,11 +6,14 @@ Only here is the batch engine used, to choose sizes; the exam's data never come 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from tests.exam.worlds import SIMULATORS
+from bench.diagnosis.worlds.settings import Setting
+from bench.diagnosis.worlds.world import SIMULATORS, Effects
+from sims.base import Array
 
 ACCURATE = 0.03  # of the wanted size
 LEAP = 8.0  # strength grows by no more at once, so that the fit can follow
@@ -28,8 +31,8 @@ class Fit:
     """
 
     left: float
-    theta: np.ndarray
-    starts: np.ndarray
+    theta: Array
+    starts: Array
 
 
 class Fitter:
@@ -37,7 +40,7 @@ class Fitter:
     run.
     """
 
-    def __init__(self, setting, effects=()):
+    def __init__(self, setting: Setting, effects: Sequence[str] = ()) -> None:
         kind = SIMULATORS[setting.system]
         self.simulator = kind(setting.constants, setting.channels, engine="batch", effects=effects)
         self.scenarios, self.sigma, self.states = (
@@ -57,7 +60,13 @@ class Fitter:
         )
         self.scales = np.where(np.arange(low.size) < len(base), self.theta, 0.1 * (high - low))
 
-    def __call__(self, observed, theta=None, starts=None, rounds=12):
+    def __call__(
+        self,
+        observed: Array,
+        theta: Array | Sequence[float] | None = None,
+        starts: Array | None = None,
+        rounds: int = 12,
+    ) -> Fit:
         """Fit observations (R, T, C), from `theta` and `starts` (default: the setting's)."""
         theta = self.theta if theta is None else np.asarray(theta, dtype=float)
         starts, damping = self.starts if starts is None else starts, 1e-6
@@ -82,13 +91,14 @@ class Fitter:
         return Fit(float(np.sqrt(np.mean(rest**2))), theta, starts)
 
     @staticmethod
-    def step(rest, slope, damping):
+    def step(rest: Array, slope: Array, damping: float) -> Array:
+        """The damped step (P,) of least squares, each number in its scale."""
         gram = slope.T @ slope
         diagonal = np.diag(gram)
         gram = gram + np.diag(damping * diagonal + 1e-9 * diagonal.max())
-        return np.linalg.solve(gram, slope.T @ rest)
+        return np.asarray(np.linalg.solve(gram, slope.T @ rest), dtype=np.float64)
 
-    def look(self, observed, theta, starts):
+    def look(self, observed: Array, theta: Array, starts: Array) -> tuple[Array, Array]:
         """What is left (N,), and how the simulation changes (N, P) with each fitted number in its
         scale.
         """
@@ -116,7 +126,7 @@ class Fitter:
         return rest.ravel() if not bad else np.full(rest.size, np.inf), slope.reshape(rest.size, -1)
 
 
-def observed_by_batch(setting, effects):
+def observed_by_batch(setting: Setting, effects: Effects) -> Array:
     """Noiseless observations (R, T, C) with these effects."""
     kind = SIMULATORS[setting.system]
     fixed = {name: list(c) for name, c in effects.items()}
@@ -127,13 +137,14 @@ def observed_by_batch(setting, effects):
     return simulator.simulate_lanes(theta, setting.scenarios)
 
 
-def gap(setting, observed):
+def gap(setting: Setting, observed: Callable[[float], Array]) -> Callable[[float], float]:
     """The gap by strength: what base parameters and initial states leave of `observed(strength)`,
     (R, T, C).
     """
-    fit, last = Fitter(setting), []
+    fit = Fitter(setting)
+    last: list[tuple[float, Fit]] = []
 
-    def left(strength):
+    def left(strength: float) -> float:
         theta, starts = fit.theta, fit.starts
         if last:  # they move about in proportion
             before, found = last[-1]
@@ -148,7 +159,9 @@ def gap(setting, observed):
     return left
 
 
-def sized(left, wanted, largest, first=1e-3):
+def sized(
+    left: Callable[[float], float], wanted: float, largest: float, first: float = 1e-3
+) -> float | None:
     """The strength at which `left(strength)`, which grows from zero, is `wanted`; None if it is not
     below `largest`.
 
@@ -169,7 +182,7 @@ def sized(left, wanted, largest, first=1e-3):
     return None
 
 
-def _between(low, high, wanted):
+def _between(low: tuple[float, float], high: tuple[float, float], wanted: float) -> float:
     """The next strength to try, given (strength, left) on either side of what is wanted."""
     if not low[0]:
         return (
@@ -178,6 +191,7 @@ def _between(low, high, wanted):
     if not np.isfinite(high[0]):
         return low[0] * min(wanted / max(low[1], 1e-9), LEAP)
     if not np.isfinite(high[1]) or high[0] / low[0] > LEAP**2:
-        return np.sqrt(low[0] * high[0])
-    share = np.log(wanted / low[1]) / np.log(high[1] / low[1])
-    return low[0] * (high[0] / low[0]) ** min(max(share, 0.05), 0.95)
+        return float(np.sqrt(low[0] * high[0]))
+    share = float(np.log(wanted / low[1]) / np.log(high[1] / low[1]))
+    part = min(max(share, 0.05), 0.95)
+    return float(low[0] * (high[0] / low[0]) ** part)

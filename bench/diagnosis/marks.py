@@ -17,12 +17,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from bench.diagnosis.worlds.items import Item, same_class
+from bench.diagnosis.worlds.world import SIMULATORS
 from sims import effects as library
-from tests.exam.items import Item, same_class
-from tests.exam.worlds import SIMULATORS
 
+Sets = list[tuple[str, ...]]
+Judged = tuple[str, int, int]
+Holds = Callable[[str, tuple[str, ...]], bool]
 MOST = 2  # a cause counts as found within a set of at most so many
 
 
@@ -46,19 +51,19 @@ class Mark:
     covered: dict[str, bool | None]
 
     @property
-    def found(self):
+    def found(self) -> bool:
         """Whether it counts, by names."""
         return self.outcome == "right" or (self.outcome == "set" and self.set_size <= MOST)
 
     @property
-    def found_class(self):
+    def found_class(self) -> bool:
         """Whether it counts, equivalent effects being one."""
         return self.outcome == "right" or (
             self.outcome in ("set", "class") and self.class_size <= MOST
         )
 
 
-def marked(item: Item, verdict) -> Mark:
+def marked(item: Item, verdict: Mapping[str, Any] | None) -> Mark:
     """Mark one answer; a verdict of None is no answer."""
     if verdict is None:
         return Mark("failed", 0, 0, "", {})
@@ -74,17 +79,17 @@ def marked(item: Item, verdict) -> Mark:
     return Mark(outcome, strict, loose, " + ".join("|".join(names) for names in sets), covered)
 
 
-def _clean(item, verdict, sets):
+def _clean(item: Item, verdict: str, sets: Sets) -> Judged:
     return "right" if verdict == "adequate" else "alarm", 0, 0
 
 
-def _foreign(item, verdict, sets):
+def _foreign(item: Item, verdict: str, sets: Sets) -> Judged:
     if verdict == "adequate":
         return "missed", 0, 0
     return "right" if verdict in ("unknown", "partial") else "wrong", 0, 0
 
 
-def _library(item, verdict, sets):
+def _library(item: Item, verdict: str, sets: Sets) -> Judged:
     """One or two effects of the library: every one in a set of its own, and no set without one."""
     if verdict == "adequate":
         return "missed", 0, 0
@@ -106,7 +111,7 @@ def _library(item, verdict, sets):
     return "right" if sizes == 1 else "set", sizes, classes
 
 
-def _matched(effects, sets, holds):
+def _matched(effects: Iterable[str], sets: Sets, holds: Holds) -> dict[str, int]:
     """Which set holds which effect, no set two: the fullest of the assignments, of two effects at
     most.
     """
@@ -126,18 +131,18 @@ def _matched(effects, sets, holds):
     return best
 
 
-def _same(item, effect):
+def _same(item: Item, effect: str) -> frozenset[str]:
     return same_class(item.system, item.driven, effect)
 
 
-def _classes(item, names):
+def _classes(item: Item, names: Sequence[str]) -> int:
     return len({min(_same(item, name)) for name in names})
 
 
 OUTCOMES = {"clean": _clean, "foreign": _foreign, "single": _library, "double": _library}
 
 
-def _covered(item, verdict, sets):
+def _covered(item: Item, verdict: Mapping[str, Any], sets: Sets) -> dict[str, bool | None]:
     """Intervals of base parameters and of the coefficients of what leads its set."""
     system, truth, said = (
         SIMULATORS[item.system].system,
@@ -156,7 +161,7 @@ def _covered(item, verdict, sets):
     return {name: _holds(said[name], value) for name, value in truth.items() if said.get(name)}
 
 
-def _holds(estimate, value):
+def _holds(estimate: Mapping[str, float | None], value: float) -> bool | None:
     low, high = estimate["low"], estimate["high"]
     if low is None or high is None:
         return None

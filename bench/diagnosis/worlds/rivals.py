@@ -4,17 +4,22 @@ ones.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from itertools import product
 
 import numpy as np
 
+from bench.diagnosis.worlds.settings import Setting
+from bench.diagnosis.worlds.sizing import Fit, Fitter
+from bench.diagnosis.worlds.world import SIMULATORS
 from sims import effects as library
-from tests.exam.sizing import Fitter
-from tests.exam.worlds import SIMULATORS
+from sims.base import Array
 
 PROMISING = 4  # effects that are refitted, of those that close most of the gap to first order
 STARTS = 3  # shapes from which one effect is refitted
-SHAPES = {  # first guesses of what shapes an effect rather than scales it, in the library's units
+SHAPES: dict[
+    str, list[tuple[float, ...]]
+] = {  # first guesses of what shapes an effect rather than scales it, in the library's units
     "force.periodic": [(f,) for f in (0.2, 0.4, 0.7, 1.2, 2.0, 3.5)],
     "force.ripple": [(p,) for p in (0.1, 0.2, 0.4, 0.8, 1.6, 3.0, 6.0)],
     "friction.position": [(p,) for p in (0.3, 0.6, 1.2, 2.5, 5.0)],
@@ -25,7 +30,9 @@ SHAPES = {  # first guesses of what shapes an effect rather than scales it, in t
 }
 
 
-def left_with(setting, observed, name, coefficients=None):
+def left_with(
+    setting: Setting, observed: Array, name: str, coefficients: Sequence[float] | None = None
+) -> float:
     """What base parameters, initial states and the effect of this name leave of observations (R, T,
     C), refitted.
 
@@ -39,19 +46,19 @@ def left_with(setting, observed, name, coefficients=None):
     return min(fit(observed, guess).left for _, guess in guesses[:STARTS])
 
 
-def best(setting, observed):
+def best(setting: Setting, observed: Array) -> tuple[str, float]:
     """The effect of the library that leaves least of observations (R, T, C), and how much."""
     bare = Fitter(setting)(observed)
-    names = library.library(SIMULATORS[setting.system].system)
-    names = [n for n in names if setting.driven or not (n.startswith("input.") or n == "backlash")]
+    usable = library.library(SIMULATORS[setting.system].system)
+    names = [n for n in usable if setting.driven or not (n.startswith("input.") or n == "backlash")]
     first = {n: _guesses(setting, observed, n, bare)[0] for n in names}
     promising = sorted(first, key=lambda n: first[n][0])[:PROMISING]
     left = {n: Fitter(setting, [n])(observed, first[n][1], bare.starts).left for n in promising}
-    name = min(left, key=left.get)
+    name = min(left, key=lambda n: left[n])
     return name, min(left[name], bare.left)
 
 
-def _guesses(setting, observed, name, bare):
+def _guesses(setting: Setting, observed: Array, name: str, bare: Fit) -> list[tuple[float, Array]]:
     """(what would be left to first order, theta) for every shape, the best first; `bare` is the fit
     without it.
     """
@@ -70,7 +77,7 @@ def _guesses(setting, observed, name, bare):
     return sorted(result, key=lambda pair: pair[0])
 
 
-def _stops(setting, path):
+def _stops(setting: Setting, path: Array) -> Iterator[tuple[float, float, float]]:
     """Soft and hard stops at either end of where it has been, met late and early."""
     low, high = float(path.min()), float(path.max())
     far = 20.0 if setting.system == "pendulum" else 5000.0
@@ -80,12 +87,14 @@ def _stops(setting, path):
         yield -part * far, low + within, 0.05
 
 
-def _left_at(fit, observed, theta, bare):
+def _left_at(fit: Fitter, observed: Array, theta: Array, bare: Fit) -> float:
     rest, _ = fit.look(observed, theta, bare.starts)
     return float(np.sqrt(np.mean(rest**2)))
 
 
-def _first_order(fit, observed, shape, bare):
+def _first_order(
+    fit: Fitter, observed: Array, shape: Sequence[float], bare: Fit
+) -> tuple[float, Array]:
     """One step of least squares from the effect at zero, its shape held; numbers a system lacks are
     left out.
     """

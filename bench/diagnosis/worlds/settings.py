@@ -4,13 +4,15 @@ drawn from a seed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from sims.base import Scenario
+from bench.diagnosis.worlds.world import Effects, World, constants_of
+from sims.base import Array, Scenario
 from sims.pendulum.simulator import Pendulum
-from tests.exam.worlds import World, constants_of
 
 ALONG_GROUND = (
     "gravity.tilt",
@@ -29,6 +31,7 @@ RATES = {
 PENDULUM = Pendulum(
     observe=["q"], engine="batch"
 )  # tells how far a drawn pendulum swings; gives no data
+Drawn = tuple[dict[str, float], tuple[str, ...], list[Scenario]]
 MOST_RUNS = 6
 NOISES = ("white", "ar1", "quantised")
 BY_INPUT = ("input.", "backlash", "supply.", "friction.load_")  # shown by a drive alone
@@ -46,17 +49,19 @@ class Noise:
     dither: float
     stated: bool = True
 
-    def added(self, observed, rng):
+    def added(self, observed: Array, rng: np.random.Generator) -> Array:
         """Noiseless observations (T, C) as recorded."""
         sigma = np.array(list(self.sigma.values()))
         white = rng.standard_normal(observed.shape)
         if self.kind == "quantised":  # rounding is good for step / sqrt(12)
             step = sigma / np.sqrt(1 / 12 + self.dither**2)
-            return np.round((observed + self.dither * step * white) / step) * step
+            rounded: Array = np.round((observed + self.dither * step * white) / step) * step
+            return rounded
         if self.kind == "ar1":
             for k in range(1, len(white)):
                 white[k] = self.phi * white[k - 1] + np.sqrt(1 - self.phi**2) * white[k]
-        return observed + sigma * white
+        recorded: Array = observed + sigma * white
+        return recorded
 
 
 @dataclass(frozen=True)
@@ -73,32 +78,62 @@ class Setting:
     seconds: float
 
     @property
-    def sigma(self):
+    def sigma(self) -> Array:
+        """(C,) of the noise, by channel."""
         return np.array([self.noise.sigma[name] for name in self.channels])
 
     @property
-    def driven(self):
+    def driven(self) -> bool:
+        """Whether there is an input."""
         return bool(self.scenarios[0].inputs)
 
-    def world(self, effects=None, foreign=None):
+    def world(self, effects: Effects | None = None, foreign: Effects | None = None) -> World:
+        """With something hidden in it."""
         return World(self.system, self.parameters, self.constants, effects or {}, foreign or {})
 
 
-def setting(system, rng, hidden=(), short=False):
+class Circumstances(NamedTuple):
+    """What of a setting is asked for and not drawn; None is drawn.
+
+    Attributes:
+        rate: samples a second.
+        runs: how many.
+        noise: one of `NOISES`.
+    """
+
+    rate: int | None = None
+    runs: int | None = None
+    noise: str | None = None
+
+
+ANY = Circumstances()
+"""Everything is drawn."""
+
+
+def setting(
+    system: str,
+    rng: np.random.Generator,
+    hidden: Sequence[str] = (),
+    short: bool = False,
+    asked: Circumstances = ANY,
+) -> Setting:
     """A setting drawn with `rng`, in which the effects named in `hidden` have a chance to show."""
     rate = int(rng.choice([50, 100, 200], p=[0.3, 0.5, 0.2]))
     seconds = float(rng.choice([2.0, 3.0, 4.0, 5.0, 6.0], p=[0.1, 0.2, 0.4, 0.2, 0.1]))
     runs = 3 if short else int(rng.choice([3, 4, 5, MOST_RUNS], p=[0.25, 0.4, 0.2, 0.15]))
+    # drawn all the same: what follows is drawn as it is without wishes
+    rate, runs = asked.rate or rate, asked.runs or runs
     times = np.arange(round(rate * seconds)) / rate
     draw = {"ball": _ball, "pendulum": _pendulum, "slider": _slider}[system]
     parameters, channels, scenarios = draw(rng, times, runs, hidden)
     noise = _noise(rng, system, channels)
+    noise = replace(noise, kind=asked.noise or noise.kind)
     return Setting(
         system, parameters, constants_of(system), channels, tuple(scenarios), noise, rate, seconds
     )
 
 
-def _noise(rng, system, channels):
+def _noise(rng: np.random.Generator, system: str, channels: Sequence[str]) -> Noise:
     sigma = float(np.exp(rng.uniform(*np.log(RANGES[system]))))
     faster = float(rng.uniform(*RATES[system])) if system in RATES else 1.0
     by_channel = {name: sigma * (faster if name in ("qd", "v") else 1.0) for name in channels}
@@ -112,7 +147,7 @@ def _noise(rng, system, channels):
     )
 
 
-def _ball(rng, times, runs, hidden):
+def _ball(rng: np.random.Generator, times: Array, runs: int, hidden: Sequence[str]) -> Drawn:
     upright = not set(hidden) & set(ALONG_GROUND) and rng.random() < 0.3
     speed = 0.0 if upright else 3.0
     parameters, scenarios = {"restitution": float(rng.uniform(0.5, 0.9))}, []
@@ -125,11 +160,12 @@ def _ball(rng, times, runs, hidden):
     return parameters, ("z",) if upright else ("x", "y", "z"), scenarios
 
 
-def _pendulum(rng, times, runs, hidden):
+def _pendulum(rng: np.random.Generator, times: Array, runs: int, hidden: Sequence[str]) -> Drawn:
     parameters = {"inertia": float(rng.uniform(2e-3, 6e-3))}
     driven = any(name.startswith(BY_INPUT) for name in hidden) or rng.random() < 0.5
     channels = ("q",) if rng.random() < 0.6 else ("q", "qd")
-    form, scenarios = str(rng.choice(["steps", "sine", "chirp"])), []
+    form = str(rng.choice(["steps", "sine", "chirp"]))
+    scenarios: list[Scenario] = []
     while len(scenarios) < runs:
         inputs = (
             {"u": rng.uniform(0.05, 0.2) * wave(form, times, rng, (0.3, 3.0))} if driven else {}
@@ -145,7 +181,7 @@ def _pendulum(rng, times, runs, hidden):
     return parameters, channels, scenarios
 
 
-def _slider(rng, times, runs, hidden):
+def _slider(rng: np.random.Generator, times: Array, runs: int, hidden: Sequence[str]) -> Drawn:
     parameters = {"mass": float(rng.uniform(0.5, 2.0))}
     channels = ("x",) if rng.random() < 0.6 else ("x", "v")
     form, scenarios = str(rng.choice(["steps", "sine", "chirp"])), []
@@ -163,16 +199,19 @@ def _slider(rng, times, runs, hidden):
     return parameters, channels, scenarios
 
 
-def wave(form, times, rng, hertz):
+def wave(form: str, times: Array, rng: np.random.Generator, hertz: tuple[float, float]) -> Array:
     """An input signal (T,) of amplitude one: steps between levels, a sine, or a chirp, within a
     range of frequency.
     """
     if form == "steps":
         lasting = rng.uniform(0.25, 1.0)
         place = np.floor(times / lasting).astype(int)
-        return rng.uniform(-1.0, 1.0, place[-1] + 1)[place]
-    low, high = np.sort(np.exp(rng.uniform(*np.log(hertz), 2)))
+        levels: Array = rng.uniform(-1.0, 1.0, place[-1] + 1)[place]
+        return levels
+    bottom, top = np.log(hertz)
+    low, high = np.sort(np.exp(rng.uniform(bottom, top, 2)))
     turns = (
         low * times if form == "sine" else low * times + (high - low) * times**2 / (2 * times[-1])
     )
-    return np.sin(2 * np.pi * (turns + rng.random()))
+    signal: Array = np.sin(2 * np.pi * (turns + rng.random()))
+    return signal

@@ -1,0 +1,1 @@
+"""Diagnosers that come with simgap, one a module; see `bench.diagnoser`."""

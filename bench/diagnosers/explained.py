@@ -1,0 +1,35 @@
+"""simgap's own: `simgap explain`, with all that it does (docs/explain.md)."""
+
+from __future__ import annotations
+
+from bench.diagnoser import Answer, Case, Diagnoser, Named
+from sims.extended import Number
+
+
+class Explained(Diagnoser):
+    """simgap explain: scores every effect in trajectory space, refits the best, holds runs out."""
+
+    name = "simgap"
+
+    def diagnose(self, case: Case) -> Answer:
+        """The verdict of `simgap explain` on the recording as it lies."""
+        from bench.gap.explain import explain
+
+        verdict = explain(case.path, seed=int(case.rng.integers(1 << 31))).answer
+        # Of the best score of the whole library, by surrogates.
+        chance = min((candidate.p_value for candidate in verdict.candidates), default=None)
+        causes = tuple(
+            Named(
+                cause.effect,
+                cause.alternatives,
+                {name: _ends(number) for name, number in cause.coefficients.items()},
+                cause.p_value,
+            )
+            for cause in verdict.causes
+        )
+        parameters = {name: _ends(number) for name, number in verdict.parameters.items()}
+        return Answer(verdict.verdict, causes, parameters, chance)
+
+
+def _ends(number: Number) -> tuple[float | None, float | None]:
+    return number.low, number.high

@@ -1,0 +1,200 @@
+"""Sparse regression of acceleration residuals on the library of effects.
+
+Two ways to choose a few of many terms, both by PySINDy: sequentially thresholded least squares
+(S. L. Brunton, J. L. Proctor, J. N. Kutz, PNAS 113(15), 3932, 2016, doi:10.1073/pnas.1517384113)
+and forward regression with orthogonal least squares (S. Chen, S. A. Billings, W. Luo, Int. J.
+Control 50(5), 1873, 1989, doi:10.1080/00207178908953472). How many terms is decided by the runs
+that are held out: the fewest that predict their accelerations about as well as the best.
+"""
+
+from __future__ import annotations
+
+import warnings
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from itertools import pairwise
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from bench.diagnoser import Answer, Case, Diagnoser, Named
+from bench.diagnosers.evidence import Column, Evidence, strongest
+from sims.base import Array
+
+WINDOWS = (0.15, 0.4, 1.0)
+"""Seconds of the polynomials: long ones see slow effects, short ones quick ones."""
+EVIDENCE = 2.5
+"""Standard errors by which held-out errors must fall."""
+ALIKE = 0.95
+"""Correlation from which two columns are taken for one cause."""
+SAME = 0.999
+"""Correlation from which one of two columns is left out of the regression."""
+RIDGE = 1e-6
+"""Of the least squares, whose columns have unit variance."""
+BLOCKS = 10
+"""Parts of the held-out runs, whose errors tell how well an error is known."""
+MOST = 3
+"""Terms at most."""
+
+
+class _Found(NamedTuple):
+    """What one regression gives: how well it is known that it predicts, and what it names."""
+
+    sigmas: float
+    causes: tuple[Named, ...]
+
+
+class _Regression(Diagnoser):
+    """Shared by both."""
+
+    requires: ClassVar[tuple[str, ...]] = ("pysindy",)
+
+    def diagnose(self, case: Case) -> Answer:
+        """Terms that predict the accelerations of runs that are held out."""
+        evidence = Evidence(case)
+        try:
+            found = [self._found(evidence, window) for window in WINDOWS]
+        finally:
+            evidence.close()
+        known = [one for one in found if one is not None]
+        if not known:
+            return Answer("unidentifiable")
+        best = max(known, key=lambda one: one.sigmas)
+        if not best.causes:
+            return Answer("adequate")
+        if len(best.causes) > MOST:
+            return Answer("unknown")
+        sets = any(cause.alternatives for cause in best.causes)
+        return Answer("ambiguous" if sets else "named", best.causes)
+
+    def _found(self, evidence: Evidence, window: float) -> _Found | None:
+        """What a regression with this window gives; None where there are too few samples."""
+        rows = evidence.accelerations(window)
+        fitted, held_out = rows.of(evidence.fitted), rows.of(evidence.held_out)
+        if min(len(fitted.left), len(held_out.left)) <= fitted.base.shape[1] + 2 * BLOCKS:
+            return None
+        left, effects = fitted.projected()
+        best = strongest(left, effects, evidence.columns)
+        chosen = [column for _, column in best.values()]
+        terms, library = _independent(
+            [(column.effect, place) for column in chosen for place in column.places], effects
+        )
+        if not terms:
+            return _Found(0.0, ())
+        places = [place for _, place in terms]
+        scale = np.sqrt(np.square(library).mean(axis=0))
+        left_out, effects_out = held_out.projected()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            models = [c for c in self._models(library / scale, left) if np.isfinite(c).all()]
+        model, sigmas = _simplest(models, left_out, effects_out[:, places] / scale)
+        picked = list(dict.fromkeys(terms[i][0] for i in np.flatnonzero(model)))
+        causes = [Named(name, _alike(name, picked, chosen, effects)) for name in picked]
+        return _Found(sigmas, tuple(causes))
+
+    @abstractmethod
+    def _models(self, library: Array, left: Array) -> Iterator[Array]:
+        """Coefficients (K,) of models with more and more terms."""
+
+
+class STLSQ(_Regression):
+    """Acceleration residuals on the library: sequentially thresholded least squares (PySINDy)."""
+
+    name = "stlsq"
+
+    def _models(self, library: Array, left: Array) -> Iterator[Array]:
+        from pysindy import optimizers
+
+        size = float(np.abs(np.linalg.lstsq(library, left, rcond=1e-6)[0]).max())
+        for threshold in size * np.geomspace(1.0, 1e-3, 16):
+            model = optimizers.STLSQ(threshold=threshold, alpha=RIDGE * len(left))
+            yield model.fit(library, left[:, None]).coef_[0]
+
+
+class FROLS(_Regression):
+    """Acceleration residuals on the library: forward orthogonal least squares (PySINDy)."""
+
+    name = "frols"
+
+    def _models(self, library: Array, left: Array) -> Iterator[Array]:
+        from pysindy import optimizers
+
+        for most in range(min(2 * MOST, library.shape[1]), 0, -1):
+            model = optimizers.FROLS(max_iter=most, alpha=RIDGE * len(left))
+            # It stops in an error where what is left of all others depends on what it has chosen.
+            with suppress(ValueError):
+                model.fit(library, left[:, None])
+                yield from (coefficients[0] for coefficients in model.history_)
+                return
+
+
+def _independent(
+    terms: Sequence[tuple[str, int]], effects: Array
+) -> tuple[list[tuple[str, int]], Array]:
+    """Terms without those whose column is that of an earlier one, and their columns."""
+    kept: list[tuple[str, int]] = []
+    columns: list[Array] = []
+    for effect, place in terms:
+        column = effects[:, place]
+        size = float(np.sqrt(column @ column))
+        if size < 1e-9 * max(len(column), 1):
+            continue
+        unit = column / size
+        if all(abs(float(unit @ other)) < SAME for other in columns):
+            kept.append((effect, place))
+            columns.append(unit)
+    library = effects[:, [place for _, place in kept]]
+    return kept, library
+
+
+def _simplest(models: Sequence[Array], left: Array, library: Array) -> tuple[Array, float]:
+    """The model of fewest terms whose held-out error is within one standard error of the best, and
+    by how many standard errors that is better than nothing; nothing where it is too few.
+    """
+    nothing = np.zeros(library.shape[1])
+    every = [nothing, *models]
+    errors = np.array([_blocks(left - library @ c) for c in every])
+    best = int(errors.mean(axis=1).argmin())
+    gain = errors[0] - errors[best]
+    sigmas = float(gain.mean() / max(_doubt(gain), 1e-12)) if best else 0.0
+    if sigmas < EVIDENCE:
+        return nothing, sigmas
+    allowed = []
+    for c, error in zip(every[1:], errors[1:], strict=True):
+        worse = error - errors[best]
+        if worse.mean() <= _doubt(worse):
+            allowed.append(c)
+    return min(allowed or [every[best]], key=np.count_nonzero), sigmas
+
+
+def _blocks(error: Array) -> Array:
+    """(BLOCKS,) mean squares of parts that follow each other: errors of neighbours are alike."""
+    ends = np.linspace(0, len(error), BLOCKS + 1).astype(int)
+    return np.array([np.square(error[a:b]).mean() for a, b in pairwise(ends.tolist())])
+
+
+def _doubt(differences: Array) -> float:
+    """Standard error of their mean."""
+    return float(differences.std(ddof=1) / np.sqrt(len(differences)))
+
+
+def _alike(
+    name: str, picked: Sequence[str], columns: Sequence[Column], effects: Array
+) -> tuple[str, ...]:
+    """Effects that were not picked, and one of whose columns is nearly that of one that was."""
+
+    def units(column: Column) -> Array:
+        part = effects[:, list(column.places)]
+        scale = np.sqrt(np.square(part).sum(axis=0))
+        unit: Array = part[:, scale > 1e-9] / scale[scale > 1e-9]
+        return unit
+
+    own = next(units(column) for column in columns if column.effect == name)
+    close = {}
+    for column in columns:
+        if column.effect not in picked:
+            other = units(column)
+            close[column.effect] = float(np.abs(own.T @ other).max()) if other.size else 0.0
+    order = sorted(close, key=lambda effect: -close[effect])
+    return tuple(effect for effect in order if close[effect] >= ALIKE)

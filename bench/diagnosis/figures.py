@@ -1,0 +1,269 @@
+"""Figures of a comparison of diagnosers, from its tables; readable in print and in grey."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from bench.diagnosis.tables import Line, by_diagnoser
+from bench.figures import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+OUTCOMES = (
+    ("right", style.BLACK, "named, alone"),
+    ("set", style.BLUE, "in a set"),
+    ("class", style.SKY, "an equivalent one"),
+    ("extra", style.ORANGE, "named, and another beside it"),
+    ("wrong", style.VERMILION, "something else named"),
+    ("unnamed", style.BAND, "seen, not named"),
+    ("missed", style.SHADE, "not seen"),
+    ("undecided", style.SHADE, "unidentifiable"),
+    ("failed", style.PURPLE, "no answer"),
+)
+"""Of single effects, the best first: its colour and what a legend calls it."""
+WANTED_ALARMS = 0.01
+"""Share of false alarms that a user may expect at most."""
+
+
+def look(name: str, order: Sequence[str]) -> dict[str, Any]:
+    """Colour, marker and line of a diagnoser, by its place."""
+    place = list(order).index(name)
+    return {
+        "color": style.colour(place),
+        "marker": style.marker(place),
+        "linestyle": style.line(place),
+        "label": name,
+    }
+
+
+def board(table: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
+    """False alarms against what is named: the best stand left and high."""
+    figure, axes = style.blank(1, 1, (7.6, 4.8))
+    axis: Axes = axes[0][0]
+    alarms = by_diagnoser(table, "false alarms")
+    named = by_diagnoser(table, "the same, up to equivalence")
+    for name in order:
+        x, y = alarms[name], named[name]
+        shown = {**look(name, order), "linestyle": "none"}
+        axis.errorbar(
+            100 * x["share"],
+            100 * y["share"],
+            xerr=_bars(x),
+            yerr=_bars(y),
+            markersize=7,
+            linewidth=1.0,
+            elinewidth=1.0,
+            capsize=2.5,
+            **shown,
+        )
+    axis.axvline(100 * WANTED_ALARMS, color=style.SOFT, linewidth=0.9, linestyle=(0, (2, 2)))
+    axis.set_xscale("symlog", linthresh=2.0)
+    axis.set_xlim(-0.15, 110)
+    ticks = [0, 1, 2, 5, 10, 20, 50, 100]
+    axis.set_xticks(ticks, [f"{tick}" for tick in ticks])
+    axis.set_ylim(-3, 103)
+    axis.set_xlabel("false alarms where nothing is hidden [%]")
+    axis.set_ylabel("single causes named [%]")
+    style.plain(axis)
+    axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
+    figure.suptitle(title, fontsize=11)
+    clean, asked = (max(int(v["of"]) for v in part.values()) for part in (alarms, named))
+    style.below(
+        figure,
+        f"{clean} recordings with nothing hidden, {asked} with one effect of at least one noise. "
+        "Named: alone or in a set of at most two, equivalent effects being one. Bars: 95 % "
+        "(Clopper-Pearson, Wilson). Dashes: 1 % of false alarms.",
+        letters=16,
+    )
+    return figure
+
+
+def power(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
+    """What is named, and what is seen at all, against the size of the effect."""
+    figure, axes = style.blank(1, 2, (9.6, 4.4), sharey=True)
+    for axis, metric, says in zip(
+        axes[0],
+        ("named", "seen"),
+        ("named (set of at most two)", "something is seen"),
+        strict=True,
+    ):
+        part = frame[frame["metric"] == metric]
+        for place, name in enumerate(order):
+            own = part[part["diagnoser"] == name].sort_values("size")
+            if own.empty:
+                continue
+            x = own["size"].to_numpy() * (1 + 0.025 * (place - (len(order) - 1) / 2))
+            y, low, high = (100 * own[key].to_numpy() for key in ("share", "low", "high"))
+            axis.errorbar(
+                x,
+                y,
+                yerr=np.maximum([y - low, high - y], 0.0),
+                linewidth=1.3,
+                elinewidth=0.7,
+                capsize=1.8,
+                markersize=5,
+                **look(name, order),
+            )
+        sizes = sorted(part["size"].unique())
+        axis.set_xscale("log")
+        axis.set_xticks(sizes, [f"{size:g}" for size in sizes])
+        axis.minorticks_off()
+        axis.set_ylim(-3, 103)
+        axis.set_xlabel("size of the hidden effect [noises]")
+        axis.set_title(says, fontsize=10)
+        style.plain(axis)
+    axes[0][0].set_ylabel("share of recordings [%]")
+    axes[0][1].legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
+    figure.suptitle(title, fontsize=11)
+    counts = frame[(frame["metric"] == "named") & (frame["diagnoser"] == order[0])]
+    said = ", ".join(
+        f"{int(n)} at {s:g}" for s, n in counts.sort_values("size")[["size", "of"]].to_numpy()
+    )
+    style.below(
+        figure,
+        f"Recordings with one hidden effect: {said} noises. Bars: 95 % (Wilson). Who alarms always "
+        "sees everything: see false alarms.",
+        letters=16,
+    )
+    return figure
+
+
+def outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
+    """What became of each recording with one hidden effect."""
+    figure, axes = style.blank(1, 1, (8.6, 0.5 * len(order) + 2.2))
+    axis: Axes = axes[0][0]
+    places = np.arange(len(order))[::-1]
+    left = np.zeros(len(order))
+    total = max(int((rows["diagnoser"] == name).sum()) for name in order)
+    for outcome, colour, says in OUTCOMES:
+        counts = [
+            int(((rows["diagnoser"] == name) & (rows["outcome"] == outcome)).sum())
+            for name in order
+        ]
+        if not any(counts):
+            continue
+        widths = 100.0 * np.array(counts) / max(total, 1)
+        axis.barh(
+            places, widths, left=left, color=colour, edgecolor=style.INK, linewidth=0.5, label=says
+        )
+        for place, width, begin, count in zip(places, widths, left, counts, strict=True):
+            if width > 4:
+                dark = colour in (style.BLACK, style.BLUE, style.VERMILION)
+                axis.text(
+                    begin + width / 2,
+                    place,
+                    str(count),
+                    ha="center",
+                    va="center",
+                    fontsize=8,
+                    color="white" if dark else style.INK,
+                )
+        left += widths
+    axis.set_yticks(places, order)
+    axis.set_xlim(0, 100)
+    axis.set_xlabel("recordings with one hidden effect of at least one noise [%]")
+    style.plain(axis)
+    axis.grid(visible=False)
+    axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8.5)
+    figure.suptitle(title, fontsize=11)
+    style.below(figure, f"{total} recordings; numbers in bars count them.", letters=16)
+    return figure
+
+
+def calibration(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
+    """How often p is at most a level where nothing is hidden: the level itself, if p is one."""
+    figure, axes = style.blank(1, 1, (6.8, 4.4))
+    axis: Axes = axes[0][0]
+    levels = sorted(frame["level"].unique())
+    axis.plot(levels, levels, color=style.SOFT, linewidth=0.9, linestyle=(0, (2, 2)))
+    names = [name for name in order if (frame["diagnoser"] == name).any()]
+    for place, name in enumerate(names):
+        own = frame[frame["diagnoser"] == name].sort_values("level")
+        y, low, high = (own[key].to_numpy() for key in ("share", "low", "high"))
+        axis.errorbar(
+            own["level"].to_numpy() * (1 + 0.03 * (place - (len(names) - 1) / 2)),
+            y,
+            yerr=np.maximum([y - low, high - y], 0.0),
+            linewidth=1.3,
+            elinewidth=0.8,
+            capsize=2,
+            markersize=5,
+            **look(name, order),
+        )
+    axis.set_xscale("log")
+    axis.set_xticks(levels, [f"{level:g}" for level in levels])
+    axis.minorticks_off()
+    axis.set_ylim(-0.03, 1.03)
+    axis.set_xlabel("level")
+    axis.set_ylabel("share of recordings whose p is at most that")
+    style.plain(axis)
+    axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
+    figure.suptitle(title, fontsize=11)
+    asked = int(frame["of"].max())
+    style.below(
+        figure,
+        f"Up to {asked} recordings with nothing hidden. Dashes: a p value that is one. Below: too "
+        "careful; above: it alarms too often. Bars: 95 % (Clopper-Pearson).",
+        letters=16,
+    )
+    return figure
+
+
+def cost(costs: pd.DataFrame, table: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
+    """What an answer costs against what is named."""
+    figure, axes = style.blank(1, 2, (9.6, 4.2), sharey=True)
+    named = by_diagnoser(table, "the same, up to equivalence")
+    held = by_diagnoser(costs)
+    for axis, column, unit in zip(
+        axes[0],
+        ("simulations", "processor_seconds"),
+        ("simulations for an answer", "processor time for an answer [s]"),
+        strict=True,
+    ):
+        for name in order:
+            y = named[name]
+            middle, high = (float(held[name][f"{column}_{what}"]) for what in ("median", "p95"))
+            if not middle > 0:
+                continue
+            axis.errorbar(
+                middle,
+                100 * y["share"],
+                xerr=[[0.0], [max(high - middle, 0.0)]],
+                yerr=_bars(y),
+                markersize=7,
+                elinewidth=0.9,
+                capsize=2,
+                **{**look(name, order), "linestyle": "none"},
+            )
+        axis.set_xscale("log")
+        axis.set_ylim(-3, 103)
+        axis.set_xlabel(unit)
+        style.plain(axis)
+    axes[0][0].set_ylabel("single causes named [%]")
+    axes[0][1].legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
+    figure.suptitle(title, fontsize=11)
+    learned = {n: int(held[n]["training_simulations"]) for n in order}
+    said = "; ".join(
+        f"{name} has learned from {count:,} simulations before".replace(",", " ")
+        for name, count in learned.items()
+        if count
+    )
+    style.below(
+        figure,
+        "Marks: median; bars to the right: 95 % of the answers; up and down: 95 % (Wilson). "
+        + (f"{said}." if said else ""),
+        letters=16,
+    )
+    return figure
+
+
+def _bars(line: Line) -> list[list[float]]:
+    """Both lengths of an error bar, in per cent."""
+    share, low, high = (float(line[key]) for key in ("share", "low", "high"))
+    return [[100 * max(share - low, 0.0)], [100 * max(high - share, 0.0)]]

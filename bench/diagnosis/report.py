@@ -1,0 +1,137 @@
+"""Writes tables and figures of a comparison of diagnosers, and says what came out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import pandas as pd
+
+from bench.diagnosis import figures
+from bench.diagnosis.kept import Answered
+from bench.diagnosis.lessons import read_lessons
+from bench.diagnosis.rows import rows_of
+from bench.diagnosis.sheet import Question
+from bench.diagnosis.tables import all_tables, by_diagnoser, complete, singles
+from bench.figures.style import mark, save
+from bench.store.folder import Configuration
+from sims.files import write
+
+ITEMS = "items.csv"
+"""A row an answer."""
+
+
+class Asked(Protocol):
+    """What is reported: the answers of a study; see `bench.diagnosis.study.DiagnosisStudy`."""
+
+    folder: Path
+    configuration: Configuration
+
+    @property
+    def answered(self) -> Answered:
+        """All that was answered."""
+
+    @property
+    def questions(self) -> list[Question]:
+        """The sheet."""
+
+    @property
+    def usable(self) -> list[str]:
+        """Diagnosers that can be used here."""
+
+    @property
+    def skipped(self) -> dict[str, str]:
+        """The others, and why."""
+
+
+def finish(study: Asked, say: Callable[[str], None]) -> int:
+    """Write what there is; how many answers failed."""
+    for name, reason in study.skipped.items():
+        say(f"skipped: {name}: {reason}")
+    order = study.usable
+    whole = rows_of(study.answered, order)
+    if whole.empty:
+        say("no answers yet")
+        return 0
+    rows = complete(whole, order)
+    if rows.empty:
+        say("no question has been put to every diagnoser yet")
+        return 0
+    tables = all_tables(rows, order, read_lessons(study.folder))
+    write(study.folder / ITEMS, csv(rows))
+    for name, frame in tables.items():
+        write(study.folder / f"{name}.csv", csv(frame))
+    drawn = draw(study, rows, tables, order)
+    for line in text(tables, order):
+        say(line)
+    asked, planned = rows["question"].nunique(), len(study.questions)
+    hopeless = sum(not one["item"] for one in study.answered.values())
+    say(f"{asked} questions of {planned}; of {hopeless} the sensors cannot show what is hidden")
+    say(f"written: {study.folder}/ with {ITEMS}, {', '.join(f'{n}.csv' for n in tables)}")
+    say(f"figures: {', '.join(sorted(path.name for path in drawn if path.suffix == '.png'))}")
+    failed = rows[rows["status"] != "done"]
+    for _, row in failed.head(_FEW).iterrows():
+        say(f"{row['status']}: {row['diagnoser']} on {row['question']}: {row['reason']}")
+    if len(failed) > _FEW:
+        say(f"({len(failed)} answers failed; see {ITEMS})")
+    return len(failed)
+
+
+_FEW = 5
+"""Failures that are said."""
+
+
+def csv(frame: pd.DataFrame) -> str:
+    """A frame as the text of a file."""
+    text: str = frame.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    return text
+
+
+def draw(
+    study: Asked, rows: pd.DataFrame, tables: dict[str, pd.DataFrame], order: Sequence[str]
+) -> list[Path]:
+    """Every figure that there is something to draw of."""
+    experiment = study.configuration.experiment
+    title = experiment.title or experiment.name
+    made = {}
+    counted = (by_diagnoser(tables["table"], what) for what in ("false alarms", "named, alone"))
+    if all(any(line["of"] for line in lines.values()) for lines in counted):
+        made["board"] = figures.board(tables["table"], order, title)
+        made["outcomes"] = figures.outcomes(singles(rows), order, title)
+        made["cost"] = figures.cost(tables["costs"], tables["table"], order, title)
+    if not tables["power"].empty:
+        made["power"] = figures.power(tables["power"], order, title)
+    if not tables["calibration"].empty:
+        made["calibration"] = figures.calibration(tables["calibration"], order, title)
+    drawn = []
+    for name, figure in made.items():
+        drawn += save(mark(figure, experiment.trusted), study.folder / "figures" / name)
+    return drawn
+
+
+def text(tables: dict[str, pd.DataFrame], order: Sequence[str]) -> list[str]:
+    """The board as lines: alarms, naming, pairs, foreign causes, cost."""
+    columns = (
+        ("false alarms", "false alarms"),
+        ("named, alone", "named alone"),
+        ("the same, up to equivalence", "in a set of 2"),
+        ("pairs: both named", "both of two"),
+        ("foreign causes: unknown or partial", "foreign"),
+    )
+    held = {metric: by_diagnoser(tables["table"], metric) for metric, _ in columns}
+    costs = by_diagnoser(tables["costs"])
+    head = ["diagnoser", *(says for _, says in columns), "simulations", "seconds"]
+    lines = [head]
+    for name in order:
+        cells = [name]
+        for metric, _ in columns:
+            line = held[metric][name]
+            ends = f"{100 * line['low']:.0f}-{100 * line['high']:.0f}"
+            cells.append(f"{100 * line['share']:.0f} % ({ends})" if line["of"] else "-")
+        cost = costs[name]
+        cells += [f"{cost['simulations_median']:.0f}", f"{cost['processor_seconds_median']:.2f}"]
+        lines.append(cells)
+    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    padded = [[c.ljust(w) for c, w in zip(line, widths, strict=True)] for line in lines]
+    return ["  ".join(cells).rstrip() for cells in padded]

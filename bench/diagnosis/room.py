@@ -1,0 +1,251 @@
+"""One question asked of several diagnosers, each in a process of its own; runs in a worker.
+
+The worker draws the question and writes its recording; a diagnoser's process gets the recording's
+two texts through a pipe, and nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import traceback
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from bench.diagnoser import Answer
+from bench.diagnosis import inside
+from bench.diagnosis.sheet import Question
+from bench.diagnosis.worlds.items import Item, realise
+from bench.problem.seeds import stream_of
+from bench.runs.housing import nursery, undisturbed
+from bench.sealing.children import PATIENCE, Child
+from bench.sealing.ended import EndedError
+from bench.sealing.outside import Tuned
+from bench.sealing.wire import STATE_LIMIT, FoulError, packed, unpacked
+from sims.base import Array, InputError
+
+AHEAD = "bench.diagnosis.ahead"
+"""Loaded in the process that starts diagnosers."""
+_ANSWER = 1 << 20
+"""Bytes that an answer may have."""
+BUDGET = "it asked for more simulations than are allowed"
+"""The reason of an answer that was not given for that."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one answer may cost.
+
+    Attributes:
+        simulations: of simgap's simulators.
+        seconds: by the clock.
+        memory: MiB; 0 for no limit.
+    """
+
+    simulations: int
+    seconds: float
+    memory: int = 0
+
+
+@dataclass(frozen=True)
+class Examined:
+    """A diagnoser that is to be asked.
+
+    Attributes:
+        label: in tables.
+        code: where its code is.
+        learned: files of what it has learned, by system.
+        trusted: whether it runs in this process.
+    """
+
+    label: str
+    code: Tuned
+    learned: Mapping[str, Path]
+    trusted: bool = False
+
+
+def answered(
+    question: dict[str, Any],
+    seed: int,
+    salt: str,
+    known: dict[str, Any] | None,
+    examined: Sequence[Examined],
+    limits: Limits,
+    hidden: tuple[str, ...],
+) -> dict[str, Any]:
+    """The question's item, and a row for each diagnoser, as JSON.
+
+    Args:
+        question: as JSON.
+        seed: of the public questions.
+        salt: that questions are drawn from.
+        known: the item as JSON if it was drawn before, {} if it was found not to show, None if it
+            was not drawn.
+        examined: who is asked.
+        limits: of each answer.
+        hidden: folders that no diagnoser may reach.
+    """
+    asked = Question.of(question)
+    item = asked.drawn(seed, salt) if known is None else Item.of(known) if known else None
+    if item is None:
+        return {"question": asked.name, "item": {}, "rows": []}
+    table, description = _written(item)
+    rows = []
+    for one in examined:
+        given = {
+            "wanted": {"name": one.code.name, "module": one.code.module, "file": one.code.file},
+            "table": table,
+            "description": description,
+            "system": item.system,
+            "budget": limits.simulations,
+            "seconds": limits.seconds,
+            "seed": stream_of("diagnosis", one.label, asked.name).tolist(),
+        }
+        rows.append(_row(one, given, asked.name, limits, hidden))
+    return {"question": asked.name, "item": item.json(), "rows": rows}
+
+
+def _written(item: Item) -> tuple[str, str]:
+    """The recording's table and its description, as texts."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = realise(item, folder, truth=False)
+        return path.read_text("utf-8"), path.with_suffix(".toml").read_text("utf-8")
+
+
+def _row(
+    one: Examined,
+    given: dict[str, Any],
+    question: str,
+    limits: Limits,
+    hidden: tuple[str, ...],
+) -> dict[str, Any]:
+    """How one diagnoser answered, or why it did not."""
+    row: dict[str, Any] = {"question": question, "diagnoser": one.label, "trusted": one.trusted}
+    learned = _learned(one.learned.get(given["system"]))
+    begun = perf_counter()
+    try:
+        if one.trusted:
+            said = _here(given, learned)
+        else:
+            said = undisturbed(lambda: _sealed(one.code, given, learned, limits, hidden))
+        end = {"status": "done", "reason": "", **said}
+    except EndedError as ended:
+        end = {"status": ended.status, "reason": _reason(ended.reason)}
+    nothing = {"answer": None, "simulations": 0, "processor_seconds": None, "seconds": None}
+    return {**row, **nothing, "seconds": perf_counter() - begun, **end}
+
+
+def _reason(text: str) -> str:
+    return f"{BUDGET}\n{text}" if "sims.tally.SpentError" in text else text
+
+
+def _here(given: dict[str, Any], learned: Mapping[str, Array]) -> dict[str, Any]:
+    """The answer of a diagnoser that is trusted."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            return inside.asked(given, Path(folder), learned)
+        except Exception:
+            traceback.print_exc()
+            raise EndedError("crashed", traceback.format_exc()) from None
+
+
+def _sealed(
+    code: Tuned,
+    given: dict[str, Any],
+    learned: Mapping[str, Array],
+    limits: Limits,
+    hidden: tuple[str, ...],
+) -> dict[str, Any]:
+    """The answer of a diagnoser in a process of its own, checked."""
+    child = _started(code, limits.memory, hidden)
+    try:
+        if learned:
+            deadline = perf_counter() + PATIENCE
+            child.send(b"L", *packed(learned), deadline=deadline)
+            child.receive(deadline=deadline)
+        begun = perf_counter()
+        deadline = begun + limits.seconds
+        child.send(b"Q", json.dumps(given).encode(), deadline=deadline)
+        message = child.receive(_ANSWER, deadline)
+        seconds = perf_counter() - begun
+        try:
+            if message.kind != b"A":
+                raise FoulError("it gave no answer")
+            said = _checked(message.document(_ANSWER), limits)
+        except (FoulError, InputError, KeyError, TypeError, ValueError) as error:
+            raise child.foul(f"{error}"[:500]) from None
+        return {**said, "seconds": seconds}
+    finally:
+        child.end()
+
+
+def _checked(said: Any, limits: Limits) -> dict[str, Any]:
+    """What a diagnoser's process said, no more believed than it must be."""
+    simulations, seconds = int(said["simulations"]), float(said["processor_seconds"])
+    if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
+        raise FoulError("it said what it cannot have used")
+    answer = Answer.of(said["answer"]).document()
+    return {"answer": answer, "simulations": simulations, "processor_seconds": seconds}
+
+
+def _started(code: Tuned, memory: int, hidden: tuple[str, ...]) -> Child:
+    house = nursery()
+    own = code.module.startswith("bench.")
+    house.load([AHEAD, *code.modules, *([code.module] if own and not code.file else [])])
+    files = [code.file] if code.file else []
+    child = house.start("bench.diagnosis.inside:serve", files, memory, hidden)
+    try:
+        child.ready()
+    except BaseException:
+        child.end()
+        raise
+    return child
+
+
+def _learned(path: Path | None) -> dict[str, Array]:
+    """Arrays that were learned; none where there is no file."""
+    if path is None:
+        return {}
+    with np.load(path, allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+def taught(
+    code: Tuned, lesson: dict[str, Any], seconds: float, hidden: tuple[str, ...], trusted: bool
+) -> tuple[dict[str, Array], int, float]:
+    """What a diagnoser learns for a system; the simulations and seconds that it took.
+
+    Args:
+        code: where its code is.
+        lesson: ``wanted``, ``system``, ``budget``, ``seed``.
+        seconds: that it may take.
+        hidden: folders that it may not reach.
+        trusted: whether it runs in this process.
+
+    Raises:
+        EndedError: it failed.
+    """
+    begun = perf_counter()
+    if trusted:
+        arrays, used = inside.taught(lesson)
+        return dict(arrays), used, perf_counter() - begun
+    child = _started(code, 0, hidden)
+    try:
+        deadline = begun + seconds
+        child.send(b"F", json.dumps(lesson).encode(), deadline=deadline)
+        message = child.receive(STATE_LIMIT, deadline)
+        try:
+            if message.kind != b"L":
+                raise FoulError("it learned nothing")
+            learned = unpacked(message.body)
+            used = int(learned.pop("simulations")[0])
+        except (FoulError, KeyError, ValueError) as error:
+            raise child.foul(f"{error}") from None
+        return learned, used, perf_counter() - begun
+    finally:
+        child.end()

@@ -1,0 +1,68 @@
+"""A row for each answer: the question with its truth, what was said, and what that is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+
+from bench.diagnosis.kept import Answered
+from bench.diagnosis.marks import marked
+from bench.diagnosis.worlds.items import Item
+
+OF_ITEM = ("noise", "stated", "rate", "seconds", "runs", "source", "driven", "size", "beyond")
+"""What of an item stands in a row."""
+OWN_SECONDS = "run_seconds"
+"""The column of a run's length, which `seconds` of an answer would hide."""
+
+
+def rows_of(answered: Answered, diagnosers: Sequence[str]) -> pd.DataFrame:
+    """A row for each answer, in the order of diagnosers and then of questions."""
+    rows = [row for name in diagnosers for row in _of(name, answered)]
+    return pd.DataFrame(rows)
+
+
+def _of(diagnoser: str, answered: Answered) -> Iterator[dict[str, Any]]:
+    for question, one in sorted(answered.items()):
+        # Not drawn, or lost before it was.
+        if "effects" not in one["item"] or diagnoser not in one["rows"]:
+            continue
+        yield row(question, Item.of(one["item"]), one["rows"][diagnoser])
+
+
+def row(question: str, item: Item, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of one answer."""
+    answer = given["answer"]
+    mark = marked(item, answer)
+    held = [holds for holds in mark.covered.values() if holds is not None]
+    causes = answer["causes"] if answer else []
+    about = {name: getattr(item, name) for name in OF_ITEM}
+    about[OWN_SECONDS] = about.pop("seconds")
+    return {
+        "question": question,
+        "diagnoser": given["diagnoser"],
+        "kind": item.kind,
+        "system": item.system,
+        "hidden": " + ".join(item.effects),
+        **about,
+        "channels": " ".join(item.channels),
+        "status": given["status"],
+        "reason": (given["reason"].strip().splitlines() or [""])[-1][:200],
+        "verdict": answer["verdict"] if answer else "",
+        "named": mark.named,
+        "outcome": mark.outcome,
+        "set_size": mark.set_size,
+        "class_size": mark.class_size,
+        "largest_set": max((1 + len(c["alternatives"]) for c in causes), default=0),
+        "found": mark.found,
+        "found_class": mark.found_class,
+        "alarm": answer is None or answer["verdict"] != "adequate",
+        "p_value": answer["p_value"] if answer else None,
+        "intervals": len(held),
+        "holding": sum(held),
+        "simulations": given["simulations"],
+        "seconds": given["seconds"],
+        "processor_seconds": given["processor_seconds"],
+        "trusted": given["trusted"],
+    }

@@ -1,0 +1,371 @@
+"""A comparison of diagnosers in its folder: questions are drawn, every diagnoser is asked each, and
+all that is said is kept and marked.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from bench.diagnosis.kept import Answered, Kept, read
+from bench.diagnosis.learning import Learned, learn
+from bench.diagnosis.lessons import Taught, write_lessons
+from bench.diagnosis.room import Examined, Limits, answered
+from bench.diagnosis.settings import Settings, settings_of
+from bench.diagnosis.sheet import Question, sheet
+from bench.problem.experiment import Experiment
+from bench.problem.salt import PUBLIC
+from bench.problem.seeds import rng_for
+from bench.registry import SkippedError, diagnosers
+from bench.runs.housing import ahead_of, seals
+from bench.runs.identity import refuse_changes
+from bench.runs.pools import Call, LostError, Pool, pool_of
+from bench.runs.runner import Progress, silent
+from bench.runs.sources import digest, plugin_files, rooms, source, versions
+from bench.runs.survey import admit, enter, foreign, installed
+from bench.runs.training import folder as trained
+from bench.sealing.ended import EndedError
+from bench.sealing.kernel import memory_hidden
+from bench.sealing.outside import Tuned
+from bench.store.folder import Configuration, configuration, create, free_folder
+from bench.store.secret import kept as kept_salt
+from bench.store.secret import reveal, salted
+from bench.store.standing import MISSING, End, Made, Standing
+from sims.base import InputError
+
+Say = Callable[[str], None]
+ROOMS = ("sims", "bench/problem", "bench/runs", "bench/sealing", "bench/gap", "bench/recordings")
+"""Folders whose code makes answers, beside those of diagnosis itself."""
+OWN = (*ROOMS, "bench/diagnosis/worlds", "bench/diagnosers")
+LONGEST_LESSON = 3600.0
+"""Seconds that a diagnoser may learn for a system."""
+_DRAWING = 300.0
+"""Seconds that a question may take to be drawn."""
+
+
+class DiagnosisStudy:
+    """Questions x diagnosers, kept in a folder; fulfils `bench.study.Study`.
+
+    Args:
+        folder: of such a comparison.
+
+    Attributes:
+        folder: where everything lies.
+        configuration: what it is for.
+        plugins: plugin files that its diagnosers need.
+
+    Raises:
+        InputError: it is no such folder, or it is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.configuration = configuration(folder)
+        self.plugins = self.configuration.plugins
+        self._kept: Kept | None = None
+
+    @classmethod
+    def begin(
+        cls,
+        experiment: Experiment,
+        plugins: Sequence[str] = (),
+        folder: Path | None = None,
+        jobs: int = 2,
+        salt: str | None = None,
+    ) -> DiagnosisStudy:
+        """A comparison in a new folder; nothing has been asked yet; see `bench.study.Study`."""
+        settings = settings_of(experiment)
+        place = free_folder(experiment, folder)
+        experiment, secret = salted(experiment, salt)
+        # Nothing is out of reach of what works in this process.
+        experiment = experiment.chosen(trusted=experiment.trusted or not jobs)
+        sheet(settings)
+        for name in settings.diagnosers:
+            _announced(name, experiment.trusted)
+        hashes = _fingerprint(experiment, plugins)
+        held = () if experiment.trusted else seals()
+        create(place, Configuration(experiment, list(plugins), hashes), jobs, secret, held)
+        return cls(place)
+
+    @classmethod
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> DiagnosisStudy:
+        """A comparison that was interrupted; see `bench.study.Study.resume`."""
+        study = cls(folder)
+        held = study.configuration
+        given = {str(Path(p).resolve()) for p in plugins}
+        study.plugins = held.plugins + sorted(given - set(held.plugins))
+        admit(study.plugins, held.experiment)
+        for name in study.settings.diagnosers:
+            _announced(name, held.experiment.trusted)
+        refuse_changes(folder, held.fingerprint, _fingerprint(held.experiment, study.plugins))
+        return study
+
+    @cached_property
+    def settings(self) -> Settings:
+        """The [diagnosis] table."""
+        return settings_of(self.configuration.experiment)
+
+    @cached_property
+    def questions(self) -> list[Question]:
+        """The sheet."""
+        return sheet(self.settings)
+
+    @cached_property
+    def skipped(self) -> dict[str, str]:
+        """Diagnosers that cannot be used here, by name, and why."""
+        reasons = {}
+        for name in self.settings.diagnosers:
+            try:
+                diagnosers.get(name)
+            except SkippedError as error:
+                reasons[name] = error.reason
+        return reasons
+
+    @property
+    def usable(self) -> list[str]:
+        """Diagnosers that can be used here."""
+        return [name for name in self.settings.diagnosers if name not in self.skipped]
+
+    def make(
+        self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
+    ) -> Made:
+        """Ask what has not been asked; see `bench.study.Study.make`."""
+        self._kept = Kept(self.folder)
+        try:
+            _Asking(self, self._kept, progress or silent).run(jobs, pool)
+        except KeyboardInterrupt:
+            return self._made(interrupted=True)
+        except LostError as error:
+            return self._made(stopped=str(error))
+        finally:
+            self.close()
+        return self._made()
+
+    def _made(self, **why: Any) -> Made:
+        ends = self.status().ends
+        missing = sum(end.status == MISSING for end in ends)
+        if not missing and not why:
+            reveal(self.folder, kept_salt(self.folder, self.configuration.experiment))
+            self.configuration = configuration(self.folder)
+        return Made(len(ends) - missing, len(ends), **why)
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        if self._kept is not None:
+            self._kept.close()
+            self._kept = None
+
+    @property
+    def answered(self) -> Answered:
+        """All that was answered, by question."""
+        return read(self.folder)
+
+    def status(self) -> Standing:
+        """Which answers the folder holds and which are missing."""
+        held = self.answered
+        ends = []
+        for question in self.questions:
+            one = held.get(question.name)
+            for name in self.settings.diagnosers:
+                label = f"{question.name} {name}"
+                if name in self.skipped:
+                    ends.append(End(label, name, "skipped", self.skipped[name]))
+                elif one is not None and not one["item"]:
+                    ends.append(End(label, name, "done", "the sensors cannot show it"))
+                elif one is None or name not in one["rows"]:
+                    ends.append(End(label, name, MISSING))
+                else:
+                    row = one["rows"][name]
+                    ends.append(End(label, name, row["status"], row["reason"]))
+        configured = self.configuration
+        name = configured.experiment.name
+        return Standing(name, "answers given", configured.fingerprint, tuple(ends))
+
+    def finish(self, say: Say) -> int:
+        """Write tables and figures of what there is, and say what came out; how many answers
+        failed.
+        """
+        from bench.diagnosis.report import finish
+
+        return finish(self, say)
+
+
+class _Asking:
+    """The work on the questions that are open."""
+
+    def __init__(self, study: DiagnosisStudy, kept: Kept, progress: Progress) -> None:
+        self._study, self._kept, self._progress = study, kept, progress
+        self._experiment = study.configuration.experiment
+        self._hidden = tuple(str(place.resolve()) for place in (study.folder, trained()))
+        self._salt = kept_salt(study.folder, self._experiment) or self._experiment.salt or PUBLIC
+        self._limits = Limits(
+            self._experiment.budget, self._experiment.timeout, self._experiment.memory
+        )
+
+    def run(self, jobs: int, pool: Pool | None) -> None:
+        """Have diagnosers learn, and ask them.
+
+        Raises:
+            LostError: what makes the calls is gone.
+        """
+        open_questions = [q for q in self._mixed() if self._open(q)]
+        if not open_questions:
+            return
+        # Here are the truths, and a diagnoser's process may be this user's.
+        trusted = self._experiment.trusted
+        with nullcontext() if trusted else memory_hidden(), pool or pool_of(jobs) as workers:
+            examined, taught = self._learn(workers)
+            write_lessons(self._study.folder, taught)
+            self._ask(workers, open_questions, examined)
+
+    def _mixed(self) -> list[Question]:
+        """The questions in an order of chance: what there is at any time is a fair sample."""
+        questions = self._study.questions
+        order = rng_for("diagnosis", "order", len(questions)).permutation(len(questions))
+        return [questions[place] for place in order.tolist()]
+
+    def _open(self, question: Question) -> list[str]:
+        """Diagnosers that have not answered a question."""
+        one = self._kept.answered.get(question.name)
+        if one is not None and not one["item"]:
+            return []
+        rows = one["rows"] if one else {}
+        return [name for name in self._study.usable if name not in rows]
+
+    def _learn(self, workers: Pool) -> tuple[dict[str, Examined], list[Taught]]:
+        """Everybody who can be asked, and what learning cost."""
+        trusted = self._experiment.trusted
+        systems = sorted({question.system for question in self._study.questions})
+        codes = {name: code_of(name) for name in self._study.usable}
+        learned = [name for name in codes if diagnosers.get(name).learned]
+        pairs = [(name, system) for name in learned for system in systems]
+        budget = self._experiment.training_budget
+        calls: list[Call] = [
+            (
+                learn,
+                (
+                    codes[name],
+                    source(diagnosers.get(name)),
+                    system,
+                    budget,
+                    LONGEST_LESSON,
+                    self._hidden,
+                    trusted,
+                ),
+            )
+            for name, system in pairs
+        ]
+        files: dict[str, dict[str, Path]] = {name: {} for name in codes}
+        taught = []
+        step = self._progress("training", len(calls)) if calls else None
+        for place, result in workers.results(calls, math.inf) if calls else ():
+            name, system = pairs[place]
+            if isinstance(result, Learned):
+                files[name][system] = result.path
+                taught.append(Taught(name, system, result.simulations, result.seconds))
+            elif isinstance(result, EndedError | TimeoutError):
+                # It is asked all the same, and says for itself what it lacks.
+                taught.append(Taught(name, system, 0, 0.0, str(result)))
+            else:
+                raise result
+            if step:
+                step()
+        examined = {n: Examined(n, code, files[n], trusted) for n, code in codes.items()}
+        return examined, taught
+
+    def _ask(
+        self, workers: Pool, questions: Sequence[Question], examined: dict[str, Examined]
+    ) -> None:
+        calls: list[Call] = []
+        for question in questions:
+            one = self._kept.answered.get(question.name)
+            asked = [examined[name] for name in self._open(question)]
+            known = one["item"] if one else None
+            given = (question.json(), self._study.settings.seed, self._salt, known, asked)
+            calls.append((answered, (*given, self._limits, self._hidden)))
+        step = self._progress("asking", len(calls))
+        longest = _DRAWING + len(examined) * (self._limits.seconds + _DRAWING)
+        for place, result in workers.results(calls, longest):
+            if isinstance(result, BaseException):
+                result = _lost(questions[place], [one.label for one in calls[place][1][4]], result)
+            self._kept.add(result)
+            step()
+
+
+def _lost(question: Question, labels: Sequence[str], error: BaseException) -> dict[str, Any]:
+    """The answers to a question whose worker died or took too long: none was given."""
+    if isinstance(error, InputError):
+        raise error
+    status = "timeout" if isinstance(error, TimeoutError) else "crashed"
+    rows = [
+        {
+            "question": question.name,
+            "diagnoser": label,
+            "status": status,
+            "reason": str(error),
+            "answer": None,
+            "simulations": 0,
+            "processor_seconds": None,
+            "seconds": None,
+            "trusted": False,
+        }
+        for label in labels
+    ]
+    return {"question": question.name, "item": {"name": question.name}, "rows": rows}
+
+
+def code_of(name: str) -> Tuned:
+    """Where a diagnoser's code is, and what may be loaded ahead of it."""
+    kind, place = diagnosers.get(name), diagnosers.place(name)
+    module = getattr(kind, "module", "") or kind.__module__
+    file = str(place) if place else ""
+    own = importlib.util.find_spec(module) if module.startswith("bench.") else None
+    # Packages that are imported where they are needed would be imported anew for each answer.
+    ahead = ahead_of(file or (own.origin or "" if own else "")) if file or own else ()
+    return Tuned(name, module, file, {}, ahead)
+
+
+def _announced(name: str, trusted: bool) -> None:
+    """Find out about a diagnoser of another package before anybody imports it here.
+
+    Raises:
+        InputError: there is none of this name, or its code is in this process already.
+    """
+    if not trusted and foreign(name, diagnosers):
+        try:
+            enter([installed(name, "diagnoser")])
+        except SkippedError:
+            return
+    try:
+        kind = diagnosers.get(name)
+    except SkippedError:
+        return
+    added = diagnosers.snapshot().get(name)
+    if not trusted and added is not None:
+        raise InputError(
+            f"diagnoser {name}: class {kind.__qualname__} is in this process, where the truths "
+            "are: put it into a plugin file, or trust the diagnosers (--trust)"
+        )
+
+
+def _fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
+    """Hashes of what must not change while it is made, by what a person would call it."""
+    public = experiment.chosen(salt="") if experiment.salt_sha256 else experiment
+    sources = []
+    for name in settings_of(experiment).diagnosers:
+        try:
+            sources.append(source(diagnosers.get(name)))
+        except SkippedError:
+            sources.append("skipped")
+    return {
+        "configuration": digest(experiment.name, public.document()),
+        "plugins": plugin_files(plugins),
+        "code": rooms(OWN),
+        "package versions": versions(),
+        "diagnosers": digest(sources),
+    }

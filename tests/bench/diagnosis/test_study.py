@@ -1,0 +1,186 @@
+"""A comparison of diagnosers: plugins in it, what misbehaves, what is kept."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from bench.cli import main
+from bench.diagnosis.kept import ANSWERS, Kept, read
+from bench.diagnosis.settings import settings_of
+from bench.diagnosis.sheet import Question, sheet
+from bench.diagnosis.worlds.settings import ANY, Circumstances
+from bench.problem.experiment import load
+from sims.base import InputError
+
+PLUGIN = Path(__file__).with_name("plugin.py")
+TOML = """
+budget = 60
+timeout = 4.0
+salt = "public"
+[diagnosis]
+diagnosers = [{diagnosers}]
+[[diagnosis.questions]]
+kind = "clean"
+systems = ["slider"]
+[[diagnosis.questions]]
+kind = "single"
+systems = ["slider"]
+effects = ["drag.linear"]
+sizes = [8.0]
+rates = [50]
+runs = [3]
+"""
+MISBEHAVING = ("peeks", "hangs", "crashes", "spends", "lies")
+
+
+def written(folder, *diagnosers, more=""):
+    path = folder / "tiny.toml"
+    names = ", ".join(f'"{name}"' for name in diagnosers)
+    path.write_text(TOML.format(diagnosers=names) + more)
+    return path
+
+
+def items(folder):
+    with (folder / "items.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("diagnosis")
+    path = written(folder, "fifteen", *MISBEHAVING)
+    out = folder / "out"
+    knowing = folder / "knowing.py"
+    knowing.write_text(PLUGIN.read_text().replace('WHERE = "/tmp"', f"WHERE = {str(out)!r}"))
+    code = main(["compare", str(path), "--plugin", str(knowing), "--out", str(out), "--jobs", "1"])
+    return code, out
+
+
+def test_a_short_one_from_outside_is_in_the_table(made):
+    _, out = made
+    own = [row for row in items(out) if row["diagnoser"] == "fifteen"]
+    assert [row["status"] for row in own] == ["done", "done"]
+    assert all(0 < int(row["simulations"]) <= 6 for row in own)
+    with (out / "table.csv").open() as file:
+        lines = {(row["diagnoser"], row["metric"]): row for row in csv.DictReader(file)}
+    assert lines["fifteen", "false alarms"]["of"] == "1"
+    assert lines["fifteen", "named, alone"]["of"] == "1"
+
+
+def test_one_that_looks_for_the_truth_finds_none(made):
+    _, out = made
+    peeks = [row for row in items(out) if row["diagnoser"] == "peeks"]
+    assert {(row["status"], row["verdict"]) for row in peeks} == {("done", "adequate")}
+
+
+def test_it_would_find_it_if_it_were_trusted(made, tmp_path):
+    _, out = made
+    path, knowing = written(tmp_path, "peeks"), out.parent / "knowing.py"
+    given = ["--plugin", str(knowing), "--out", str(tmp_path / "out"), "--jobs", "0"]
+    assert main(["compare", str(path), *given]) == 0
+    rows = items(tmp_path / "out")
+    assert {(row["verdict"], row["trusted"]) for row in rows} == {("unknown", "True")}
+
+
+def test_what_fails_costs_itself_and_stays_in_the_table(made):
+    code, out = made
+    assert code == 1
+    rows = {row["diagnoser"]: row for row in items(out) if row["kind"] == "single"}
+    assert rows["hangs"]["status"] == "timeout"
+    assert rows["crashes"]["status"] == "crashed"
+    assert rows["crashes"]["reason"] == "RuntimeError: no idea"
+    assert "simulations asked for, 60 are allowed" in rows["spends"]["reason"]
+    assert "cannot have used" in rows["lies"]["reason"]
+    assert {rows[name]["outcome"] for name in ("hangs", "crashes", "spends", "lies")} == {"failed"}
+    clean = {row["diagnoser"]: row for row in items(out) if row["kind"] == "clean"}
+    assert clean["hangs"]["alarm"] == "True"  # no answer is none that one could rely on
+
+
+def test_it_goes_on_where_it_was(made, tmp_path, capsys):
+    path = written(tmp_path, "fifteen")
+    out = tmp_path / "out"
+    given = ["--plugin", str(PLUGIN), "--jobs", "1"]
+    assert main(["compare", str(path), "--out", str(out), *given]) == 0
+    lines = (out / ANSWERS).read_text().splitlines(keepends=True)
+    (out / ANSWERS).write_text(lines[0] + lines[1][:40])  # as if it had been killed
+    capsys.readouterr()
+    assert main(["status", str(out)]) == 1
+    assert "1 of 2 answers given" in capsys.readouterr().out
+    assert main(["compare", "--resume", str(out), "--jobs", "1"]) == 0
+    assert set(read(out)) == {"clean/slider/0", "single/slider/drag.linear/8/50/3/0"}
+    first = json.loads(lines[0])
+    again = read(out)[first["question"]]["rows"]["fifteen"]
+    assert again == first["rows"][0]  # and was not asked again
+    assert main(["plot", str(out)]) == 0
+
+
+def test_a_secret_is_kept_until_the_end_and_draws_other_questions(tmp_path):
+    path = written(tmp_path, "fifteen")
+    path.write_text(path.read_text().replace('salt = "public"\n', ""))
+    out, public = tmp_path / "out", load(str(written(tmp_path, "fifteen")))
+    path.write_text(path.read_text().replace('salt = "public"\n', ""))
+    secret = ["--secret", "nobody knows", "--plugin", str(PLUGIN), "--jobs", "1"]
+    assert main(["compare", str(path), "--out", str(out), *secret]) == 0
+    configuration = (out / "experiment.toml").read_text()
+    assert "nobody knows" in configuration  # revealed, as nothing is left to ask
+    names = {one["item"]["name"] for one in read(out).values()}
+    drawn = {q.drawn(0).name for q in sheet(settings_of(public))}
+    assert not names & drawn
+
+
+def test_a_seed_says_nothing_of_the_salt():
+    question = Question("clean", "slider", None, None, ANY, 0)
+    public, secret = (question.drawn(3, salt) for salt in ("public", "a"))
+    assert public.name == "clean-slider-3000"
+    assert secret.seed == question.drawn(9, "a").seed
+    assert secret.seed not in (public.seed, question.drawn(3, "b").seed)
+
+
+def test_circumstances_are_as_asked():
+    asked = Circumstances(50, 3, "ar1")
+    item = Question("clean", "pendulum", None, None, asked, 0).drawn(0)
+    assert (item.rate, item.runs, item.noise) == (50, 3, "ar1")
+    assert type(item).of(json.loads(json.dumps(item.json()))) == item
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ('[[diagnosis.questions]]\nkind = "strange"', "unknown kind 'strange'"),
+        ('[[diagnosis.questions]]\nkind = "clean"\nsystems = ["boat"]', "unknown system 'boat'"),
+        ('[[diagnosis.questions]]\nkind = "single"\nsizes = [-1.0]', "sizes: expected above 0"),
+        ('[[diagnosis.questions]]\nkind = "clean"\neffects = ["wind"]', "no effects are named"),
+        ('[[diagnosis.questions]]\nkind = "clean"\nhow = 3', "unknown entry"),
+        ('[[diagnosis.questions]]\nkind = "clean"\ncount = 0', "count: expected 1 to"),
+    ],
+)
+def test_a_fault_in_the_table_is_one_line(tmp_path, capsys, more, says):
+    path = written(tmp_path, "simgap", more=more)
+    assert main(["compare", str(path), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_diagnoser_is_refused(tmp_path, capsys):
+    path = written(tmp_path, "oracle")
+    assert main(["compare", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert "unknown diagnoser 'oracle'; there are: classifier" in capsys.readouterr().err
+
+
+def test_two_at_a_time_are_refused(tmp_path):
+    held = Kept(tmp_path)
+    with pytest.raises(InputError, match="another simgap is at work there"):
+        Kept(tmp_path)
+    held.close()
+    Kept(tmp_path).close()
+
+
+def test_the_shipped_sheets_are_as_large_as_they_say():
+    small, full = (sheet(settings_of(load(f"diagnosis-{name}"))) for name in ("small", "full"))
+    assert len({q.name for q in small}) == len(small) == 56
+    assert len({q.name for q in full}) == len(full) == 654
+    assert {q.kind for q in small} == {"clean", "single", "double", "foreign"}
