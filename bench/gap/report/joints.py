@@ -13,7 +13,7 @@ import numpy as np
 from bench.figures.style import BAND, BLUE, INK, SOFT, ZERO, blank
 from bench.gap.report.panels import AFTER, BEFORE, changed, label
 from bench.gap.report.places import marks
-from bench.gap.report.shots import Shot, kept
+from bench.gap.report.shots import MOST_OUTLINES, Shot, kept
 from bench.gap.report.story import Story
 from bench.gap.report.words import FAMILY, clean, number
 from sims.base import Array
@@ -160,6 +160,7 @@ def _motion(panel: Axes, story: Story, shot: Shot, row: Row, found: bool) -> Non
         markeredgewidth=0,
         label="measured",
         zorder=1,
+        rasterized=rows.size > MOST_OUTLINES,
     )
     tuned = "simulated before (tuned)" if changed(story) else "simulated (tuned)"
     panel.plot(t, before, label=tuned, zorder=3, **BEFORE)
@@ -199,6 +200,7 @@ def _residual(panel: Axes, story: Story, shot: Shot, c: int) -> None:
         look = {**BEFORE, "linewidth": 1.0, "zorder": 3}
         if which == "after":
             look = {**AFTER, "linewidth": 0.8, "zorder": 2}
+        look["rasterized"] = rows.size > MOST_OUTLINES
         panel.plot(times[rows], left[rows], **look)
     sizes = [number(_size(story, shot, c, which), 2) for which in whiches]
     panel.text(

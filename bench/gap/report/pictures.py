@@ -34,7 +34,7 @@ from bench.gap.report.panels import (
 )
 from bench.gap.report.places import has_places, marks
 from bench.gap.report.ranking import entries, ranked
-from bench.gap.report.shots import Shot, kept, worst
+from bench.gap.report.shots import MOST_OUTLINES, Shot, kept, worst
 from bench.gap.report.story import Story
 from sims.base import InputError, unknown
 
@@ -181,6 +181,8 @@ def _signal(above: Axes, below: Axes, story: Story, shot: Shot, c: int) -> None:
 
     size = 3.6 if rows.size < 250 else 2.6
     marks: dict[str, Any] = {"color": "black", "markersize": size, "markeredgewidth": 0}
+    # Thousands of outlines would be most of a page.
+    marks["rasterized"] = rows.size > MOST_OUTLINES
     above.plot(t, measured, "o", label="measured", zorder=4, **marks)
     tuned = "simulated before (tuned)" if changed(story) else "simulated (tuned)"
     above.plot(t, before, label=tuned, zorder=3, **BEFORE)

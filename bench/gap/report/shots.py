@@ -15,6 +15,8 @@ from sims.base import Array
 
 MOST_POINTS = 3000
 """Samples of a run that are drawn; of a longer one the extremes of each part are."""
+MOST_OUTLINES = 1000
+"""Dots that are drawn as outlines; more are pixels, in vector files too."""
 MOST_CHANNELS = 3
 """Channels of the run that are shown, the worst."""
 

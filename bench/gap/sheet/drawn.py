@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-DPI = 130
-"""Dots an inch of a picture."""
 A4 = (8.27, 11.69)
 """Inches."""
 _MARGIN = 0.06
@@ -42,12 +40,12 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-def picture(diagram: Diagram) -> bytes:
-    """The diagram as PNG."""
+def picture(diagram: Diagram) -> tuple[bytes, bytes]:
+    """The diagram as SVG and PDF."""
     with _styled():
         figure, axes = style.blank(1, 1, (5.4, 4.6))
         draw(axes[0, 0], diagram)
-        return style.png(figure, DPI)
+        return style.svg(figure), style.pdf(figure)
 
 
 def draw(axes: Axes, diagram: Diagram) -> None:

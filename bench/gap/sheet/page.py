@@ -1,12 +1,14 @@
-"""The page of a data sheet: one file, readable without a network or scripts, in print too."""
+"""The page of a data sheet: one file without a network, readable without scripts, in print too."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from html import escape
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bench.gap.report.words import (
+    clean,
     estimated,
     joined,
     number,
@@ -18,9 +20,15 @@ from bench.gap.sheet.facts import Facts
 from bench.gap.sheet.mjcf import CLASS, Made
 from bench.gap.sheet.quantity import Quantity
 from bench.gap.sheet.words import TITLES, another, beside, called, evidence, reached
-from bench.pages.elements import code, figure, heading, listed, paragraph, safe, table
+from bench.pages.chart import Static
+from bench.pages.elements import code, listed, paragraph, safe, table
+from bench.pages.page import Page
 
-_STYLE = Path(__file__).parents[1] / "report" / "page.css"
+if TYPE_CHECKING:
+    import pandas as pd
+
+DIAGRAM = "diagram"
+"""Name of the figure, and of the table with its numbers."""
 HEADS = ("", "quantity", "-value (95 %)", "-in another run", "-the file says", "evidence")
 """Of the table of what is shown."""
 _REACH = (
@@ -31,25 +39,36 @@ _REACH = (
 )
 
 
-def page(sheet: Facts, diagram: Diagram, drawn: bytes, made: Made) -> str:
-    """The page as HTML, with the diagram as it is drawn (PNG)."""
-    parts = [*_head(sheet), *_found(sheet), *_diagram(diagram, drawn), *_absent(sheet)]
-    return "\n".join([*parts, *_class(made), *_foot(sheet)])
+def page(sheet: Facts, diagram: Diagram, drawn: tuple[bytes, bytes], made: Made) -> str:
+    """The page as HTML, with the diagram as it is drawn (SVG and PDF)."""
+    built = Page(f"Data sheet: {clean(sheet.name, 80)}", _foot(sheet))
+    built.table(DIAGRAM, _numbers(diagram))
+    built.add(*_head(sheet))
+    built.section("shown", "What these data show", *_found(sheet))
+    built.section(
+        "drive", "Drive and back-drive", *_diagram(built, diagram, Static(*drawn, "", DIAGRAM))
+    )
+    built.section("absent", "Not shown by these data", *_absent(sheet))
+    built.section("mujoco", "For MuJoCo", *_class(made))
+    return built.html()
+
+
+def _numbers(diagram: Diagram) -> pd.DataFrame:
+    """The curves of the diagram."""
+    import pandas as pd
+
+    columns = {"load": diagram.load, "moves_forward": diagram.forward, "moves_back": diagram.back}
+    return pd.DataFrame(columns)
 
 
 def _head(sheet: Facts) -> Iterator[str]:
-    yield '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">'
-    yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
-    yield f"<title>Data sheet: {safe(sheet.name, 80)}</title>"
-    yield f"<style>\n{_STYLE.read_text(encoding='utf-8')}</style>\n</head>\n<body>\n<main>"
     title = sheet.recording.title or sheet.recording.path.stem
-    yield "<header>\n" + paragraph(safe(title), "recording")
+    yield "<header>\n" + paragraph(safe(title), "soft")
     yield f"<h1>{safe(sheet.name, 80)}</h1>"
     yield paragraph(safe(sentence(sheet.verdict.says)), "lead") + "\n</header>"
 
 
 def _found(sheet: Facts) -> Iterator[str]:
-    yield heading("What these data show")
     rows, marks = [], []
     for row in sheet.rows:
         if row.number is None:
@@ -68,8 +87,7 @@ def _found(sheet: Facts) -> Iterator[str]:
     yield table(HEADS, rows, marks)
 
 
-def _diagram(diagram: Diagram, drawn: bytes) -> Iterator[str]:
-    yield heading("Drive and back-drive")
+def _diagram(built: Page, diagram: Diagram, drawn: Static) -> Iterator[str]:
     starts = with_unit(number(diagram.breakaway), diagram.unit)
     said = f"At rest it starts without a load at {starts}; "
     if diagram.backdrive < float("inf"):
@@ -84,7 +102,8 @@ def _diagram(diagram: Diagram, drawn: bytes) -> Iterator[str]:
     if diagram.without:
         said += f" Not in it, with a state of its own: {', '.join(diagram.without)}."
     yield paragraph(safe(said))
-    yield f'<div style="max-width:34rem">{figure(drawn, safe(said), caption)}</div>'
+    shown = built.picture(DIAGRAM, replace(drawn, alternative=said), caption, [DIAGRAM])
+    yield f'<div style="max-width:34rem">{shown}</div>'
 
 
 def _absent(sheet: Facts) -> Iterator[str]:
@@ -99,7 +118,6 @@ def _absent(sheet: Facts) -> Iterator[str]:
         for row in sheet.rows
         if row.number is None
     ]
-    yield heading("Not shown by these data")
     yield paragraph(_REACH, "soft")
     yield table(["", "quantity", "-these data resolve", "-the file says", "mixed up with"], rows)
 
@@ -111,22 +129,20 @@ def _stated(row: Quantity) -> str:
 def _class(made: Made) -> Iterator[str]:
     """The class, and what MJCF cannot say."""
     if CLASS in made.contents:
-        yield heading("For MuJoCo")
         said = f"{code(CLASS)} holds it as a default class: include the file, and give the joint "
         yield paragraph(said + "and its actuator the class.")
-        yield f"<pre>{escape(made.contents[CLASS])}</pre>"
+        yield f'<pre class="copied" tabindex="0">{escape(made.contents[CLASS])}</pre>'
     if made.said:
         yield listed(safe(line) for line in made.said)
 
 
-def _foot(sheet: Facts) -> Iterator[str]:
+def _foot(sheet: Facts) -> str:
     elsewhere = list(sheet.elsewhere())
     runs = [run.name for run in sheet.recording.training()]
     said = f"From {safe(_few(runs), 300)} of {code(safe(sheet.recording.path.name, 200))}."
     if elsewhere:
         said += f" The model has besides, elsewhere: {safe(joined(elsewhere), 400)}."
-    yield f'<footer class="soft">\n{paragraph(said + " Made by simgap datasheet.")}\n</footer>'
-    yield "</main>\n</body>\n</html>\n"
+    return said + " Made by simgap datasheet."
 
 
 def _few(runs: Sequence[str], most: int = 8) -> str:

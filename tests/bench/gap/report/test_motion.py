@@ -7,6 +7,7 @@ import pytest
 
 from bench.gap.report.motion import LEAST_ROWS, MOST_ROWS, extremes, motion, motion_chart
 from bench.gap.report.page import page
+from bench.gap.report.pictures import figure
 from bench.gap.report.story import Shown, Side
 from tests.bench.gap.stories import story
 
@@ -93,3 +94,12 @@ def test_runs_of_one_sample_and_runs_without_any_are_no_trouble():
     rows = found.frame[found.frame["run"] == side.names[1]]
     assert list(rows["t"]) == ["0", "0"]
     assert set(found.frame[found.frame["run"] == side.names[0]]["measured"]) == {""}
+
+
+def test_dots_of_a_long_run_are_pixels_in_vector_files_too():
+    dots, outlines = (
+        next(line for line in figure(told, "overview").axes[0].lines if line.get_marker() == "o")
+        for told in (long_story(1, 1), story())
+    )
+    assert dots.get_rasterized()
+    assert not outlines.get_rasterized()

@@ -5,6 +5,7 @@ from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from bench.gap.identify import Number
 from bench.gap.report.page import page
 from bench.gap.report.pictures import Printed
 from bench.gap.report.sections import errors_of
+from bench.gap.tell import Teller
 from bench.pages.elements import framed
 from bench.pages.grid import FEW
 from tests.bench.gap.report.test_account import VERDICTS
@@ -303,3 +305,24 @@ def test_what_the_recording_can_fix_comes_before_any_verdict(figures):
 
 def test_where_nobody_knows_there_is_no_word_of_it(figures):
     assert "What this recording can fix" not in Reader(page(story("named"), figures)).text
+
+
+def test_of_a_tracked_film_the_picture_of_its_track_stands_beside_the_curves(figures, tmp_path):
+    png = b"\x89PNG\r\n\x1a\n-a track"
+    html = page(story(track=png), figures)
+    found = re.search(r'src="data:image/png;base64,([^"]+)" alt="The scene of the film', html)
+    assert b64decode(found[1]) == png
+    assert "image/png" not in page(story(), figures)
+
+    def track(extra):
+        recording = SimpleNamespace(path=tmp_path / "drop.csv", extra=dict.fromkeys(extra, "px"))
+        return Teller._track(SimpleNamespace(assessor=SimpleNamespace(recording=recording)))
+
+    tracked = ("u", "v", "radius_px")
+    assert track(tracked) == b""
+    (tmp_path / "drop.png").write_bytes(png)
+    assert track(tracked) == png
+    # A picture beside another recording, and what is none, stay where they are.
+    assert track(("u", "v")) == b""
+    (tmp_path / "drop.png").write_bytes(b"<svg onload=alert(1)>")
+    assert track(tracked) == b""
