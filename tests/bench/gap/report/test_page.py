@@ -312,7 +312,7 @@ def test_of_a_tracked_film_the_picture_of_its_track_stands_beside_the_curves(fig
     html = page(story(track=png), figures)
     found = re.search(r'src="data:image/png;base64,([^"]+)" alt="The scene of the film', html)
     assert b64decode(found[1]) == png
-    assert "image/png" not in page(story(), figures)
+    assert "data:image/png" not in page(story(), figures)
 
     def track(extra):
         recording = SimpleNamespace(path=tmp_path / "drop.csv", extra=dict.fromkeys(extra, "px"))
