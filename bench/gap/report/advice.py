@@ -56,7 +56,7 @@ def _numbers(story: Story) -> Iterator[str]:
         for cause in story.verdict.causes
     ]
     trust = [safe(text, 1000) for text in told(story)]
-    yield paragraph(strong("Numbers to trust (95 % interval):"))
+    yield paragraph(strong("Which numbers to trust (95 % intervals):"))
     yield listed([*found, *trust])
 
 
