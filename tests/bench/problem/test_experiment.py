@@ -212,7 +212,7 @@ def test_what_only_describes_enters_no_name_of_a_run_or_of_weights(spring):
 
 def test_every_shipped_experiment_has_tags():
     assert {tag for name in names() for tag in load(name).tags} == {
-        "misspecified", "other-engine", "published", "quick", "real", "robot",
+        "diagnosis", "misspecified", "other-engine", "published", "quick", "real", "robot",
         "several-parameters", "video",
     }  # fmt: skip
     assert all(load(name).tags for name in names())
