@@ -88,8 +88,7 @@ class Words:
 
     def fault(self, kind: FaultKind, message: str, code: int) -> None:  # noqa: ARG002
         """One line on stderr; the traceback of what is internal says more."""
-        if kind != "internal":
-            print(f"simgap: {message}", file=sys.stderr)
+        _warn(kind, message)
 
 
 class Json:
@@ -107,8 +106,14 @@ class Json:
         print(text(answer.document))
 
     def fault(self, kind: FaultKind, message: str, code: int) -> None:
-        """Print it in the form that every command's faults have."""
+        """Print it in the form of every command; a log of stderr has its line too."""
+        _warn(kind, message)
         print(text({"error": {"kind": kind, "message": message, "code": code}}))
+
+
+def _warn(kind: FaultKind, message: str) -> None:
+    if kind != "internal":
+        print(f"simgap: {message}", file=sys.stderr)
 
 
 def text(document: Document) -> str:

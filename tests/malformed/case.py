@@ -139,6 +139,8 @@ def _judge(case: Case, heard: Heard, before: Mapping[str, bytes], after: Mapping
         raise FaultError(f"said a traceback: {heard.err}")
     if heard.code == 2:
         _judge_refusal(heard)
+        if "--json" in case.arguments:
+            _judge_document(heard)
         owned = ()
     else:
         owned = tuple(f"{HERE}/{name}" for name in case.owns)
@@ -164,6 +166,13 @@ def _judge_refusal(heard: Heard) -> None:
         raise FaultError(f"expected a printable line of simgap's, found {lines[0]!r:.2000}")
     if not 15 < len(lines[0]) < MESSAGE + 200:
         raise FaultError(f"a line of {len(lines[0])} characters: {lines[0]:.2000}")
+
+
+def _judge_document(heard: Heard) -> None:
+    """A program reads on stdout what a person reads on stderr."""
+    error = json.loads(heard.out, parse_constant=_refuse)["error"]
+    if f"simgap: {error['message']}\n" != heard.err or error["code"] != heard.code:
+        raise FaultError(f"said {error} to a program, and {heard.err!r:.2000} to a person")
 
 
 def _judge_sense(case: Case, heard: Heard) -> None:

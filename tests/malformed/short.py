@@ -13,6 +13,7 @@ from typing import Any
 from unittest.mock import patch
 
 import bench
+from bench.commands.answer import Answer
 from bench.registry import REGISTRIES
 from sims.base import InputError
 
@@ -32,9 +33,9 @@ def _nothing(*_: Any, **__: Any) -> list[Any]:
     return []
 
 
-def _closed(study: Any, *_: Any) -> int:
+def _closed(study: Any, *_: Any) -> Answer:
     study.close()
-    return 0
+    return Answer({})
 
 
 def _nobody(address: str) -> Any:
@@ -46,8 +47,8 @@ SHORT = {
     "bench.runs.cluster.ClusterPool": _nobody,
     "bench.report.tables": _cut,
     "bench.verify.tables": _cut,
-    "bench.across.Together.tables": _cut,
-    "bench.store.folder.distributions": _nothing,
+    "bench.across.Together.frames": _cut,
+    "bench.store.made.distributions": _nothing,
     "bench.gap.explain._Explainer.run": _cut,
     "bench.checks.command._isolated": _cut,
     "bench.recordings.film.write_video": _cut,
