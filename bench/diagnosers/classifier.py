@@ -286,7 +286,9 @@ def _asked(learned: Mapping[str, Array], image: Array, classes: int) -> Array:
     """(classes,) probabilities."""
     import torch
 
-    network = _network(image.shape[1], classes)
+    # weights drawn at random for a moment, and from nobody's generator
+    with torch.random.fork_rng(devices=[]):
+        network = _network(image.shape[1], classes)
     network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in learned.items()})
     network.eval()
     inputs, weights = _stacked([image])
