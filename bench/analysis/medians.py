@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.analysis.rounding import FLOOR
 from bench.analysis.table import checkpoints, interval, target_curves
 from sims.base import Array
 
-FLOOR = 1e-9
-"""Errors below this count as this: less than rounding in the observation."""
 MEDIAN_COLUMNS = ["tuner", "simulations", "median", "low", "high", "targets"]
 DISTANCE_COLUMNS = [
     "simulations",

@@ -95,8 +95,11 @@ def taught(
 
 
 def _only(simulator: str) -> str:
-    """The only experiment that comes with the project and has this simulator."""
-    fitting = [name for name in names() if load(name).simulator == simulator]
+    """The only experiment that comes with the project and has this simulator; those that compare
+    simulators besides are no usual ones.
+    """
+    shipped = [load(name) for name in names()]
+    fitting = [e.name for e in shipped if e.simulator == simulator and e.calibration is None]
     if len(fitting) == 1:
         return fitting[0]
     there = "none of the project's fits; give a TOML file"

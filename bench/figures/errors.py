@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.analysis.medians import BINS, FLOOR, bin_names, moments
+from bench.analysis.medians import BINS, bin_names, moments
+from bench.analysis.rounding import FLOOR
 from bench.analysis.statistics import Statistics
 from bench.analysis.table import checkpoints
 from bench.figures.style import SOFT, TITLES, Styles, behind_id, canvas, finish

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from bench.analysis.medians import FLOOR
+from bench.analysis.rounding import FLOOR
 from bench.problem.experiment import Experiment
 from sims.base import InputError
 from sims.files import write_all

@@ -25,6 +25,8 @@ WHITE = 3
 """So many of the best by sum of squares alone are refitted besides: far from the data, noise that
 remembers explains almost anything.
 """
+WHOLE = 2
+"""So many of those at most whose scores are no first order, where they lead."""
 PROMISING = 0.25
 """Candidates are refitted that promise at least this share of the best one's score."""
 CLOSE = 0.6
@@ -56,7 +58,7 @@ def nominated(
         most, share = PATIENT, 0.0
     # Where scores mean less they order what is tried with patience, and leave nothing out.
     everything = patient and not world.linear
-    for i in _promising(scores, most, share, everything):
+    for i in _promising(scores, most, share, everything, _apart(world, scores)):
         name = scores.effects[i]
         # The peaks of an effect are fitted apart: each may end in a minimum of its own.
         for peak, (group, scored) in enumerate(scores.peaks[i]):
@@ -69,17 +71,34 @@ def nominated(
     return _nearest(world, noise, numbered, share)
 
 
-def _promising(scores: Scores, most: int, share: float, everything: bool) -> list[int]:
+def _apart(world: World, scores: Scores) -> frozenset[int]:
+    """Places of candidates whose scores are those of whole simulations, among scores that are of
+    first order.
+    """
+    if not world.linear:
+        return frozenset()
+    named = enumerate(scores.effects)
+    return frozenset(i for i, name in named if getattr(world.effects[name], "between", ()))
+
+
+def _promising(
+    scores: Scores, most: int, share: float, everything: bool, apart: frozenset[int]
+) -> list[int]:
     """Places of the candidates to refit, the most promising first."""
     promise = scores.score - scores.chance
-    order: list[int] = np.argsort(-promise, kind="stable").tolist()
+    ranked: list[int] = np.argsort(-promise, kind="stable").tolist()
     if everything:
-        return order
-    good = [i for i in order if promise[i] >= share * promise[order[0]]]
-    good = good[:most]
-    by_squares = np.argsort(-scores.white, kind="stable")
-    besides = by_squares[:WHITE].tolist()
-    return good + [i for i in besides if i not in good]
+        return ranked
+    # Far from the data a whole change outdoes the first order of the truth: it stands beside what
+    # is nominated, and takes nothing's place.
+    order = [i for i in ranked if i not in apart]
+    good = [i for i in order if promise[i] >= share * promise[order[0]]][:most]
+    by_squares = [int(i) for i in np.argsort(-scores.white, kind="stable") if i not in apart]
+    besides = by_squares[:WHITE]
+    leading = promise[order[0]] if order else -np.inf
+    whole = [i for i in ranked if i in apart and promise[i] >= leading][:WHOLE]
+    good += [i for i in besides if i not in good]
+    return good + whole
 
 
 def _with(world: World, model: Model, name: str, c: Array) -> Start:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.analysis.medians import FLOOR
 from bench.analysis.paired import log_errors
+from bench.analysis.rounding import FLOOR
 from bench.pages.comparison.results import RANGES, Results
 from bench.pages.elements import safe, strong
 from bench.pages.text import number, percent
