@@ -335,7 +335,7 @@ def explained(_):
 def crashing(tmp_path, monkeypatch, fresh_registries):
     """An experiment with a tuner that fails, and its options; explain and pictures cost nothing."""
     monkeypatch.setattr(tune, "_explained", explained)
-    monkeypatch.setattr("bench.shot.report.draw", lambda *_: [])
+    monkeypatch.setattr("bench.shot.report.draw", lambda *_: {})
     monkeypatch.setattr("bench.shot.report.animate", lambda *_: "animation")
     path = tmp_path / "mine.toml"
     path.write_text(
