@@ -119,7 +119,11 @@ class DiagnosisStudy:
     def skipped(self) -> dict[str, str]:
         """Diagnosers that cannot be used here, by name, and why."""
         reasons = {}
+        # A plugin's is known where its file was loaded: who only reads the folder needs none.
+        known = set(diagnosers.names())
         for name in self.settings.diagnosers:
+            if name not in known:
+                continue
             try:
                 diagnosers.get(name)
             except SkippedError as error:

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from bench.cli import main
+from bench import cli
 from bench.diagnosis.kept import ANSWERS, Kept, read
 from bench.diagnosis.settings import settings_of
 from bench.diagnosis.sheet import Question, sheet
 from bench.diagnosis.worlds.settings import ANY, Circumstances
 from bench.problem.experiment import load
+from bench.registry import REGISTRIES
 from sims.base import InputError
 
 PLUGIN = Path(__file__).with_name("plugin.py")
@@ -33,6 +34,16 @@ rates = [50]
 runs = [3]
 """
 MISBEHAVING = ("peeks", "hangs", "crashes", "spends", "lies")
+
+
+def main(arguments):
+    """As in a process of its own: no plugin is known after it."""
+    before = [registry.snapshot() for registry in REGISTRIES]
+    try:
+        return cli.main(arguments)
+    finally:
+        for registry, snapshot in zip(REGISTRIES, before, strict=True):
+            registry.restore(snapshot)
 
 
 def written(folder, *diagnosers, more=""):
