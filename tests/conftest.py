@@ -74,6 +74,15 @@ def fresh_registries():
         registry.restore(snapshot)
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Comparisons of this process write their tables alone; figures and pages have tests of their
+    own.
+    """
+    monkeypatch.setattr("bench.report._drawn", lambda *_: {})
+    monkeypatch.setattr("bench.report.comparison_page", lambda _: "")
+
+
 _SECONDS = {True: 15.0, False: 0.2}
 """What a test takes, about, by whether it is marked as slow."""
 

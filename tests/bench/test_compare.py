@@ -18,6 +18,8 @@ from tests.conftest import PLUGINS
 from tests.experiments import SPRING
 from tests.plugins.chaos import STATUSES
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 SPRING_PLUGIN, CHAOS = str(PLUGINS / "spring.py"), str(PLUGINS / "chaos.py")
 MEASURED = ["tuner_seconds", "simulator_seconds", "fit_seconds", "seconds"]
 

@@ -123,6 +123,7 @@ def test_a_bounce_shot_has_tables_too(tmp_path):
     assert "<table" in run._repr_html_()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_sweep_is_several_comparisons_on_the_same_targets(experiment, tmp_path, capsys):
     experiment.write_text(tomli_w.dumps({**SETTINGS, "sweep": {"budget": [3, 5]}}))
     with pytest.raises(simgap.InputError, match=r"sweeps over values: use simgap\.sweep"):

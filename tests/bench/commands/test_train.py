@@ -17,6 +17,7 @@ from bench.runs.training import Lesson, WeightsError, key, train, trained
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING
 
+pytestmark = pytest.mark.usefixtures("undrawn")
 PLUGIN = str(PLUGINS / "spring.py")
 TUNER = {"tuner": "tunenet", "options": {"epochs": 4, "points": 30}}
 

@@ -245,7 +245,7 @@ def test_a_plugins_simulator_with_forces_is_explained(tmp_path):
     load_plugins([EXAMPLES / "puck.py"])
     path = tmp_path / "puck.csv"
     truth = Wish("puck", ["0.3"], ["drag.linear=0.15"], noise=["0.002"], initial=["v=0.2:1"])
-    write(replace(truth, runs=2, seconds=0.8, rate=25), path)
+    write(replace(truth, runs=2, seconds=0.6, rate=25), path)
     found = explained(path)
     cause = found.causes[0]
     assert "drag.linear" in (cause.effect, *cause.alternatives)
