@@ -8,10 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.store.folder import (
-    Configuration,
     configuration,
-    create,
-    free_folder,
     read,
     write_results,
 )
@@ -19,7 +16,7 @@ from bench.store.journal import Journal
 from bench.store.planned import check_plan
 from bench.store.rows import RunsFile
 from bench.store.secret import kept as kept_salt
-from bench.store.secret import reveal, salted
+from bench.store.secret import reveal
 from bench.store.segments import (
     FOLDER,
     PLAN,
@@ -78,23 +75,17 @@ class Comparison:
         """A comparison in a new folder; the plan stands, and nothing has been run; see
         `bench.study.Study.begin`.
         """
-        from bench.runs.housing import seals
+        from bench.runs.begun import begun
         from bench.runs.identity import fingerprint
         from bench.runs.runner import prepare, refuse_unreachable
 
-        place = free_folder(experiment, folder)
-        experiment, secret = salted(experiment, salt)
-        # Nothing is out of reach of what works in this process.
-        experiment = experiment.chosen(trusted=experiment.trusted or not jobs)
-        results = prepare(experiment, secret)
+        new = begun(experiment, folder, jobs, salt)
+        results = prepare(new.experiment, new.secret)
         # Before there is a folder: a fault of the user's leaves nothing behind.
         if jobs:
-            refuse_unreachable(experiment)
-        hashes = fingerprint(experiment, plugins)
-        held = () if experiment.trusted else seals()
-        create(place, Configuration(experiment, list(plugins), hashes), jobs, secret, held)
-        comparison = cls(place)
-        comparison.secret = secret
+            refuse_unreachable(new.experiment)
+        comparison = cls(new.write(plugins, fingerprint(new.experiment, plugins)))
+        comparison.secret = new.secret
         comparison._attach(results)
         return comparison
 

@@ -22,7 +22,8 @@ from bench.problem.experiment import Experiment
 from bench.problem.salt import PUBLIC
 from bench.problem.seeds import rng_for
 from bench.registry import SkippedError, diagnosers
-from bench.runs.housing import ahead_of, seals
+from bench.runs.begun import begun
+from bench.runs.housing import ahead_of
 from bench.runs.identity import refuse_changes
 from bench.runs.pools import Call, LostError, Pool, pool_of
 from bench.runs.runner import Progress, silent
@@ -32,9 +33,9 @@ from bench.runs.training import folder as trained
 from bench.sealing.ended import EndedError
 from bench.sealing.kernel import memory_hidden
 from bench.sealing.outside import Tuned
-from bench.store.folder import Configuration, configuration, create, free_folder
+from bench.store.folder import configuration
 from bench.store.secret import kept as kept_salt
-from bench.store.secret import reveal, salted
+from bench.store.secret import reveal
 from bench.store.standing import MISSING, End, Made, Standing
 from sims.base import InputError
 
@@ -80,17 +81,11 @@ class DiagnosisStudy:
     ) -> DiagnosisStudy:
         """A comparison in a new folder; nothing has been asked yet; see `bench.study.Study`."""
         settings = settings_of(experiment)
-        place = free_folder(experiment, folder)
-        experiment, secret = salted(experiment, salt)
-        # Nothing is out of reach of what works in this process.
-        experiment = experiment.chosen(trusted=experiment.trusted or not jobs)
+        new = begun(experiment, folder, jobs, salt)
         sheet(settings)
         for name in settings.diagnosers:
-            _announced(name, experiment.trusted)
-        hashes = _fingerprint(experiment, plugins)
-        held = () if experiment.trusted else seals()
-        create(place, Configuration(experiment, list(plugins), hashes), jobs, secret, held)
-        return cls(place)
+            _announced(name, new.experiment.trusted)
+        return cls(new.write(plugins, _fingerprint(new.experiment, plugins)))
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> DiagnosisStudy:

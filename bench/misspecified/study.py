@@ -23,8 +23,8 @@ from bench.misspecified.calibration import (
     extension,
     record,
 )
-from bench.store.folder import CONFIGURATION, Configuration, configuration, create, free_folder
-from bench.store.secret import kept, reveal, salted
+from bench.store.folder import CONFIGURATION, configuration
+from bench.store.secret import kept, reveal
 from bench.store.segments import FOLDER
 from bench.store.standing import MISSING, End, Made, Standing
 
@@ -71,22 +71,16 @@ class MisspecifiedStudy:
         salt: str | None = None,
     ) -> MisspecifiedStudy:
         """A study in a new folder; nothing has been recorded yet; see `bench.study.Study.begin`."""
-        from bench.runs.housing import seals
+        from bench.runs.begun import begun
         from bench.runs.identity import fingerprint
         from bench.runs.runner import prepare, refuse_unreachable
 
-        place = free_folder(experiment, folder)
-        experiment, secret = salted(experiment, salt)
-        # Nothing is out of reach of what works in this process.
-        experiment = experiment.chosen(trusted=experiment.trusted or not jobs)
+        new = begun(experiment, folder, jobs, salt)
         # Before there is a folder: a fault of the user's leaves nothing behind.
-        prepare(before(experiment), secret)
+        prepare(before(new.experiment), new.secret)
         if jobs:
-            refuse_unreachable(experiment)
-        hashes = fingerprint(experiment, plugins)
-        held = () if experiment.trusted else seals()
-        create(place, Configuration(experiment, list(plugins), hashes), jobs, secret, held)
-        return cls(place)
+            refuse_unreachable(new.experiment)
+        return cls(new.write(plugins, fingerprint(new.experiment, plugins)))
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> MisspecifiedStudy:

@@ -11,7 +11,8 @@ from typing import Any
 
 from bench.problem.experiment import Experiment
 from bench.registry import tuners
-from bench.runs.housing import seals, tuned_of
+from bench.runs.begun import begun
+from bench.runs.housing import tuned_of
 from bench.runs.pools import Call, LostError, Pool, pool_of
 from bench.runs.runner import Progress, check, refuse_unreachable, silent
 from bench.runs.survey import admitted
@@ -24,8 +25,8 @@ from bench.shot.deal import RECORDINGS, Deal, deals, in_view, record
 from bench.shot.kept import SHOTS, keep, missing
 from bench.shot.kept import check as check_kept
 from bench.shot.settings import Settings, settings_of
-from bench.store.folder import Configuration, configuration, create, free_folder
-from bench.store.secret import kept, reveal, salted
+from bench.store.folder import configuration
+from bench.store.secret import kept, reveal
 from bench.store.standing import MISSING, End, Made, Standing
 from sims.base import InputError
 from sims.camera import packages
@@ -74,18 +75,12 @@ class BounceShotStudy:
             raise InputError(
                 f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'
             )
-        place = free_folder(experiment, folder)
-        experiment, secret = salted(experiment, salt)
-        # Nothing is out of reach of what works in this process.
-        experiment = experiment.chosen(trusted=experiment.trusted or not jobs)
+        new = begun(experiment, folder, jobs, salt)
         # Before there is a folder: a fault of the user's leaves nothing behind.
-        check(experiment)
+        check(new.experiment)
         if jobs:
-            refuse_unreachable(experiment)
-        hashes = fingerprint(experiment, plugins)
-        held = () if experiment.trusted else seals()
-        create(place, Configuration(experiment, list(plugins), hashes), jobs, secret, held)
-        return cls(place)
+            refuse_unreachable(new.experiment)
+        return cls(new.write(plugins, fingerprint(new.experiment, plugins)))
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> BounceShotStudy:

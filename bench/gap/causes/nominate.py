@@ -77,8 +77,10 @@ def _apart(world: World, scores: Scores) -> frozenset[int]:
     """
     if not world.linear:
         return frozenset()
-    named = enumerate(scores.effects)
-    return frozenset(i for i, name in named if getattr(world.effects[name], "between", ()))
+    # loaded where there is a robot alone
+    from sims.robot.series import is_series
+
+    return frozenset(i for i, name in enumerate(scores.effects) if is_series(world.effects[name]))
 
 
 def _promising(
