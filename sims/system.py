@@ -551,7 +551,7 @@ class Element:
     Attributes:
         stiffness: (L,) N/m or N m/rad of its spring; none where it is not above zero.
         damping: (L,) share of the critical one of what is carried on that spring.
-        gap: (L,) m or rad between its flanks, where it has no spring.
+        gap: (L,) m or rad between its flanks; with a spring, flanks that give.
         drive: (L,) inertia of the drive besides what is stated, as a share of the joint's.
     """
 

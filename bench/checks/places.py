@@ -194,7 +194,7 @@ def _put_in_series(effect: Hidden, c: Array, kind: type) -> tuple[object, ...]:
     model = robot.compiled
     fields = {name: np.repeat(np.array(getattr(model, name))[None], 2, 0) for name in series.FIELDS}
     before = {name: values.copy() for name, values in fields.items()}
-    series.write(fields, robot, effect, c[:, :, 0])
+    series.write(fields, robot, ((effect, c),))
     changed = [name for name, values in fields.items() if (values != before[name]).any()]
     return tuple((name, effect.place) for name in changed)
 

@@ -18,7 +18,7 @@ from sims.robot.causes import Cause, one_by_one
 from sims.robot.commands import COMMANDS, order
 from sims.robot.model import Robot
 from sims.robot.native import FIELDS
-from sims.robot.series import element, in_series, is_series, name_of, with_flanks
+from sims.robot.series import element, gives, in_series, is_series, second_of, together, with_flanks
 from sims.robot.series import state as state_element
 from sims.robot.stated import (
     ATTRIBUTES,
@@ -92,15 +92,19 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
     """
     found = one_by_one(robot, causes)
     said = []
-    if any(is_series(library.get(c.effect)) for c in found if c.effect in library.names()):
+    series = _in_series(found)
+    if series:
         said += [KEYLESS] if robot.compiled.nkey else []
-        robot = _in_series(robot, found)
+        added = tuple((c.place, c.effect) for c in found if _is_in_series(c))
+        robot = with_flanks(in_series(robot, added), series)
     wanted = fields(robot.compiled)
     comments: dict[Element, list[str]] = {}
-    held = []
-    for cause in sorted(found, key=order):
+    held: list[Cause] = []
+    # What is in series takes its part of the armatures that there are.
+    for cause in sorted(found, key=lambda c: (order(c), _is_in_series(c))):
         before = {name: values.copy() for name, values in wanted.items()}
-        answer = _write(wanted, robot, cause)
+        done = {one.place for one in held if _is_in_series(one)}
+        answer = _write(wanted, robot, cause, series if cause.place not in done else {})
         if answer and not answer.startswith("+"):
             said.append(f"{cause.told(recording)}: not in the file: {answer}")
             continue
@@ -109,24 +113,30 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
         if note and note not in said:
             said.append(note)
         changed = [one.element for one in differing(robot.compiled, before, wanted, 0.0)]
-        if name_of(cause.place, cause.effect) in robot.series:
-            second = Element("joint", robot.joint(name_of(cause.place, cause.effect)).id)
+        if _is_in_series(cause):
+            second = Element("joint", robot.joint(second_of(robot, cause.place)).id)
             changed += [] if second in changed else [second]
         for one in changed:
             comments.setdefault(one, []).append(cause.told(recording))
     spec, model = _compiled(robot, wanted)
+    if any(gives(made)[0] for made in series.values()):
+        # What a limit takes for a spring hangs on all that acts.
+        robot = with_flanks(robot, series, model)
+        spec, model = _compiled(robot, wanted)
     return Applied(robot, spec, model, wanted, comments, tuple(held), tuple(said))
 
 
-def _in_series(robot: Robot, causes: Sequence[Cause]) -> Robot:
-    """The robot with the joints that some of its causes put in series with others."""
-    there = [c for c in causes if c.effect in library.names()]
-    there = [c for c in there if is_series(library.get(c.effect))]
-    added = tuple((c.place, c.effect) for c in there)
-    gaps = {
-        name_of(c.place, c.effect): float(_element(c).gap[0]) for c in there if _element(c).gap[0]
-    }
-    return with_flanks(in_series(robot, added), gaps)
+def _is_in_series(cause: Cause) -> bool:
+    return cause.effect in library.names() and is_series(library.get(cause.effect))
+
+
+def _in_series(causes: Sequence[Cause]) -> dict[str, Transmission]:
+    """What causes put in series with joints, by their names."""
+    elements: dict[str, list[Transmission]] = {}
+    for cause in causes:
+        if _is_in_series(cause):
+            elements.setdefault(cause.place, []).append(_element(cause))
+    return {place: together(own) for place, own in elements.items()}
 
 
 def _element(cause: Cause) -> Transmission:
@@ -134,13 +144,16 @@ def _element(cause: Cause) -> Transmission:
     return element(library.get(cause.effect), numbers)
 
 
-def _write(wanted: Fields, robot: Robot, cause: Cause) -> str | None:
-    """Let a cause change the fields."""
+def _write(
+    wanted: Fields, robot: Robot, cause: Cause, series: Mapping[str, Transmission]
+) -> str | None:
+    """Let a cause change the fields; those in `series` are still to be written."""
     if cause.effect in FIELDS:
         FIELDS[cause.effect].write(wanted, robot, cause.place, cause.coefficients[:, None])
         return None
-    if name_of(cause.place, cause.effect) in robot.series:
-        state_element(wanted, robot, cause.place, cause.effect, _element(cause))
+    if _is_in_series(cause):
+        if cause.place in series:
+            state_element(wanted, robot, cause.place, series[cause.place])
         return None
     if cause.effect in COMMANDS:
         return COMMANDS[cause.effect](wanted, robot, cause)

@@ -20,7 +20,7 @@ from sims.robot.model import Robot
 from sims.robot.native import FIELDS, SOLIMP, lanes_spec, stiff_of
 from sims.robot.quiet import quiet
 from sims.robot.series import FIELDS as SERIES
-from sims.robot.series import hung, is_series
+from sims.robot.series import WRITTEN, hung, is_series, press
 from sims.robot.series import write as in_series
 from sims.system import Acting
 
@@ -176,18 +176,20 @@ class Bench:
         self._changed.clear()
         derives = was_derived or bool(self.robot.series)
         for effect, c in acting:
-            if not c.any():
-                continue
-            if is_series(effect):
-                in_series(self.fields, self.robot, effect, c[:, :, 0])
-                self._changed.update(SERIES)
+            if not c.any() or is_series(effect):
                 continue
             native = FIELDS[effect.of or effect.name]
             native.write(self.fields, self.robot, effect.place, c[:, :, 0])
             self._changed.update(native.fields)
             derives = derives or native.derived
+        if self.robot.series:
+            # After the armatures, of which each takes its own part.
+            in_series(self.fields, self.robot, acting)
+            self._changed.update(WRITTEN)
         if derives:
             self.batch.set_const()
+        if self.robot.series:
+            press(self.fields, self.robot)
 
     @staticmethod
     def _derives(field: str) -> bool:

@@ -12,19 +12,28 @@ joint d = y - x about the same axis makes the body's position y, and
 
     T = -k d - c d'         of a spring with a damper                      (3)
     |d| <= gap / 2          of flanks, which MuJoCo's limit holds          (4)
+    T = -k e - c d'         of both: flanks that give, e what d exceeds    (5)
 
 with shares of inertia and damping counted by M_jj in the pose that the file states (q = 0 where it
-states none), so MuJoCo integrates it as it does any joint, and a model file can say it.
+states none), so MuJoCo integrates it as it does any joint, and a model file can say it. Of (5), T
+pushes only, and is nothing between the flanks. A limit of MuJoCo with impedance s exerts
+
+    -(K e + C d') / (A + R), R = (1 - s) A0 / s                            (6)
+
+for `solref` (-K s, -C s), A being the inverse inertia along d and A0 that of the pose of the file
+(MuJoCo's documentation, "Computation", constraint model): at the least s, 1e-4, a spring of K s /
+A0 with an error of the size of s.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sims.base import Array
 from sims.robot.model import Robot
@@ -40,18 +49,38 @@ RESOLVED, RESOLVED_BY_RK4 = 1.2, 2.0
 """Radians of the swing of drive and links against each other in a step, at most."""
 HARD = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """`solimp` of flanks: as hard as MuJoCo allows."""
+GIVING = (1e-4, 1e-4, 0.001, 0.5, 2.0)
+"""The same of flanks that give as a spring does: as soft as MuJoCo allows, see (6)."""
 UNLOADED = 1e-3
 """Share of a typical force below which a load leaves the links between the flanks."""
-FIELDS = ("dof_armature", "jnt_stiffness", "dof_damping", "jnt_range", "jnt_solref", "jnt_solimp")
-"""Of the model, that are written for it."""
+WRITTEN = ("dof_armature", "jnt_stiffness", "dof_damping", "jnt_range", "jnt_solref", "jnt_solimp")
+"""Fields of the model that are written for it."""
+FIELDS = (*WRITTEN, "dof_invweight0")
+"""The same, and what MuJoCo derives that is read for it."""
+
+Flags = NDArray[np.bool_]
 
 Added = tuple[tuple[str, str], ...]
-"""Joints, and the name of the effect that each has in series."""
+"""Joints, and the name of an effect that each has in series; a joint may have several."""
 
 
-def name_of(joint: str, effect: str) -> str:
-    """What the second joint is called: ``elbow_flexibility``."""
-    return f"{joint}_{effect.rpartition('.')[2]}"
+def name_of(joint: str, effects: Collection[str]) -> str:
+    """What the second joint is called: ``elbow_flexibility``, ``elbow_transmission`` of several."""
+    kind = next(iter(effects)).rpartition(".")[2] if len(effects) == 1 else "transmission"
+    return f"{joint}_{kind}"
+
+
+def second_of(robot: Robot, joint: str) -> str:
+    """The name of the one that is in series with a joint; empty where none is."""
+    return next((name for name in robot.series if name.rpartition("_")[0] == joint), "")
+
+
+def by_joint(added: Added) -> dict[str, list[str]]:
+    """The effects in series with each joint."""
+    effects: dict[str, list[str]] = {}
+    for joint, effect in added:
+        effects.setdefault(joint, []).append(effect)
+    return effects
 
 
 def by_series(acting: Acting, count: int) -> dict[Added, list[int]]:
@@ -62,11 +91,6 @@ def by_series(acting: Acting, count: int) -> dict[Added, list[int]]:
         added = tuple((e.place, e.of) for e, on in there if on[lane])
         lanes.setdefault(added, []).append(lane)
     return lanes
-
-
-def twice(added: Added) -> bool:
-    """Whether one joint has two in series: nothing with an inertia lies between them."""
-    return len({joint for joint, _ in added}) < len(added)
 
 
 @lru_cache(maxsize=128)
@@ -85,18 +109,18 @@ def in_series(robot: Robot, added: Added) -> Robot:
     joints = {joint.id: joint for joint in spec.joints}
     _named(spec, robot, joints)
     inertias = _inertias(robot)
-    for name, effect in added:
+    for name, effects in by_joint(added).items():
         first = joints[robot.joint(name).id]
         # Whatever the file's defaults say is said of the first joint alone.
         nothing = {"damping": 0.0, "frictionloss": 0.0, "armature": 0.0, "stiffness": 0.0}
         second = first.parent.add_joint(
-            name=name_of(name, effect), type=first.type, axis=first.axis, pos=first.pos
+            name=name_of(name, effects), type=first.type, axis=first.axis, pos=first.pos
         )
         for attribute, value in nothing.items():
             setattr(second, attribute, np.full_like(getattr(second, attribute), value))
         second.springdamper = (0.0, 0.0)
         second.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-        play = effect.endswith("backlash")
+        play = any(effect.endswith("backlash") for effect in effects)
         limited = mujoco.mjtLimited
         second.limited = limited.mjLIMITED_TRUE if play else limited.mjLIMITED_FALSE
         if play:
@@ -106,7 +130,7 @@ def in_series(robot: Robot, added: Added) -> Robot:
     # Poses that are kept lack the new coordinates.
     for key in list(spec.keys):
         spec.delete(key)
-    series = {name_of(name, effect): inertias[name] for name, effect in added}
+    series = {name_of(name, own): inertias[name] for name, own in by_joint(added).items()}
     return replace(robot, spec=spec, series=series)
 
 
@@ -136,17 +160,23 @@ def is_series(effect: Effect | type[Effect]) -> bool:
     return issubclass(kind, Hidden) and bool(kind.between)
 
 
-def write(fields: Mapping[str, Any], robot: Robot, effect: Effect, c: Array) -> None:
-    """Write an effect in series with a joint into the fields of lanes.
+def write(fields: Mapping[str, Any], robot: Robot, acting: Acting) -> None:
+    """Write effects in series with joints into the fields of lanes; `press` follows once MuJoCo has
+    derived what it does.
 
     Args:
         fields: of the lanes' models.
         robot: of `in_series`.
-        effect: at its place.
-        c: (K, L) its coefficients there.
+        acting: effects with coefficients (K, L, 1), of which others are left alone.
     """
-    numbers = dict(zip((one.name for one in effect.coefficients), c, strict=True))
-    state(fields, robot, effect.place, effect.of, element(type(effect), numbers))
+    made: dict[str, list[Element]] = {}
+    for effect, c in acting:
+        if not is_series(effect) or not (c[0] > 0).any():
+            continue
+        numbers = dict(zip((one.name for one in effect.coefficients), c[:, :, 0], strict=True))
+        made.setdefault(effect.place, []).append(element(type(effect), numbers))
+    for place, elements in made.items():
+        state(fields, robot, place, together(elements))
 
 
 def element(kind: type[Effect], numbers: Mapping[str, Array]) -> Element:
@@ -157,17 +187,22 @@ def element(kind: type[Effect], numbers: Mapping[str, Array]) -> Element:
     return kind().element(np.stack(values))
 
 
-def state(fields: Mapping[str, Any], robot: Robot, place: str, effect: str, made: Element) -> None:
+def together(elements: Sequence[Element]) -> Element:
+    """What lies between one drive and its links as one element: gap first, then the spring."""
+    names = ("stiffness", "damping", "gap", "drive")
+    return Element(*(np.sum([getattr(e, name) for e in elements], axis=0) for name in names))
+
+
+def state(fields: Mapping[str, Any], robot: Robot, place: str, made: Element) -> None:
     """Write elements (L,) into fields of models.
 
     Args:
         fields: of the models.
         robot: of `in_series`.
         place: the joint with which they are in series.
-        effect: the name of what they are.
         made: they.
     """
-    second = robot.joint(name_of(place, effect))
+    second = robot.joint(second_of(robot, place))
     inertia = robot.series[second.name]
     dof = robot.joint(place).velocity
     stated = fields["dof_armature"][:, dof]
@@ -177,13 +212,31 @@ def state(fields: Mapping[str, Any], robot: Robot, place: str, effect: str, made
     step = float(fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep)
     number = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
     stiffness, damping = _stepped(made, inertia, drive, step, int(number) == RK4)
-    fields["jnt_stiffness"][:, second.id] = stiffness
-    fields["dof_damping"][:, second.velocity] = damping
+    give = gives(made)
+    fields["jnt_stiffness"][:, second.id] = np.where(give, 0.0, stiffness)
+    fields["dof_damping"][:, second.velocity] = np.where(give, 0.0, damping)
     if "jnt_range" in fields:
         half = 0.5 * made.gap
         fields["jnt_range"][:, second.id] = np.stack([-half, half], axis=1)
-        fields["jnt_solref"][:, second.id] = _hard(step)
-        fields["jnt_solimp"][:, second.id] = HARD
+        soft = np.stack([-stiffness, -damping], axis=1)
+        fields["jnt_solref"][:, second.id] = np.where(give[:, None], soft, _hard(step))
+        fields["jnt_solimp"][:, second.id] = np.where(give[:, None], GIVING, HARD)
+
+
+def gives(made: Element) -> Flags:
+    """(L,) whether it is flanks that give as a spring does."""
+    return (made.gap > 0) & (made.stiffness > 0)
+
+
+def press(fields: Mapping[str, Any], robot: Robot) -> None:
+    """Turn stiffness and damping of flanks that give into what MuJoCo's limit takes for them; see
+    (6).
+    """
+    for name in robot.series:
+        second = robot.joint(name)
+        soft = fields["jnt_solimp"][:, second.id, 0] == GIVING[0]
+        inverse = fields["dof_invweight0"][soft, second.velocity, None]
+        fields["jnt_solref"][soft, second.id] *= inverse  # (6)
 
 
 def _hard(step: float) -> tuple[float, float]:
@@ -191,18 +244,32 @@ def _hard(step: float) -> tuple[float, float]:
     return 2.0 * step, 1.0
 
 
-def with_flanks(robot: Robot, gaps: Mapping[str, float]) -> Robot:
-    """The robot of `in_series` whose file is to state these gaps, by name of the second joint."""
-    spec = robot.spec.copy()
-    for joint in spec.joints:
-        if joint.name not in gaps:
+def with_flanks(robot: Robot, made: Mapping[str, Element], model: Any = None) -> Robot:
+    """The robot of `in_series` whose file is to state flanks.
+
+    Args:
+        robot: of `in_series`.
+        made: elements of one lane, by the joint with which they are in series.
+        model: that is compiled of it, with all that acts; those that give are told by it.
+    """
+    spec, option = robot.spec.copy(), (model or robot.compiled).opt
+    joints = {joint.name: joint for joint in spec.joints}
+    step, explicit = float(option.timestep), int(option.integrator) == RK4
+    for place, one in made.items():
+        joint = joints[second_of(robot, place)]
+        half = 0.5 * float(one.gap[0])
+        if not half:
             continue
-        half = 0.5 * gaps[joint.name]
         turns = robot.joint(joint.name).kind == "hinge" and spec.compiler.degree
         half = float(np.rad2deg(half)) if turns else half
         joint.range = (-half, half)
-        joint.solref_limit = _hard(float(robot.compiled.opt.timestep))
-        joint.solimp_limit = HARD
+        joint.solref_limit, joint.solimp_limit = _hard(step), HARD
+        if model is not None and gives(one)[0]:
+            inertia, drive = robot.series[joint.name], model.dof_armature
+            drive = drive[[robot.joint(place).velocity]]
+            numbers = np.stack(_stepped(one, inertia, drive, step, explicit))[:, 0]
+            inverse = model.dof_invweight0[robot.joint(joint.name).velocity]
+            joint.solref_limit, joint.solimp_limit = -numbers * inverse, GIVING  # (6)
     return replace(robot, spec=spec)
 
 
@@ -216,10 +283,13 @@ def _stepped(
     most = ((RESOLVED_BY_RK4 if explicit else RESOLVED) / step) ** 2 / softened
     stiffness = np.minimum(made.stiffness, most)
     damping = 2.0 * made.damping * np.sqrt(stiffness * inertia)
+    borne = np.minimum(damping, RESOLVED / step / softened)
     if explicit:
-        return stiffness, np.minimum(damping, RESOLVED / step / softened)
+        return stiffness, borne
     # Where dampings are implicit so is a stiffness, by the backward rule: k (d + h d').
-    return made.stiffness, damping + step * (made.stiffness - stiffness)
+    give = gives(made)
+    backward = damping + step * (made.stiffness - stiffness)
+    return np.where(give, stiffness, made.stiffness), np.where(give, borne, backward)
 
 
 def hung(fields: Mapping[str, Any], robot: Robot, loads: Sequence[Array]) -> list[Array]:
@@ -232,9 +302,15 @@ def hung(fields: Mapping[str, Any], robot: Robot, loads: Sequence[Array]) -> lis
     """
     places = []
     for (name, inertia), load in zip(robot.series.items(), loads, strict=True):
-        number, n = robot.joint(name).id, len(load)
-        stiffness = fields["jnt_stiffness"][:n, number]
-        half = fields["jnt_range"][:n, number, 1]
+        second, n = robot.joint(name), len(load)
+        stiffness = fields["jnt_stiffness"][:n, second.id]
+        soft = fields["jnt_solimp"][:n, second.id, 0] == GIVING[0]
+        inverse = fields["dof_invweight0"][:n, second.velocity]
+        pressed = np.where(
+            soft, -fields["jnt_solref"][:n, second.id, 0] / inverse, stiffness
+        )  # (6)
+        half = fields["jnt_range"][:n, second.id, 1]
         on_flank = half * np.clip(load / (UNLOADED * inertia), -1.0, 1.0)
-        places.append(np.where(stiffness > 0, load / np.maximum(stiffness, 1e-300), on_flank))
+        away = np.where(pressed > 0, load / np.maximum(pressed, 1e-300), 0.0)
+        places.append(away + np.where(soft | (stiffness <= 0), on_flank, 0.0))
     return places

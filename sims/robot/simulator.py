@@ -26,7 +26,7 @@ from sims.robot.model import Actuator, Robot
 from sims.robot.numerics import INTEGRATORS, Numerics, RobotEngine, own_numerics
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
-from sims.robot.series import Added, by_series, in_series, twice
+from sims.robot.series import Added, by_series, in_series
 from sims.robot.system import RobotSystem, system_of
 from sims.robot.work import Given, Made, Start, Work, by_run, instants
 from sims.simulated import Simulated
@@ -389,9 +389,6 @@ def _alike(acting: Acting, derived: Mask, asked: Mask) -> Iterator[tuple[Added, 
     kind, and which they are.
     """
     for series, own in by_series(acting, len(derived)).items():
-        # Two in series at one joint have no motion: those lanes stay as they are, without numbers.
-        if twice(series):
-            continue
         there = np.zeros(len(derived), dtype=bool)
         there[own] = True
         for kind in range(4):

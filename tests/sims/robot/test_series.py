@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from sims.base import Scenario
 from sims.extended import Number
@@ -115,22 +116,91 @@ PENDULUM = """
 
 
 @pytest.mark.parametrize(
-    ("effect", "c"), [("joint.flexibility@axle", [0.003, 0.05]), ("joint.backlash@axle", [0.01])]
+    ("effects", "c"),
+    [
+        (["joint.flexibility@axle"], [0.003, 0.05]),
+        (["joint.backlash@axle"], [0.01]),
+        (["joint.backlash@axle", "joint.flexibility@axle"], [0.01, 0.003, 0.05]),
+    ],
 )
-def test_links_hang_on_their_springs_and_flanks_when_a_run_begins(effect, c):
+def test_links_hang_on_their_springs_and_flanks_when_a_run_begins(effects, c):
     """A servo that holds what the link weighs holds it at rest: nothing moves."""
     held = {"u.m_axle": np.full(TIMES.size, -9.81 * 0.3 / 60.0)}
-    seen = moved(made(PENDULUM), [effect], c, Scenario(TIMES, {}, held))
+    seen = moved(made(PENDULUM), effects, c, Scenario(TIMES, {}, held))
     # Not hung, it would fall by some 5 mrad.
     np.testing.assert_allclose(seen, 0.0, atol=2e-4)
 
 
-def test_two_in_series_at_one_joint_have_no_motion():
-    kind = made(WHEEL)
-    seen = moved(
-        kind, ["joint.flexibility@axle", "joint.backlash@axle"], [0.01, 0.1, 0.01], pushed(0.1)
+PLANAR = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.0005" integrator="RK4" gravity="0 0 -9.81"/>
+  <worldbody>
+    <body>
+      <joint name="shoulder" axis="0 0 1"/>
+      <inertial pos="0.2 0 0" mass="1.5" diaginertia="0.02 0.02 0.02"/>
+      <body pos="0.4 0 0">
+        <joint name="elbow" axis="0 0 1" armature="0.02"/>
+        <inertial pos="0.15 0 0" mass="0.8" diaginertia="0.008 0.008 0.008"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="m_elbow" joint="elbow"/></actuator>
+</mujoco>
+"""
+GIVES, RATIO, GAP = 0.02, 0.1, 0.06  # rad/(N m), share of the critical damping, rad
+
+
+def through(apart, speed, stiffness, damping, gap):
+    """What passes on: gap first, then spring and damper, whose flanks push and never pull."""
+    beyond = apart - min(max(apart, -gap / 2), gap / 2)
+    force = stiffness * beyond + damping * speed
+    if gap == 0.0:
+        return force
+    return max(force, 0.0) if beyond > 0 else min(force, 0.0) if beyond < 0 else 0.0
+
+
+def planar(times, torque, gap, compliance=GIVES):
+    """(T, 2) of the arm's joints, the elbow's on its drive's side, by scipy; begun at rest."""
+    moved = 0.008 + 0.8 * 0.15**2
+    stiffness = 1 / compliance
+    # Counted by what the file states of the joint: links and drive.
+    damping = 2 * RATIO * np.sqrt(stiffness * (moved + 0.02))
+
+    def rates(t, s):
+        _, y, x, first, link, drive = s
+        cosine, sine = 0.8 * 0.4 * 0.15 * np.cos(y), 0.8 * 0.4 * 0.15 * np.sin(y)
+        far = moved + cosine
+        near = 0.02 + 1.5 * 0.2**2 + 0.8 * 0.4**2 + moved + 2 * cosine
+        passed = through(x - y, drive - link, stiffness, damping, gap)
+        pulls = sine * (2 * first * link + link**2), passed - sine * first**2
+        bends = np.linalg.solve([[near, far], [far, moved]], pulls)
+        return [first, link, drive, *bends, (torque(t) - passed) / 0.02]
+
+    given = {"rtol": 1e-8, "atol": 1e-10, "max_step": 1e-3, "t_eval": times}
+    state = solve_ivp(rates, (0, times[-1]), np.zeros(6), **given).y
+    return state[[0, 2]].T
+
+
+def test_a_gap_before_a_spring_moves_an_arm_as_scipy_does():
+    """One element: through the gap nothing passes, behind it the spring and the damper do."""
+    times = np.arange(81) / 100.0
+    run = Scenario(times, {}, {"u.m_elbow": np.where(times < 0.4, 0.6, -0.6)})
+    spring, play, both = (
+        "joint.flexibility@elbow",
+        "joint.backlash@elbow",
+        ("q.shoulder", "q.elbow"),
     )
-    assert np.isnan(seen).all()
+    seen = moved(made(PLANAR), [spring, play], [GIVES, RATIO, GAP], run, both)
+    turned = moved(made(PLANAR), [play, spring], [GAP, GIVES, RATIO], run, both)
+    np.testing.assert_array_equal(seen, turned)
+    exact, flexible, loose = (
+        planar(times, lambda t: 0.6 if t < 0.4 else -0.6, *one)
+        for one in ((GAP,), (0.0,), (GAP, GIVES / 100))
+    )
+    np.testing.assert_allclose(seen, exact, atol=1e-4)
+    for alone in (flexible, loose):
+        assert np.abs(alone - exact).max() > 0.02
 
 
 SWUNG = Scenario(
@@ -207,6 +277,9 @@ CAUSES = {
 }  # fmt: skip
 
 
+LOOSE = {**CAUSES, "joint.backlash@elbow": {"gap": number(0.02), "rotor": number(0.0)}}
+
+
 def test_a_file_holds_joints_in_series_and_moves_as_the_simulator_does(tmp_path):
     robot = arm(tmp_path)
     done = written(robot, CAUSES, "log.csv")
@@ -218,18 +291,30 @@ def test_a_file_holds_joints_in_series_and_moves_as_the_simulator_does(tmp_path)
     assert model.joint("shoulder_backlash").range == pytest.approx([-0.01, 0.01])
 
 
-def test_a_rollout_of_the_file_moves_as_the_simulator_does(tmp_path):
+def test_a_file_holds_a_gap_before_a_spring_as_flanks_that_give(tmp_path):
+    robot = arm(tmp_path)
+    done = written(robot, LOOSE, "log.csv")
+    check(robot, LOOSE, done)
+    model = mujoco.MjSpec.from_string(done.xml).compile()
+    joint = model.joint("elbow_transmission")
+    assert joint.range == pytest.approx([-0.01, 0.01])
+    inverse = model.dof_invweight0[joint.dofadr[0]]
+    assert model.jnt_solref[joint.id, 0] == pytest.approx(-50.0 * inverse)
+
+
+@pytest.mark.parametrize("causes", [CAUSES, LOOSE], ids=["spring", "gap before it"])
+def test_a_rollout_of_the_file_moves_as_the_simulator_does(tmp_path, causes):
     """Where nothing hangs, what is in series begins in the simulator where it does in the file."""
     robot = arm(tmp_path, ARM.replace("0 0 -9.81", "0 0 0"))
-    model = mujoco.MjSpec.from_string(written(robot, CAUSES).xml).compile()
+    model = mujoco.MjSpec.from_string(written(robot, causes).xml).compile()
     data = mujoco.MjData(model)
     data.ctrl[:2] = 0.1, 0.3
     rows = []
     for _ in range(50):
         rows.append([data.joint(name).qpos[0] for name in ("shoulder", "elbow")])
         mujoco.mj_step(model, data, 10)
-    simulator = robot_simulator(robot)(observe=["q.shoulder", "q.elbow"], effects=list(CAUSES))
-    lane = np.array([[0.02, 0.05, 0.3, 0.02, 0.1]])
+    simulator = robot_simulator(robot)(observe=["q.shoulder", "q.elbow"], effects=list(causes))
+    lane = np.array([[n.value for cause in causes.values() for n in cause.values()]])
     pushed = {"u.m_shoulder": np.full(50, 0.1), "u.m_elbow": np.full(50, 0.3)}
     seen = simulator.simulate(lane, Scenario(TIMES[:50], {}, pushed))[0]
     np.testing.assert_allclose(seen, rows, atol=1e-9)
