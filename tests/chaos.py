@@ -13,7 +13,6 @@ import argparse
 import fcntl
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -32,6 +31,7 @@ from bench.store.segments import finished
 from tests.cluster import cluster, said
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING
+from tests.undrawn import COMMAND
 
 MEASURED = ["tuner_seconds", "simulator_seconds", "fit_seconds", "seconds"]
 TUNERS = {"random": {}, "cma_es": {}, "least_squares": {}, "regressor": {"seeds": 1}}
@@ -50,9 +50,7 @@ def start(folder, experiment, address, environment, isolation="run"):
     )
     where = ["--cluster", address] if address else ["--jobs", "2"]
     command = [
-        sys.executable,
-        "-m",
-        "bench.cli",
+        *COMMAND,
         "compare",
         *begun,
         *where,

@@ -13,6 +13,10 @@ _BESIDE = Path(__file__).parents[2] / "shared" / "data"
 if _BESIDE.is_dir():  # for child processes too; who has set it knows better
     os.environ.setdefault("SIMGAP_DATA", str(_BESIDE))
 
+# One test's threads of linear algebra wait for another's, and spend its time waiting.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background; children inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -75,12 +79,12 @@ def fresh_registries():
 
 
 @pytest.fixture
-def undrawn(monkeypatch):
-    """Comparisons of this process write their tables alone; figures and pages have tests of their
-    own.
-    """
-    monkeypatch.setattr("bench.report._drawn", lambda *_: {})
-    monkeypatch.setattr("bench.report.comparison_page", lambda _: "")
+def undrawn():
+    """Comparisons of this process write their tables alone."""
+    from tests import undrawn
+
+    with undrawn.undrawn():
+        yield
 
 
 _SECONDS = {True: 15.0, False: 0.2}

@@ -14,6 +14,7 @@ from bench.analysis.table import COLUMNS
 from bench.cli import main
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING
+from tests.undrawn import COMMAND
 
 SPRING_PLUGIN = str(PLUGINS / "spring.py")
 PLUGIN_TUNER = """from methods.base import Tuner
@@ -147,14 +148,7 @@ def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path)
         "--targets",
         4000,
     ]
-    command = [
-        sys.executable,
-        "-m",
-        "bench.cli",
-        *map(str, arguments),
-        "--out",
-        str(tmp_path / "out"),
-    ]
+    command = [*COMMAND, *map(str, arguments), "--out", str(tmp_path / "out")]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )

@@ -17,6 +17,7 @@ from sims.base import InputError
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING
 from tests.plugins.chaos import STATUSES
+from tests.undrawn import COMMAND
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
@@ -30,7 +31,7 @@ def write(path, **changes):
 
 
 def simgap(*arguments, **options):
-    command = [sys.executable, "-m", "bench.cli", *map(str, arguments)]
+    command = [*COMMAND, *map(str, arguments)]
     return subprocess.run(
         command, capture_output=True, text=True, timeout=300, check=False, **options
     )
@@ -64,9 +65,7 @@ def begun(folder, experiment, enough):
     folder.
     """
     command = [
-        sys.executable,
-        "-m",
-        "bench.cli",
+        *COMMAND,
         "compare",
         str(experiment),
         "--plugin",

@@ -62,6 +62,7 @@ def test_what_the_log_can_fix_stands_beside_the_errors(compared):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_finished_comparison_is_taken_up_and_one_of_another_file_is_not(compared, log, capsys):
     assert main(["compare", "--resume", str(compared), "--jobs", "1"]) == 0
     written(log.parent, SWINGING.replace('mass="0.8"', 'mass="0.81"'))

@@ -13,6 +13,7 @@ from bench.cli import main
 from bench.store.folder import configuration
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING
+from tests.undrawn import undrawn
 
 SECRET = "a secret of the tests"
 PLUGIN = ["--plugin", str(PLUGINS / "spring.py")]
@@ -27,7 +28,8 @@ def sound(tmp_path_factory):
     }  # fmt: skip
     (folder / "e.toml").write_text(tomli_w.dumps(document))
     command = ["compare", str(folder / "e.toml"), *PLUGIN, "--jobs", "1", "--salt", SECRET]
-    assert main([*command, "--out", str(folder / "out")]) == 0
+    with undrawn():
+        assert main([*command, "--out", str(folder / "out")]) == 0
     return folder / "out"
 
 
@@ -112,6 +114,7 @@ def test_another_salt_is_refused(folder, capsys, old):
     assert "one of the two was changed" in said
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes_on_with_it(
     sound, tmp_path, capsys, monkeypatch
 ):

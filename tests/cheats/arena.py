@@ -16,6 +16,7 @@ from bench.store.folder import read
 from methods.base import Tuner
 from tests.conftest import PLUGINS
 from tests.experiments import SPRING
+from tests.undrawn import COMMAND
 
 HERE = Path(__file__).parent
 SALT = "a secret of the tests"
@@ -49,7 +50,7 @@ def compared(folder, tuners, plugins=(), options=(), **changes):
     # Copies: some write to their own file.
     given = [PLUGINS / "spring.py", *(HERE / f"{name}.py" for name in plugins)]
     files = [shutil.copy(file, folder) for file in given]
-    command = [sys.executable, "-m", "bench.cli", "compare", str(experiment)]
+    command = [*COMMAND, "compare", str(experiment)]
     command += ["--out", str(folder / "run"), "--allow-failures", *options]
     command += [word for file in files for word in ("--plugin", str(file))]
     # Where their processes are told to keep files, by which they are known.

@@ -230,9 +230,12 @@ def test_budget_is_met_exactly_and_never_passed():
     assert toy.used == 320
 
 
-def test_same_seed_gives_the_same_weights_and_touches_no_global_state():
+def test_same_seed_gives_the_same_weights_and_touches_no_global_state(request):
     import torch
 
+    before = torch.get_num_threads()
+    request.addfinalizer(lambda: torch.set_num_threads(before))
+    torch.set_num_threads(2)
     torch_state, numpy_state, threads = (
         torch.get_rng_state(),
         np.random.get_state()[1].copy(),  # noqa: NPY002

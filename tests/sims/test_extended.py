@@ -305,6 +305,7 @@ samples = 30
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_compare_tunes_it_in_worker_processes(path, tmp_path, capsys):
     (tmp_path / "swing.toml").write_text(EXPERIMENT)
     out = tmp_path / "out"

@@ -231,6 +231,7 @@ def test_bob_swings_as_the_closed_form_says():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_puck_is_compared_as_a_plugin(tmp_path, capsys):
     arguments = [
         "compare",

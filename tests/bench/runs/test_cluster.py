@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 import time
 
 import pandas as pd
@@ -12,6 +11,7 @@ from bench.cli import main
 from bench.store.segments import finished
 from tests.bench.test_compare import CHAOS, SPRING_PLUGIN, same, simgap, write
 from tests.cluster import cluster
+from tests.undrawn import COMMAND
 
 pytestmark = pytest.mark.slow
 TUNERS = {"random": {}, "least_squares": {}, "regressor": {"seeds": 1}}
@@ -33,7 +33,7 @@ def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_no
     folder = tmp_path / "far"
     # A cache of its own: the weights that the cluster trains must come back and go out again.
     environment = {**os.environ, "SIMGAP_CACHE": str(tmp_path / "cache")}
-    command = [sys.executable, "-m", "bench.cli", *map(str, common), "--cluster", started.address]
+    command = [*COMMAND, *map(str, common), "--cluster", started.address]
     process = subprocess.Popen(
         [*command, "--out", str(folder)],
         env=environment,
@@ -60,9 +60,7 @@ def test_runs_are_isolated_there_too_and_a_lost_scheduler_leaves_a_folder_to_res
     folder = tmp_path / "out"
     common = ["--plugin", SPRING_PLUGIN, "--plugin", CHAOS]
     command = [
-        sys.executable,
-        "-m",
-        "bench.cli",
+        *COMMAND,
         "compare",
         str(experiment),
         *common,
