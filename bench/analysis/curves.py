@@ -57,7 +57,9 @@ class Curves:
     def by_target(self) -> tuple[list[str], list[NDArray[np.int64]]]:
         """Names of the targets, sorted, and the rows of each."""
         codes, names = pd.factorize(self.keys["target"], sort=True)
-        return [str(n) for n in names], [np.flatnonzero(codes == i) for i in range(len(names))]
+        ends = np.cumsum(np.bincount(codes, minlength=len(names)))
+        groups = np.split(np.argsort(codes, kind="stable"), ends[:-1])
+        return [str(n) for n in names], groups[: len(names)]
 
     def final(self) -> Array:
         """(R,) the metric at the end; infinite for a run that failed: it delivered nothing one
@@ -120,10 +122,17 @@ def mean_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Array
     """(targets, ...) the mean of each target's rows of `values` (R, ...), without those that are
     NaN.
     """
+    result = np.empty((len(groups), *values.shape[1:]))
+    counts = np.array([len(rows) for rows in groups])
     with warnings.catch_warnings():
         # Nothing but NaN has no mean: NaN.
         warnings.simplefilter("ignore", RuntimeWarning)
-        return np.array([np.nanmean(values[rows], axis=0) for rows in groups])
+        # Targets with as many seeds are laid side by side.
+        for count in np.unique(counts):
+            places = np.flatnonzero(counts == count).tolist()
+            rows = np.array([groups[place] for place in places])
+            result[places] = np.nanmean(values[rows], axis=1)
+    return result
 
 
 class Decisive(NamedTuple):

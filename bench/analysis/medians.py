@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.analysis.curves import Curves
+from bench.analysis.resampling import interval, medians
 from bench.analysis.rounding import FLOOR
-from bench.analysis.table import checkpoints, interval, target_curves
+from bench.analysis.table import checkpoints, target_curves
 from sims.base import Array
 
 MEDIAN_COLUMNS = ["tuner", "simulations", "median", "low", "high", "targets"]
@@ -46,46 +48,52 @@ def moments(budget: int) -> list[int]:
     return [k for k in _MOMENTS if k < budget] + [budget]
 
 
-def median_curves(runs: pd.DataFrame, metric: str, budget: int) -> pd.DataFrame:
+def median_curves(curves: Curves, metric: str, budget: int) -> pd.DataFrame:
     """Each tuner's median of a metric over targets against simulations, `MEDIAN_COLUMNS`.
 
     A target's value is the mean over its seeds. A tuner all of whose runs failed has no rows.
     """
     points = drawn(budget)
     parts = []
-    for tuner, group in runs.groupby("tuner", sort=False):
-        curves = np.maximum(target_curves(group, metric, points).to_numpy(dtype=np.float64), FLOOR)
+    for tuner in curves.tuners():
+        lines = np.maximum(_values(target_curves(curves.of(tuner=tuner), points)), FLOOR)
         # A target whose runs all failed has no curve; failures are counted in the table.
-        curves = curves[np.isfinite(curves).all(axis=1)]
-        if not len(curves):
+        lines = lines[np.isfinite(lines).all(axis=1)]
+        if not len(lines):
             continue
-        low, high = interval(curves, np.median, "figure", str(tuner), metric, resamples=_RESAMPLES)
-        columns = (str(tuner), points, np.median(curves, axis=0), low, high, len(curves))
+        low, high = interval(lines, medians, "figure", tuner, metric, resamples=_RESAMPLES)
+        columns = (tuner, points, np.median(lines, axis=0), low, high, len(lines))
         parts.append(pd.DataFrame(dict(zip(MEDIAN_COLUMNS, columns, strict=True))))
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=MEDIAN_COLUMNS)
 
 
-def by_distance(runs: pd.DataFrame, metric: str, budget: int) -> pd.DataFrame:
+def by_distance(curves: Curves, distances: pd.Series[float], budget: int) -> pd.DataFrame:
     """Median error after few, some and all simulations by how far the target lies outside the
     training range, `DISTANCE_COLUMNS`: bin 0 is inside it, the others are of one width.
 
     Args:
-        runs: rows of the range `wide`.
-        metric: of the error.
+        curves: of the error, in the range `wide`.
+        distances: of each target from the training range, by its name.
         budget: largest number of simulations.
     """
-    bins, edges = _binned(runs.groupby("target")["outside"].first())
+    bins, edges = _binned(distances)
+    points = moments(budget)
+    errors = {t: target_curves(curves.of(tuner=t), points) for t in curves.tuners()}
     lines = []
-    for k in moments(budget):
-        for tuner, group in runs.groupby("tuner", sort=False):
-            values = target_curves(group, metric, [k])[k].dropna().clip(lower=FLOOR)
+    for k in points:
+        for tuner, by_target in errors.items():
+            values = by_target[k].dropna().clip(lower=FLOOR)
             places = bins[values.index].to_numpy()
             lines += [
-                (k, tuner, b, *edges[b], int((bins == b).sum()), *_middle(part, str(tuner), b))
+                (k, tuner, b, *edges[b], int((bins == b).sum()), *_middle(part, tuner, b))
                 for b in range(BINS + 1)
                 if len(part := values.to_numpy()[places == b])
             ]
     return pd.DataFrame(lines, columns=DISTANCE_COLUMNS)
+
+
+def _values(frame: pd.DataFrame) -> Array:
+    return frame.to_numpy(dtype=np.float64)
 
 
 def _binned(distances: pd.Series[float]) -> tuple[pd.Series[Any], list[tuple[float, float]]]:
@@ -102,7 +110,7 @@ def _middle(values: Array, tuner: str, place: int) -> tuple[float, float, float]
     """Median of (n,) values with its interval; NaN for that of a single one."""
     # The stream's name counts targets inside as the bin before the first.
     names = ("distance", tuner, str(place - 1))
-    low, high = interval(values[:, None], np.median, *names, resamples=_RESAMPLES)
+    low, high = interval(values[:, None], medians, *names, resamples=_RESAMPLES)
     return float(np.median(values)), float(low[0]), float(high[0])
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from bench.analysis.amortisation import Price, prices
-from bench.analysis.curves import Rows, primary
+from bench.analysis.curves import Curves, Rows, primary
 from bench.analysis.medians import by_distance, median_curves
 from bench.analysis.runtimes import share_table, thresholds
 from bench.problem.experiment import Experiment
@@ -44,11 +44,12 @@ class Statistics:
         costs: Mapping[str, tuple[float, float]],
     ) -> None:
         self.metric, self.runs, in_widths = primary(runs)
-        self._rows = Rows(self.runs, statuses, experiment.budget)
+        self._statuses, self._budget, self._costs = statuses, experiment.budget, costs
+        self._rows = self._laid_out(self.runs)
         self.curves = self._rows.curves(self.metric)
         self.spread, self.levels = thresholds(self.curves, in_widths)
-        self._budget, self._costs = experiment.budget, costs
         self.all_runs = runs
+        self._curves: dict[str, Curves] = {}
         self._medians: dict[tuple[str, str], pd.DataFrame] = {}
 
     def of(self, kind: str) -> pd.DataFrame:
@@ -67,9 +68,26 @@ class Statistics:
         """
         key = metric, kind
         if key not in self._medians:
-            part = self.of(kind)
-            self._medians[key] = median_curves(part[part[metric].notna()], metric, self._budget)
+            curves = self._of_all(metric).of(range=kind)
+            self._medians[key] = median_curves(curves, metric, self._budget)
         return self._medians[key]
+
+    def _of_all(self, metric: str) -> Curves:
+        """A metric of all runs that have it."""
+        if metric not in self._curves:
+            there = self.all_runs[metric].notna()
+            rows = self._all if there.all() else self._laid_out(self.all_runs[there])
+            self._curves[metric] = rows.curves(metric)
+        return self._curves[metric]
+
+    @cached_property
+    def _all(self) -> Rows:
+        """All rows; most often those that decide, which are laid out already."""
+        whole = len(self.runs) == len(self.all_runs)
+        return self._rows if whole else self._laid_out(self.all_runs)
+
+    def _laid_out(self, runs: pd.DataFrame) -> Rows:
+        return Rows(runs, self._statuses, self._budget)
 
     @property
     def parameter_metric(self) -> str:
@@ -79,7 +97,9 @@ class Statistics:
     @cached_property
     def distances(self) -> pd.DataFrame:
         """Errors by distance from the training range; see `bench.analysis.medians.by_distance`."""
-        return by_distance(self.of("wide"), self.parameter_metric, self._budget)
+        first = self.of("wide").drop_duplicates("target").set_index("target")["outside"]
+        curves = self._of_all(self.parameter_metric).of(range="wide")
+        return by_distance(curves, first.sort_index(), self._budget)
 
     @cached_property
     def shares(self) -> pd.DataFrame:

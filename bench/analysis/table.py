@@ -9,15 +9,14 @@ taken for independent evidence.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from bench.analysis.curves import Curves, Rows, mean_over_seeds
-from bench.problem.seeds import rng_for
+from bench.analysis.resampling import interval, means
 from bench.store.schema import METRICS
 from sims.base import Array
 
@@ -103,53 +102,20 @@ def _over_targets(
     """(4, len(points)): median, mean, low and high over targets of the runs in rows `mine`."""
     _, groups = curves.where(np.isin(np.arange(len(curves.used)), mine)).by_target()
     values = mean_over_seeds(curves.values[mine][:, points], groups)
-    low, high = interval(values, np.mean, *names, resamples=resamples)
+    low, high = interval(values, means, *names, resamples=resamples)
     with warnings.catch_warnings():
         # A column of failures alone has no mean: NaN, which is shown.
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.array([np.nanmedian(values, axis=0), np.nanmean(values, axis=0), low, high])
 
 
-def target_curves(runs: pd.DataFrame, metric: str, points: list[int]) -> pd.DataFrame:
+def target_curves(curves: Curves, points: list[int]) -> pd.DataFrame:
     """One row a target (sorted), one column for each of `points`: the mean over the seeds of its
     runs.
     """
-    rows = Rows(runs, pd.DataFrame({"run": [], "status": []}), max(points))
-    names, groups = (curves := rows.curves(metric)).by_target()
+    names, groups = curves.by_target()
     values = mean_over_seeds(curves.values[:, points], groups)
     return pd.DataFrame(values, index=pd.Index(names, name="target"), columns=points)
-
-
-def interval(
-    values: Array, statistic: Callable[..., Any], *names: str, resamples: int = 2000
-) -> tuple[Array, Array]:
-    """95 % percentile-bootstrap interval of a statistic over rows of `values` (n, m); NaN for fewer
-    than two rows.
-
-    Args:
-        values: what was measured, one row a target.
-        statistic: np.mean or np.median.
-        names: what the resampling's random stream depends on.
-        resamples: number of resamples.
-    """
-    values = values[np.isfinite(values).all(axis=1)]
-    if len(values) < 2:
-        return np.full(values.shape[1], np.nan), np.full(values.shape[1], np.nan)
-    from scipy.stats import bootstrap
-
-    rng = rng_for("bootstrap", *names)
-    with warnings.catch_warnings():
-        # Of a constant column the interval is that constant.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        found = bootstrap(
-            (values,),
-            statistic,
-            n_resamples=resamples,
-            method="percentile",
-            vectorized=True,
-            rng=rng,
-        )
-    return np.asarray(found.confidence_interval.low), np.asarray(found.confidence_interval.high)
 
 
 def summary(table: pd.DataFrame, metric: str, kind: str) -> pd.DataFrame:

@@ -16,7 +16,7 @@ from bench.analysis.medians import BINS, bin_names, moments
 from bench.analysis.rounding import FLOOR
 from bench.analysis.statistics import Statistics
 from bench.analysis.table import checkpoints
-from bench.figures.style import SOFT, TITLES, Styles, behind_id, canvas, finish
+from bench.figures.style import SOFT, TITLES, Styles, behind_id, canvas, finish, titled
 from bench.problem.experiment import Experiment
 
 if TYPE_CHECKING:
@@ -50,8 +50,7 @@ def error_figure(
     what = "starts" if "real" in experiment.ranges else "targets"
     for axis, panel in zip(axes, shown, strict=True):
         samples_panel(axis, statistics, panel.metric, panel.kind, style)
-        count = statistics.of(panel.kind)["target"].nunique()
-        axis.set_title(f"{panel.title} ({count} {what})", fontsize=10)
+        titled(axis, f"{panel.title} ({statistics.targets[panel.kind]} {what})")
         axis.set_ylabel(f"{panel.label}, median")
     finish(figure, axes, style, experiment)
     return figure
@@ -100,7 +99,7 @@ def misfit_figure(
             textcoords="offset points",
             fontsize=7.5,
         )
-        axis.set_title(f"{TITLES[kind]} ({part['target'].nunique()} targets)", fontsize=10)
+        titled(axis, f"{TITLES[kind]} ({statistics.targets[kind]} targets)")
         axis.set_ylabel(f"RMSE of {channel}, median")
     finish(figure, axes, style, experiment)
     return figure
@@ -169,7 +168,7 @@ def distance_figure(experiment: Experiment, statistics: Statistics, parameter: s
             _distance_line(axis, line, str(tuner), style)
         axis.set_xticks(range(BINS + 1), bin_names(table), fontsize=7)
         axis.set_yscale("log")
-        axis.set_title(f"After {k} simulations", fontsize=10)
+        titled(axis, f"After {k} simulations")
         axis.set_xlabel(
             "distance of the target from the training range,\nin widths of that range; n targets"
         )

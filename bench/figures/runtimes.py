@@ -23,7 +23,7 @@ from bench.analysis.runtimes import percentile_interval, resampled
 from bench.analysis.statistics import Statistics
 from bench.analysis.table import checkpoints
 from bench.figures.errors import simulations_axis
-from bench.figures.style import INK, TITLES, Styles, blank, canvas, finish
+from bench.figures.style import INK, TITLES, Styles, blank, canvas, finish, titled
 from bench.problem.experiment import Experiment
 from sims.base import Array
 
@@ -60,7 +60,7 @@ def runtime_figure(experiment: Experiment, style: Styles, statistics: Statistics
         axis.set_ylim(-0.02, 1.02)
         axis.set_ylabel("share of (run, threshold) pairs reached for good")
         targets = statistics.curves.of(range=str(kind)).keys["target"].nunique()
-        axis.set_title(f"{TITLES[str(kind)]} ({targets} targets)", fontsize=10)
+        titled(axis, f"{TITLES[str(kind)]} ({targets} targets)")
     finish(figure, axes, style, experiment, spread_caption(spread))
     return figure
 
@@ -98,7 +98,7 @@ def amortisation_figure(
         axis.set_yscale("log")
         axis.set_xlabel("number of targets")
         axis.set_ylabel("simulations in total, training included")
-        axis.set_title(TITLES[kind], fontsize=10)
+        titled(axis, TITLES[kind])
     caption = (
         f"To reach an error of {level:.2g} for good: training + targets × expected simulations "
         "(ERT). Rings: a learned tuner passes a search tuner; bars: 95 % bootstrap interval. "
@@ -142,7 +142,7 @@ def cost_figure(experiment: Experiment, style: Styles, prices: Prices, level: fl
         _strip(axis, by_tuner, style)
         axis.set_xlabel("seconds that one simulation takes")
         axis.set_ylabel("seconds for one target")
-        axis.set_title(TITLES[kind], fontsize=10)
+        titled(axis, TITLES[kind])
     caption = (
         f"To reach an error of {level:.2g} for good: ERT × seconds of a simulation + seconds of "
         f"the tuner as measured; training shared by {SHARED} targets. "

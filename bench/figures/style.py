@@ -276,6 +276,12 @@ def canvas(panels: int) -> tuple[Figure, list[Axes]]:
     return figure, list(axes[0])
 
 
+def titled(axis: Axes, title: str) -> None:
+    """A title above a panel that has no ticks there."""
+    # Where its place is left open, every drawing measures all ticks for it.
+    axis.set_title(title, fontsize=10, y=1.0)
+
+
 def plain(axis: Axes) -> None:
     """A faint grid, and no frame above and to the right."""
     axis.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
@@ -419,12 +425,17 @@ class Pictures(NamedTuple):
 def _laid_out_once(
     figure: Figure, dpi: int, *makers: Callable[[Figure], bytes]
 ) -> tuple[bytes, ...]:
-    as_png = png(figure, dpi)
-    engine = figure.get_layout_engine()
-    figure.set_layout_engine(None)
+    engine, screen = figure.get_layout_engine(), figure.dpi
     try:
-        return as_png, *(make(figure) for make in makers)
+        if engine is not None:
+            # Left to savefig, layout would cost a drawing of its own.
+            figure.set_dpi(dpi)
+            engine.execute(figure)
+            figure.set_dpi(screen)
+            figure.set_layout_engine(None)
+        return png(figure, dpi), *(make(figure) for make in makers)
     finally:
+        figure.set_dpi(screen)
         figure.set_layout_engine(engine)
 
 

@@ -18,7 +18,7 @@ import pandas as pd
 from bench.analysis.curves import Rows
 from bench.analysis.paired import PROBLEMS, nemenyi
 from bench.analysis.rankings import agreement, mean_ranks, tau
-from bench.analysis.table import interval
+from bench.analysis.resampling import interval, means
 from bench.misspecified.calibration import EXTENDED, MODELS, PLAIN
 from bench.problem.experiment import Experiment
 from bench.problem.problem import Problem
@@ -171,7 +171,7 @@ def table(one: Outcome) -> pd.DataFrame:
             values = part[column].to_numpy(dtype=np.float64)
             values = values[np.isfinite(values)][:, None]
             names = (one.experiment.name, str(model), str(tuner))
-            low, high = interval(values, np.mean, *names, metric, parameter)
+            low, high = interval(values, means, *names, metric, parameter)
             mean = float(values.mean()) if len(values) else np.nan
             key = (one.experiment.name, model, tuner, metric, parameter, unit)
             lines.append((*key, mean, low[0], high[0], *counts))

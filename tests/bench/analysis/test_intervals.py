@@ -2,19 +2,36 @@
 
 import numpy as np
 import pytest
+from scipy.stats import bootstrap
 
+from bench.analysis.resampling import interval, means, medians
 from bench.analysis.runtimes import ert_table, percentile_interval
-from bench.analysis.table import interval, table
+from bench.analysis.table import table
+from bench.problem.seeds import rng_for
 from tests.bench.analysis.test_statistics import curves_of
 from tests.bench.analysis.test_table import at, runs_of, statuses_of
 
 
 def test_the_tables_interval_is_as_wide_as_95_percent_of_a_normal_distribution():
     values = np.random.default_rng(4).normal(3.0, 2.0, size=(500, 6))
-    low, high = interval(values, np.mean, "width", resamples=4000)
+    low, high = interval(values, means, "width", resamples=4000)
     ratio = (high - low) / (2 * 1.96 * values.std(axis=0, ddof=1) / np.sqrt(500))
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.03)
     assert (np.abs(ratio - 1.0) < 0.1).all()
+
+
+@pytest.mark.parametrize("targets", [2, 7, 60, 301])
+@pytest.mark.parametrize(("own", "plain"), [(means, np.mean), (medians, np.median)])
+def test_intervals_are_those_of_scipy_from_the_same_draws(targets, own, plain):
+    values = np.exp(3 * np.random.default_rng(targets).normal(size=(targets, 3)))
+    # Equal values, as where errors end at rounding, in one column.
+    values[: targets // 2 + 1, 0] = 1e-9
+    stream = rng_for("bootstrap", "a", "b")
+    expected = bootstrap(
+        (values,), plain, n_resamples=200, method="percentile", vectorized=True, rng=stream
+    ).confidence_interval
+    found = interval(values, own, "a", "b", resamples=200)
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
 
 
 def test_seeds_of_one_target_are_no_further_evidence():

@@ -2,7 +2,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.analysis.table import COLUMNS, checkpoints, interval, summary, table
+from bench.analysis.resampling import interval, means
+from bench.analysis.table import COLUMNS, checkpoints, summary, table
 
 
 def runs_of(curves, tuner="a", kind="in", metric="param_abs_error"):
@@ -91,29 +92,29 @@ def test_columns_are_those_of_the_file_format():
 def test_bootstrap_interval_matches_the_normal_one_and_covers():
     rng = np.random.default_rng(1)
     values = rng.normal(3.0, 2.0, size=(400, 1))
-    low, high = interval(values, np.mean, "x")
+    low, high = interval(values, means, "x")
     half = 1.96 * values.std(ddof=1) / np.sqrt(400)
     assert low[0] == pytest.approx(values.mean() - half, abs=0.04)
     assert high[0] == pytest.approx(values.mean() + half, abs=0.04)
     inside = 0
     for i in range(200):
         sample = rng.exponential(1.0, size=(40, 1))
-        low, high = interval(sample, np.mean, "c", str(i), resamples=400)
+        low, high = interval(sample, means, "c", str(i), resamples=400)
         inside += int(low[0] <= 1.0 <= high[0])
     assert 0.86 <= inside / 200 <= 0.98
 
 
 def test_interval_of_one_target_is_unknown_and_of_equal_ones_is_a_point():
-    low, high = interval(np.ones((1, 2)), np.mean, "x")
+    low, high = interval(np.ones((1, 2)), means, "x")
     assert np.isnan(low).all()
     assert np.isnan(high).all()
-    low, high = interval(np.full((5, 1), 0.25), np.mean, "x")
+    low, high = interval(np.full((5, 1), 0.25), means, "x")
     assert (low[0], high[0]) == (0.25, 0.25)
 
 
 def test_bootstrap_repeats():
     values = np.random.default_rng(0).exponential(size=(30, 3))
-    np.testing.assert_array_equal(interval(values, np.mean, "a"), interval(values, np.mean, "a"))
+    np.testing.assert_array_equal(interval(values, means, "a"), interval(values, means, "a"))
 
 
 def test_summary_puts_the_best_at_the_end_first():
