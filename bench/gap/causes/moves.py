@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 
@@ -27,6 +28,9 @@ that its simpler form leaves.
 """
 BETTER = 1e-6
 """A merit must grow by more than this for an exchange to count; less is rounding."""
+
+Parts = dict[str, Array]
+"""Effects with coefficients to begin with."""
 
 
 @dataclass
@@ -70,27 +74,35 @@ class Moves(Scored):
         return model
 
     def plainer(self, model: Model) -> Model:
-        """The model with simpler laws in the place of richer ones that contain them, and with the
-        one place that acts most in the place of all, where these come no nearer to the data.
+        """The model with simpler laws in the place of richer ones that contain them, one of them or
+        all together, and with the one place that acts most in the place of all, where these come no
+        nearer to the data.
         """
         for name in model.names:
-            for part, c in self._parts(model, name):
-                other = self._with_part(model, name, part, c)
+            for parts in self._parts(model, name):
+                other = self._with_parts(model, name, parts)
                 enough = self.excess(model) > NEARER * self.excess(other) > 0.0
                 if other.merit >= model.merit or enough:
                     return self.plainer(other)
         return model
 
-    def _parts(self, model: Model, name: str) -> Iterator[tuple[str, Array]]:
-        """The simpler laws at the same place that an effect contains, and of a family the member
-        that changes most; each with coefficients to begin with.
+    def _parts(self, model: Model, name: str) -> Iterator[Parts]:
+        """The simpler laws at the same place that an effect contains, one by one and all together,
+        and of a family the member that changes most; each with coefficients to begin with.
         """
         effects, slots = self.world.effects, self.world.slots
         own = model.fit.theta[slots[name]]
+        together, begin = Parts(), 0
         for part in effects[name].contains:
             if part in effects and effects[part].place == effects[name].place:
                 # What scales a law comes first in the law that it is part of.
-                yield part, own[: slots[part].stop - slots[part].start]
+                end = begin + slots[part].stop - slots[part].start
+                together[part], begin = own[begin:end], end
+        yield from ({part: c} for part, c in together.items())
+        # Of several it is the sum where what shapes it lies beyond the data: one law with a time
+        # far longer than the runs stands for two that are told, and comes near the data at once.
+        if len(together) > 1:
+            yield together
         members = getattr(effects[name], "members", ())
         each = len(members[0].coefficients) if members else 0
         # One coefficient for all places says nothing of one of them.
@@ -100,16 +112,18 @@ class Moves(Scored):
             responses = np.sqrt(np.square(model.fit.jacobian[..., columns]).sum(axis=(0, 1, 2)))
             sizes = (np.abs(own) * responses).reshape(len(members), each).max(axis=1)
             most = int(np.argmax(sizes))
-            yield members[most].name, own[each * most : each * (most + 1)]
+            yield {members[most].name: own[each * most : each * (most + 1)]}
 
-    def _with_part(self, model: Model, name: str, part: str, c: Array) -> Model:
-        """The model with a simpler effect in the place of a richer one."""
-        names = tuple(dict.fromkeys(part if n == name else n for n in model.names))
+    def _with_parts(self, model: Model, name: str, parts: Parts) -> Model:
+        """The model with simpler effects in the place of a richer one."""
+        replaced = ([*parts] if n == name else [n] for n in model.names)
+        names = tuple(dict.fromkeys(chain.from_iterable(replaced)))
         key = frozenset(names)
         if key not in self.models:
             theta = model.fit.theta.copy()
             theta[self.world.slots[name]] = 0.0
-            theta[self.world.slots[part]] = c
+            for part, c in parts.items():
+                theta[self.world.slots[part]] += c
             self.refit([Start(names, theta, model.fit.states)], race=False)
         return self.models[key]
 

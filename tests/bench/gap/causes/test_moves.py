@@ -53,6 +53,25 @@ def test_the_richer_law_stands_where_it_comes_nearer(truth, richer, kept):
         assert plainer.fit.theta[place] == pytest.approx(truth[kept], rel=0.05)
 
 
+@pytest.mark.parametrize(
+    ("truth", "kept"),
+    [
+        ({"friction.coulomb": 0.7, "drag.linear": 0.6}, {"friction.coulomb", "drag.linear"}),
+        ({"friction.warming": (0.7, 0.6, 2.0)}, {"friction.warming"}),
+    ],
+    ids=["far longer than the run", "within it"],
+)
+def test_a_law_whose_time_the_data_do_not_show_gives_way_to_the_sum_of_its_parts(truth, kept):
+    """In 4 s friction that falls over 300 s does not fall: it is dry and viscous friction."""
+    made = search({**truth, "force.bias": 0.4})
+    values = {"friction.warming": (0.7, 0.6, 2.0 if len(kept) == 1 else 300.0), "force.bias": 0.3}
+    plainer = made.plainer(fitted(made, ("force.bias", "friction.warming"), values))
+    assert set(plainer.names) == {"force.bias", *kept}
+    for name in truth:
+        c = plainer.fit.theta[made.world.slots[name]]
+        np.testing.assert_allclose(c, truth[name], rtol=0.05)
+
+
 def test_what_is_far_from_the_data_is_told_by_the_shorter_account(monkeypatch):
     """Where structure is left merits mislead: a richer law that leaves as much as its part goes."""
     made = search({"friction.coulomb": 0.7, "force.bias": 0.4})
