@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sims.base import Array, Simulator
+from sims.base import Array, InputError, Simulator
 from sims.recording.recording import Recording, Run
 
 MOST = 1.6e5
@@ -63,6 +63,13 @@ def cut(
     """
     if seconds is None and (whole or not kind.has_model):
         return Cut(recording, "")
+    robot: Any = kind
+    floats = kind.has_model and robot.system.floats
+    if floats and seconds is not None:
+        raise InputError(
+            f"{recording.path}: expected no --pieces: bodies of {recording.system} float, and "
+            "nothing says where they are when a piece begins; leave it out"
+        )
     budget = np.inf if whole or not kind.has_model else _budget(kind)
     kept: list[Run] = []
     notes = []
@@ -72,7 +79,8 @@ def cut(
             kept += runs
             continue
         share = min(budget / all_of_it, 1.0) if all_of_it > 0 else 1.0
-        pieces = [p for run in runs for p in _pieces(run, share * _seconds(run), seconds or PIECE)]
+        take = _first if floats else _pieces
+        pieces = [p for run in runs for p in take(run, share * _seconds(run), seconds or PIECE)]
         kept += pieces
         left = sum(map(_seconds, pieces))
         notes.append(f"{left:.3g} s of {all_of_it:.4g} s for {word}, in {len(pieces)} pieces")
@@ -118,6 +126,12 @@ def _pieces(run: Run, seconds: float, longest: float) -> list[Run]:
         name = f"{run.name} from {run.times[begin]:.4g} s"
         pieces.append(run.part(slice(begin, end), name))
     return pieces
+
+
+def _first(run: Run, seconds: float, _: float) -> list[Run]:
+    """The beginning of a run, which is known where bodies float."""
+    end = int(np.searchsorted(run.times, run.times[0] + seconds - EVEN))
+    return [run.part(slice(0, max(end, FEWEST)), f"{run.name}, its first {seconds:.4g} s")]
 
 
 def _changes(run: Run) -> Array:

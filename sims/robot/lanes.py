@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.base import Array
+from sims.robot.floating import Afloat, Floating
 from sims.robot.model import Robot
 from sims.robot.native import FIELDS, SOLIMP, lanes_spec, stiff_of
 from sims.robot.quiet import quiet
@@ -126,6 +127,7 @@ class Bench:
         places: addresses of the joints of the robot's file.
         second: those of joints in series with them.
         whole: all of these, in this order.
+        floating: bodies that float or turn on balls.
         drives: columns of the sensors' data that show what actuators exert, by joint.
 
     Args:
@@ -147,6 +149,7 @@ class Bench:
         self.count = count
         self.places, self.second = Addresses(robot), Addresses(robot, series=True)
         self.whole = Addresses(robot, both=True)
+        self.floating = Floating.of(robot)
         model = read_model(robot, derived)
         # A lane that fails must be NaN: MuJoCo would reset it, and it would pass for done.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -195,15 +198,18 @@ class Bench:
     def _derives(field: str) -> bool:
         return any(field in native.fields and native.derived for native in FIELDS.values())
 
-    def begin(self, positions: Array, velocities: Array) -> tuple[Array, Array]:
-        """Put the lanes at their initial states, (n, D) each, of the file's joints; returns where
-        joints in series begin (n, H): where the links hang while their drives are held.
+    def begin(self, positions: Array, velocities: Array, afloat: Afloat) -> tuple[Array, Array]:
+        """Put the lanes at their initial states, (n, D) each, of the file's joints, and of what
+        floats; returns where joints in series begin (n, H): where the links hang while their drives
+        are held.
         """
         self.batch.reset(stage=0)
         qpos, qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         n = len(positions)
         qpos[:n, self.places.positions] = positions
         qvel[:n, self.places.velocities] = velocities
+        qpos[:n, self.floating.positions] = afloat.pose
+        qvel[:n, self.floating.velocities] = afloat.rate
         second = self.second
         begun = np.zeros((n, second.positions.size))
         if begun.size:

@@ -4,17 +4,18 @@ sensors would show it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from sims.base import Array, Scenario
 from sims.robot.felt import INSTANT
 from sims.robot.felt import felt as felt_over
+from sims.robot.floating import Afloat
 from sims.robot.native import FIELDS
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
-from sims.robot.scales import scales
+from sims.robot.scales import floating_forces, scales
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
 from sims.robot.tangent import TOGETHER, Change, Motion, Tangent
@@ -87,7 +88,18 @@ class Linear:
             instant=given.instant[0],
             inputs={name: u[0] for name, u in given.felt.items()},
             carried=carried,
+            afloat=self._afloat(made.fields),
             step=simulator.step,
+        )
+
+    def _afloat(self, fields: Mapping[str, Array]) -> Afloat:
+        """What floats, at the beginnings of steps and at the end."""
+        begun = self._simulator.begins_afloat(self._work)
+        floating = self._simulator.wide(self._work.acting).floating
+        pose = fields["qpos"][0][:, floating.positions]
+        rate = fields["qvel"][0][:, floating.velocities]
+        return Afloat(
+            np.concatenate([begun.pose[None], pose]), np.concatenate([begun.rate[None], rate])
         )
 
     def _neighbourhood(self) -> Tangent:
@@ -103,7 +115,7 @@ class Linear:
             self._motion,
             self._work.acting,
             outputs,
-            np.append(sizes, sizes[second]),
+            np.concatenate([sizes, sizes[second], floating_forces(simulator.robot)]),
             bench.whole,
         )
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.base import Array
+from sims.robot.floating import Floating
 from sims.robot.model import Robot
 
 POSES = 24
@@ -55,3 +56,16 @@ def scales(robot: Robot) -> Scales:
     inertia = np.mean(inertias, axis=0)
     force = np.maximum(np.max(weights, axis=0), ACCELERATION * inertia)
     return Scales(np.maximum(force, LEAST), np.maximum(inertia, 1e-9))
+
+
+def floating_forces(robot: Robot) -> Array:
+    """(F,) of each move of what floats, what it takes to accelerate, in N or N m."""
+    import mujoco
+
+    model = robot.compiled
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    whole = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, whole)
+    result: Array = ACCELERATION * np.diagonal(whole)[Floating.of(robot).velocities]
+    return result

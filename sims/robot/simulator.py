@@ -20,6 +20,7 @@ from sims.plan import Runs, make_runs
 from sims.robot.acting import derives, filled, is_asked, lanes_with, natives, part_of
 from sims.robot.felt import INSTANT, SHARE
 from sims.robot.felt import felt as felt_over
+from sims.robot.floating import Afloat, Floating
 from sims.robot.forces import Forces, over_time
 from sims.robot.lanes import LANES, Addresses, Bench, Mask, Places
 from sims.robot.model import Actuator, Robot
@@ -63,6 +64,7 @@ class RobotSimulator(Simulated):
         self._freed: list[Effect] = [effect() for effect in freed]
         self.robotic = self.system()
         self.addresses = Addresses(self.robot)
+        self._floating = Floating.of(self.robot)
         self._benches: dict[tuple[bool, int, Added], Bench] = {}
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
@@ -188,7 +190,9 @@ class RobotSimulator(Simulated):
         whole = Given.of(given)
         x = np.concatenate([work.x for work in works])
         v = np.concatenate([work.v for work in works])
-        made = self._stepped(Start(x, v, acting), whole, derived, asked, series=series)
+        made = self._stepped(
+            Start(x, v, acting, self._afloat(works)), whole, derived, asked, series=series
+        )
         seen = []
         first = 0
         for work, size in zip(works, sizes, strict=True):
@@ -196,6 +200,16 @@ class RobotSimulator(Simulated):
             seen.append(self._shown(made.of(own), work, work.times, size))
             first += len(work.x)
         return seen
+
+    def _afloat(self, works: Sequence[Work]) -> Afloat:
+        """Where what floats begins in the lanes of all runs."""
+        begun = [self.begins_afloat(work) for work in works]
+        sizes = [len(work.x) for work in works]
+        return Afloat(*(np.repeat(rows, sizes, axis=0) for rows in zip(*begun, strict=True)))
+
+    def begins_afloat(self, work: Work) -> Afloat:
+        """Where what floats begins in a run: as the recording states it, else as the file does."""
+        return self._floating.begun(self.run_initial(work.scenario))
 
     def steps_of(self, times: Array) -> int:
         """How many steps it takes to the last of some instants since the start."""
@@ -260,7 +274,7 @@ class RobotSimulator(Simulated):
         derived = bool(lanes_with(work.acting, n, derives).any())
         asked = bool(lanes_with(work.acting, n, is_asked).any())
         (series,) = by_series(work.acting, n)
-        start = Start(work.x, work.v, work.acting)
+        start = Start(work.x, work.v, work.acting, self._afloat([work]))
         return self._stepped(start, given, derived, asked, more, series)
 
     def _stepped(
@@ -277,7 +291,7 @@ class RobotSimulator(Simulated):
         bench = self._bench(derived, 1 if n == 1 else LANES, series)
         places, second = bench.places, bench.second
         bench.load(filled(natives(start.acting), n, bench.count))
-        behind = bench.begin(start.x, start.v)
+        behind = bench.begin(start.x, start.v, start.afloat)
         begun = bench.settle(given.controls[:, 0])
         record = ["qpos", "qvel", *more]
         if self._feels():

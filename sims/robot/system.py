@@ -10,6 +10,7 @@ from sims import effects as library
 from sims.base import Array, Channel, InputError, Parameter, unknown
 from sims.registry import SkippedError
 from sims.robot import places
+from sims.robot.floating import Floating
 from sims.robot.model import Robot
 from sims.robot.moment import OneJoint, Slide
 from sims.robot.native import FIELDS
@@ -163,6 +164,8 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
     model = robot.compiled
     states = {f"q.{j.name}": float(model.qpos0[j.position]) for j in joints}
     states |= {f"qd.{j.name}": 0.0 for j in joints}
+    floating = Floating.of(robot)
+    states |= floating.states(model)
     drives: dict[int, tuple[str, ...]] = {}
     servos: dict[int, str] = {}
     gears: dict[int, float] = {}
@@ -186,6 +189,7 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
         "states": MappingProxyType(states),
         "sensed": tuple(c.name for c in channels),
         "robot": robot,
+        "floats": bool(floating),
         "spots": places.spots(robot, [(c.name, c.unit) for c in channels]),
         "alone": tuple(OneJoint() if j.kind == "hinge" else Slide() for j in joints),
         "drives": drives,

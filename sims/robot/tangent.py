@@ -29,6 +29,7 @@ import numpy as np
 
 from sims.base import Array
 from sims.robot.acting import is_asked, natives
+from sims.robot.floating import Afloat
 from sims.robot.forces import LOADED, moment_of
 from sims.robot.lanes import Addresses, Bench, Places
 from sims.robot.moment import RobotMoment
@@ -61,6 +62,7 @@ class Motion:
         forces: (S, nv) generalised, known beforehand.
         inputs: (S,) what is felt of each input, by name.
         carried: (2, S, D) what transmissions carry, from either side.
+        afloat: (S + 1, P) poses and (S + 1, F) velocities of what floats.
         step: seconds.
     """
 
@@ -72,18 +74,25 @@ class Motion:
     forces: Array
     inputs: Mapping[str, Array]
     carried: Array
+    afloat: Afloat
     step: float
+
+    @property
+    def rates(self) -> Array:
+        """(S + 1, D + F) all velocities."""
+        return np.concatenate([self.v, self.afloat.rate], axis=1)
 
 
 class Quotients(NamedTuple):
-    """The quotients of (1) and those of readings, in every step; Z states, O readings.
+    """The quotients of (1) and those of readings, in every step; Z states, O readings, E = D + F
+    forces.
 
     Attributes:
         states: A (S, Z, Z).
-        forces: B (S, Z, D).
+        forces: B (S, Z, E).
         controls: C (S, Z, nu).
         read_states: (S, O, Z).
-        read_forces: (S, O, D).
+        read_forces: (S, O, E).
         read_controls: (S, O, nu).
     """
 
@@ -104,7 +113,7 @@ class Change(NamedTuple):
         actuator: whose control it is; -1 if it is none.
         series: (S,) forces or controls; None if numbers of the model change.
         instant: (S,) controls as they are when each step begins.
-        forces: (N, D) what these amount to, at each instant that is looked at.
+        forces: (N, E) what these amount to, at each instant that is looked at.
         readings: (N, O) and what they do to readings.
     """
 
@@ -127,7 +136,7 @@ class Tangent:
         acting: effects that act in it, with coefficients (K, 1, 1).
         places: addresses of the joints.
         outputs: names of MuJoCo's data and their columns that are read, beside the state.
-        sizes: (D,) typical forces.
+        sizes: (E,) typical forces.
     """
 
     def __init__(
@@ -145,6 +154,8 @@ class Tangent:
         self._outputs = tuple(outputs)
         self._sizes = sizes
         self._places = places
+        self._floating = bench.floating
+        self._dofs = np.append(places.velocities, self._floating.velocities)
         self._steps = len(motion.controls)
         self._looks, self._of = looks, of = _looks(motion)
         every = max(round(HELD / motion.step), 1)
@@ -169,7 +180,9 @@ class Tangent:
 
     @property
     def size(self) -> int:
-        """Numbers of a state: positions, velocities, activations, what effects remember."""
+        """Numbers of a state: positions, velocities, activations, what effects remember, moves and
+        velocities of what floats.
+        """
         return int(self._base.shape[1])
 
     # -- one step from every instant that is looked at
@@ -181,28 +194,34 @@ class Tangent:
         state moved.
         """
         states, readings = [], []
-        bind, places = self._bench.batch.bind, self._places
+        bind, places, floating = self._bench.batch.bind, self._places, self._floating
+        begin = 0
         for n, ids in self._placed(moved, acting):
             self._bench.batch.step(ids)
             parts = [bind("qpos")[:n, places.positions], bind("qvel")[:n, places.velocities]]
             if self._motion.act.shape[1]:
                 parts.append(bind("act")[:n])
             parts += [state.v for state in self._after.values()]
+            if floating:
+                reached = self._motion.afloat.pose[self._looks[begin : begin + n] + 1]
+                parts.append(floating.apart(bind("qpos")[:n, floating.positions], reached))
+                parts.append(bind("qvel")[:n, floating.velocities])
+            begin += n
             states.append(np.concatenate(parts, axis=1))
             readings.append(self._readings(n))
         return np.concatenate(states), np.concatenate(readings)
 
     def _accelerated(self, acting: Acting, more: Array | None = None) -> tuple[Array, Array]:
-        """Accelerations (N, D) at each instant, and readings (N, O); with more forces (N, D)."""
+        """Accelerations (N, E) at each instant, and readings (N, O); with more forces (N, E)."""
         accelerations, readings = [], []
         applied = self._bench.batch.bind("qfrc_applied")
-        dofs, begin = self._places.velocities, 0
+        dofs, begin = self._dofs, 0
         for n, ids in self._placed({}, acting):
             if more is not None:
                 applied[:n, dofs] += more[begin : begin + n]
                 begin += n
             self._bench.batch.forward(ids)
-            accelerations.append(self._bench.batch.bind("qacc")[:n, self._places.velocities].copy())
+            accelerations.append(self._bench.batch.bind("qacc")[:n, dofs].copy())
             readings.append(self._readings(n))
         return np.concatenate(accelerations), np.concatenate(readings)
 
@@ -216,7 +235,7 @@ class Tangent:
         self, moved: Mapping[str, tuple[int, float]], acting: Acting
     ) -> Iterator[tuple[int, Places | None]]:
         """Put the lanes at the instants, batch after batch: how many there are, and which."""
-        motion, places = self._motion, self._places
+        motion, places, floating = self._motion, self._places, self._floating
         count = self._bench.count
         self.looks += self._looks.size
         self._bench.load(_repeated(acting, count))
@@ -228,9 +247,10 @@ class Tangent:
         targets = {
             "q": lambda k: qpos[:, places.positions[k]],
             "v": lambda k: qvel[:, places.velocities[k]],
-            "f": lambda k: applied[:, places.velocities[k]],
+            "f": lambda k: applied[:, self._dofs[k]],
             "u": lambda k: ctrl[:, k],
             "a": lambda k: bind("act")[:, k],
+            "r": lambda k: qvel[:, floating.velocities[k]],
         }
         for begin in range(0, self._looks.size, count):
             at = self._looks[begin : begin + count]
@@ -238,12 +258,17 @@ class Tangent:
             batch.state[:] = self._fresh
             qpos[:n, places.positions] = motion.x[at]
             qvel[:n, places.velocities] = motion.v[at]
+            qpos[:n, floating.positions] = motion.afloat.pose[at]
+            qvel[:n, floating.velocities] = motion.afloat.rate[at]
             ctrl[:n] = motion.controls[at]
             applied[:n] = motion.forces[at]
             if na:
                 bind("act")[:n] = motion.act[at]
             for name, (k, size) in moved.items():
-                if name != "w":
+                if name == "p":
+                    poses = floating.moved(motion.afloat.pose[at], k, size)
+                    qpos[:n, floating.positions] = poses
+                elif name != "w":
                     targets[name](k)[:n] += size
             self._ask(at, n, dict([moved["w"]]) if "w" in moved else {})
             yield n, None if n == count else np.arange(n)
@@ -287,7 +312,7 @@ class Tangent:
         return np.repeat(self._stiffness, count, axis=0)
 
     def _quotients(self) -> Quotients:
-        size = self._motion.x.shape[1]
+        size, afloat = self._motion.x.shape[1], self._floating.velocities.size
         na, nu = self._motion.act.shape[1], self._motion.controls.shape[1]
         # What effects remember stands behind the activations.
         remembered = list(self._after)
@@ -295,8 +320,10 @@ class Tangent:
             "z": [("q", j, POSITION) for j in range(size)]
             + [("v", j, VELOCITY) for j in range(size)]
             + [("a", j, CONTROL) for j in range(na)]
-            + [("w", k, CONTROL) for k in remembered],
-            "f": [("f", j, SHARE * float(self._sizes[j])) for j in range(size)],
+            + [("w", k, CONTROL) for k in remembered]
+            + [("p", j, POSITION) for j in range(afloat)]
+            + [("r", j, VELOCITY) for j in range(afloat)],
+            "f": [("f", j, SHARE * float(self._sizes[j])) for j in range(size + afloat)],
             "u": [("u", j, CONTROL) for j in range(nu)],
         }
         found: dict[str, tuple[Array, Array]] = {}
@@ -327,7 +354,7 @@ class Tangent:
 
     @cached_property
     def _meant(self) -> Array:
-        """(N, D) forces with which the acceleration at each instant is that over its step, which
+        """(N, E) forces with which the acceleration at each instant is that over its step, which
         an implicit integrator has damped, and in which the others have gone on.
         """
         apart = self.accelerations[self._looks] - self._still[0]
@@ -336,7 +363,7 @@ class Tangent:
 
     @cached_property
     def _inertias(self) -> Array:
-        """(N, D, D) of the joints at each instant that is looked at."""
+        """(N, E, E) of all that moves at each instant that is looked at."""
         import mujoco
 
         self._bench.load(_repeated(self._acting, self._bench.count))
@@ -345,13 +372,15 @@ class Tangent:
         places = self._places
         whole = np.zeros((model.nv, model.nv))
         found = []
-        for x in self._motion.x[self._looks]:
+        poses = self._motion.afloat.pose[self._looks]
+        for x, pose in zip(self._motion.x[self._looks], poses, strict=True):
             data.qpos[places.positions] = x
+            data.qpos[self._floating.positions] = pose
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_crb(model, data)
             mujoco.mj_fullM(model, data, whole)
-            found.append(whole[np.ix_(places.velocities, places.velocities)])
+            found.append(whole[np.ix_(self._dofs, self._dofs)])
         return np.array(found)
 
     def by_force(self, owner: int, effect: Effect, c: Array) -> list[Change]:
@@ -384,9 +413,9 @@ class Tangent:
 
     @cached_property
     def accelerations(self) -> Array:
-        """(S, D) over each step."""
+        """(S, E) over each step."""
         motion = self._motion
-        result: Array = np.diff(motion.v, axis=0)[: self._steps] / motion.step
+        result: Array = np.diff(motion.rates, axis=0)[: self._steps] / motion.step
         return result
 
     # -- through time

@@ -10,6 +10,7 @@ import numpy as np
 from sims.base import Array, Scenario
 from sims.plan import Runs
 from sims.robot.acting import Mask
+from sims.robot.floating import Afloat
 from sims.robot.lanes import Places
 from sims.system import Acting, Sensor
 
@@ -56,11 +57,12 @@ def instants(work: Work) -> Array:
 
 
 class Start(NamedTuple):
-    """Where n lanes begin, (n, D) each, and what acts on them."""
+    """Where n lanes begin, (n, D) each, what acts on them, and where what floats begins."""
 
     x: Array
     v: Array
     acting: Acting
+    afloat: Afloat
 
 
 class Given(NamedTuple):

@@ -35,11 +35,12 @@ HOLES = 2
 def pieces(world: World) -> World | None:
     """The world of the pieces, with the same parameters; None where every run is too short for two.
 
-    None for what bounces, too: a piece that begins beside an impact leaves open on which side of
-    it, and a ball that comes to rest is searched for a minimum among hundreds of small bounces
-    (minutes, on the exam's updrafts).
+    None for what floats, since nothing says where it is when a piece begins. None for what bounces,
+    too: a piece that begins beside an impact leaves open on which side of it, and a ball that comes
+    to rest is searched for a minimum among hundreds of small bounces (minutes, on the exam's
+    updrafts).
     """
-    if world.simulator.system.bounces:
+    if world.simulator.system.bounces or world.simulator.system.floats:
         return None
     runs = [piece for run in world.runs for piece in _cut(run)]
     if len(runs) == len(world.runs):
