@@ -1,4 +1,6 @@
-"""Bodies that float or turn on balls: where runs begin with them, and how they carry what is small."""
+"""Bodies that float or turn on balls: where runs begin with them, and how they carry what is small
+away.
+"""
 
 import numpy as np
 import pytest
