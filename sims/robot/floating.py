@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,10 +25,19 @@ from sims.base import Array, InputError
 from sims.robot.model import Joint, Robot
 
 Places = NDArray[np.intp]
-PLACE, TURN = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
-MOVES, TURNS = ("x", "y", "z"), ("wx", "wy", "wz")
+AXES, TURN, SPIN = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("wx", "wy", "wz")
 LEAST = 1e-6
 """Length of a quaternion that is none."""
+
+
+class Own(NamedTuple):
+    """Of a joint: its axes of translation, of which a ball has none; where its quaternion stands in
+    a pose; and the number of the first of its moves.
+    """
+
+    axes: tuple[str, ...]
+    turn: slice
+    first: int
 
 
 class Afloat(NamedTuple):
@@ -55,8 +65,8 @@ class Floating:
     def of(cls, robot: Robot) -> Floating:
         """Those of a robot."""
         joints = tuple(joint for joint in robot.joints if not joint.single)
-        positions = [j.position + k for j in joints for k in range(7 if j.kind == "free" else 4)]
-        velocities = [j.velocity + k for j in joints for k in range(6 if j.kind == "free" else 3)]
+        positions = [j.position + k for j in joints for k in range(len(_axes(j) + TURN))]
+        velocities = [j.velocity + k for j in joints for k in range(len(_axes(j) + SPIN))]
         return cls(joints, np.array(positions, np.intp), np.array(velocities, np.intp))
 
     def __bool__(self) -> bool:
@@ -64,11 +74,9 @@ class Floating:
 
     def names(self) -> tuple[list[str], list[str]]:
         """Of positions and velocities, as recordings state them: ``q.base.qw``, ``qd.base.wx``."""
-        positions, velocities = [], []
-        for joint in self.joints:
-            free = joint.kind == "free"
-            positions += [f"q.{joint.name}.{axis}" for axis in (*(PLACE if free else ()), *TURN)]
-            velocities += [f"qd.{joint.name}.{axis}" for axis in (*(MOVES if free else ()), *TURNS)]
+        axes = [(joint.name, _axes(joint)) for joint in self.joints]
+        positions = [f"q.{name}.{axis}" for name, own in axes for axis in own + TURN]
+        velocities = [f"qd.{name}.{axis}" for name, own in axes for axis in own + SPIN]
         return positions, velocities
 
     def states(self, model: Any) -> dict[str, float]:
@@ -86,7 +94,7 @@ class Floating:
         positions, velocities = self.names()
         pose = np.array([states[name] for name in positions], dtype=float)
         rate = np.array([states[name] for name in velocities], dtype=float)
-        for joint, turn in zip(self.joints, self._turns(), strict=True):
+        for joint, (_, turn, _) in zip(self.joints, self._own, strict=True):
             length = float(np.linalg.norm(pose[turn]))
             if length < LEAST:
                 given = ", ".join(f"q.{joint.name}.{axis}" for axis in TURN)
@@ -97,40 +105,41 @@ class Floating:
     def moved(self, pose: Array, number: int, by: float) -> Array:
         """Poses (n, P) with one of the F numbers of a small move made, as (1) has it."""
         result = pose.copy()
-        for joint, turn, first in zip(self.joints, self._turns(), self._firsts(), strict=True):
-            own = number - first
-            places = 3 if joint.kind == "free" else 0
-            if 0 <= own < places:
-                result[:, turn.start - 3 + own] += by
-            elif places <= own < places + 3:
-                small = np.zeros(4)
-                small[0], small[1 + own - places] = np.cos(0.5 * by), np.sin(0.5 * by)
+        for axes, turn, first in self._own:
+            # of a free joint the place comes first
+            own = number - first - len(axes)
+            if -len(axes) <= own < 0:
+                result[:, turn.start + own] += by
+            elif 0 <= own < len(SPIN):
+                small = np.zeros(len(TURN))
+                small[0], small[1 + own] = np.cos(0.5 * by), np.sin(0.5 * by)
                 result[:, turn] = _product(pose[:, turn], small[None])
         return result
 
     def apart(self, pose: Array, reference: Array) -> Array:
         """(n, F) the moves that lead from reference poses (n, P) to poses."""
         parts = []
-        for joint, turn in zip(self.joints, self._turns(), strict=True):
-            if joint.kind == "free":
-                own = slice(turn.start - 3, turn.start)
-                parts.append(pose[:, own] - reference[:, own])
+        for axes, turn, _ in self._own:
+            place = slice(turn.start - len(axes), turn.start)
+            parts.append(pose[:, place] - reference[:, place])
             back = reference[:, turn] * np.array([1.0, -1.0, -1.0, -1.0])
             parts.append(_logarithm(_product(back, pose[:, turn])))
         return np.concatenate(parts, axis=1) if parts else np.zeros((len(pose), 0))
 
-    def _turns(self) -> list[slice]:
-        """Where in a pose the quaternions stand."""
-        slices, end = [], 0
-        for joint in self.joints:
-            end += 7 if joint.kind == "free" else 4
-            slices.append(slice(end - 4, end))
-        return slices
+    @cached_property
+    def _own(self) -> tuple[Own, ...]:
+        """Where each joint's numbers stand."""
+        own, end, first = [], 0, 0
+        for axes in map(_axes, self.joints):
+            end += len(axes + TURN)
+            own.append(Own(axes, slice(end - len(TURN), end), first))
+            first += len(axes + SPIN)
+        return tuple(own)
 
-    def _firsts(self) -> list[int]:
-        """The first number of each joint's moves."""
-        sizes = [6 if joint.kind == "free" else 3 for joint in self.joints]
-        return [sum(sizes[:k]) for k in range(len(sizes))]
+
+def _axes(joint: Joint) -> tuple[str, ...]:
+    """Along which it moves from its place."""
+    return AXES if joint.kind == "free" else ()
 
 
 def _product(one: Array, other: Array) -> Array:

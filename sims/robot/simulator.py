@@ -209,7 +209,7 @@ class RobotSimulator(Simulated):
 
     def begins_afloat(self, work: Work) -> Afloat:
         """Where what floats begins in a run: as the recording states it, else as the file does."""
-        return self._floating.begun(self.run_initial(work.scenario))
+        return self._floating.begun(self.run_initial(work.scenario) if self._floating else {})
 
     def steps_of(self, times: Array) -> int:
         """How many steps it takes to the last of some instants since the start."""

@@ -93,8 +93,8 @@ def test_a_run_begins_as_the_recording_states_it():
 
 
 def test_a_free_body_that_a_sensor_shows_keeps_the_spin_it_was_given():
-    text = SATELLITE.replace("</actuator>", "</actuator><sensor><framequat name='att' objtype="
-                             "'body' objname='hull'/></sensor>").replace("5 ", "5 ")  # fmt: skip
+    sensor = "<sensor><framequat name='att' objtype='body' objname='hull'/></sensor>"
+    text = SATELLITE.replace("</actuator>", f"</actuator>{sensor}")
     text = text.replace('diaginertia="0.2 0.25 0.3"', 'diaginertia="2e3 2e3 2e3"')
     kind = kind_of(text).stepped_by(Numerics(0.002, "RK4"))
     names = [f"s.att.{axis}" for axis in "wxyz"]
