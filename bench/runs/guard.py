@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from bench.runs.births import ignore_interrupts
 from bench.sealing.kernel import hide_memory
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def initialise(plugins: Sequence[Plugin], births: Any) -> None:
         births: where the worker tells that it is there.
     """
     # A terminal's Ctrl-C reaches every process of the group; the parent alone answers it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ignore_interrupts()
     # First of all that may fail: a birth that nobody hears of would look like a worker at work.
     births.send(os.getpid())
     threading.Thread(target=_end_with_parent, daemon=True, name="end-with-parent").start()

@@ -9,7 +9,6 @@ all of them, and here stops only itself.
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
 import threading
 import traceback
@@ -22,6 +21,7 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol
 
+from bench.runs.births import HeldBackContext
 from bench.runs.guard import initialise
 from bench.sealing.ended import how_it_ended
 from sims.base import InputError
@@ -258,7 +258,7 @@ class _Slot:
         from pebble import ProcessPool
 
         # Not forked: a fork inherits the parent's memory, and in it the truth.
-        context = multiprocessing.get_context("spawn")
+        context = HeldBackContext()
         # Each process that the pool starts tells of its birth here: a second one means that the
         # first is dead, which pebble does not notice where it exited with code 0.
         self._births, telling = context.Pipe(duplex=False)

@@ -1,3 +1,4 @@
+import multiprocessing
 import os
 import signal
 import sys
@@ -8,6 +9,7 @@ import numpy as np
 import psutil
 import pytest
 
+from bench.runs.births import HeldBackContext, ignore_interrupts
 from bench.runs.pools import RETRIES, DeathError, LocalPool
 from bench.runs.survey import Plugin
 from bench.sealing.memory import memory_limit
@@ -170,3 +172,28 @@ def test_memory_beyond_the_limit_is_refused_and_the_limit_ends_with_the_block():
     assert np.ones(37_500_000).nbytes == 300_000_000
     with memory_limit(0):
         assert np.ones(37_500_000).nbytes == 300_000_000
+
+
+def interrupted_at_birth(context):
+    """A process that Ctrl-C reaches as soon as it is there: its exit code."""
+    process = context.Process(target=leave_when_told)
+    process.start()
+    os.kill(process.pid, signal.SIGINT)
+    process.join(60.0)
+    return process.exitcode
+
+
+def leave_when_told():
+    ignore_interrupts()
+    os.kill(os.getpid(), signal.SIGINT)
+    os._exit(7)
+
+
+def test_an_interrupt_waits_for_a_worker_that_is_not_there_yet():
+    """Ctrl-C goes to the whole group; a worker at its imports would end with a traceback."""
+    assert interrupted_at_birth(HeldBackContext()) == 7
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+def test_an_interrupt_ends_a_process_that_nothing_shelters():
+    assert interrupted_at_birth(multiprocessing.get_context("spawn")) != 7
