@@ -27,7 +27,7 @@ class _HeldBack(SpawnProcess):
 class HeldBackContext(SpawnContext):
     """multiprocessing's spawn context, with processes that interrupts wait for."""
 
-    Process = _HeldBack  # type: ignore[assignment]
+    Process = _HeldBack
 
 
 @contextmanager
