@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench import study
+from bench.diagnosis import columns as diagnosis
 from bench.figures import comparison
 from bench.misspecified.calibration import MODELS
 from bench.problem.asked import asked
@@ -305,7 +306,8 @@ class Compared:
     """A comparison that has been made, read from its folder.
 
     Args:
-        folder: of a comparison, a bounce shot or a study of a missing effect, finished or not.
+        folder: of a comparison of tuners or of diagnosers, a bounce shot or a study of a missing
+            effect, finished or not.
 
     Attributes:
         folder: where everything lies.
@@ -342,7 +344,15 @@ class Compared:
     @property
     def _in_files(self) -> bool:
         """Whether tables and figures are such as no comparison has."""
-        return bool(self.experiment.shot or self.experiment.calibration)
+        asked = self.experiment
+        return bool(asked.shot or asked.calibration or asked.diagnosis)
+
+    @property
+    def _what(self) -> str:
+        """What such a folder is called."""
+        if self.experiment.diagnosis:
+            return "a comparison of diagnosers"
+        return "a bounce shot" if self.experiment.shot else "a study of two comparisons"
 
     def _both(self, rows: Callable[[Stored], pd.DataFrame]) -> pd.DataFrame:
         """Rows of both comparisons of a study of two, the simulator's name in front."""
@@ -359,8 +369,11 @@ class Compared:
     def tables(self) -> dict[str, pd.DataFrame]:
         """The tables by name: table, ert, pairs, break_even, who_wins; of a bounce shot table and
         shots (docs/results-films.md), of a study of a missing effect table, ranks and ranking
-        (docs/misspecified.md).
+        (docs/misspecified.md), of a comparison of diagnosers table, failures, items and the others
+        (docs/diagnosers.md).
         """
+        if self.experiment.diagnosis:
+            return {name: diagnosis.read_table(self.folder, name) for name in diagnosis.TABLES}
         if self.experiment.shot:
             return {name: self._csv(name) for name in ("table", "shots")}
         if self.experiment.calibration:
@@ -369,27 +382,35 @@ class Compared:
 
     @property
     def table(self) -> pd.DataFrame:
-        """Error after N simulations by tuner, range and metric, in long form, as table.csv."""
+        """Error after N simulations by tuner, range and metric, in long form, as table.csv; of
+        diagnosers each share with its interval.
+        """
         return self.tables["table"]
 
     @property
     def runs(self) -> pd.DataFrame:
-        """A row for each simulation, as runs.parquet; of a bounce shot a row for each shot."""
+        """A row for each simulation, as runs.parquet; of a bounce shot a row for each shot, of
+        diagnosers for each answer.
+        """
+        if self.experiment.diagnosis:
+            return self.tables["items"]
         if self.experiment.calibration:
             return self._both(lambda stored: stored.runs)
         return self.tables["shots"] if self.experiment.shot else self._stored.runs
 
     @property
     def statuses(self) -> pd.DataFrame:
-        """A row for each run, how it ended and why, as status.csv."""
+        """A row for each run or answer, how it ended and why, as status.csv."""
+        if self.experiment.diagnosis:
+            return self.tables["items"][list(diagnosis.STATUS)]
         if self.experiment.calibration:
             return self._both(lambda stored: stored.statuses)
         return self._csv("status") if self.experiment.shot else self._stored.statuses
 
     @property
     def figures(self) -> list[str]:
-        """Names of the figures that there are; those of a bounce shot and of a study of a missing
-        effect are files in its folder.
+        """Names of the figures that there are; those of a bounce shot, of a study of a missing
+        effect and of diagnosers are files in its folder.
         """
         return [] if self._in_files else comparison.names(self._stored)
 
@@ -405,15 +426,18 @@ class Compared:
             InputError: there is none of that name, or a reference cannot be drawn behind it.
         """
         if self._in_files:
-            what = "a bounce shot" if self.experiment.shot else "a study of two comparisons"
-            raise InputError(f"figures of {what} are files: {self.folder / 'figures'}")
+            raise InputError(f"figures of {self._what} are files: {self.folder / 'figures'}")
         asked = [behind] if isinstance(behind, str) else behind
         references = [find(one) for one in asked]
         return comparison.figure(self._stored, self._labels, name, behind=references)
 
     def summary(self) -> pd.DataFrame:
-        """The last mean error of each tuner, the best first, with how many runs failed."""
+        """The last mean error of each tuner, the best first, with how many runs failed; of
+        diagnosers what each raises and names.
+        """
         table = self.table
+        if self.experiment.diagnosis:
+            return diagnosis.board(table)
         if self._in_files:
             return table
         last = table[table["simulations"] == table["simulations"].max()]
@@ -424,7 +448,8 @@ class Compared:
 
     def __repr__(self) -> str:
         failed = int((~self.statuses["status"].isin(("done", "converged"))).sum())
-        runs = f"{len(self.statuses)} runs, {failed} of them failed or skipped"
+        what = "answers" if self.experiment.diagnosis else "runs"
+        runs = f"{len(self.statuses)} {what}, {failed} of them failed or skipped"
         return f"<comparison {self.experiment.name}: {runs}; {self.folder}>"
 
     def _repr_html_(self) -> str:

@@ -62,8 +62,9 @@ def _plot(options: argparse.Namespace, say: Say) -> Answer:
 
     for folder in options.runs:
         if not isinstance(study := opened(folder), Comparison):
-            shot = study.configuration.experiment.shot
-            found = "a bounce shot" if shot else "a study of two comparisons"
+            asked = study.configuration.experiment
+            found = "a bounce shot" if asked.shot else "a study of two comparisons"
+            found = "a comparison of diagnosers" if asked.diagnosis else found
             raise InputError(f"{folder}: expected the folder of a comparison, found {found}")
     document = across(options.runs, options.out, say).document()
     return Answer({**document, "behind": _each_before(options.runs, references, options.out, say)})

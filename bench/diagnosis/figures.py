@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from bench.diagnosis.tables import Line, by_diagnoser
+from bench.diagnosis.tables import NAMED, Line, by_diagnoser
 from bench.figures import style
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def board(table: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
     figure, axes = style.blank(1, 1, (7.6, 4.8))
     axis: Axes = axes[0][0]
     alarms = by_diagnoser(table, "false alarms")
-    named = by_diagnoser(table, "the same, up to equivalence")
+    named = by_diagnoser(table, NAMED)
     for name in order:
         x, y = alarms[name], named[name]
         shown = {**look(name, order), "linestyle": "none"}
@@ -218,7 +218,7 @@ def calibration(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure
 def cost(costs: pd.DataFrame, table: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
     """What an answer costs against what is named."""
     figure, axes = style.blank(1, 2, (9.6, 4.2), sharey=True)
-    named = by_diagnoser(table, "the same, up to equivalence")
+    named = by_diagnoser(table, NAMED)
     held = by_diagnoser(costs)
     for axis, column, unit in zip(
         axes[0],

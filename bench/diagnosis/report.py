@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
 import pandas as pd
 
 from bench.diagnosis import figures
+from bench.diagnosis.confusion import families
+from bench.diagnosis.failures import failures
 from bench.diagnosis.kept import Answered
 from bench.diagnosis.lessons import read_lessons
+from bench.diagnosis.page.page import diagnosis_page
+from bench.diagnosis.page.shown import Shown
 from bench.diagnosis.rows import rows_of
 from bench.diagnosis.sheet import Question
-from bench.diagnosis.tables import all_tables, by_diagnoser, complete, singles
-from bench.figures.style import mark, save
+from bench.diagnosis.tables import NAMED, all_tables, by_diagnoser, complete, singles
+from bench.figures.style import Pictures, keep, mark, taken
+from bench.problem.experiment import Experiment
+from bench.report import REPORT
 from bench.store.folder import Configuration
 from sims.files import write
 
@@ -58,18 +64,34 @@ def finish(study: Asked, say: Callable[[str], None]) -> int:
     if rows.empty:
         say("no question has been put to every diagnoser yet")
         return 0
-    tables = all_tables(rows, order, read_lessons(study.folder))
+    training = read_lessons(study.folder)
+    tables = all_tables(rows, order, training)
     write(study.folder / ITEMS, csv(rows))
-    for name, frame in tables.items():
+    for name, frame in {**tables, "failures": failures(rows, order)}.items():
         write(study.folder / f"{name}.csv", csv(frame))
-    drawn = draw(study, rows, tables, order)
+    pictures = draw(study.configuration.experiment, rows, tables, order)
+    for name, picture in pictures.items():
+        keep(study.folder / "figures" / name, picture.png, picture.pdf)
+    shown = Shown(
+        study.configuration.experiment,
+        str(study.folder),
+        order,
+        rows,
+        tables,
+        training,
+        pictures,
+        study.skipped,
+        len(study.questions),
+    )
+    write(study.folder / REPORT, diagnosis_page(shown))
     for line in text(tables, order):
         say(line)
     asked, planned = rows["question"].nunique(), len(study.questions)
     hopeless = sum(not one["item"] for one in study.answered.values())
     say(f"{asked} questions of {planned}; of {hopeless} the sensors cannot show what is hidden")
     say(f"written: {study.folder}/ with {ITEMS}, {', '.join(f'{n}.csv' for n in tables)}")
-    say(f"figures: {', '.join(sorted(path.name for path in drawn if path.suffix == '.png'))}")
+    say(f"figures: {', '.join(f'{name}.png' for name in sorted(pictures))}")
+    say(f"report: {study.folder / REPORT}")
     failed = rows[rows["status"] != "done"]
     for _, row in failed.head(_FEW).iterrows():
         say(f"{row['status']}: {row['diagnoser']} on {row['question']}: {row['reason']}")
@@ -89,33 +111,33 @@ def csv(frame: pd.DataFrame) -> str:
 
 
 def draw(
-    study: Asked, rows: pd.DataFrame, tables: dict[str, pd.DataFrame], order: Sequence[str]
-) -> list[Path]:
-    """Every figure that there is something to draw of."""
-    experiment = study.configuration.experiment
+    experiment: Experiment,
+    rows: pd.DataFrame,
+    tables: Mapping[str, pd.DataFrame],
+    order: Sequence[str],
+) -> dict[str, Pictures]:
+    """Every figure that there is something to draw of, by name."""
     title = experiment.title or experiment.name
     made = {}
     counted = (by_diagnoser(tables["table"], what) for what in ("false alarms", "named, alone"))
     if all(any(line["of"] for line in lines.values()) for lines in counted):
         made["board"] = figures.board(tables["table"], order, title)
         made["outcomes"] = figures.outcomes(singles(rows), order, title)
+        made["confusion"] = families(rows, order, title)
         made["cost"] = figures.cost(tables["costs"], tables["table"], order, title)
     if not tables["power"].empty:
         made["power"] = figures.power(tables["power"], order, title)
     if not tables["calibration"].empty:
         made["calibration"] = figures.calibration(tables["calibration"], order, title)
-    drawn = []
-    for name, figure in made.items():
-        drawn += save(mark(figure, experiment.trusted), study.folder / "figures" / name)
-    return drawn
+    return {name: taken(mark(figure, experiment.trusted)) for name, figure in made.items()}
 
 
-def text(tables: dict[str, pd.DataFrame], order: Sequence[str]) -> list[str]:
+def text(tables: Mapping[str, pd.DataFrame], order: Sequence[str]) -> list[str]:
     """The board as lines: alarms, naming, pairs, foreign causes, cost."""
     columns = (
         ("false alarms", "false alarms"),
         ("named, alone", "named alone"),
-        ("the same, up to equivalence", "in a set of 2"),
+        (NAMED, "in a set of 2"),
         ("pairs: both named", "both of two"),
         ("foreign causes: unknown or partial", "foreign"),
     )

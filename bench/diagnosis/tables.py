@@ -22,6 +22,11 @@ OWN = "simgap"
 """With which the others are compared."""
 SETS = ((1, 1), (2, 2), (3, 4), (5, 10**6))
 """Sizes of sets that are counted together."""
+SETS_SAID = ("1", "2", "3 to 4", "5 or more")
+"""The same in words."""
+
+NAMED = "the same, up to equivalence"
+"""The metric that counts as named: alone or in a set of at most two, equivalent effects as one."""
 
 Of = Callable[[pd.DataFrame], pd.DataFrame]
 Right = Callable[[pd.DataFrame], "pd.Series[bool]"]
@@ -57,7 +62,7 @@ METRICS: tuple[tuple[str, Callable[[pd.DataFrame], pd.DataFrame], Right, bool], 
     ("false alarms", clean, lambda rows: rows["alarm"], True),
     ("named, alone", singles, lambda rows: rows["outcome"] == "right", False),
     ("named, in a set of at most two", singles, lambda rows: rows["found"], False),
-    ("the same, up to equivalence", singles, lambda rows: rows["found_class"], False),
+    (NAMED, singles, lambda rows: rows["found_class"], False),
     ("named, in a set of any size", singles, _within, False),
     ("something seen", singles, lambda rows: rows["alarm"], False),
     ("pairs: both named", lambda r: r[r["kind"] == "double"], lambda r: r["found_class"], False),
@@ -165,11 +170,8 @@ def sets(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
     for name in order:
         own = singles(rows[rows["diagnoser"] == name])
         own = own[own["largest_set"] > 0]
-        for low, high in SETS:
+        for (low, high), said in zip(SETS, SETS_SAID, strict=True):
             part = own[own["largest_set"].between(low, high)]
-            said = (
-                str(low) if low == high else f"{low} or more" if high > 10 else f"{low} to {high}"
-            )
             counted = share(int(_within(part).sum()), len(part))
             lines.append({"diagnoser": name, "largest_set": said, **counted})
     return pd.DataFrame(lines)

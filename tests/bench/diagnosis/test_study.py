@@ -2,10 +2,12 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
+import simgap
 from bench import cli
 from bench.diagnosis.kept import ANSWERS, Kept, read
 from bench.diagnosis.settings import settings_of
@@ -44,6 +46,12 @@ def main(arguments):
     finally:
         for registry, snapshot in zip(REGISTRIES, before, strict=True):
             registry.restore(snapshot)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Comparisons of diagnosers draw nothing: those of `made` do."""
+    monkeypatch.setattr("bench.diagnosis.report.draw", lambda *_: {})
 
 
 def written(folder, *diagnosers, more=""):
@@ -86,6 +94,7 @@ def test_one_that_looks_for_the_truth_finds_none(made):
     assert {(row["status"], row["verdict"]) for row in peeks} == {("done", "adequate")}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_it_would_find_it_if_it_were_trusted(made, tmp_path):
     _, out = made
     path, knowing = written(tmp_path, "peeks"), out.parent / "knowing.py"
@@ -109,6 +118,37 @@ def test_what_fails_costs_itself_and_stays_in_the_table(made):
     assert clean["hangs"]["alarm"] == "True"  # no answer is none that one could rely on
 
 
+def test_python_reads_what_the_command_has_made(made):
+    _, out = made
+    run = simgap.Compared(out)
+    assert len(run.runs) == 2 * (1 + len(MISBEHAVING))
+    assert run.runs["alarm"].dtype == bool
+    status = run.statuses.set_index(["diagnoser", "question"])["status"]
+    assert set(status["hangs"]) == {"timeout"}
+    best = run.summary()
+    assert set(best["diagnoser"]) == {"fifteen", *MISBEHAVING}
+    assert best.set_index("diagnoser").loc["hangs", "without an answer"] == 1.0
+    wrong = run.tables["failures"]
+    assert set(wrong["right_by"][wrong["diagnoser"] == "hangs"]) == {"peeks", "nobody"}
+    assert "12 answers, 8 of them failed or skipped" in repr(run)
+    with pytest.raises(InputError, match="figures of a comparison of diagnosers are files"):
+        run.figure("board")
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "Without an answer (crashed, too late or too costly): crashes 2, hangs 2" in page
+    assert str(out) in page
+
+
+def test_a_damaged_table_is_one_line(made, tmp_path):
+    _, out = made
+    folder = tmp_path / "copy"
+    shutil.copytree(out, folder)
+    table = folder / "items.csv"
+    table.write_text(table.read_text().replace(",True,", ",maybe,"))
+    with pytest.raises(InputError, match=r"items.csv, line \d+: .*True or False.*maybe"):
+        simgap.Compared(folder).runs  # noqa: B018
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_it_goes_on_where_it_was(made, tmp_path, capsys):
     path = written(tmp_path, "fifteen")
     out = tmp_path / "out"
@@ -124,9 +164,15 @@ def test_it_goes_on_where_it_was(made, tmp_path, capsys):
     first = json.loads(lines[0])
     again = read(out)[first["question"]]["rows"]["fifteen"]
     assert again == first["rows"][0]  # and was not asked again
-    assert main(["plot", str(out)]) == 0
+    capsys.readouterr()
+    assert main(["plot", str(out), "--json"]) == 0
+    (said,) = json.loads(capsys.readouterr().out)["comparisons"]
+    shares = {line["metric"]: line for line in said["results"]}
+    assert shares["false alarms"]["of"] == shares["named, alone"]["of"] == 1
+    assert str(out / "report.html") in said["files"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_secret_is_kept_until_the_end_and_draws_other_questions(tmp_path):
     path = written(tmp_path, "fifteen")
     path.write_text(path.read_text().replace('salt = "public"\n', ""))

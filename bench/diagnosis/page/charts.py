@@ -1,0 +1,197 @@
+"""The charts of a comparison of diagnosers; their numbers are those of its tables."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from bench.diagnosis.page.shown import Shown
+from bench.diagnosis.tables import LEVELS, NAMED, SETS_SAID
+from bench.figures.style import GREY, drawn
+from bench.pages.chart import Axis, Chart, Panel, Rule, Series
+from bench.pages.elements import paragraph, safe
+from bench.pages.page import Page
+
+_SHARES = (
+    ("false alarms", "alarms"),
+    ("named, alone", "alone"),
+    (NAMED, "set of 2"),
+    ("something seen", "seen"),
+    ("pairs: both named", "pairs"),
+    ("foreign causes: unknown or partial", "foreign"),
+    ("95 % intervals that hold", "intervals"),
+)
+"""Metrics of the chart of shares and what stands below it."""
+_SHARE = (-0.03, 1.03)
+"""Ends of an axis of shares."""
+_WILSON = "Bars: 95 % (Wilson)."
+
+
+def board_chart(shown: Shown, page: Page) -> str:
+    """False alarms against what is named."""
+    table = shown.tables["table"]
+    parts = {
+        metric: table[table["metric"] == metric].set_index("diagnoser")
+        for metric in ("false alarms", NAMED)
+    }
+    alarms, named = parts["false alarms"], parts[NAMED]
+    if not (alarms["of"].any() and named["of"].any()):
+        return ""
+    frame = named.assign(alarms=100 * alarms["share"]).reset_index()
+    for name in ("share", "low", "high"):
+        frame[name] = 100 * frame[name]
+    page.table("board", frame)
+    across = Axis(
+        "false alarms where nothing is hidden [%]",
+        "symlog",
+        ("symlog", "linear"),
+        (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0),
+        ends=(-0.15, 110.0),
+    )
+    up = Axis("single causes named [%]", scales=("linear",), ends=(-3.0, 103.0))
+    rule = Rule(1.0, "1 %", "x")
+    series = shown.points("share")
+    panel = Panel("", "board", "alarms", series, across, up, rules=(rule,))
+    clean, asked = int(alarms["of"].max()), int(named["of"].max())
+    caption = (
+        f"{clean} recordings with nothing hidden, {asked} with one effect of at least one noise. "
+        "Named: alone or in a set of at most two, equivalent effects being one. The best stand "
+        f"left and high. {_WILSON}"
+    )
+    still = shown.still("board", "False alarms of each diagnoser against what it names.")
+    return page.chart(Chart("board", "Who names, and who cries wolf", caption, (panel,), still))
+
+
+def shares_chart(shown: Shown, page: Page) -> str:
+    """Every share of the table, side by side."""
+    table = shown.tables["table"]
+    there = [(m, says) for m, says in _SHARES if table.loc[table["metric"] == m, "of"].any()]
+    if not there:
+        return ""
+    place = {metric: i for i, (metric, _) in enumerate(there)}
+    frame = table[table["metric"].isin(place)].assign(place=lambda t: t["metric"].map(place))
+    page.table("shares", frame)
+    most = frame.groupby("metric")["of"].max()
+    names = tuple(f"{says}\nn={int(most[metric])}" for metric, says in there)
+    across = Axis("what is counted; n answers or intervals at most", names=names)
+    up = Axis("share", scales=("linear",), ends=_SHARE)
+    panel = Panel("", "shares", "place", shown.points("share", beside=True), across, up)
+    caption = (
+        "False alarms where nothing is hidden; single causes named alone, in a set of at most two, "
+        "and seen at all; pairs of which both are named; foreign causes told as unknown; 95 % "
+        "intervals that hold. Of alarms less is better, of the others more. Bars: 95 %, of alarms "
+        "Clopper-Pearson's, else Wilson's. Intervals that overlap widely say little."
+    )
+    chart = Chart("shares", "Alarms, names, pairs, foreign causes", caption, (panel,))
+    return page.chart(chart)
+
+
+def power_chart(shown: Shown, page: Page) -> str:
+    """What is named and seen against the size of the effect."""
+    frame = shown.tables["power"]
+    if frame.empty:
+        return ""
+    page.table("power", frame)
+    sizes = tuple(sorted(float(size) for size in frame["size"].unique()))
+    across = Axis("size of the hidden effect [noises]", "log", ticks=sizes)
+    panels = []
+    for metric, says in (("named", "named, in a set of at most two"), ("seen", "something seen")):
+        up = Axis(f"share {metric}", scales=("linear",), ends=_SHARE)
+        lines = shown.lines("share", frame, metric=metric)
+        facets = {"what": says}
+        panels.append(Panel(says.capitalize(), "power", "size", lines, across, up, facets))
+    counts = frame[(frame["metric"] == "named") & (frame["diagnoser"] == frame["diagnoser"].iat[0])]
+    said = ", ".join(f"{int(n)} of {s:g} noises" for s, n in counts[["size", "of"]].to_numpy())
+    caption = f"Recordings with one hidden effect: {said}. {_WILSON} Who alarms always sees all."
+    still = shown.still("power", "The share named and seen by each diagnoser against the size.")
+    chart = Chart("power", "Power against size", caption, tuple(panels), still, "what")
+    return page.chart(chart)
+
+
+def calibration_chart(shown: Shown, page: Page) -> str:
+    """How often p values fall below a level where nothing is hidden."""
+    frame = shown.tables["calibration"]
+    if frame.empty:
+        return ""
+    fair = pd.DataFrame({"diagnoser": "", "level": LEVELS, "share": LEVELS})
+    page.table("calibration", pd.concat([frame, fair], ignore_index=True))
+    ideal = Series("a p value that is one", "share", drawn(GREY, (4.0, 3.0)), {"diagnoser": ""})
+    across = Axis("level", "log", ticks=LEVELS)
+    up = Axis("share of clean recordings with p below", scales=("linear",), ends=_SHARE)
+    lines = (*shown.lines("share", frame), ideal)
+    panel = Panel("", "calibration", "level", lines, across, up)
+    caption = (
+        f"Up to {int(frame['of'].max())} recordings with nothing hidden, of diagnosers that give p "
+        "values. Above the dashes it alarms too often, below it is too careful. Bars: 95 % "
+        "(Clopper-Pearson)."
+    )
+    still = shown.still("calibration", "How often p is at most a level where nothing is hidden.")
+    title = "Calibration of p"
+    return page.chart(Chart("calibration", title, caption, (panel,), still))
+
+
+def sets_chart(shown: Shown, page: Page) -> str:
+    """Answers by the size of their largest set: how many there are, and how many hold the truth."""
+    frame = shown.tables["sets"]
+    if not frame["of"].any():
+        return ""
+    place = {said: i for i, said in enumerate(SETS_SAID)}
+    page.table("sets", frame.assign(place=frame["largest_set"].map(place)))
+    across = Axis("effects in the largest set of an answer", names=tuple(place))
+    points = shown.points("share", beside=True)
+    counts = tuple(
+        Series(one.name, "of", one.look, one.where, draw="points", shift=one.shift)
+        for one in points
+    )
+    up = Axis("share that holds the truth", scales=("linear",), ends=_SHARE)
+    many = Axis("answers of this size", scales=("linear",), holds=(0.0,))
+    panels = (
+        Panel("Held", "sets", "place", points, across, up, {"what": "held"}),
+        Panel("How many", "sets", "place", counts, across, many, {"what": "how many"}),
+    )
+    caption = (
+        "Answers about single effects of at least one noise that name something. A set is only as "
+        f"good as it is small. {_WILSON}"
+    )
+    title = "Sets by their size"
+    return page.chart(Chart("sets", title, caption, panels, None, "what"))
+
+
+def cost_chart(shown: Shown, page: Page) -> str:
+    """What an answer costs against what is named."""
+    table, costs = shown.tables["table"], shown.tables["costs"]
+    named = table[(table["metric"] == NAMED) & (table["of"] > 0)]
+    frame = named.merge(costs, on="diagnoser")
+    if frame.empty:
+        return ""
+    page.table("cost", frame)
+    up = Axis("share of single causes named", scales=("linear",), ends=_SHARE)
+    panels = []
+    for column, label in (
+        ("simulations_median", "simulations for an answer, median"),
+        ("processor_seconds_median", "processor time for an answer [s], median"),
+    ):
+        across = Axis(label, "log")
+        facets = {"cost": label}
+        panels.append(Panel("", "cost", column, shown.points("share"), across, up, facets))
+    caption = f"Left and high is better. {_WILSON} {_learned(costs)}"
+    still = shown.still("cost", "What an answer of each diagnoser costs against what it names.")
+    return page.chart(Chart("cost", "Cost against truth", caption, tuple(panels), still, "cost"))
+
+
+def _learned(costs: pd.DataFrame) -> str:
+    """Who has learned from how many simulations before it was asked."""
+    told = costs[costs["training_simulations"] > 0]
+    return " ".join(
+        f"{safe(name, 60)} has learned from {count:,} simulations before.".replace(",", " ")
+        for name, count in told[["diagnoser", "training_simulations"]].itertuples(index=False)
+    )
+
+
+def pictures(shown: Shown, page: Page, *names: tuple[str, str, str]) -> str:
+    """Figures that are the same on the screen: name, title, how to read it."""
+    parts = []
+    for name, title, caption in names:
+        if still := shown.still(name, caption):
+            parts.append(f"<h3>{safe(title)}</h3>")
+            parts.append(page.picture(f"{name}-figure", still, safe(caption)))
+    return "\n".join(parts) or paragraph("There is nothing to draw.", "soft")

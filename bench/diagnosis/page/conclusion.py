@@ -1,0 +1,126 @@
+"""What the page of a comparison of diagnosers says first, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pandas as pd
+
+from bench.diagnosis.failures import counted, right
+from bench.diagnosis.figures import WANTED_ALARMS
+from bench.diagnosis.page.shown import Shown
+from bench.diagnosis.tables import NAMED, OWN, by_diagnoser
+from bench.figures.style import TRUSTED
+from bench.pages.elements import code, safe, strong
+from bench.pages.text import percent, probability
+
+_SURE = 0.05
+"""Holm-corrected probability below which two diagnosers are told apart."""
+_KINDS = {
+    "clean": "false alarms in {of} clean recordings",
+    "single": "of {of} single effects of at least one noise",
+    "double": "of {of} pairs",
+    "foreign": "of {of} foreign causes",
+}
+
+
+def conclusion(shown: Shown) -> Iterator[str]:
+    """Safe HTML, a sentence each: simgap's failures, who leads at few alarms, who is better."""
+    yield from _own_failures(shown)
+    yield from _leading(shown)
+    yield from _better(shown)
+
+
+def _own_failures(shown: Shown) -> Iterator[str]:
+    own = counted(shown.rows[shown.rows["diagnoser"] == OWN])
+    if own.empty:
+        return
+    wrong = own[~right(own)]
+    parts = []
+    for kind, says in _KINDS.items():
+        of = int((own["kind"] == kind).sum())
+        if of:
+            parts.append(f"{int((wrong['kind'] == kind).sum())} {says.format(of=of)}")
+    said = f"{strong(OWN)} fails on {len(wrong)} of {len(own)} questions: {', '.join(parts)}."
+    yield f'{said} <a href="#failures">They are listed first</a>.' if len(wrong) else said
+
+
+def _leading(shown: Shown) -> Iterator[str]:
+    """Who names most among those that hardly alarm, and whether that is more than chance."""
+    table = shown.tables["table"]
+    alarms, named = by_diagnoser(table, "false alarms"), by_diagnoser(table, NAMED)
+    if not any(line["of"] for line in alarms.values()):
+        return
+    quiet = [name for name in shown.order if alarms[name]["share"] <= WANTED_ALARMS]
+    asked = [name for name in quiet if named[name]["of"]]
+    limit = f"{100 * WANTED_ALARMS:g} %".replace(" %", "\u00a0%")
+    if not asked:
+        yield f"Nobody stays at {limit} of false alarms or less here."
+        return
+    best = max(asked, key=lambda name: float(named[name]["share"]))
+    said = f"Of those that alarm in {limit} of the clean recordings or less ({_names(asked)}), "
+    yield f"{said}{strong(safe(best, 60))} names most: {_share(named[best])}. " + _apart(
+        shown, best, [name for name in asked if name != best]
+    )
+    line = alarms[best]
+    if line["high"] > WANTED_ALARMS:
+        yield (
+            f"That {safe(best, 60)} stays below {limit} these {int(line['of'])} clean recordings "
+            f"cannot show: {int(line['count'])} alarms leave up to {percent(line['high'])}."
+        )
+
+
+def _apart(shown: Shown, best: str, others: list[str]) -> str:
+    """Whether pairs with simgap's own tell the best from the others."""
+    if not others or best != OWN:
+        return ""
+    lines = by_diagnoser(shown.tables["pairs"], "named")
+    near = [name for name in others if float(lines[name]["p_holm"]) >= _SURE]
+    if near:
+        return f"It is not told apart from {_names(near)} (McNemar, Holm)."
+    worst = max(float(lines[name]["p_holm"]) for name in others)
+    return f"It is told apart from each of the others ({probability(worst)}; McNemar, Holm)."
+
+
+def _better(shown: Shown) -> Iterator[str]:
+    """Who beats simgap at something, with significance."""
+    pairs = shown.tables["pairs"]
+    if pairs.empty:
+        return
+    sure = pairs[(pairs["p_holm"] < _SURE) & (pairs["only_other"] > pairs["only_simgap"])]
+    for line in sure.to_dict("records"):
+        yield (
+            f"{strong(safe(line['diagnoser'], 60))} is better than simgap at "
+            f"“{safe(line['metric'])}”: alone right on {int(line['only_other'])} questions, simgap "
+            f"on {int(line['only_simgap'])} ({probability(line['p_holm'])})."
+        )
+    if sure.empty:
+        yield "No other is better than simgap at naming or at keeping quiet, with significance."
+
+
+def warnings(shown: Shown) -> Iterator[str]:
+    """What takes away from the result; safe HTML."""
+    if shown.experiment.trusted:
+        yield f"{TRUSTED.capitalize()}."
+    if shown.asked < shown.planned:
+        yield (
+            f"{shown.asked} of {shown.planned} questions: those that everybody has been asked. "
+            "Questions are asked in an order of chance, so these are a fair sample."
+        )
+    failed = shown.rows[shown.rows["status"] != "done"]
+    if len(failed):
+        by = failed.groupby("diagnoser").size()
+        told = ", ".join(f"{safe(name, 60)} {count}" for name, count in by.items())
+        yield f"Without an answer (crashed, too late or too costly): {told}."
+    for name, reason in shown.skipped.items():
+        yield f"{code(safe(name, 60))} was not asked: {safe(reason)}"
+
+
+def _names(names: list[str]) -> str:
+    return ", ".join(safe(name, 60) for name in names)
+
+
+def _share(line: dict[str, Any] | pd.Series[Any]) -> str:
+    ends = f"95 % interval {percent(line['low'])} to {percent(line['high'])}"
+    return f"{int(line['count'])} of {int(line['of'])}, {percent(line['share'])} ({ends})"
