@@ -51,6 +51,8 @@ class Grid:
         marked: a column, and the beginning of its text in rows that stand out; empty for none.
         lights: column of names by which rows light up together with whatever in the page bears the
             same name.
+        links: column of addresses to which the first shown column leads; empty for none. Such an
+            address is a path from where the page lies, quoted (`urllib.parse.quote`).
     """
 
     name: str
@@ -63,6 +65,7 @@ class Grid:
     switch: str = ""
     marked: tuple[str, ...] = ()
     lights: str = ""
+    links: str = ""
 
     def spec(self) -> dict[str, Any]:
         """What the page's script is told, as JSON holds it."""
@@ -94,9 +97,11 @@ class Grid:
         return bool(self.marked) and str(row[self.marked[0]]).startswith(self.marked[1])
 
     def _cells(self, row: Mapping[Any, Any]) -> Sequence[str]:
-        cells = []
+        cells: list[str] = []
         for column in self.columns:
             value = row[column.name]
             # Longer than elsewhere: of a traceback every line is wanted.
             cells.append(number(value, column.digits) if column.digits else safe(value, 300))
+        if self.links and row[self.links]:
+            cells[0] = f'<a href="{safe(row[self.links], 2000)}">{cells[0]}</a>'
         return cells

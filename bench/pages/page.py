@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 _HERE = Path(__file__).parent
 _LIBRARY = _HERE / "vendor" / "uplot"
-_SCRIPTS = ("text", "tables", "state", "ticks", "look", "draw", "panel", "figure", "grid", "page")
+_SCRIPTS = (
+    "text", "tables", "state", "ticks", "look", "draw", "panel", "files", "figure", "grid", "page",
+)  # fmt: skip
 """In this order: one that comes later may use what came before."""
 
 

@@ -1,19 +1,19 @@
 """What the page of a comparison costs: seconds, bytes, and how soon it answers, beside cocopp's.
 Run: `python -m tests.benchmarks.pages`.
 
-Prints one JSON line a measurement; seconds are the processor's, but for those of the browser.
-cocopp (`pip install cocopp six`) is measured where it is installed, on as many runs of the same
-lengths: 24 functions, 15 instances each, two algorithms.
+Prints one JSON line a measurement; seconds are the processor's, but for those of the browser and
+where the clock is named. A click is answered when the next frame is painted: the `duration` of the
+browser's Event Timing, which counts in steps of 8 ms. cocopp is that of the Python that $PEERS
+names, or is installed into a throwaway environment; it gets as many runs of the same length
+(`tests.benchmarks.coco`).
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import tempfile
-from importlib.util import find_spec
 from pathlib import Path
+from statistics import median
 from time import perf_counter, process_time
 
 import numpy as np
@@ -26,11 +26,23 @@ from bench.pages.comparison.results import Results
 from bench.problem.experiment import load
 from bench.report import _drawn, tables
 from bench.store.folder import Stored
+from tests.benchmarks import coco
 from tests.browser import Opened, launched
 
 TUNERS = ("random", "cma_es", "nelder_mead", "bayes", "least_squares", "tunenet")
 RANGES = ("in", "wide")
-FUNCTIONS, INSTANCES = 24, 15
+CLICKS = 12
+ANSWERED = """
+() => {
+  window.answered = [];
+  const note = (list) => list.getEntries().filter(({ name }) => name === "click")
+    .forEach(({ duration }) => window.answered.push(duration));
+  new PerformanceObserver(note).observe({ type: "event", durationThreshold: 16 });
+}
+"""
+"""Milliseconds from each click to the next frame, from now on; what takes less than 16 is not told
+of.
+"""
 
 
 def invented(targets, budget):
@@ -68,6 +80,18 @@ def invented(targets, budget):
     return Stored(experiment, rows, statuses, {"tunenet": (1600.0, 30.0)})
 
 
+def clicked(page):
+    """Milliseconds from each of some clicks on tuners to the next frame."""
+    page.evaluate(ANSWERED)
+    keys = page.locator("#error .key")
+    for i in range(CLICKS):
+        keys.nth(i % len(TUNERS)).click()
+        # Each click finds the page at rest.
+        page.wait_for_timeout(300)
+    answers = page.evaluate("window.answered")
+    return [*answers, *[16] * (CLICKS - len(answers))]
+
+
 def ours(browser, place, targets, budget):
     stored = invented(targets, budget)
     labels = Labels("z [m]", "restitution")
@@ -84,68 +108,15 @@ def ours(browser, place, targets, budget):
     made, opening = process_time(), perf_counter()
     with Opened(browser, path) as one:
         loaded = perf_counter() - opening
-        # From a click to the next frame, all figures and tables drawn anew.
-        answer = one.page.evaluate(
-            "() => { const keys = document.querySelectorAll('#error .key'); const began ="
-            " performance.now(); for (let i = 0; i < 10; i += 1) keys[i % 6]?.click();"
-            " return (performance.now() - began) / 10; }"
-        )
+        answers = clicked(one.page)
         assert one.complaints == []
     print(json.dumps({
         "runs": len(stored.statuses), "rows": len(stored.runs),
         "tables_seconds": round(tabled - started, 2),
         "printed_figures_seconds": round(drawn - tabled, 2),
         "page_seconds": round(made - drawn, 2), "page_MB": round(path.stat().st_size / 1e6, 2),
-        "opened_in_seconds": round(loaded, 2), "a_click_milliseconds": round(answer, 1),
-    }), flush=True)  # fmt: skip
-
-
-def algorithm(folder, name, rate, budget):
-    """Data of one algorithm in COCO's old format, as its postprocessing reads it."""
-    rng = np.random.default_rng(1)
-    k = np.arange(1, budget + 1)
-    for function in range(1, FUNCTIONS + 1):
-        below = folder / name / f"data_f{function}"
-        below.mkdir(parents=True)
-        dat, runs = [], []
-        for instance in range(1, INSTANCES + 1):
-            error = 10 * np.exp(-rate * k) * rng.uniform(0.2, 2)
-            dat.append(
-                "% function evaluation | noise-free fitness - Fopt (0) | best noise-free fitness - "
-                "Fopt | measured fitness | best measured fitness | x1 | x2\n"
-            )
-            dat += [
-                f"{n} {e:.9e} {e:.9e} {e:.9e} {e:.9e} +0.0 +0.0\n"
-                for n, e in zip(k, error, strict=False)
-            ]
-            runs.append(f"{instance}:{budget}|{error[-1]:.1e}")
-        stem = f"bbobexp_f{function}_DIM2"
-        (below / f"{stem}.dat").write_text("".join(dat))
-        (below / f"{stem}.tdat").write_text("".join(dat))
-        (folder / name / f"bbobexp_f{function}.info").write_text(
-            f"funcId = {function}, DIM = 2, Precision = 1.000e-08, algId = '{name}'\n% none\n"
-            f"data_f{function}/{stem}.dat, {', '.join(runs)}\n"
-        )
-
-
-def theirs(place, budget):
-    if find_spec("cocopp") is None:
-        print(json.dumps({"cocopp": "not installed: pip install cocopp"}))
-        return
-    import cocopp
-
-    for name, rate in (("quick", 0.05), ("slow", 0.01)):
-        algorithm(place / "data", name, rate, budget)
-    cocopp.genericsettings.interested_in_opening_results_in_browser = False
-    out = place / "ppdata"
-    started = process_time()
-    with contextlib.redirect_stdout(io.StringIO()):
-        cocopp.main(f"-o {out} {place / 'data' / 'quick'} {place / 'data' / 'slow'}")
-    took = process_time() - started
-    size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
-    print(json.dumps({
-        "cocopp_runs": 2 * FUNCTIONS * INSTANCES, "seconds": round(took, 1),
-        "files_MB": round(size / 1e6, 1),
+        "opened_in_seconds": round(loaded, 2), "clicks": CLICKS,
+        "click_to_frame_ms": median(answers), "slowest_click_ms": max(answers),
     }), flush=True)  # fmt: skip
 
 
@@ -155,7 +126,7 @@ def main():
             # The first pays for imports.
             for targets, budget in ((5, 20), (60, 100), (825, 100)):
                 ours(browser, Path(folder), targets, budget)
-        theirs(Path(folder), 100)
+        coco.measured(Path(folder), 100)
 
 
 if __name__ == "__main__":

@@ -159,14 +159,14 @@ def benchopt_run(python, folder):
     return 1e3 * (times[410] - times[10]) / 400
 
 
-def environment(folder):
+def environment(folder, packages=("benchopt", "nevergrad")):
     """Python of an environment that has the peers: of $PEERS, else of one made below `folder`; None
     where they cannot be had.
     """
     if os.environ.get("PEERS"):
         return os.environ["PEERS"]
     python = str(folder / "venv" / "bin" / "python")
-    install = [python, "-m", "pip", "install", "--quiet", "benchopt", "nevergrad"]
+    install = [python, "-m", "pip", "install", "--quiet", *packages]
     try:
         subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
         subprocess.run(install, check=True, capture_output=True)

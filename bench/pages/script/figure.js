@@ -22,6 +22,23 @@ class FigureView {
     this.addFiles();
     this.draw();
     new ResizeObserver(() => this.resized()).observe(this.live);
+    this.near = true;
+    new IntersectionObserver((happened) => this.moved(happened.at(-1).isIntersecting), { rootMargin: "300px 0px" }).observe(this.live);
+  }
+
+  // What concerns all figures was chosen, or, where there is a key, maybe this one alone. What
+  // nobody sees is drawn when it comes into sight, so that no click waits for it.
+  changed(key = "") {
+    if (this.near || this.owns(key)) this.draw();
+    else {
+      this.old = true;
+      this.addChoices(this.shown());
+    }
+  }
+
+  moved(near) {
+    this.near = near;
+    if (near && this.old) this.draw();
   }
 
   key(name) {
@@ -177,13 +194,18 @@ class FigureView {
     return { x: range("x", 0, (line) => [line.xs]), y: range("y", 2, (line) => [line.ys, line.low, line.high].map((list) => sighted(line, list))) };
   }
 
-  draw() {
-    this.views.forEach((view) => view.destroy());
-    const panels = this.shown();
-    const off = state.off();
+  addChoices(panels) {
     this.addControls(panels[0] ?? this.spec.panels[0]);
     this.addSwitches();
     this.addLegend(panels);
+  }
+
+  draw() {
+    this.old = false;
+    this.views.forEach((view) => view.destroy());
+    const panels = this.shown();
+    const off = state.off();
+    this.addChoices(panels);
     this.width = this.live.clientWidth;
     // Names of categories need more room than numbers.
     const need = Math.max(370, ...panels.map((panel) => 76 * panel.across.names.length + 80));
@@ -261,8 +283,12 @@ class FigureView {
     if (this.live.clientWidth && this.live.clientWidth !== this.width) this.draw();
   }
 
+  owns(key) {
+    return key.startsWith(`${this.spec.name}.`);
+  }
+
   concerns(key) {
-    return key === "off" || key === "theme" || key.startsWith(`${this.spec.name}.`);
+    return key === "off" || key === "theme" || this.owns(key);
   }
 
   addFiles() {
@@ -276,43 +302,6 @@ function refill(place, ...made) {
   const focused = usable().indexOf(document.activeElement);
   place.replaceChildren(...made);
   if (focused >= 0) usable()[focused]?.focus();
-}
-
-// SVG and PNG from the printed figure, the numbers from the tables.
-function filesOf(place, own, tables) {
-  const still = place.querySelector("img.still");
-  const files = place.querySelector(".files") ?? element("p", { class: "files" });
-  const button = (text, act) => element("button", { type: "button", on: { click: act } }, text);
-  const made = [];
-  if (still) {
-    const name = still.dataset.file;
-    made.push(button("SVG", () => fileOf(still.src).then((blob) => save(`${name}.svg`, "", blob))));
-    made.push(button("PNG", () => pixels(still).then((blob) => save(`${name}.png`, "", blob))));
-  }
-  for (const name of tables) {
-    made.push(button(`numbers as CSV${name === own ? "" : ` (${name})`}`, () => save(`${name}.csv`, "text/csv", DATA.tables[name])));
-  }
-  files.prepend("Save this figure: ");
-  files.append(...made);
-  return files;
-}
-
-// The bytes of an image that lies in the page; nothing is asked of anybody.
-async function fileOf(source) {
-  const text = atob(source.slice(source.indexOf(",") + 1));
-  return new Blob([Uint8Array.from(text, (letter) => letter.charCodeAt(0))], { type: "image/svg+xml" });
-}
-
-async function pixels(still) {
-  const image = new Image();
-  image.src = still.src;
-  await image.decode();
-  const canvas = element("canvas", { width: 2 * image.naturalWidth, height: 2 * image.naturalHeight });
-  const ctx = canvas.getContext("2d");
-  ctx.fillStyle = "#ffffff";
-  ctx.fillRect(0, 0, canvas.width, canvas.height);
-  ctx.drawImage(image, 0, 0, canvas.width, canvas.height);
-  return new Promise((done) => canvas.toBlob(done, "image/png"));
 }
 
 const FIGURES = [];

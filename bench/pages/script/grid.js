@@ -105,10 +105,12 @@ class GridView {
     return { class: found && "found", "data-lights": (spec.lights && text(spec.lights)) || false };
   }
 
-  cell(row, { name, digits }) {
-    const { held } = this;
+  cell(row, { name, digits }, place) {
+    const { held, spec } = this;
     const text = held.rows[row][held.places.get(name)];
-    return digits ? readable(held.values(name)[row], digits) : text;
+    const shown = digits ? readable(held.values(name)[row], digits) : text;
+    const address = spec.links && !place && held.rows[row][held.places.get(spec.links)];
+    return address ? element("a", { href: address }, shown) : shown;
   }
 
   draw() {
@@ -119,7 +121,7 @@ class GridView {
     const every = state.get(this.key("rows")) === "all";
     const shown = every ? rows : rows.slice(0, spec.few);
     this.body.replaceChildren(...shown.map((row) =>
-      element("tr", this.standing(row), ...spec.columns.map((column) => element("td", { class: column.digits ? "number" : false }, this.cell(row, column))))));
+      element("tr", this.standing(row), ...spec.columns.map((column, i) => element("td", { class: column.digits ? "number" : false }, this.cell(row, column, i))))));
     const { name, down } = this.sorting();
     this.heads.forEach((head, i) => {
       if (spec.columns[i].name === name) head.setAttribute("aria-sort", down ? "descending" : "ascending");
@@ -138,7 +140,11 @@ class GridView {
     return [names, ...this.rows().map((row) => places.map((place) => clean(this.held.rows[row][place])))].map((line) => line.join("\t")).join("\n");
   }
 
+  changed() {
+    this.draw();
+  }
+
   concerns(key) {
-    return key === "off" || key.startsWith(`${this.spec.name}.`);
+    return (key === "off" && Boolean(this.spec.switch)) || key.startsWith(`${this.spec.name}.`);
   }
 }

@@ -25,9 +25,9 @@ const PARTS = [...FIGURES, ...DATA.grids.map((spec) => new GridView(spec))];
 
 state.listen((key) => {
   if (key === "theme") applyTheme(themePick);
-  for (const part of PARTS) if (part.concerns(key)) part.draw();
+  for (const part of PARTS) if (part.concerns(key)) part.changed(key);
 });
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => FIGURES.forEach((figure) => figure.draw()));
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => FIGURES.forEach((figure) => figure.changed()));
 
 // What bears the same name lights up together: a joint in a list, its curves, its place in a picture.
 function light(event) {
@@ -63,5 +63,5 @@ if (state.get("at")) document.getElementById(state.get("at"))?.scrollIntoView();
 window.addEventListener("hashchange", () => {
   state.read();
   applyTheme(themePick);
-  PARTS.forEach((part) => part.draw());
+  PARTS.forEach((part) => part.changed());
 });

@@ -142,6 +142,27 @@ def test_a_series_that_is_switched_off_is_gone_everywhere_and_stays_so(browser, 
     assert [text.strip() for text in on] == ["random"]
 
 
+def test_what_nobody_sees_is_drawn_when_it_comes_into_sight(browser, opened):
+    page = opened.page
+    marked = "all => all.forEach(one => { one.dataset.drawn = 'before'; })"
+    left = "#motion canvas[data-drawn]"
+    page.locator("canvas").evaluate_all(marked)
+    page.locator("#error .key").first.click()
+    # The figure that was clicked is drawn anew; one far below knows of it, and waits.
+    assert page.locator("#error canvas[data-drawn]").count() == 0
+    assert page.locator(left).count() == 4
+    page.locator("#theme").select_option("dark")
+    assert page.locator(left).count() == 4
+    page.locator("#motion").scroll_into_view_if_needed()
+    page.wait_for_function(f"!document.querySelector('{left}')")
+    # What is chosen in a figure itself is drawn at once, wherever the reader is.
+    page.evaluate("scrollTo(0, 0)")
+    page.locator("canvas").evaluate_all(marked)
+    page.locator("#motion .key", has_text="hip").dispatch_event("click")
+    assert page.locator("#motion canvas").count() == 6
+    assert page.locator(left).count() == 0
+
+
 def test_facets_and_scales_are_chosen_and_kept(browser, opened, path):
     page = opened.page
     assert page.locator("#error .panel").count() == 2

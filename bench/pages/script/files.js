@@ -1,0 +1,38 @@
+// Files that are saved from the page.
+
+// SVG and PNG from the printed figure, the numbers from the tables.
+function filesOf(place, own, tables) {
+  const still = place.querySelector("img.still");
+  const files = place.querySelector(".files") ?? element("p", { class: "files" });
+  const button = (text, act) => element("button", { type: "button", on: { click: act } }, text);
+  const made = [];
+  if (still) {
+    const name = still.dataset.file;
+    made.push(button("SVG", () => fileOf(still.src).then((blob) => save(`${name}.svg`, "", blob))));
+    made.push(button("PNG", () => pixels(still).then((blob) => save(`${name}.png`, "", blob))));
+  }
+  for (const name of tables) {
+    made.push(button(`numbers as CSV${name === own ? "" : ` (${name})`}`, () => save(`${name}.csv`, "text/csv", DATA.tables[name])));
+  }
+  files.prepend("Save this figure: ");
+  files.append(...made);
+  return files;
+}
+
+// The bytes of an image that lies in the page; nothing is asked of anybody.
+async function fileOf(source) {
+  const text = atob(source.slice(source.indexOf(",") + 1));
+  return new Blob([Uint8Array.from(text, (letter) => letter.charCodeAt(0))], { type: "image/svg+xml" });
+}
+
+async function pixels(still) {
+  const image = new Image();
+  image.src = still.src;
+  await image.decode();
+  const canvas = element("canvas", { width: 2 * image.naturalWidth, height: 2 * image.naturalHeight });
+  const ctx = canvas.getContext("2d");
+  ctx.fillStyle = "#ffffff";
+  ctx.fillRect(0, 0, canvas.width, canvas.height);
+  ctx.drawImage(image, 0, 0, canvas.width, canvas.height);
+  return new Promise((done) => canvas.toBlob(done, "image/png"));
+}
