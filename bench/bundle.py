@@ -18,7 +18,7 @@ from bench.registry import simulators
 from bench.schemas import faults
 from bench.store.archive import MANIFEST, Unpacked, pack, unpacked
 from bench.store.folder import CONFIGURATION, configuration
-from bench.store.made import environment, sha256
+from bench.store.made import environment, explaining, sha256
 from bench.store.segments import FOLDER
 from bench.study import parts_of
 from bench.verify import Doubt, Verified, verify
@@ -144,13 +144,7 @@ def _explaining(folder: Path) -> str:
     """The command that makes an explanation again, as far as its folder knows."""
     made = environment(folder)
     tables = [each["file"] for each in made.get("recordings", []) if each["file"][-5:] != ".toml"]
-    words = ["simgap", "explain", *(tables or ["RECORDING.csv"])]
-    for name, value in made.get("settings", {}).items():
-        if value is True:
-            words.append(f"--{name}")
-        elif value is not False:
-            joined = ",".join(map(str, value)) if isinstance(value, list) else str(value)
-            words += [f"--{name}", joined]
+    words = explaining(tables or ["RECORDING.csv"], made.get("settings", {}))
     return shlex.join(words)
 
 

@@ -197,10 +197,13 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
 
 def _explain_each(options: argparse.Namespace, say: Say) -> Answer:
     """Explain every recording by itself, as the rows come in, and print what they say together."""
-    from bench.gap.each import TABLE, Row, explain_each, logs_of, told
+    from bench.gap.each.page import Asked, write_page
+    from bench.gap.each.rows import TABLE, Row, named, told
+    from bench.gap.each.run import explain_each, logs_of
     from bench.gap.model.crew import cores
     from bench.runs.pools import pool_of
     from bench.runs.survey import Plugin
+    from bench.store.made import explaining, now, write_explained
     from sims.files import stamped
 
     settings = {
@@ -211,9 +214,10 @@ def _explain_each(options: argparse.Namespace, say: Say) -> Answer:
     } | {"free": tuple(names(options.free))}  # fmt: skip
     out = options.out or stamped(Path("results"), "explain-each")
     logs = logs_of(options.recordings, out, settings)
+    started = now()
 
     def done(row: Row) -> None:
-        causes = [" or ".join([c["effect"], *c["alternatives"]]) for c in row.causes]
+        causes = [named(cause) for cause in row.causes]
         seconds = "" if row.seconds is None else f" ({row.seconds:.0f} s)"
         say(f"{row.log}: {row.error or row.verdict} {'; '.join(causes)}".rstrip() + seconds)
 
@@ -222,17 +226,28 @@ def _explain_each(options: argparse.Namespace, say: Say) -> Answer:
         with pool:
             pool.load([Plugin(str(path)) for path in options.plugin])
             rows = explain_each(logs, out, settings, pool, done, interrupts.asked)
-    together = told(rows)
-    for line in ("", *together, f"\ntable   {out / TABLE}"):
-        say(line)
     left = len(logs) - len(rows)
+    folders = {log.name: log.folder for log in logs}
+    given = {name: getattr(options, name) for name in _SETTINGS} | {"each": True}
+    words = explaining(options.recordings, {**given, "out": out})
+    recordings = dict(zip(folders, options.recordings, strict=True))
+    report = write_page(rows, Asked(out, folders, recordings, words, left))
+    write_explained(out, started, given, options.recordings)
+    together = told(rows)
+    for line in ("", *together, f"\nreport  {report}", f"table   {out / TABLE}"):
+        say(line)
     code = WRONG if any(row.error for row in rows) else DONE
     if left:
         say(f"{left} of {len(logs)} left: the same command goes on with them")
         code = INTERRUPTED
-    folders = {log.name: log.folder for log in logs}
     found = [{**asdict(row), "folder": folders[row.log]} for row in rows]
-    document = {"logs": found, "together": together, "left": left, "table": out / TABLE}
+    document = {
+        "logs": found,
+        "together": together,
+        "left": left,
+        "table": out / TABLE,
+        "report": report,
+    }
     return Answer(document, code)
 
 

@@ -39,6 +39,25 @@ def now() -> str:
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
+def explaining(recordings: Iterable[object], settings: Mapping[str, Any]) -> list[str]:
+    """The words of the command that explains recordings.
+
+    Args:
+        recordings: their tables.
+        settings: of `simgap explain`, by the names of its options; what is not set is left out.
+    """
+    words = ["simgap", "explain", *map(str, recordings)]
+    for name, value in settings.items():
+        if value is True:
+            words.append(f"--{name}")
+        elif isinstance(value, (list, tuple)):
+            # An option that can be given several times.
+            words += [word for one in value for word in (f"--{name}", str(one))]
+        elif value not in (None, False, ""):
+            words += [f"--{name}", str(value)]
+    return words
+
+
 def write_explained(
     folder: Path, started: str, settings: Mapping[str, Any], recordings: Iterable[Path]
 ) -> Path:

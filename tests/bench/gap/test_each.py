@@ -1,13 +1,14 @@
 """Many logs, each by itself: a folder for each, one table, and nothing made twice."""
 
 import csv
+import hashlib
 import json
 
 import numpy as np
 import pytest
 
 from bench.cli import main
-from bench.gap.each import HEAD, Row, table, told
+from bench.gap.each.rows import HEAD, Row, table, told
 from sims.base import Scenario
 from sims.recording.recording import Recording, Run
 from sims.recording.write import write_recording
@@ -63,6 +64,17 @@ def test_every_log_has_its_folder_and_its_row(logs, tmp_path, capsys):
         assert (out / row["log"] / "report.html").exists()
     said = capsys.readouterr().out
     assert "friction.coulomb: in 3 of 3 logs, 0.3" in said
+    assert f"report  {out / 'report.html'}" in said
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "3 logs, each explained by itself" in page
+    assert page.count('<a href="day') == 3
+    environment = json.loads((out / "environment.json").read_text())
+    assert environment["settings"]["each"] is True
+    named = [(one["file"], one["sha256"]) for one in environment["recordings"]]
+    assert [name for name, _ in named] == [
+        file for k in range(3) for file in (f"day{k}.csv", f"day{k}.toml")
+    ]
+    assert named[2][1] == hashlib.sha256(logs[1].read_bytes()).hexdigest()
 
 
 def test_a_log_that_cannot_be_explained_costs_no_other_and_what_is_there_stays(logs, tmp_path):
@@ -72,6 +84,7 @@ def test_a_log_that_cannot_be_explained_costs_no_other_and_what_is_there_stays(l
     assert explain([*logs[:2], bad], out, "--jobs", "1") == 1
     first = rows_of(out)
     assert [row["verdict"] for row in first] == ["named", "named", ""]
+    assert "1 could not be explained" in (out / "report.html").read_text(encoding="utf-8")
     assert "bad.toml" in first[2]["error"]
     stamps = [(out / f"day{k}" / "verdict.json").stat().st_mtime_ns for k in range(2)]
     # Mended, and one log more: only these two are explained.
@@ -80,6 +93,8 @@ def test_a_log_that_cannot_be_explained_costs_no_other_and_what_is_there_stays(l
     bad.with_suffix(".toml").write_bytes((tmp_path / "bad2.toml").read_bytes())
     assert explain([*logs, bad], out, "--jobs", "1") == 0
     assert [row["log"] for row in rows_of(out)] == ["day0", "day1", "day2", "bad"]
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "<strong>4 named</strong>" in page
     again = [(out / f"day{k}" / "verdict.json").stat().st_mtime_ns for k in range(2)]
     assert again == stamps
     # Asked otherwise, everything is another question.

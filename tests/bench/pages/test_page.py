@@ -154,7 +154,7 @@ def test_what_nobody_sees_is_drawn_when_it_comes_into_sight(browser, opened):
     page.locator("#theme").select_option("dark")
     assert page.locator(left).count() == 4
     page.locator("#motion").scroll_into_view_if_needed()
-    page.wait_for_function(f"!document.querySelector('{left}')")
+    page.locator(left).first.wait_for(state="detached")
     # What is chosen in a figure itself is drawn at once, wherever the reader is.
     page.evaluate("scrollTo(0, 0)")
     page.locator("canvas").evaluate_all(marked)
@@ -185,7 +185,7 @@ def test_dragging_zooms_and_whole_shows_everything_again(opened):
     page.mouse.down()
     page.mouse.move(box["x"] + 0.9 * box["width"], box["y"] + 0.7 * box["height"], steps=4)
     page.mouse.up()
-    page.wait_for_function("location.hash.includes('zoom')")
+    page.wait_for_url(re.compile("zoom"))
     low, high, least, most = map(
         float, re.search(r"error\.zoom=(.*)", opened.state())[1].split(",")
     )
@@ -359,7 +359,7 @@ def test_one_stretch_of_time_is_zoomed_in_every_panel_and_the_vertical_axis_foll
     page.mouse.down()
     page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.6 * box["height"], steps=4)
     page.mouse.up()
-    page.wait_for_function("location.hash.includes('zoom')")
+    page.wait_for_url(re.compile("zoom"))
     low, high, least, most = re.search(r"motion\.zoom=(.*)", opened.state())[1].split(",")
     # A quarter and a half of 9.9 s with 4 % more at both ends.
     assert float(low) == pytest.approx(2.28, abs=0.1)

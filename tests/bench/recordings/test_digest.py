@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.gap.each import logs_of
+from bench.gap.each.run import logs_of
 from bench.recordings.digest import PIECE, digest_of
 
 DESCRIPTION = """model = "arm.xml"

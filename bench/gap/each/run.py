@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from bench.gap.each.rows import TABLE, Row, table
 from bench.gap.explain import explain
-from bench.gap.explanation import csv_text
 from bench.gap.model.watch import Watch
 from bench.recordings.digest import content_of, digest_of
 from bench.recordings.joined import names_of
@@ -25,12 +25,6 @@ from sims.files import first_line, refuse_full, write
 
 STATE = "logs.json"
 """What is known of the logs: it is written again whenever one is done."""
-TABLE = "logs.csv"
-"""The table: a row for each number of each cause of each log."""
-HEAD = (
-    "log", "verdict", "cause", "alternatives", "coefficient", "value", "low", "high", "unit",
-    "gap_closed", "seconds", "error",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -49,29 +43,6 @@ class Log:
     path: Path
     folder: Path
     digest: str
-
-
-@dataclass(frozen=True)
-class Row:
-    """What came of a log.
-
-    Attributes:
-        log: its name.
-        digest: that of `Log`.
-        verdict: the word; empty where it could not be explained.
-        causes: as verdict.json has them.
-        gap_closed: share of the held-out gap that is closed; None where nothing is held out.
-        seconds: that it took.
-        error: why it could not be explained, in one line.
-    """
-
-    log: str
-    digest: str
-    verdict: str = ""
-    causes: tuple[Mapping[str, Any], ...] = ()
-    gap_closed: float | None = None
-    seconds: float | None = None
-    error: str = ""
 
 
 def logs_of(paths: Sequence[Path], out: Path, settings: Mapping[str, Any]) -> list[Log]:
@@ -178,39 +149,3 @@ def _write(out: Path, rows: Sequence[Row]) -> None:
         write(out / TABLE, table(rows))
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror})") from None
-
-
-def table(rows: Sequence[Row]) -> str:
-    """The table of all logs as CSV, a row for each number of each cause."""
-    lines: list[tuple[object, ...]] = []
-    for row in rows:
-        cells: list[tuple[object, ...]] = []
-        for cause in row.causes:
-            for name, number in cause["coefficients"].items():
-                what = cause["effect"], " or ".join(cause["alternatives"]), name
-                cells.append((*what, *(number[key] for key in ("value", "low", "high", "unit"))))
-        last = row.gap_closed, row.seconds, row.error
-        lines += [(row.log, row.verdict, *cell, *last) for cell in cells or [("",) * 7]]
-    return csv_text(HEAD, lines)
-
-
-def told(rows: Sequence[Row]) -> list[str]:
-    """How often each cause was named, and its numbers' range over the logs; most frequent first."""
-    places: dict[str, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        for cause in row.causes:
-            places.setdefault(" or ".join([cause["effect"], *cause["alternatives"]]), []).append(
-                cause["coefficients"]
-            )
-    lines = []
-    for effects, found in sorted(places.items(), key=lambda entry: (-len(entry[1]), entry[0])):
-        numbers = []
-        for name, first in found[0].items():
-            values = [c[name]["value"] for c in found if name in c]
-            label = "" if name == "coefficient" else f"{name} "
-            unit = "" if first["unit"] == "1" else f" {first['unit']}"
-            low, high = min(values), max(values)
-            span = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-            numbers.append(f"{label}{span}{unit}")
-        lines.append(f"{effects}: in {len(found)} of {len(rows)} logs, {', '.join(numbers)}")
-    return lines

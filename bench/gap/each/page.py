@@ -1,0 +1,259 @@
+"""The page of many logs that were explained each by itself: report.html beside logs.csv."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from bench.figures import style
+from bench.figures.logs import NAMED, PANELS, held_out, numbers
+from bench.gap.each import frames
+from bench.gap.each.rows import TABLE, Row, named
+from bench.gap.report.advice import command
+from bench.gap.report.words import joined, name_of, number, percent, sentence, with_unit
+from bench.pages.chart import Axis, Chart, Panel, Rule, Series, Static
+from bench.pages.elements import code, listed, paragraph, safe, strong
+from bench.pages.grid import Column, Grid
+from bench.pages.page import Page
+from sims.base import InputError
+from sims.files import write
+
+_FEW = 8
+"""Logs that stand with their names on an axis; more have their number there."""
+_SAID = 6
+"""Causes, and logs without an answer, that are told before the tables."""
+_ORDER = ("named", "ambiguous", "partial", "adequate", "unknown", "unidentifiable")
+_BEFORE = style.drawn(style.VERMILION, (), "s")
+_AFTER = style.drawn(style.BLUE, (), "o")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the page is of, besides the rows.
+
+    Attributes:
+        out: the folder of all.
+        folders: by log where its explanation lies.
+        recordings: by log the recording.
+        words: of the command that goes on with what is left.
+        left: logs that are not explained yet.
+    """
+
+    out: Path
+    folders: Mapping[str, Path]
+    recordings: Mapping[str, Path]
+    words: Sequence[str]
+    left: int = 0
+
+
+def write_page(rows: Sequence[Row], asked: Asked) -> Path:
+    """Write the page beside the table.
+
+    Returns:
+        Where it is.
+    """
+    path = asked.out / frames.REPORT
+    try:
+        write(path, each_page(rows, asked))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    return path
+
+
+def each_page(rows: Sequence[Row], asked: Asked) -> str:
+    """The page as HTML: what was found in how many logs, then log by log.
+
+    Args:
+        rows: what came of each log, in the order given.
+        asked: what they were asked with.
+    """
+    logs = frames.logs(rows, asked.folders)
+    found = frames.numbers(rows)
+    made = f"Made by simgap explain --each; the table is {code(TABLE)} in {code(safe(asked.out))}."
+    page = Page(f"{_counted(len(rows))}, each explained by itself", made)
+    page.table("each", logs)
+    page.table("logs", frames.written(rows))
+    page.add(f"<header>\n<h1>{_counted(len(rows))}, each explained by itself</h1>\n</header>")
+    page.add(f'<div class="conclusion">{listed(_conclusion(rows, logs, found, asked))}</div>')
+    page.section("next", "What to do next", *_next(rows, asked))
+    page.section("logs", "Log by log", page.grid(_each_grid()))
+    page.section("numbers", "The numbers of the causes", *_found(page, logs, found))
+    page.section("gap", "What the causes explain", _held_out(page, logs))
+    page.section("making", "How it was made", command(*asked.words))
+    return page.html()
+
+
+def _counted(count: int) -> str:
+    return "One log" if count == 1 else f"{count} logs"
+
+
+def _conclusion(
+    rows: Sequence[Row], logs: pd.DataFrame, found: pd.DataFrame, asked: Asked
+) -> Iterator[str]:
+    """Verdicts, the commonest causes, what they close, what is left."""
+    words = Counter(row.verdict for row in rows if row.verdict)
+    said = [f"{words[word]} {safe(word)}" for word in _ORDER if words[word]]
+    said += [f"{count} {safe(word)}" for word, count in words.items() if word not in _ORDER]
+    failed = sum(1 for row in rows if row.error)
+    if failed:
+        said.append(f"{failed} could not be explained")
+    yield f"Verdicts: {strong(joined(said) or 'none yet')}."
+    causes = Counter(named(cause) for row in rows for cause in row.causes)
+    for name, count in causes.most_common(_SAID):
+        words_of = joined([name_of(part) for part in name.split(" or ")], "or")
+        what = strong(safe(sentence(words_of)[:-1], 300))
+        where = f"({code(safe(name, 200))}) in {count} of {len(rows)} logs"
+        yield f"{what} {where}{safe(_spans(found[found['cause'] == name]))}."
+    if len(causes) > _SAID:
+        yield f"{len(causes) - _SAID} causes more, each in fewer logs or as many."
+    closed = logs["gap_closed"][logs["causes"] != ""].dropna()
+    if len(closed):
+        ends = dict.fromkeys([percent(closed.min()), percent(closed.max())])
+        middle = f"{percent(closed.median())} of the held-out gap (median)"
+        yield f"What was found closes {middle}; {' to '.join(ends)} in {len(closed)} logs."
+    if asked.left:
+        yield f"{strong(f'{asked.left} logs are left')}: the same command goes on with them."
+
+
+def _spans(found: pd.DataFrame) -> str:
+    """Between what each number of a cause lies: ``: 0.3 to 0.7 N``."""
+    parts = []
+    for name, mine in found.groupby("name", sort=False):
+        ends = dict.fromkeys(number(end) for end in (mine["value"].min(), mine["value"].max()))
+        label = "" if name == "coefficient" else f"{name} "
+        parts.append(label + with_unit(" to ".join(ends), str(mine["unit"].iloc[0])))
+    return f": {joined(parts)}" if parts else ""
+
+
+def _next(rows: Sequence[Row], asked: Asked) -> Iterator[str]:
+    """What is to be mended, what goes on, and what many logs of one cause are good for."""
+    failed = [row for row in rows if row.error]
+    if failed:
+        yield paragraph(strong("Not explained:"))
+        more = len(failed) - _SAID
+        told = [f"{code(safe(row.log, 100))}: {safe(row.error)}" for row in failed[:_SAID]]
+        yield listed([*told, *([f"and {more} more, in the table below"] if more > 0 else [])])
+    if failed or asked.left:
+        again = '<a href="#making">The same command</a>'
+        yield paragraph(f"{again} explains what is mended or left, and nothing twice.")
+    causes = Counter(named(cause) for row in rows for cause in row.causes)
+    commonest = causes.most_common(1)
+    if commonest and commonest[0][1] > 1:
+        name, _ = commonest[0]
+        having = [row.log for row in rows if name in map(named, row.causes)]
+        yield paragraph(
+            f"{strong('Do the numbers differ from log to log by more than chance?')} Explained "
+            f"together, the {len(having)} logs with {code(safe(name, 200))} say so, and with what "
+            "a number moves:"
+        )
+        yield command("simgap", "explain", *(asked.recordings[log] for log in having))
+    if not causes and not failed:
+        yield paragraph("Nothing: no log shows a cause.")
+
+
+def _each_grid() -> Grid:
+    columns = (
+        Column("log", says="leads to its own report"),
+        Column("number", "#", 6),
+        Column("verdict"),
+        Column("causes"),
+        Column("gap_closed", "gap closed", 3, "share of the held-out error above its noise floor"),
+        Column("low", "95 % low", 3),
+        Column("high", "95 % high", 3),
+        Column("before", "before [floors]", 3, "error on held-out runs, in noise floors"),
+        Column("after", "after [floors]", 3, "the same with what was found"),
+        Column("seconds", "s", 3),
+        Column("error", "why not"),
+    )  # fmt: skip
+    return Grid("each", "Every log", "each", columns, ("verdict",), links="report")
+
+
+def _across(logs: pd.DataFrame) -> Axis:
+    """The logs along an axis."""
+    if len(logs) > _FEW:
+        ends = (0.5, len(logs) + 0.5)
+        return Axis("log, by its number", scales=("linear",), ends=ends)
+    names = tuple(str(name)[-20:] for name in logs["log"])
+    return Axis("log", names=names)
+
+
+def _placed(frame: pd.DataFrame, logs: pd.DataFrame) -> pd.DataFrame:
+    """With the place along the axis: named ones stand at 0, 1, 2, ..."""
+    return frame.assign(place=frame["number"] - (1 if len(logs) <= _FEW else 0))
+
+
+def _found(page: Page, logs: pd.DataFrame, found: pd.DataFrame) -> Iterator[str]:
+    """Each number over the logs, and the table of all."""
+    columns = (
+        Column("log"),
+        Column("verdict"),
+        Column("cause"),
+        Column("alternatives"),
+        Column("coefficient", "number"),
+        Column("value", digits=4),
+        Column("low", "95 % low", 4),
+        Column("high", "95 % high", 4),
+        Column("unit"),
+    )  # fmt: skip
+    if found.empty:
+        return
+    page.table("found", _placed(found, logs))
+    panels = []
+    for what in dict.fromkeys(found["what"]):
+        name, _, label = str(what).rpartition(": ")
+        where = {"what": str(what)}
+        series = (Series("each log", "value", _AFTER, where, "low", "high", "points"),)
+        up = Axis(label, scales=("linear",))
+        panels.append(Panel(name, "found", "place", series, _across(logs), up, {"number": what}))
+    caption = (
+        "A point is what a log gives by itself, the bar its 95 % interval. Bars that do not "
+        "overlap are numbers that moved."
+    )
+    if len(panels) > PANELS:
+        caption += f" In print the {PANELS} commonest numbers."
+    # Many side by side are none that one could compare.
+    beside = "number" if len(panels) <= PANELS else ""
+    still = _still(numbers(logs, found), "Each number of the causes over the logs.", "numbers")
+    title = "What each log gives"
+    yield page.chart(Chart("found", title, caption, tuple(panels), still, beside))
+    filters = ("log", "cause", "coefficient")
+    yield page.grid(Grid("all-numbers", f"All numbers: {TABLE}", "logs", columns, filters))
+
+
+def _held_out(page: Page, logs: pd.DataFrame) -> str:
+    """Errors on held-out runs before and after, in noise floors."""
+    measured = logs[logs[["before", "after"]].map(lambda x: isfinite(x) and x > 0).all(axis=1)]
+    if measured.empty:
+        return ""
+    page.table("held-out", _placed(logs[["number", "log", "before", "after"]], logs))
+    series = (
+        Series("before: tuned simulation", "before", _BEFORE, draw="points"),
+        Series("after: with what was found", "after", _AFTER, draw="points"),
+    )
+    up = Axis("error on held-out runs [noise floors]", "log", holds=(1.0,))
+    rules = (Rule(1.0, "noise floor"),)
+    title = "Error on held-out runs"
+    panel = Panel(
+        _counted(len(measured)), "held-out", "place", series, _across(logs), up, rules=rules
+    )
+    caption = (
+        "Squares: the tuned simulation as it is. Circles: with what was found. 1 is the noise "
+        "floor, the best that any model can reach."
+    )
+    if len(logs) > NAMED:
+        caption += " Logs have the numbers of the table above."
+    shows = "Error on held-out runs of each log before and after, in noise floors."
+    return page.chart(
+        Chart("held-out", title, caption, (panel,), _still(held_out(measured), shows, "held-out"))
+    )
+
+
+def _still(figure: Any, shows: str, name: str) -> Static:
+    picture = style.taken(figure)
+    return Static(picture.svg, picture.pdf, shows, name)

@@ -1,0 +1,122 @@
+"""The page of many logs in a real browser: what it says, and that it leads to each log's own."""
+
+import json
+
+import pytest
+
+from bench.gap.each.page import Asked, each_page
+from bench.gap.each.rows import Row, table
+from tests.browser import WIDTHS, Opened
+
+ODD = "a </b><b>$x$"
+EFFECTS = "friction.coulomb@elbow or joint.backlash@elbow"
+ERROR = "bad.toml: expected a number, found <i>none</i>"
+
+
+def cause(value, effect="friction.coulomb@elbow", alternatives=("joint.backlash@elbow",)):
+    number = {"value": value, "low": 0.9 * value, "high": 1.2 * value, "unit": "N*m"}
+    return {
+        "effect": effect,
+        "alternatives": list(alternatives),
+        "coefficients": {"coefficient": number},
+    }
+
+
+def made(tmp_path, count=4, left=2):
+    """Rows of so many logs with a cause, one without, one that failed; the folders of those that
+    were explained.
+    """
+    rows = [
+        Row(ODD if k == 0 else f"day{k}", "d", "ambiguous", (cause(0.1 * (k + 1)),), 0.9, 1.5)
+        for k in range(count)
+    ]
+    rows += [Row("clean", "d", "adequate", (), None, 0.5), Row("bad", "d", error=ERROR)]
+    folders = {row.log: tmp_path / row.log.replace("/", "_") for row in rows}
+    for k, row in enumerate(rows[:count]):
+        folders[row.log].mkdir(exist_ok=True)
+        held = {"rmse_base": 20.0 + k, "rmse_extended": 3.0, "noise_floor": 2.0, "low": 0.8}
+        (folders[row.log] / "verdict.json").write_text(
+            json.dumps({"heldout": {**held, "high": 0.95, "gap_closed": 0.9, "unit": "rad"}})
+        )
+        (folders[row.log] / "report.html").write_text(f"<title>report of log {k}</title>")
+    recordings = {row.log: tmp_path / f"{row.log}.csv" for row in rows}
+    words = ["simgap", "explain", *map(str, recordings.values()), "--each"]
+    return rows, Asked(tmp_path, folders, recordings, words, left)
+
+
+def written(tmp_path, count=4, left=2):
+    rows, asked = made(tmp_path, count, left)
+    file = tmp_path / "report.html"
+    file.write_text(each_page(rows, asked), encoding="utf-8")
+    return file, rows
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_the_page_says_what_was_found_and_leads_to_every_log(browser, tmp_path, width):
+    file, rows = written(tmp_path)
+    with Opened(browser, file, width=width) as one:
+        page, said = one.page, one.text(".conclusion")
+        assert "Verdicts: 4 ambiguous, 1 adequate and 1 could not be explained." in said
+        assert (
+            "(friction.coulomb@elbow or joint.backlash@elbow) in 4 of 6 logs: 0.1 to 0.4 N·m"
+            in said
+        )
+        assert "closes 90 % of the held-out gap (median); 90 % in 4 logs" in said.replace(
+            "\xa0", " "
+        )
+        assert "2 logs are left" in said
+        assert ERROR in one.text("#next")
+        together = page.locator("#next pre").last.inner_text()
+        assert together.count(".csv") == 4
+        assert "bad.csv" not in together
+        first = page.locator("#each tbody tr").first.locator("td").all_inner_texts()
+        # Errors of 20 and 3 above a floor of 2.
+        assert first[:9] == [
+            ODD, "1", "ambiguous", EFFECTS,
+            "0.9", "0.8", "0.95", "10", "1.5",
+        ]  # fmt: skip
+        assert page.locator("#each tbody a").count() == 5
+        saved = one.saved(page.locator("#all-numbers").get_by_text("save as CSV").click)
+        assert saved == ("logs.csv", table(rows).encode())
+        assert page.locator("canvas").count() == 2
+        assert one.overflow() <= 0
+        assert one.barriers() == []
+        page.locator("#each").get_by_label("verdict").select_option("not explained")
+        assert page.locator("#each tbody td").first.inner_text() == "bad"
+        assert page.locator("#each tbody a").count() == 0
+        page.locator("#each").get_by_label("verdict").select_option("")
+        assert one.complaints == []
+        with page.expect_navigation():
+            page.locator("#each tbody a").first.click()
+        assert page.title() == "report of log 0"
+
+
+def test_without_a_script_its_tables_lead_and_its_figures_stand(browser, tmp_path):
+    file, _ = written(tmp_path)
+    with Opened(browser, file, java_script_enabled=False) as one:
+        assert one.page.locator("img.still").count() == 2
+        assert one.page.locator("img.still").first.is_visible()
+        one.page.locator("#each tbody a").nth(1).click()
+        assert one.page.title() == "report of log 1"
+
+
+def test_logs_beyond_what_an_axis_holds_have_numbers(browser, tmp_path):
+    file, _ = written(tmp_path, count=45)
+    with Opened(browser, file) as one:
+        assert one.text("#each .count") == "47 of 47 rows"
+        one.page.locator("#found").scroll_into_view_if_needed()
+        box = one.page.locator("#found .u-over").bounding_box()
+        one.page.mouse.move(box["x"] + box["width"] * 44.5 / 47, box["y"] + 5)
+        one.page.locator("#found .tip").wait_for()
+        tip = one.text("#found .tip")
+        assert "log, by its number: 45" in tip
+        assert "4.5 (4.05 to 5.4)" in tip
+        assert one.complaints == []
+
+
+def test_nothing_explained_yet_is_a_page_too(tmp_path):
+    _, asked = made(tmp_path)
+    html = each_page([], asked)
+    assert "0 logs, each explained by itself" in html
+    assert "<strong>none yet</strong>" in html
+    assert "<figure" not in html
