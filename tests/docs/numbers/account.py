@@ -21,6 +21,7 @@ NO_TEXT = re.compile(
 
 TABLE = re.compile(r"(?:^ *\|.*\n?)+", re.M)
 LINE = re.compile(r"^.+$", re.M)
+HEADING = re.compile(r"^#+ (.*)$", re.M)
 
 
 class Account:
@@ -67,18 +68,20 @@ class Account:
                 continue
             self.held.update(n.span() for n in NUMBER.finditer(self.text, *lines[line]))
 
-    def table(self, header, value):
+    def table(self, header, value, place=0):
         """The page has a table that begins with this header line, and its cells agree.
 
         Args:
             header: the first cells, as the page has them.
+            place: among the tables that begin so.
             value: of a row's cells by their headings and a heading: the values of the numbers of
                 that cell, in order; None for a cell that is no statement.
 
         Returns:
             How many numbers were compared.
         """
-        names, _, *rows = lines_of(self.text, self.text.index(f"| {header}"))
+        begins = [found.start() for found in re.finditer(re.escape(f"| {header}"), self.text)]
+        names, _, *rows = lines_of(self.text, begins[place])
         headings = [text for text, _ in names]
         for text, start in names:
             here = NUMBER.finditer(self.text, start, start + len(text))
@@ -100,16 +103,33 @@ class Account:
 
     def left(self):
         """Numbers that nothing was said of, each with the words about it."""
+        found = []
+        for number in self._untold():
+            about = self.text[max(0, number.start() - 40) : number.end() + 20]
+            found.append((number[0], " ".join(about.split())))
+        return found
+
+    def left_by_section(self):
+        """The same numbers by the heading that they stand below, as the page has them."""
+        fenced = [m.span() for m in FENCE.finditer(self.text)]
+        heads = [(m.start(), m[1]) for m in HEADING.finditer(self.text)]
+        # A comment in a block of code looks like a heading.
+        heads = [(at, name) for at, name in heads if not any(a <= at < b for a, b in fenced)]
+        found = {}
+        for number in self._untold():
+            above = [name for at, name in heads if at < number.start()]
+            found.setdefault(above[-1] if above else "", []).append(number[0])
+        return found
+
+    def _untold(self):
+        """Where numbers stand that nothing was said of."""
         nothing = [m.span() for m in NO_TEXT.finditer(self.text)]
         nothing += [m.span() for m in FENCE.finditer(self.text)]
-        found = []
+        spans = sorted([*nothing, *self.held])
         for number in NUMBER.finditer(self.text):
             begin, end = number.span()
-            inside = any(a <= begin and end <= b for a, b in nothing)
-            if not inside and not any(a <= begin and end <= b for a, b in self.held):
-                about = self.text[max(0, begin - 40) : end + 20]
-                found.append((number[0], " ".join(about.split())))
-        return found
+            if not any(a <= begin and end <= b for a, b in spans):
+                yield number
 
     def _hold(self, span, value):
         """Hold the number that stands somewhere against a value."""
