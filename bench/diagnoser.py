@@ -169,7 +169,8 @@ class Case:
         recorded = [c.name for c in self.kind.channels if c.name in run.channels]
         fixed = {name: list(c) for name, c in (effects or {}).items()}
         constants = {**self.recording.constants, **run.constants}
-        made = self.kind(constants, recorded, engine="batch", fixed=fixed)
+        engine = None if self.kind.own_engine else "batch"
+        made = self.kind(constants, recorded, engine=engine, fixed=fixed)
         given = parameters or {}
         theta = [given.get(p.name, p.nominal) for p in made.parameters]
         begin = {**self.kind.states, **run.initial, **(initial or {})}
@@ -216,6 +217,14 @@ class Diagnoser(ABC):
     @abstractmethod
     def diagnose(self, case: Case) -> Answer | str | Mapping[str, Any]:
         """What is missing from the simulation of this recording."""
+
+    def cannot(self, kind: type[Simulated]) -> str:  # noqa: ARG002
+        """Why it cannot be asked about recordings of a simulator at all; empty where it can.
+
+        It then counts as skipped there, and not as failed. It sees no recording: nobody chooses his
+        questions.
+        """
+        return ""
 
     def train(self, lesson: Lesson) -> Mapping[str, Array]:  # noqa: ARG002
         """Learn once for a system, before any recording is seen; what is learned, as arrays."""

@@ -63,6 +63,10 @@ class Classifier(Diagnoser):
     name = "classifier"
     learned: ClassVar[bool] = True
 
+    def cannot(self, kind: type[Simulated]) -> str:
+        """It learns a system before anybody shows it a recording, or a model file."""
+        return "nobody knows a robot's file before it is asked" if kind.has_model else ""
+
     def train(self, lesson: Lesson) -> Mapping[str, Array]:
         """Simulate recordings until the budget is spent, and fit the network."""
         classes = ["", *sorted(lesson.library)]

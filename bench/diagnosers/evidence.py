@@ -112,7 +112,9 @@ class Evidence:
     def __init__(self, case: Case, every: bool = True) -> None:
         recording = case.recording
         runs = [*recording.training(), *(recording.held_out() if every else ())]
-        self.world = World(case.kind, recording, runs, "batch", candidates=list(case.library))
+        # A robot steps as its file says.
+        engine = None if case.kind.own_engine else "batch"
+        self.world = World(case.kind, recording, runs, engine, candidates=list(case.library))
         floor = noise_floor(self.world, recording)
         self.noise = Noise(floor.sigma, np.zeros(floor.sigma.size))
         self.stated: Mask = floor.stated

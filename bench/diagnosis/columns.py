@@ -9,7 +9,7 @@ import pandas as pd
 
 from bench.diagnosis.failures import COLUMNS as FAILED
 from bench.diagnosis.tables import NAMED
-from bench.diagnosis.worlds.items import KINDS
+from bench.diagnosis.worlds.item import KINDS
 from bench.store.csvs import Csv
 from bench.store.schema import Column, Columns, Empty
 

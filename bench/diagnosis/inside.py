@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from bench.diagnoser import Answer, Case, Diagnoser, Lesson, library_of
+from bench.recordings.inspection import kind_of
 from bench.registry import simulators
 from bench.sealing.inside import found
 from bench.sealing.seals import Reach
@@ -85,11 +86,11 @@ def asked(
     learned: Mapping[str, Array],
     diagnoser: Diagnoser | None = None,
 ) -> dict[str, Any]:
-    """One answer, as JSON.
+    """One answer, as JSON, or why there is to be none (``skipped``).
 
     Args:
         question: ``wanted`` (name, module, file), ``table`` and ``description`` of the recording,
-            its ``system``, ``budget``, ``seconds``, ``seed``.
+            ``budget``, ``seconds``, ``seed``, and ``beside``, texts of files that lie beside it.
         folder: to write the recording to.
         learned: what the diagnoser has learned.
         diagnoser: built already.
@@ -98,7 +99,12 @@ def asked(
     path = folder / "recording.csv"
     path.write_text(question["table"], encoding="utf-8")
     path.with_suffix(".toml").write_text(question["description"], encoding="utf-8")
-    kind = simulator_of(question["system"])
+    for name, text in question.get("beside", {}).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    kind = kind_of(path, path)
+    assert issubclass(kind, Simulated)
+    if reason := diagnoser.cannot(kind):
+        return {"answer": None, "simulations": 0, "processor_seconds": 0.0, "skipped": str(reason)}
     recording = read_recording(path, kind)
     case = Case(
         path,

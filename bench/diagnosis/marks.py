@@ -13,6 +13,7 @@
 | alarm | clean | something is seen |
 | undecided | all | said to be unidentifiable |
 | failed | all | there is no answer: it crashed or took too long |
+| skipped | all | it cannot be asked about such simulators; counts nowhere |
 """
 
 from __future__ import annotations
@@ -21,9 +22,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bench.diagnosis.worlds.items import Item, same_class
-from bench.diagnosis.worlds.world import SIMULATORS
-from sims import effects as library
+from bench.diagnosis.worlds.item import Item
+from bench.diagnosis.worlds.questions import coefficients_of, same_class
 
 Sets = list[tuple[str, ...]]
 Judged = tuple[str, int, int]
@@ -132,11 +132,16 @@ def _matched(effects: Iterable[str], sets: Sets, holds: Holds) -> dict[str, int]
 
 
 def _same(item: Item, effect: str) -> frozenset[str]:
-    return same_class(item.system, item.driven, effect)
+    return same_class(item, effect)
 
 
 def _classes(item: Item, names: Sequence[str]) -> int:
-    return len({min(_same(item, name)) for name in names})
+    """Names of a set, equivalent ones as one; a robot's family adds nothing to one of its places
+    that stands beside it.
+    """
+    placed = {name.partition("@")[0] for name in names if not name.endswith("@*")}
+    counted = [n for n in names if not n.endswith("@*") or n.partition("@")[0] not in placed]
+    return len({min(_same(item, name)) for name in counted})
 
 
 OUTCOMES = {"clean": _clean, "foreign": _foreign, "single": _library, "double": _library}
@@ -144,15 +149,11 @@ OUTCOMES = {"clean": _clean, "foreign": _foreign, "single": _library, "double": 
 
 def _covered(item: Item, verdict: Mapping[str, Any], sets: Sets) -> dict[str, bool | None]:
     """Intervals of base parameters and of the coefficients of what leads its set."""
-    system, truth, said = (
-        SIMULATORS[item.system].system,
-        dict(item.parameters),
-        dict(verdict["parameters"]),
-    )
+    truth, said = dict(item.parameters), dict(verdict["parameters"])
     led = {names[0] for names in sets}
     for cause in verdict["causes"]:
         if cause["effect"] in item.effects:
-            names = [c.name for c in library.get(cause["effect"]).on(system)]
+            names = coefficients_of(item.system, cause["effect"])
             for name, value in zip(names, item.effects[cause["effect"]], strict=False):
                 truth[f"{cause['effect']}.{name}"] = value
                 said[f"{cause['effect']}.{name}"] = cause["coefficients"].get(name)

@@ -13,9 +13,10 @@ from bench.diagnosis.confusion import families
 from bench.diagnosis.failures import failures
 from bench.diagnosis.kept import Answered
 from bench.diagnosis.lessons import read_lessons
+from bench.diagnosis.page.conclusion import cannot
 from bench.diagnosis.page.page import diagnosis_page
 from bench.diagnosis.page.shown import Shown
-from bench.diagnosis.rows import rows_of
+from bench.diagnosis.rows import SKIPPED, rows_of
 from bench.diagnosis.sheet import Question
 from bench.diagnosis.tables import NAMED, all_tables, by_diagnoser, complete, singles
 from bench.figures.style import Pictures, keep, mark, taken
@@ -65,8 +66,10 @@ def finish(study: Asked, say: Callable[[str], None]) -> int:
         say("no question has been put to every diagnoser yet")
         return 0
     training = read_lessons(study.folder)
-    tables = all_tables(rows, order, training)
     write(study.folder / ITEMS, csv(rows))
+    left_out = rows[rows["status"] == SKIPPED]
+    rows = rows[rows["status"] != SKIPPED]
+    tables = all_tables(rows, order, training)
     for name, frame in {**tables, "failures": failures(rows, order)}.items():
         write(study.folder / f"{name}.csv", csv(frame))
     pictures = draw(study.configuration.experiment, rows, tables, order)
@@ -82,10 +85,13 @@ def finish(study: Asked, say: Callable[[str], None]) -> int:
         pictures,
         study.skipped,
         len(study.questions),
+        left_out,
     )
     write(study.folder / REPORT, diagnosis_page(shown))
     for line in text(tables, order):
         say(line)
+    for name, reason, count in cannot(left_out):
+        say(f"{name} cannot be asked {count} of these: {reason}")
     asked, planned = rows["question"].nunique(), len(study.questions)
     hopeless = sum(not one["item"] for one in study.answered.values())
     say(f"{asked} questions of {planned}; of {hopeless} the sensors cannot show what is hidden")

@@ -20,7 +20,8 @@ import numpy as np
 from bench.diagnoser import Answer
 from bench.diagnosis import inside
 from bench.diagnosis.sheet import Question
-from bench.diagnosis.worlds.items import Item, realise
+from bench.diagnosis.worlds.item import Item
+from bench.diagnosis.worlds.questions import texts_of
 from bench.problem.seeds import stream_of
 from bench.runs.housing import nursery, undisturbed
 from bench.sealing.children import PATIENCE, Child
@@ -33,6 +34,8 @@ AHEAD = "bench.diagnosis.ahead"
 """Loaded in the process that starts diagnosers."""
 _ANSWER = 1 << 20
 """Bytes that an answer may have."""
+_REASON = 200
+"""Letters of why a diagnoser cannot be asked."""
 BUDGET = "it asked for more simulations than are allowed"
 """The reason of an answer that was not given for that."""
 
@@ -94,13 +97,14 @@ def answered(
     item = asked.drawn(seed, salt) if known is None else Item.of(known) if known else None
     if item is None:
         return {"question": asked.name, "item": {}, "rows": []}
-    table, description = _written(item)
+    written = texts_of(item)
     rows = []
     for one in examined:
         given = {
             "wanted": {"name": one.code.name, "module": one.code.module, "file": one.code.file},
-            "table": table,
-            "description": description,
+            "table": written.table,
+            "description": written.description,
+            "beside": written.beside,
             "system": item.system,
             "budget": limits.simulations,
             "seconds": limits.seconds,
@@ -108,13 +112,6 @@ def answered(
         }
         rows.append(_row(one, given, asked.name, limits, hidden))
     return {"question": asked.name, "item": item.json(), "rows": rows}
-
-
-def _written(item: Item) -> tuple[str, str]:
-    """The recording's table and its description, as texts."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = realise(item, folder, truth=False)
-        return path.read_text("utf-8"), path.with_suffix(".toml").read_text("utf-8")
 
 
 def _row(
@@ -133,7 +130,8 @@ def _row(
             said = _here(given, learned)
         else:
             said = undisturbed(lambda: _sealed(one.code, given, learned, limits, hidden))
-        end = {"status": "done", "reason": "", **said}
+        skipped = said.pop("skipped", "")
+        end = {"status": "skipped" if skipped else "done", "reason": skipped, **said}
     except EndedError as ended:
         end = {"status": ended.status, "reason": _reason(ended.reason)}
     nothing = {"answer": None, "simulations": 0, "processor_seconds": None, "seconds": None}
@@ -162,7 +160,8 @@ def _sealed(
     hidden: tuple[str, ...],
 ) -> dict[str, Any]:
     """The answer of a diagnoser in a process of its own, checked."""
-    child = _started(code, limits.memory, hidden)
+    robots = ("mujoco",) if given["beside"] else ()
+    child = _started(code, limits.memory, hidden, robots)
     try:
         if learned:
             deadline = perf_counter() + PATIENCE
@@ -189,14 +188,20 @@ def _checked(said: Any, limits: Limits) -> dict[str, Any]:
     simulations, seconds = int(said["simulations"]), float(said["processor_seconds"])
     if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
         raise FoulError("it said what it cannot have used")
+    if skipped := str(said.get("skipped", ""))[:_REASON]:
+        nothing = {"answer": None, "simulations": 0, "processor_seconds": 0.0}
+        return {**nothing, "skipped": skipped}
     answer = Answer.of(said["answer"]).document()
     return {"answer": answer, "simulations": simulations, "processor_seconds": seconds}
 
 
-def _started(code: Tuned, memory: int, hidden: tuple[str, ...]) -> Child:
+def _started(
+    code: Tuned, memory: int, hidden: tuple[str, ...], more: tuple[str, ...] = ()
+) -> Child:
     house = nursery()
     own = code.module.startswith("bench.")
-    house.load([AHEAD, *code.modules, *([code.module] if own and not code.file else [])])
+    # MuJoCo starts a process while it is imported, which no diagnoser may.
+    house.load([AHEAD, *more, *code.modules, *([code.module] if own and not code.file else [])])
     files = [code.file] if code.file else []
     child = house.start("bench.diagnosis.inside:serve", files, memory, hidden)
     try:

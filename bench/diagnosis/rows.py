@@ -9,10 +9,12 @@ import pandas as pd
 
 from bench.diagnosis.kept import Answered
 from bench.diagnosis.marks import marked
-from bench.diagnosis.worlds.items import Item
+from bench.diagnosis.worlds.item import Item
 
 OF_ITEM = ("noise", "stated", "rate", "seconds", "runs", "source", "driven", "size", "beyond")
 """What of an item stands in a row."""
+SKIPPED = "skipped"
+"""Status and outcome where a diagnoser cannot be asked at all."""
 OWN_SECONDS = "run_seconds"
 """The column of a run's length, which `seconds` of an answer would hide."""
 
@@ -51,7 +53,7 @@ def row(question: str, item: Item, given: Mapping[str, Any]) -> dict[str, Any]:
         "reason": (given["reason"].strip().splitlines() or [""])[-1][:200],
         "verdict": answer["verdict"] if answer else "",
         "named": mark.named,
-        "outcome": mark.outcome,
+        "outcome": SKIPPED if given["status"] == SKIPPED else mark.outcome,
         "set_size": mark.set_size,
         "class_size": mark.class_size,
         "largest_set": max((1 + len(c["alternatives"]) for c in causes), default=0),

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bench.diagnosis.worlds.items import KINDS, SYSTEMS
+from bench.diagnosis.worlds.item import KINDS
+from bench.diagnosis.worlds.questions import SYSTEMS, USUAL
 from bench.diagnosis.worlds.settings import NOISES
 from bench.problem.experiment import Experiment
 from sims.base import InputError
@@ -35,7 +36,7 @@ class Asked:
     """
 
     kind: str
-    systems: tuple[str, ...] = SYSTEMS
+    systems: tuple[str, ...] = USUAL
     effects: tuple[str, ...] = ()
     sizes: tuple[float, ...] = ()
     rates: tuple[int, ...] = ()

@@ -14,9 +14,9 @@ from itertools import product
 from typing import Any
 
 from bench.diagnosis.settings import Asked, Settings
-from bench.diagnosis.worlds.items import Item, draw
+from bench.diagnosis.worlds.item import Item
+from bench.diagnosis.worlds.questions import SYSTEMS, draw, foreign_to, hidden_in
 from bench.diagnosis.worlds.settings import Circumstances
-from bench.diagnosis.worlds.world import FOREIGN, SIMULATORS
 from bench.problem.salt import PUBLIC
 from bench.problem.seeds import rng_for
 from sims import effects as library
@@ -131,15 +131,12 @@ def _effects(asked: Asked, system: str) -> list[str | None]:
         if asked.effects:
             raise InputError(f"diagnosis.questions: of {asked.kind} questions no effects are named")
         return [None]
-    there = (
-        list(FOREIGN[system])
-        if asked.kind == "foreign"
-        else sorted(library.library(SIMULATORS[system].system))
+    foreign = asked.kind == "foreign"
+    there = foreign_to(system) if foreign else hidden_in(system)
+    every = (
+        {n for s in SYSTEMS for n in foreign_to(s)} if foreign else set(library.registry.names())
     )
-    if asked.kind == "single":
-        for name in asked.effects:
-            library.find(name, SIMULATORS[system].system)
     for name in asked.effects:
-        if asked.kind == "foreign" and name not in {n for names in FOREIGN.values() for n in names}:
-            raise unknown("foreign cause", name, there)
+        if name not in every:
+            raise unknown("foreign cause" if foreign else "effect", name, there)
     return [name for name in there if not asked.effects or name in asked.effects]

@@ -21,7 +21,7 @@ from bench.diagnosis.sheet import Question, sheet
 from bench.problem.experiment import Experiment
 from bench.problem.salt import PUBLIC
 from bench.problem.seeds import rng_for
-from bench.registry import SkippedError, diagnosers
+from bench.registry import SkippedError, diagnosers, simulators
 from bench.runs.begun import begun
 from bench.runs.housing import ahead_of
 from bench.runs.identity import refuse_changes
@@ -239,7 +239,9 @@ class _Asking:
     def _learn(self, workers: Pool) -> tuple[dict[str, Examined], list[Taught]]:
         """Everybody who can be asked, and what learning cost."""
         trusted = self._experiment.trusted
-        systems = sorted({question.system for question in self._study.questions})
+        # Of a robot nobody knows the file before it is asked about.
+        wanted = {question.system for question in self._study.questions}
+        systems = sorted(wanted & set(simulators.names()))
         codes = {name: code_of(name) for name in self._study.usable}
         learned = [name for name in codes if diagnosers.get(name).learned]
         pairs = [(name, system) for name in learned for system in systems]

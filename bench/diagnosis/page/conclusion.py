@@ -113,8 +113,16 @@ def warnings(shown: Shown) -> Iterator[str]:
         by = failed.groupby("diagnoser").size()
         told = ", ".join(f"{safe(name, 60)} {count}" for name, count in by.items())
         yield f"Without an answer (crashed, too late or too costly): {told}."
+    for name, reason, count in cannot(shown.left_out):
+        yield f"{safe(name, 60)} cannot be asked {count} of the questions: {safe(reason)}."
     for name, reason in shown.skipped.items():
         yield f"{code(safe(name, 60))} was not asked: {safe(reason)}"
+
+
+def cannot(left_out: pd.DataFrame) -> list[tuple[str, str, int]]:
+    """Diagnosers that cannot be asked some questions: name, why, how many."""
+    groups = left_out.groupby(["diagnoser", "reason"], sort=False).size().reset_index(name="of")
+    return [(str(n), str(why), int(of)) for n, why, of in groups.itertuples(index=False)]
 
 
 def _names(names: list[str]) -> str:

@@ -26,6 +26,7 @@ class Shown:
         pictures: figures by name, as they are printed.
         skipped: diagnosers that could not be asked, and why.
         planned: questions of the sheet.
+        left_out: rows of questions that a diagnoser cannot be asked, and that count nowhere.
     """
 
     experiment: Experiment
@@ -37,6 +38,7 @@ class Shown:
     pictures: Mapping[str, Pictures]
     skipped: Mapping[str, str]
     planned: int
+    left_out: pd.DataFrame
 
     @property
     def asked(self) -> int:

@@ -8,15 +8,15 @@ the truth. Whatever is drawn follows from the item's name; an item is a recipe, 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from bench.diagnosis.worlds import rivals, shapes, sizing
+from bench.diagnosis.worlds.item import KINDS as KINDS
+from bench.diagnosis.worlds.item import Item as Item
 from bench.diagnosis.worlds.settings import ANY, Circumstances, Setting
 from bench.diagnosis.worlds.settings import setting as drawn_setting
 from bench.diagnosis.worlds.world import FOREIGN, SIMULATORS, simulated, solved
@@ -26,7 +26,6 @@ from sims.recording.recording import Recording, Run
 from sims.recording.write import write_recording
 
 SYSTEMS = ("ball", "pendulum", "slider")
-KINDS = ("clean", "single", "double", "foreign")
 SMALL = (0.1, 0.2, 0.3, 0.5)  # sizes asked for the power curve only
 
 # Noises that must be left when only one of two effects, or no foreign cause, is in the model.
@@ -63,60 +62,6 @@ EQUIVALENT: tuple[tuple[str, bool, frozenset[str]], ...] = (
 )
 """Effects of a system, with an input or without, that give the same motion for some parameters and
 initial states: exactly, whatever the data."""
-
-
-@dataclass(frozen=True)
-class Item:
-    """One question.
-
-    Attributes:
-        name: says kind, system, what was asked for, and seed.
-        system, kind: see `SYSTEMS`, `KINDS`.
-        effects: coefficients of what is hidden, by name; of a foreign cause its own numbers.
-        size: RMS of the gap that base parameters and initial states, refitted, leave in the runs
-            for fitting, in units of the noise; of two effects that of each by itself.
-        noise: white, ar1 or quantised.
-        stated: whether the recording states the noise.
-        rate, seconds, runs: sampling in Hz, a run's length, how many.
-        source: scipy or mujoco.
-        driven: whether there is an input.
-        channels: what is recorded.
-        seed: what it was drawn from.
-        parameters: the base parameters.
-        beyond: what is left of the gap, in units of the noise, with the best other answer: of a
-            foreign cause the best effect of the library, of two effects one of them, of an effect
-            in `SIMPLER` those.
-        asked: circumstances that were asked for.
-    """
-
-    name: str
-    system: str
-    kind: str
-    effects: dict[str, tuple[float, ...]]
-    size: float
-    noise: str
-    stated: bool
-    rate: int
-    seconds: float
-    runs: int
-    source: str
-    driven: bool
-    channels: tuple[str, ...]
-    seed: int
-    parameters: dict[str, float] = field(default_factory=dict)
-    beyond: float | None = None
-    asked: Circumstances = ANY
-
-    def json(self) -> dict[str, Any]:
-        """As plain values."""
-        return asdict(self)
-
-    @classmethod
-    def of(cls, document: Mapping[str, Any]) -> Item:
-        """An item from its JSON."""
-        effects = {name: tuple(c) for name, c in document["effects"].items()}
-        given = {**document, "effects": effects, "channels": tuple(document["channels"])}
-        return cls(**{**given, "asked": Circumstances(*document.get("asked", ()))})
 
 
 def same_class(system: str, driven: bool, effect: str) -> frozenset[str]:

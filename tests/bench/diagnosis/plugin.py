@@ -67,6 +67,18 @@ class Crashes(Diagnoser):
         raise RuntimeError("no idea")
 
 
+class Declines(Diagnoser):
+    """Knows no sliders."""
+
+    name = "declines"
+
+    def cannot(self, kind):
+        return "it knows no sliders" if kind.name == "slider" else ""
+
+    def diagnose(self, case):
+        raise AssertionError("it was asked all the same")
+
+
 class Spends(Diagnoser):
     name = "spends"
 

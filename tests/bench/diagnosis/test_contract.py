@@ -2,7 +2,7 @@
 
 import pytest
 
-from bench.diagnoser import Answer, Named
+from bench.diagnoser import Answer, Diagnoser, Named
 from bench.diagnosis.inside import asked, simulator_of
 from bench.recordings.simulate import Wish, make
 from sims.base import InputError, Scenario
@@ -53,8 +53,10 @@ def test_every_lane_is_counted():
     assert TALLY.used == 3
 
 
-class Counts:
+class Counts(Diagnoser):
     """One that simulates each run once, and looks at what it got."""
+
+    name = "counts"
 
     def diagnose(self, case):
         self.case = case

@@ -38,6 +38,7 @@ def shown(rows, order=ORDER, **changes):
         "pictures": dict.fromkeys(names, taken(figure)),
         "skipped": {"<i>sparse</i>": "no such package"},
         "planned": 654,
+        "left_out": rows.iloc[:0],
     }
     return Shown(**{**given, **changes})
 

@@ -149,6 +149,23 @@ def test_a_damaged_table_is_one_line(made, tmp_path):
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_who_cannot_be_asked_counts_nowhere(tmp_path, capsys):
+    path, out = written(tmp_path, "fifteen", "declines"), tmp_path / "out"
+    given = ["--plugin", str(PLUGIN), "--out", str(out), "--jobs", "0"]
+    assert main(["compare", str(path), *given]) == 0
+    assert "declines cannot be asked 2 of these: it knows no sliders" in capsys.readouterr().out
+    run = simgap.Compared(out)
+    rows = run.runs.set_index("diagnoser")
+    assert set(rows.loc["declines", "outcome"]) == {"skipped"}
+    counted = run.table.set_index(["diagnoser", "metric"])["of"]
+    assert counted["declines", "false alarms"] == counted["declines", "without an answer"] == 0
+    assert counted["fifteen", "false alarms"] == 1
+    assert "declines" not in set(run.tables["failures"]["diagnoser"])
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "declines cannot be asked 2 of the questions: it knows no sliders." in page
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_it_goes_on_where_it_was(made, tmp_path, capsys):
     path = written(tmp_path, "fifteen")
     out = tmp_path / "out"
@@ -237,7 +254,10 @@ def test_two_at_a_time_are_refused(tmp_path):
 
 
 def test_the_shipped_sheets_are_as_large_as_they_say():
-    small, full = (sheet(settings_of(load(f"diagnosis-{name}"))) for name in ("small", "full"))
+    names = ("small", "full", "machines")
+    small, full, machines = (sheet(settings_of(load(f"diagnosis-{name}"))) for name in names)
     assert len({q.name for q in small}) == len(small) == 56
     assert len({q.name for q in full}) == len(full) == 654
+    assert len({q.name for q in machines}) == len(machines) == 98
+    assert {q.system for q in machines} == {"servo", "arm2"}
     assert {q.kind for q in small} == {"clean", "single", "double", "foreign"}

@@ -1,0 +1,166 @@
+"""What can be hidden in a machine, where, and how strongly: coefficients as a function of a
+strength, 1 being the far end of plausible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from bench.diagnosis.worlds.machines.plants import PLANTS
+from bench.diagnosis.worlds.machines.settings import Setting
+
+Shape = Callable[[float], tuple[float, ...]]
+
+JOINT = (
+    "drag.linear",
+    "drag.quadratic",
+    "force.bias",
+    "force.ripple",
+    "friction.coulomb",
+    "friction.stribeck",
+    "spring.linear",
+)
+INPUT = (
+    "input.bias",
+    "input.deadband",
+    "input.delay",
+    "input.gain",
+    "input.lag",
+    "input.saturation",
+)
+SENSOR = ("sensor.bias", "sensor.delay", "sensor.drift", "sensor.gain")
+WORLD = ("gravity.scale", "gravity.tilt")
+_TAKEN_UP = {"drag.linear", "input.gain", "sensor.gain"}
+"""By a servo's own parameters, wholly or but for what hardly shows."""
+EFFECTS = {
+    "servo": tuple(sorted({*JOINT, *INPUT, *SENSOR, "gravity.tilt", "servo.deadband"} - _TAKEN_UP)),
+    "arm2": tuple(sorted({*JOINT, *INPUT, *SENSOR, *WORLD, "inertia.armature", "mass.scale"})),
+}
+"""By machine."""
+FOREIGN = ("gust", "patch")
+"""Causes that the library does not have: a push for a while in every run, and dry friction in a
+part of a joint's travel.
+"""
+SIGNED = (
+    "force.bias",
+    "gravity.scale",
+    "gravity.tilt",
+    "input.bias",
+    "input.gain",
+    "mass.scale",
+    "sensor.bias",
+    "sensor.drift",
+    "sensor.gain",
+)
+_FAR = {
+    "gravity.scale": 0.3,
+    "input.delay": 0.1,
+    "input.gain": 0.4,
+    "input.lag": 0.2,
+    "mass.scale": 0.5,
+    "sensor.bias": 0.2,
+    "sensor.delay": 0.1,
+    "sensor.drift": 0.1,
+    "sensor.gain": 0.3,
+}
+"""Of effects that need no scale of the motion."""
+
+
+def places(system: str, effect: str) -> tuple[str, ...]:
+    """Where an effect or foreign cause can be: ``effect@place``, or ``effect`` alone."""
+    plant = PLANTS[system]
+    if effect in WORLD or system == "servo":
+        return (effect,)
+    if effect == "mass.scale":
+        at: tuple[str, ...] = plant.bodies
+    elif effect in INPUT:
+        at = plant.motors
+    elif effect in SENSOR:
+        at = plant.channels
+    else:
+        at = plant.joints
+    return tuple(f"{effect}@{place}" for place in at)
+
+
+def joint_of(system: str, place: str) -> int:
+    """The joint that a place belongs to."""
+    plant = PLANTS[system]
+    for names in (plant.joints, plant.bodies, plant.motors, plant.channels):
+        if place in names:
+            return names.index(place)
+    return 0
+
+
+def shape(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
+    """Coefficients of ``effect@place`` by strength."""
+    effect, _, place = name.partition("@")
+    joint = joint_of(setting.system, place)
+    typical = {what: float(values[joint]) for what, values in setting.typical.items()}
+    sign = float(rng.choice([-1.0, 1.0])) if effect in SIGNED else 1.0
+    if effect in _FAR:
+        return lambda s: (sign * _FAR[effect] * s,)
+    if effect in _SHAPES:
+        return _SHAPES[effect](typical, rng)
+    if effect == "gravity.tilt":
+        more = (0.0,) if setting.system == "arm2" else ()
+        return lambda s: (0.3 * sign * s, *more)
+    command = setting.fitted.commands[:, :, joint]
+    most = float(np.abs(command).max())
+    return {
+        "input.bias": lambda s: (sign * float(np.ptp(command)) / 2 * s,),
+        "input.deadband": lambda s: (most * s,),
+        # At strength 0 at the command's peak, at 1 at nothing.
+        "input.saturation": lambda s: (most * (1 - s),),
+        "servo.deadband": lambda s: (0.3 * s,),
+    }[effect]
+
+
+def _per_force(bottom: Callable[[dict[str, float]], float]) -> Callable[..., Shape]:
+    def made(typical: dict[str, float], rng: np.random.Generator) -> Shape:
+        far = 2.0 * typical["force"] / bottom(typical)
+        return lambda s: (far * s,)
+
+    return made
+
+
+def _ripple(typical: dict[str, float], rng: np.random.Generator) -> Shape:
+    angle = rng.uniform(0, 2 * np.pi)
+    period = float(np.clip(typical["travel"] / rng.uniform(1.5, 4.0), 0.08, 1.0))
+    sine, cosine = (2 * typical["force"] * float(of(angle)) for of in (np.sin, np.cos))
+    return lambda s: (sine * s, cosine * s, period)
+
+
+def _stribeck(typical: dict[str, float], rng: np.random.Generator) -> Shape:
+    extra = float(rng.uniform(2.0, 6.0))
+    speed = typical["speed"] * float(rng.uniform(0.15, 0.5))
+    return lambda s: (0.3 * typical["force"] * s, 0.3 * extra * typical["force"] * s, speed)
+
+
+_SHAPES: dict[str, Callable[..., Shape]] = {
+    "drag.linear": _per_force(lambda typical: typical["speed"]),
+    "drag.quadratic": _per_force(lambda typical: typical["speed"] ** 2),
+    "force.bias": _per_force(lambda typical: 1.0),
+    "force.ripple": _ripple,
+    "friction.coulomb": _per_force(lambda typical: 2.0),
+    "friction.stribeck": _stribeck,
+    "inertia.armature": lambda typical, rng: lambda s: (2.0 * typical["inertia"] * s,),
+    "spring.linear": _per_force(lambda typical: typical["position"] + 0.05),
+}
+
+
+def foreign(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
+    """Numbers of a foreign cause by strength."""
+    cause, _, place = name.partition("@")
+    joint = joint_of(setting.system, place)
+    force = float(setting.typical["force"][joint])
+    if cause == "gust":
+        lasting = float(rng.uniform(0.1, 0.3) * setting.seconds)
+        begin = float(rng.uniform(0.1, 0.6) * setting.seconds)
+        sign = float(rng.choice([-1.0, 1.0]))
+        return lambda s: (2.0 * sign * force * s, begin, lasting)
+    path = setting.bare.q[:, :, joint]
+    centre = float(np.quantile(path, rng.uniform(0.3, 0.7)))
+    half = float(np.ptp(path) * rng.uniform(0.08, 0.2))
+    return lambda s: (2.0 * force * s, centre, half)

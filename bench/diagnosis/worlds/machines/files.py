@@ -1,0 +1,48 @@
+"""An arm's model file, as a user would have it: what it states is right, and what is hidden is not
+in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+NAME = "robot.xml"
+"""Of the file, beside the recording."""
+
+
+def model_file(numbers: Mapping[str, float]) -> str:
+    """The MJCF of an arm; see `bench.diagnosis.worlds.machines.plants.Arm` for its numbers."""
+    links = [
+        (body, joint, {k.removesuffix(end): v for k, v in numbers.items() if k.endswith(end)})
+        for body, joint, end in (("upper_arm", "shoulder", "1"), ("forearm", "elbow", "2"))
+    ]
+    inner, outer = (_link(*link) for link in links)
+    return f"""<mujoco model="arm2">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.002" integrator="RK4" gravity="0 0 -9.81">
+    <flag contact="disable"/>
+  </option>
+  <worldbody>
+    <body name="upper_arm">
+      {inner}
+      <body name="forearm" pos="0 0 {-numbers["length"]!r}">
+        {outer}
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="m_shoulder" joint="shoulder" gear="1"/>
+    <motor name="m_elbow" joint="elbow" gear="1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def _link(body: str, joint: str, n: Mapping[str, float]) -> str:
+    """A link's inertia and joint; about its own axis it is as a thin rod would be."""
+    moments = f"{n['inertia']!r} {n['inertia']!r} {0.1 * n['inertia']!r}"
+    return (
+        f'<inertial pos="0 0 {-n["centre"]!r}" mass="{n["mass"]!r}" diaginertia="{moments}"/>\n'
+        f'      <joint name="{joint}" type="hinge" axis="0 1 0" damping="{n["damping"]!r}" '
+        f'armature="{n["armature"]!r}"/>'
+    )

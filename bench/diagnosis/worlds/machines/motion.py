@@ -1,0 +1,248 @@
+"""Machines in motion: Runge and Kutta's steps of fourth order, and dry friction that holds what
+pulls less; what is commanded on its way to the drive, and what sensors make of the motion.
+
+Within a step every joint that rubs keeps its way, or is held. Where one comes to rest in a step,
+the rest of that step is its own: it is held, or goes on with friction the other way (E. Hairer, S.
+P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, section II.6, for steps up
+to a change of the law).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.worlds.machines.plants import Effects, Plant
+from sims.base import Array
+
+SMOOTH = 1e-3
+"""Seconds of a step where nothing rubs."""
+DRY = 5e-4
+"""The same where something does."""
+_LATER = 1e-9
+"""Share of its limit by which dry friction has to be exceeded."""
+
+
+class Runs(NamedTuple):
+    """Runs of one length side by side.
+
+    Attributes:
+        times: (T,) seconds from the first sample, evenly.
+        commands: (L, T, N), each held to the next sample.
+        q, v: (L, N) where they begin.
+    """
+
+    times: Array
+    commands: Array
+    q: Array
+    v: Array
+
+
+class Motion(NamedTuple):
+    """What came of it: (K,) times of the steps, (K, L, N) positions and rates there."""
+
+    times: Array
+    q: Array
+    v: Array
+
+
+def moved(plant: Plant, runs: Runs, coarse: float = 1.0) -> Motion:
+    """The motion of a machine.
+
+    Args:
+        plant: which.
+        runs: from where, and what is commanded.
+        coarse: steps are so many times longer.
+    """
+    rate = runs.times[1] - runs.times[0]
+    wanted = coarse * (DRY if plant.rubs.any() else SMOOTH)
+    parts = int(np.ceil(rate / wanted - 1e-9))
+    times = np.linspace(0.0, runs.times[-1], (len(runs.times) - 1) * parts + 1)
+    felt = felt_over(runs, plant, times)
+    mover = _Mover(plant, runs.q, runs.v)
+    q, v = [mover.q], [mover.v]
+    for k, t in enumerate(times[:-1].tolist()):
+        mover.step(t, float(times[k + 1]) - t, felt[:, k])
+        q.append(mover.q)
+        v.append(mover.v)
+    return Motion(times, np.array(q), np.array(v))
+
+
+class _Mover:
+    def __init__(self, plant: Plant, q: Array, v: Array) -> None:
+        self.plant, self.q, self.v = plant, q.copy(), v.copy()
+        self.rubs = plant.rubs
+        self.dry = bool(self.rubs.any())
+        self.way = np.zeros_like(q)
+        self.held = np.zeros(q.shape, dtype=bool)
+
+    def step(self, t: float, h: float, u: Array) -> None:
+        if self.dry:
+            self._decide(t, u)
+        q, v = self.q, self.v
+        a1 = self._acceleration(t, q, v, u)
+        v2 = v + 0.5 * h * a1
+        a2 = self._acceleration(t + 0.5 * h, q + 0.5 * h * v, v2, u)
+        v3 = v + 0.5 * h * a2
+        a3 = self._acceleration(t + 0.5 * h, q + 0.5 * h * v2, v3, u)
+        v4 = v + h * a3
+        a4 = self._acceleration(t + h, q + h * v3, v4, u)
+        self.q = q + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
+        self.v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        if self.dry:
+            self._turn(t, h, u, v)
+
+    def _acceleration(self, t: float, q: Array, v: Array, u: Array) -> Array:
+        force = self.plant.force(t, q, v, u)
+        if self.dry:
+            force = force - self.way * self.plant.limit(q, v)
+        return self._solved(q, force)
+
+    def _solved(self, q: Array, force: Array) -> Array:
+        """Accelerations of joints that are not held, and none of the others."""
+        free = ~self.held
+        inertia = self.plant.inertia(q)
+        if self.held.any():
+            inertia = np.where(free[:, :, None] & free[:, None], inertia, 0.0)
+            inertia += np.eye(q.shape[1]) * self.held[:, :, None]
+            force = np.where(free, force, 0.0)
+        one = q.shape[1] == 1
+        solved = (
+            force / inertia[:, 0] if one else np.linalg.solve(inertia, force[:, :, None])[..., 0]
+        )
+        return np.asarray(solved, dtype=np.float64)
+
+    def _decide(self, t: float, u: Array) -> None:
+        """Which joints at rest are held, and which way the others go."""
+        resting = self.rubs & (self.v == 0.0)
+        self.way = np.where(self.rubs & ~resting, np.sign(self.v), 0.0)
+        self.held = resting
+        if not resting.any():
+            return
+        limit = self.plant.limit(self.q, self.v)
+        force = self.plant.force(t, self.q, self.v, u) - self.way * limit
+        accelerations = self._solved(self.q, force)
+        # What holds a joint still while the others move.
+        need = force - np.einsum("lij,lj->li", self.plant.inertia(self.q), accelerations)
+        loose = resting & (np.abs(need) > limit * (1 + _LATER))
+        self.way = np.where(loose, np.sign(need), self.way)
+        self.held = resting & ~loose
+
+    def _turn(self, t: float, h: float, u: Array, before: Array) -> None:
+        """Joints that came to rest within the step: the rest of it with friction as it is then."""
+        turned = (self.way * self.v < 0.0) & (self.way * before >= 0.0)
+        if not turned.any():
+            return
+        with np.errstate(divide="ignore", invalid="ignore"):
+            left = np.where(turned, self.v / (self.v - before), 0.0) * h
+        q = self.q - np.where(turned, 0.5 * self.v * left, 0.0)
+        v = np.where(turned, 0.0, self.v)
+        self.q, self.v = q, v
+        self._decide(t + h, u)
+        onward = np.where(turned, self._acceleration(t + h, q, v, u), 0.0)
+        self.q, self.v = q + 0.5 * onward * left**2, v + onward * left
+
+
+def felt_over(runs: Runs, plant: Plant, times: Array) -> Array:
+    """(L, K, N) the mean of each command over each step, as the drive gets it."""
+    lanes, _, joints = runs.commands.shape
+    felt = np.empty((lanes, len(times) - 1, joints))
+    for joint, motor in enumerate(plant.motors):
+        own = {
+            name.partition("@")[0]: c
+            for name, c in plant.effects.items()
+            if name.startswith("input.") and name.partition("@")[2] in ("", motor)
+        }
+        for lane in range(lanes):
+            levels: Array = runs.commands[lane, :, joint]
+            for name, c in own.items():
+                levels = np.asarray(_level(name, c[0], levels), dtype=np.float64)
+            late = own.get("input.delay", (0.0,))[0]
+            lag = own.get("input.lag", (0.0,))[0]
+            felt[lane, :, joint] = _means(runs.times, levels, times, late, lag)
+    return felt
+
+
+def _level(name: str, c: float, u: Array) -> Array:
+    """A command after an effect that has no memory."""
+    match name:
+        case "input.gain":
+            return (1 + c) * u
+        case "input.bias":
+            return u + c
+        case "input.deadband":
+            return np.sign(u) * np.maximum(np.abs(u) - c, 0.0)
+        case "input.saturation":
+            return np.clip(u, -c, c)
+    return u
+
+
+def _means(stamps: Array, levels: Array, times: Array, late: float, lag: float) -> Array:
+    """Mean over each step of levels that hold, arrive late, and are approached with a lag."""
+    # The first holds before the first stamp, the last behind the last.
+    ends = np.append(stamps[1:], times[-1] + 1.0)
+    area = np.concatenate([[0.0], np.cumsum(levels * (ends - stamps))])
+    at = times - late
+
+    def integral(t: Array) -> Array:
+        held: Array = np.interp(t, np.append(stamps, ends[-1]), area)
+        return np.where(t < 0, levels[0] * t, held)
+
+    over = integral(at)
+    if lag > 0:
+        # x' = (u - x) / lag, so that what x lacks of u's area is lag times its own change.
+        over = over - lag * _approached(stamps, levels, at, lag)
+    return np.diff(over) / np.diff(times)
+
+
+def _approached(stamps: Array, levels: Array, at: Array, lag: float) -> Array:
+    """What follows the levels with a lag, at instants; it begins at the first level."""
+    reached = np.empty_like(levels)
+    reached[0] = levels[0]
+    decay = np.exp(-np.diff(stamps) / lag)
+    for k in range(len(stamps) - 1):
+        reached[k + 1] = levels[k] + (reached[k] - levels[k]) * decay[k]
+    place = np.clip(np.searchsorted(stamps, at, side="right") - 1, 0, None)
+    since = np.maximum(at - stamps[place], 0.0)
+    followed: Array = levels[place] + (reached[place] - levels[place]) * np.exp(-since / lag)
+    return followed
+
+
+def read(motion: Motion, plant: Plant, times: Array) -> Array:
+    """(L, T, N) what encoders read at the times of samples."""
+    lanes, joints = motion.q.shape[1:]
+    seen = np.empty((lanes, len(times), joints))
+    for joint, channel in enumerate(plant.channels):
+        own = sensing(plant.effects, channel)
+        at = np.maximum(times - own.get("sensor.delay", (0.0,))[0], 0.0)
+        values = _between(motion, at)[:, :, joint].T
+        values = values * (1 + own.get("sensor.gain", (0.0,))[0])
+        values = values + own.get("sensor.bias", (0.0,))[0]
+        seen[:, :, joint] = values + own.get("sensor.drift", (0.0,))[0] * times
+    return seen
+
+
+def sensing(effects: Effects, channel: str) -> dict[str, tuple[float, ...]]:
+    """Effects of a channel's sensor, by their names."""
+    return {
+        name.partition("@")[0]: tuple(c)
+        for name, c in effects.items()
+        if name.startswith("sensor.") and name.partition("@")[2] in ("", channel)
+    }
+
+
+def _between(motion: Motion, at: Array) -> Array:
+    """(T, L, N) positions at instants: the cubic through both ends of a step with both rates."""
+    h = motion.times[1] - motion.times[0]
+    place = np.clip((at / h).astype(int), 0, len(motion.times) - 2)
+    s = ((at - motion.times[place]) / h)[:, None, None]
+    q0, q1 = motion.q[place], motion.q[place + 1]
+    v0, v1 = motion.v[place] * h, motion.v[place + 1] * h
+    found: Array = (
+        q0 * (1 + 2 * s) * (1 - s) ** 2
+        + v0 * s * (1 - s) ** 2
+        + q1 * s**2 * (3 - 2 * s)
+        + v1 * s**2 * (s - 1)
+    )
+    return found

@@ -1,0 +1,266 @@
+"""What moves, many lanes side by side: a servo that carries a pendulum, and an arm of two links.
+
+Every law is written out here in plain numbers; nothing is shared with the simulators and the
+library that the questions are about. Arrays are (L, N), of L lanes and N joints; numbers of a
+machine are scalars, or (L,) where lanes differ in them.
+
+A servo, its angle q from hanging down, g gravity (R. Krishnan, Electric Motor Drives, 2001, chapter
+2, for the motor):
+
+    (J + m l^2) q'' = k (d V - k q') / R - m g l sin q,   d = clip(p e (goal - q), -1, 1)     (1)
+
+An arm that hangs in a vertical plane, q2 from the line of the first link (M. W. Spong, S.
+Hutchinson, M. Vidyasagar, Robot Modeling and Control, 2006, section 7.4), with rotors' inertias A:
+
+    M11 = I1 + m1 c1^2 + I2 + m2 (l^2 + c2^2 + 2 l c2 cos q2) + A1                             (2)
+    M12 = I2 + m2 (c2^2 + l c2 cos q2),   M22 = I2 + m2 c2^2 + A2                              (3)
+    M q'' = u - damping q' - g(q) + m2 l c2 sin q2 (2 q1' q2' + q2'^2, -q1'^2)                 (4)
+    g1 = (m1 c1 + m2 l) g sin q1 + m2 c2 g sin(q1 + q2),   g2 = m2 c2 g sin(q1 + q2)           (5)
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.base import Array
+
+Numbers = Mapping[str, Any]
+"""Of a machine, by name: scalars, or (L,)."""
+Effects = Mapping[str, Sequence[float]]
+"""Coefficients by ``effect@place``, or ``effect`` where a machine has one place for it."""
+Acts = Callable[[float, Array, Array, Array], Array]
+"""(t, q, v, u) to generalised forces (L, N)."""
+GRAVITY = 9.81
+
+
+class Plant(ABC):
+    """A machine with whatever is hidden in it.
+
+    Args:
+        numbers: see `Numbers`.
+        effects: of the library.
+        foreign: causes that it does not have.
+
+    Attributes:
+        joints: their names; of a machine that has one place for an effect one that is empty.
+        channels: what its sensors read, by joint.
+        motors: inputs, by joint.
+        acts: what pushes besides.
+        dry: (N,) dry friction, and what Stribeck's law adds to it.
+        rubs: which joints have dry friction, (N,).
+    """
+
+    joints: ClassVar[tuple[str, ...]]
+    bodies: ClassVar[tuple[str, ...]] = ()
+    channels: ClassVar[tuple[str, ...]]
+    motors: ClassVar[tuple[str, ...]]
+
+    def __init__(self, numbers: Numbers, effects: Effects, foreign: Effects) -> None:
+        self.numbers = {name: np.asarray(value, dtype=float) for name, value in numbers.items()}
+        self.effects, self.foreign = effects, foreign
+        count = len(self.joints)
+        self.dry, self.extra, self.speed = np.zeros(count), np.zeros(count), np.ones(count)
+        self.added = np.zeros(count)
+        self.patch: tuple[int, float, float, float] | None = None
+        self.dull = 0.0
+        self.heavier = 1.0
+        self.acts: list[Acts] = []
+        for name, c in effects.items():
+            effect, _, place = name.partition("@")
+            self._take(effect, place, list(c))
+        for name, c in foreign.items():
+            cause, _, place = name.partition("@")
+            self._foreign(cause, place, list(c))
+
+    @property
+    def rubs(self) -> NDArray[np.bool_]:
+        """Which joints have dry friction, (N,)."""
+        rubs = (self.dry > 0) | (self.extra > 0)
+        if self.patch:
+            rubs[self.patch[0]] = True
+        return rubs
+
+    def limit(self, q: Array, v: Array) -> Array:
+        """(L, N) the largest dry friction."""
+        limit = np.tile(self.dry, (len(q), 1))
+        if self.extra.any():
+            limit += self.extra * np.exp(-((v / self.speed) ** 2))
+        if self.patch:
+            joint, most, centre, half = self.patch
+            inside = (half - np.abs(q[:, joint] - centre)) / (0.1 * half)
+            limit[:, joint] += most * np.clip(inside, 0.0, 1.0)
+        return limit
+
+    def force(self, t: float, q: Array, v: Array, u: Array) -> Array:
+        """(L, N) of drives, gravity and whatever else, without dry friction; u is felt."""
+        total = self.own(q, v, u)
+        for act in self.acts:
+            total = total + act(t, q, v, u)
+        return total
+
+    @abstractmethod
+    def inertia(self, q: Array) -> Array:
+        """(L, N, N)."""
+
+    @abstractmethod
+    def own(self, q: Array, v: Array, u: Array) -> Array:
+        """(L, N) of everything but inertia in its equations of motion."""
+
+    @abstractmethod
+    def sideways(self, q: Array) -> Array:
+        """(L, N) forces of an acceleration of 1 along x."""
+
+    @abstractmethod
+    def weight(self, q: Array) -> Array:
+        """(L, N) gravity's."""
+
+    def _take(self, effect: str, place: str, c: list[float]) -> None:
+        """Put an effect in; those of commands and sensors act elsewhere."""
+        if effect in LAWS:
+            joint, law = self.joints.index(place), LAWS[effect]
+
+            def act(t: float, q: Array, v: Array, u: Array) -> Array:
+                pushed = np.zeros_like(q)
+                pushed[:, joint] = law(c, q[:, joint], v[:, joint])
+                return pushed
+
+            self.acts.append(act)
+        elif effect == "friction.coulomb":
+            self.dry[self.joints.index(place)] = c[0]
+        elif effect == "friction.stribeck":
+            joint = self.joints.index(place)
+            self.dry[joint], self.extra[joint], self.speed[joint] = c
+        elif effect == "inertia.armature":
+            self.added[self.joints.index(place)] = c[0]
+        elif effect == "gravity.tilt":
+            self.acts.append(lambda t, q, v, u: c[0] * GRAVITY * self.sideways(q))
+        elif effect == "gravity.scale":
+            self.acts.append(lambda t, q, v, u: c[0] * self.weight(q))
+        elif effect == "servo.deadband":
+            self.dull = c[0]
+        elif effect == "mass.scale":
+            self._heavier(self.bodies.index(place), 1.0 + c[0])
+
+    def _heavier(self, body: int, times: float) -> None:
+        """A body's mass and inertia, so many times."""
+        for name in (f"mass{body + 1}", f"inertia{body + 1}"):
+            self.numbers[name] = times * self.numbers[name]
+
+    def _foreign(self, cause: str, place: str, c: list[float]) -> None:
+        joint = self.joints.index(place)
+        if cause == "patch":
+            most, centre, half = c
+            self.patch = joint, most, centre, half
+        elif cause == "gust":
+            push, begin, lasting = c
+
+            def blow(t: float, q: Array, v: Array, u: Array) -> Array:
+                pushed = np.zeros_like(q)
+                pushed[:, joint] = push * (begin <= t < begin + lasting)
+                return pushed
+
+            self.acts.append(blow)
+
+
+LAWS: dict[str, Callable[[list[float], Array, Array], Array]] = {
+    "drag.linear": lambda c, q, v: -c[0] * v,
+    "drag.quadratic": lambda c, q, v: -c[0] * np.abs(v) * v,
+    "spring.linear": lambda c, q, v: -c[0] * q,
+    "force.bias": lambda c, q, v: c[0] + 0.0 * q,
+    "force.ripple": lambda c, q, v: (
+        c[0] * np.sin(2 * np.pi * q / c[2]) + c[1] * np.cos(2 * np.pi * q / c[2])
+    ),
+}
+"""Forces at a joint by its own motion: coefficients, q and v (L,)."""
+
+
+class Servo(Plant):
+    """(1)."""
+
+    joints = ("",)
+    channels = ("q",)
+    motors = ("goal",)
+
+    def inertia(self, q: Array) -> Array:
+        """See `Plant`."""
+        n = self.numbers
+        inertia = np.empty((len(q), 1, 1))
+        inertia[:, 0, 0] = n["armature"] + n["mass"] * n["length"] ** 2 + self.added[0]
+        return inertia
+
+    def own(self, q: Array, v: Array, u: Array) -> Array:
+        """See `Plant`."""
+        n = self.numbers
+        error = u[:, 0] - q[:, 0]
+        if self.dull:
+            error = error - np.clip(error, -self.dull, self.dull)
+        duty = np.clip(n["kp"] * n["error_gain"] * error, -1.0, 1.0)
+        k = n["torque_constant"]
+        torque = k * (duty * n["voltage"] - k * v[:, 0]) / n["resistance"]
+        total: Array = torque[:, None] + self.weight(q)
+        return total
+
+    def weight(self, q: Array) -> Array:
+        """See `Plant`."""
+        n = self.numbers
+        weight: Array = -n["mass"] * n["gravity"] * n["length"] * np.sin(q[:, 0])
+        return weight[:, None]
+
+    def sideways(self, q: Array) -> Array:
+        """See `Plant`; x is to the right, where q is positive."""
+        n = self.numbers
+        sideways: Array = n["mass"] * n["length"] * np.cos(q[:, 0])
+        return sideways[:, None]
+
+
+class Arm(Plant):
+    """(2) to (5); both joints turn about y, so that a positive angle is to the left of x."""
+
+    joints = ("shoulder", "elbow")
+    bodies = ("upper_arm", "forearm")
+    channels = ("q.shoulder", "q.elbow")
+    motors = ("m_shoulder", "m_elbow")
+
+    def inertia(self, q: Array) -> Array:
+        """See `Plant`."""
+        n = self.numbers
+        across = n["mass2"] * n["length"] * n["centre2"] * np.cos(q[:, 1])
+        outer = n["inertia2"] + n["mass2"] * n["centre2"] ** 2
+        inner = n["inertia1"] + n["mass1"] * n["centre1"] ** 2 + n["mass2"] * n["length"] ** 2
+        inertia = np.empty((len(q), 2, 2))
+        inertia[:, 0, 0] = inner + outer + 2 * across + n["armature1"] + self.added[0]
+        inertia[:, 0, 1] = inertia[:, 1, 0] = outer + across
+        inertia[:, 1, 1] = outer + n["armature2"] + self.added[1]
+        return inertia
+
+    def own(self, q: Array, v: Array, u: Array) -> Array:
+        """See `Plant`."""
+        n = self.numbers
+        turning = n["mass2"] * n["length"] * n["centre2"] * np.sin(q[:, 1])
+        total = u + self.weight(q)
+        total[:, 0] += turning * (2 * v[:, 0] * v[:, 1] + v[:, 1] ** 2) - n["damping1"] * v[:, 0]
+        total[:, 1] += -turning * v[:, 0] ** 2 - n["damping2"] * v[:, 1]
+        return total
+
+    def weight(self, q: Array) -> Array:
+        """See `Plant`."""
+        return -GRAVITY * self._lever(np.sin, q)
+
+    def sideways(self, q: Array) -> Array:
+        """See `Plant`."""
+        return -self._lever(np.cos, q)
+
+    def _lever(self, of: Callable[[Array], Array], q: Array) -> Array:
+        n = self.numbers
+        outer = n["mass2"] * n["centre2"] * of(q[:, 0] + q[:, 1])
+        inner = (n["mass1"] * n["centre1"] + n["mass2"] * n["length"]) * of(q[:, 0])
+        return np.stack([inner + outer, outer], axis=1)
+
+
+PLANTS: dict[str, type[Plant]] = {"servo": Servo, "arm2": Arm}
+"""Machines by the name of their system."""
