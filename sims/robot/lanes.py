@@ -64,10 +64,8 @@ class Asked(Protocol):
     rubs: Mask
     addresses: Addresses
 
-    def at(
-        self, t: float, x: Array, v: Array, inputs: Mapping[str, Array], carried: Array
-    ) -> tuple[Array, Array]:
-        """Forces and limits of dry friction."""
+    def at(self, k: int, x: Array, v: Array, drive: Array, bias: Array) -> tuple[Array, Array]:
+        """Forces and limits of dry friction at the beginning of step k."""
         ...
 
 
@@ -282,9 +280,7 @@ class Bench:
         self,
         controls: Array,
         forces: Array,
-        felt: Mapping[str, Array],
         asking: Asked,
-        step: float,
         record: Sequence[str],
     ) -> dict[str, Array]:
         """The same where effects are asked for their forces in every step.
@@ -292,10 +288,8 @@ class Bench:
         Args:
             controls: as in `run`.
             forces: likewise.
-            record: likewise.
-            felt: inputs as they are felt, (n, S) by name.
             asking: the effects.
-            step: seconds.
+            record: likewise.
         """
         n, steps, _ = controls.shape
         dofs = asking.addresses.velocities
@@ -316,17 +310,14 @@ class Bench:
         ids = self._ids(n)
         ctrl[:n] = controls[:, 0]
         self.batch.forward(ids)
+        at, of = _together(asking.addresses.positions), _together(dofs)
         for k in range(steps):
-            x = qpos[:n, asking.addresses.positions]
-            v = qvel[:n, dofs]
-            inputs = {name: u[:, k, None] for name, u in felt.items()}
-            carried = np.stack([drive[:n, dofs], bias[:n, dofs]])
-            force, limit = asking.at(k * step, x, v, inputs, carried)
+            force, limit = asking.at(k, qpos[:n, at], qvel[:n, of], drive[:n, of], bias[:n, of])
             ctrl[:n] = controls[:, k]
             applied[:n] = forces[:, k]
-            applied[:n, dofs] += force
+            applied[:n, of] += force
             if rubs:
-                loss[:n, dofs] = own + np.maximum(limit, 0.0)
+                loss[:n, of] = own + np.maximum(limit, 0.0)
             self.batch.step(ids)
             for name, values in result.items():
                 values[:, k] = shown[name]
@@ -375,3 +366,10 @@ class Bench:
         largest = max(INTERRUPTED // max(lanes, 1), 1)
         for begin in range(0, steps, largest):
             yield slice(begin, min(begin + largest, steps))
+
+
+def _together(places: Places) -> Places | slice:
+    """The same places as a slice where they lie side by side, of which numpy copies nothing."""
+    first = int(places[0]) if places.size else 0
+    alike = np.array_equal(places, np.arange(first, first + places.size))
+    return slice(first, first + places.size) if alike else places

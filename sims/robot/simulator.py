@@ -18,6 +18,7 @@ from sims import effects as library
 from sims.base import Array, InputError, Scenario, unknown
 from sims.plan import Runs, make_runs
 from sims.robot.acting import derives, filled, is_asked, lanes_with, natives, part_of
+from sims.robot.compiled import compiled
 from sims.robot.felt import INSTANT, SHARE
 from sims.robot.felt import felt as felt_over
 from sims.robot.floating import Afloat, Floating
@@ -299,9 +300,9 @@ class RobotSimulator(Simulated):
         record = list(dict.fromkeys(record))
         if asked:
             stiffness = bench.stiffness(places)[:n]
-            asking = Forces(self.robotic, start.acting, n, places, stiffness, self.step)
+            asking = Forces(self.robotic, start.acting, given.felt, places, stiffness, self.step)
             forces = bench.spread(given.forces)
-            done = bench.ask(given.controls, forces, given.felt, asking, self.step, record)
+            done = bench.ask(given.controls, forces, compiled(asking) or asking, record)
         else:
             done = bench.run(given.controls, bench.spread(given.forces), record)
         x = np.concatenate([start.x[:, None], done["qpos"][:, :, places.positions]], axis=1)
