@@ -4,7 +4,7 @@ every step, of all lanes at once.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -68,72 +68,103 @@ class Forces:
 
     Attributes:
         rubs: (L, D) where dry friction is among them.
-
-    Args:
         system: the robot's.
-        acting: effects at one place each.
-        count: how many lanes.
+        felt: inputs as they are felt, (L, S) by name.
         addresses: of the joints.
         stiffness: (L, D) of their position servos.
         step: seconds.
+        forces: the effects that push, with their coefficients (K, L, 1).
+        frictions: those that rub.
+        hidden: those with states.
+
+    Args:
+        system: see above.
+        acting: effects at one place each.
+        felt: see above.
+        addresses: see above.
+        stiffness: see above.
+        step: see above.
     """
 
     def __init__(
         self,
         system: RobotSystem,
         acting: Acting,
-        count: int,
+        felt: Mapping[str, Array],
         addresses: Addresses,
-        stiffness: Array | None = None,
-        step: float = 0.0,
+        stiffness: Array,
+        step: float,
     ) -> None:
-        self._system = system
-        self._stiffness = stiffness
-        self._count = count
+        self.system = system
+        self.felt = felt
         self.addresses = addresses
+        self.stiffness = stiffness
+        self.step = step
         asked = [(e, c) for e, c in acting if e.hook == "force" and e.of not in OVER_TIME]
-        self._forces = [(e, c) for e, c in asked if isinstance(e, Force) and e.of not in FIELDS]
-        self._frictions = [
+        self.forces = [(e, c) for e, c in asked if isinstance(e, Force) and e.of not in FIELDS]
+        self.frictions = [
             (e, c) for e, c in asked if isinstance(e, Friction) and e.of not in FIELDS
         ]
-        self.rubs: Mask = np.zeros((count, len(addresses.velocities)), dtype=bool)
-        for effect, c in self._frictions:
+        self.rubs: Mask = np.zeros((len(stiffness), len(addresses.velocities)), dtype=bool)
+        for effect, c in self.frictions:
             self.rubs[:, effect.coordinate] |= (c != 0).any(axis=0)[:, 0]
-        self._hidden = [(e, c) for e, c in acting if isinstance(e, Hidden) and not is_series(e)]
+        self.hidden = [(e, c) for e, c in acting if isinstance(e, Hidden) and not is_series(e)]
         self._states: list[State] = []
-        self._last: float | None = None
-        self._half = 0.5 * step
 
-    def at(
-        self, t: float, x: Array, v: Array, inputs: Mapping[str, Array], carried: Array
-    ) -> tuple[Array, Array]:
-        """Forces and limits of dry friction (L, D) each, at an instant."""
-        now = np.full((len(x), 1), t)
-        moment = moment_of(self._system, now, x, v, inputs, carried, self._stiffness)
-        force = np.zeros_like(x)
-        for effect, c in self._forces:
-            force += effect.force(c, moment)
-        if self._hidden:
-            force += self._remembered(moment)
-        limit = np.zeros_like(x)
-        for dry, c in self._frictions:
-            joint = dry.coordinate
-            assert joint is not None
-            limit[:, joint] += dry.limit(c, moment)[:, 0]
-        return force, limit
+    def at(self, k: int, x: Array, v: Array, drive: Array, bias: Array) -> tuple[Array, Array]:
+        """Forces and limits of dry friction (L, D) each, at the beginning of step k.
 
-    def _remembered(self, moment: RobotMoment) -> Array:
-        """(L, D) forces of effects with states, which go from the middle of the last step to that
-        of this one.
+        Args:
+            k: every step in turn.
+            x: (L, D) positions of the joints.
+            v: (L, D) their velocities.
+            drive: (L, D) what actuators exert on them.
+            bias: (L, D) what comes of gravity and the motion of the other bodies.
         """
-        now = float(moment.t[0, 0])
-        total = np.zeros_like(moment.x)
-        for k, (effect, c) in enumerate(self._hidden):
-            if self._last is None:
-                self._states.append(effect.begin(c, moment))
-            step = self._half if self._last is None else now - self._last
-            self._states[k] = advanced(effect, c, moment, self._states[k], step)
-            force, _ = effect.act(c, moment, self._states[k])
-            total += np.where(c[0] > 0, force, 0.0)
-        self._last = now
-        return total
+        now = np.full((len(x), 1), k * self.step)
+        inputs = {name: u[:, k, None] for name, u in self.felt.items()}
+        carried = np.stack([drive, bias])
+        moment = moment_of(self.system, now, x, v, inputs, carried, self.stiffness)
+        force = pushed(self.forces, moment)
+        if self.hidden:
+            self._states = self._states or [e.begin(c, moment) for e, c in self.hidden]
+            # From the middle of the last step to that of this one.
+            step = self.step if k else 0.5 * self.step
+            more, self._states = remembered(self.hidden, moment, self._states, step)
+            force += more
+        return force, rubbed(self.frictions, moment)
+
+
+def pushed(forces: Sequence[tuple[Force, Array]], moment: RobotMoment) -> Array:
+    """(L, D) what effects exert."""
+    total = np.zeros_like(moment.x)
+    for effect, c in forces:
+        total = total + effect.force(c, moment)
+    return total
+
+
+def rubbed(frictions: Sequence[tuple[Friction, Array]], moment: RobotMoment) -> Array:
+    """(L, D) limits of dry friction."""
+    limit = np.zeros_like(moment.x)
+    for effect, c in frictions:
+        joint = effect.coordinate
+        assert joint is not None
+        limit[:, joint] = limit[:, joint] + effect.limit(c, moment)[:, 0]
+    return limit
+
+
+def remembered(
+    hidden: Sequence[tuple[Hidden, Array]],
+    moment: RobotMoment,
+    states: Sequence[State],
+    step: float,
+) -> tuple[Array, list[State]]:
+    """(L, D) forces of effects with states, and these so many seconds later."""
+    total = np.zeros_like(moment.x)
+    later = []
+    for (effect, c), state in zip(hidden, states, strict=True):
+        after = advanced(effect, c, moment, state, step)
+        force, _ = effect.act(c, moment, after)
+        total = total + np.where(c[0] > 0, force, 0.0)
+        later.append(after)
+    return total, later

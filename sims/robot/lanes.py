@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sims.base import Array
 from sims.robot.floating import Afloat, Floating
 from sims.robot.model import Robot
-from sims.robot.native import COUPLING, FIELDS, SOLIMP, lanes_spec, stiff_of
+from sims.robot.native import FIELDS, SOLIMP, lanes_spec, stiff_of
 from sims.robot.quiet import quiet
 from sims.robot.series import FIELDS as SERIES
 from sims.robot.series import WRITTEN, hung, is_series, press
@@ -64,10 +64,8 @@ class Asked(Protocol):
     rubs: Mask
     addresses: Addresses
 
-    def at(
-        self, t: float, x: Array, v: Array, inputs: Mapping[str, Array], carried: Array
-    ) -> tuple[Array, Array]:
-        """Forces and limits of dry friction."""
+    def at(self, k: int, x: Array, v: Array, drive: Array, bias: Array) -> tuple[Array, Array]:
+        """Forces and limits of dry friction at the beginning of step k."""
         ...
 
 
@@ -162,7 +160,6 @@ class Bench:
             for field in native.fields
         }
         names |= set(SERIES) if robot.series else set()
-        names -= set() if robot.coupled else {COUPLING}
         self.fields: dict[str, Any] = {name: self.batch.expand(name) for name in sorted(names)}
         self._stated = {name: values[:1].copy() for name, values in self.fields.items()}
         self._changed: set[str] = set()
@@ -283,9 +280,7 @@ class Bench:
         self,
         controls: Array,
         forces: Array,
-        felt: Mapping[str, Array],
         asking: Asked,
-        step: float,
         record: Sequence[str],
     ) -> dict[str, Array]:
         """The same where effects are asked for their forces in every step.
@@ -293,10 +288,8 @@ class Bench:
         Args:
             controls: as in `run`.
             forces: likewise.
-            record: likewise.
-            felt: inputs as they are felt, (n, S) by name.
             asking: the effects.
-            step: seconds.
+            record: likewise.
         """
         n, steps, _ = controls.shape
         dofs = asking.addresses.velocities
@@ -317,17 +310,14 @@ class Bench:
         ids = self._ids(n)
         ctrl[:n] = controls[:, 0]
         self.batch.forward(ids)
+        at, of = _together(asking.addresses.positions), _together(dofs)
         for k in range(steps):
-            x = qpos[:n, asking.addresses.positions]
-            v = qvel[:n, dofs]
-            inputs = {name: u[:, k, None] for name, u in felt.items()}
-            carried = np.stack([drive[:n, dofs], bias[:n, dofs]])
-            force, limit = asking.at(k * step, x, v, inputs, carried)
+            force, limit = asking.at(k, qpos[:n, at], qvel[:n, of], drive[:n, of], bias[:n, of])
             ctrl[:n] = controls[:, k]
             applied[:n] = forces[:, k]
-            applied[:n, dofs] += force
+            applied[:n, of] += force
             if rubs:
-                loss[:n, dofs] = own + np.maximum(limit, 0.0)
+                loss[:n, of] = own + np.maximum(limit, 0.0)
             self.batch.step(ids)
             for name, values in result.items():
                 values[:, k] = shown[name]
@@ -376,3 +366,10 @@ class Bench:
         largest = max(INTERRUPTED // max(lanes, 1), 1)
         for begin in range(0, steps, largest):
             yield slice(begin, min(begin + largest, steps))
+
+
+def _together(places: Places) -> Places | slice:
+    """The same places as a slice where they lie side by side, of which numpy copies nothing."""
+    first = int(places[0]) if places.size else 0
+    alike = np.array_equal(places, np.arange(first, first + places.size))
+    return slice(first, first + places.size) if alike else places

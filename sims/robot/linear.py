@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sims.base import Array, Scenario
 from sims.robot.felt import INSTANT
@@ -14,7 +15,7 @@ from sims.robot.felt import felt as felt_over
 from sims.robot.floating import Afloat
 from sims.robot.native import FIELDS
 from sims.robot.quiet import quiet
-from sims.robot.sampling import sampled
+from sims.robot.sampling import keeps_time, places, read, sampled
 from sims.robot.scales import floating_forces, scales
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
@@ -197,8 +198,7 @@ class Linear:
         if key not in self._known:
             acting = (*self._work.acting, (effect, c))
             with quiet():
-                bench = self._simulator.wide(acting)
-                self._known[key] = self._tangent.by_numbers(0, acting, 1.0, bench)
+                self._known[key] = self._tangent.by_numbers(0, acting, 1.0)
         return [self._known[key]._replace(owner=owner)]
 
     def _springs(self, name: str, joint: int | None) -> bool:
@@ -252,20 +252,29 @@ class Linear:
         size = self._motion.x.shape[1]
         own = tuple((e, np.repeat(c, count, axis=1)) for e, c in self._work.acting)
         columns = []
+        at_ends = places(simulator.step, self._times, upto)
         for channel in simulator.channels:
+            acting = _on(channel.name, own, sensors)
+            # Of most channels only some instants are ever shown.
+            some = at_ends if keeps_time(acting) else None
+            rows: slice | NDArray[np.intp] = slice(upto) if some is None else some
             kind, _, of = channel.name.partition(".")
             slopes = None
             if kind in ("q", "qd"):
                 j = simulator.system.coordinates.index(f"q.{of}")
-                x = self._motion.x[:upto, j] + states[:, :upto, j]
-                v = self._motion.v[:upto, j] + states[:, :upto, size + j]
-                values, slopes = (x, v) if kind == "q" else (v, None)
+                place = j if kind == "q" else size + j
+                motion = self._motion.x if kind == "q" else self._motion.v
+                values = motion[rows, j] + states[:, rows, place]
+                if kind == "q" and some is None:
+                    slopes = self._motion.v[rows, j] + states[:, rows, size + j]
             else:
                 place = self._names.index(channel.name)
-                values = self._readings[channel.name][:upto] + readings[:, :upto, place]
-            acting = _on(channel.name, own, sensors)
-            seen = sampled(values, slopes, simulator.step, self._times, acting, self._clock)
-            columns.append(seen)
+                values = self._readings[channel.name][rows] + readings[:, rows, place]
+            if some is None:
+                step, times = simulator.step, self._times
+                columns.append(sampled(values, slopes, step, times, acting, self._clock))
+            else:
+                columns.append(read(values, self._times, acting, self._clock))
         return np.stack(columns, axis=2)
 
 

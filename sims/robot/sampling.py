@@ -58,7 +58,15 @@ def sampled(
         filtered = sensed(filters, values[some], steps, grid, clock)
         # What a filter shows has a slope that nobody knows.
         result[some] = _at(filtered, None, step, instants[some])
-    stamps = np.broadcast_to(times, (lanes, times.size))
+    return read(result, times, sensors, clock)
+
+
+def read(readings: Array, times: Array, sensors: Acting, clock: float = 0.0) -> Array:
+    """What sensors make of readings (L, T), which are changed, where they neither filter nor show
+    another instant; the rest as for `sampled`.
+    """
+    result = readings
+    stamps = np.broadcast_to(times, result.shape)
     for effect, c in sensors:
         assert isinstance(effect, Sensor)
         if effect.filters or type(effect).read is Sensor.read:
@@ -67,6 +75,20 @@ def sampled(
         signal = Signal(result[on], np.zeros_like(result[on]), result[on, :1], stamps[on], clock)
         result[on] = effect.read(c[:, on], signal)
     return result
+
+
+def places(step: float, times: Array, count: int) -> NDArray[np.intp] | None:
+    """(T,) which of the `count` ends of steps instants are; None where some lie between."""
+    place = np.clip(times / step, 0.0, count - 1.0)
+    nearest = np.rint(place)
+    near = bool((np.abs(place - nearest) < EXACT).all())
+    return nearest.astype(np.intp) if near else None
+
+
+def keeps_time(sensors: Acting) -> bool:
+    """Whether what they show hangs on no other instant."""
+    shown = [e for e, _ in sensors if isinstance(e, Sensor)]
+    return all(type(e).times is Sensor.times and not e.filters for e in shown)
 
 
 def _filtering(sensors: Acting) -> Iterator[tuple[NDArray[np.intp], Acting]]:

@@ -21,7 +21,6 @@ likewise, with their own quotients.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -32,7 +31,7 @@ from sims.base import Array
 from sims.robot.acting import is_asked, natives
 from sims.robot.floating import Afloat
 from sims.robot.forces import LOADED, moment_of
-from sims.robot.lanes import Addresses, Bench, Places
+from sims.robot.lanes import Addresses, Bench, Mask, Places
 from sims.robot.moment import RobotMoment
 from sims.robot.remembered import advanced, along
 from sims.robot.system import RobotSystem
@@ -47,8 +46,8 @@ SLOW = 1e-3
 """rad/s or m/s over which dry friction turns its sign along the motion."""
 SIDES = ("qfrc_actuator", "qfrc_bias")
 """What presses on a joint's transmission from either side, in MuJoCo's data."""
-TOGETHER = 128
-"""Changes that go through time side by side."""
+TOGETHER = 64
+"""Changes that go through time side by side; of more, what is held for them leaves the cache."""
 
 
 @dataclass(frozen=True)
@@ -343,33 +342,15 @@ class Tangent:
 
     # -- changes
 
-    def by_numbers(self, owner: int, acting: Acting, change: float, bench: Bench) -> Change:
-        """The change that other numbers of the model make, as (2) has it, per `change`; `bench` has
-        the elements that they are of.
-        """
-        meant = self._meant
-        with self._on(bench):
-            accelerations, readings = self._accelerated(acting, meant)
-            if self._outputs:
-                _, readings = self._accelerated(acting)
+    def by_numbers(self, owner: int, acting: Acting, change: float) -> Change:
+        """The change that other numbers of the model make, as (2) has it, per `change`."""
+        accelerations, readings = self._accelerated(acting, self._meant)
+        if self._outputs:
+            _, readings = self._accelerated(acting)
         # What accelerates the robot by so much more is a force, and acts as one.
         apart = (accelerations - self.accelerations[self._looks]) / change
         force = np.einsum("nij,nj->ni", self._inertias, apart)
         return Change(owner, forces=force, readings=(readings - self._still[1]) / change)
-
-    @contextmanager
-    def _on(self, bench: Bench) -> Iterator[None]:
-        """Look at the instants in other lanes, of the same coordinates."""
-        own = self._bench, self._fresh
-        if bench is not self._bench:
-            for name in ("qacc", *SIDES, *dict(self._outputs)):
-                bench.batch.bind(name)
-            bench.batch.reset(stage=0)
-            self._bench, self._fresh = bench, bench.batch.state.copy()
-        try:
-            yield
-        finally:
-            self._bench, self._fresh = own
 
     @cached_property
     def _meant(self) -> Array:
@@ -448,38 +429,39 @@ class Tangent:
         """
         q = self.quotients
         size, joints = q.forces.shape[1:]
-        actuators = q.controls.shape[2]
-        # States, forces and controls below each other, so that a step is one product.
-        whole = np.zeros((self._steps + 1, size + joints + actuators, count))
-        forces, controls = whole[:-1, size : size + joints], whole[:-1, size + joints :]
-        at_once = np.zeros_like(controls) if self._outputs else controls
-        read = np.zeros((self._steps, len(self._outputs), count))
+        steps, actuators = self._steps, q.controls.shape[2]
+        # An owner's series lie together while they are added up.
+        pushed = np.zeros((joints + actuators, count, steps))
+        at_once = np.zeros((actuators, count, steps)) if self._outputs else pushed[joints:]
+        read = np.zeros((steps, len(self._outputs), count))
         for change in changes:
             owner = change.owner
             if change.joint >= 0 and change.series is not None:
-                forces[:, change.joint, owner] += change.series
+                pushed[change.joint, owner] += change.series
             if change.actuator >= 0 and change.series is not None:
-                controls[:, change.actuator, owner] += change.series
+                pushed[joints + change.actuator, owner] += change.series
                 instant = change.series if change.instant is None else change.instant
                 if self._outputs:
-                    at_once[:, change.actuator, owner] += instant
+                    at_once[change.actuator, owner] += instant
             if change.forces is not None:
-                forces[:, :, owner] += self._between(change.forces)
+                pushed[:joints, owner] += self._between(change.forces).T
             if change.readings is not None:
                 read[:, :, owner] += self._between(change.readings)
-        step = np.concatenate([q.states, q.forces, q.controls], axis=2)
-        for t in range(self._steps):
-            np.matmul(step[self._of[t]], whole[t], out=whole[t + 1, :size])  # (2)
-        states = whole[:, :size]
+        # States, forces and controls below each other, so that a step is one product.
+        whole = np.zeros((steps + 1, size + joints + actuators, count))
+        whole[:-1, size:] = pushed.transpose(2, 0, 1)
+        step = list(np.concatenate([q.states, q.forces, q.controls], axis=2))
+        rows = list(whole)
+        for t, look in enumerate(self._of.tolist()):
+            np.matmul(step[look], rows[t], out=rows[t + 1][:size])  # (2)
         if self._outputs:
             # What numbers of the model change about readings is in them already.
+            whole[:, size : size + joints, self._numbered(changes, count)] = 0.0
             seen = np.concatenate([q.read_states, q.read_forces], axis=2)
-            plain = self._plain(changes, count)
-            for t in range(self._steps):
-                look = self._of[t]
-                pushed = np.where(plain, whole[t, size : size + joints], 0.0)
-                read[t] += seen[look] @ np.concatenate([whole[t, :size], pushed])
-                read[t] += q.read_controls[look] @ at_once[t]
+            read += np.matmul(seen[self._of], whole[:-1, : size + joints])
+            instants = np.ascontiguousarray(at_once.transpose(2, 0, 1))
+            read += np.matmul(q.read_controls[self._of], instants)
+        states = whole[:, :size]
         return np.moveaxis(states, 2, 0), np.moveaxis(read, 2, 0)
 
     def _between(self, values: Array) -> Array:
@@ -491,11 +473,11 @@ class Tangent:
         return result
 
     @staticmethod
-    def _plain(changes: Sequence[Change], count: int) -> Array:
-        """(n,) which owners change no numbers of the model."""
-        plain = np.ones(count, dtype=bool)
-        plain[[change.owner for change in changes if change.forces is not None]] = False
-        return plain
+    def _numbered(changes: Sequence[Change], count: int) -> Mask:
+        """(n,) which owners change numbers of the model."""
+        numbered = np.zeros(count, dtype=bool)
+        numbered[[change.owner for change in changes if change.forces is not None]] = True
+        return numbered
 
     def begun(self) -> tuple[Array, Array]:
         """Changes by the initial state, (2 D, S + 1, Z) and (2 D, S, O): one for each position and

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sims.engines.compiled import build, evaluate, kept, kinds, machine, native
+from sims.engines.compiled import build, evaluate, graph, kept, kinds, machine, native
 from sims.engines.compiled.machine import _machine as unkept
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -178,3 +178,31 @@ def test_arrays_of_other_shapes_never_reach_the_machine(name, value):
     far = program._replace(code=np.array([[evaluate.ADD, 7, 0, 0, 0]]))
     with pytest.raises(ValueError, match="not one for these lanes"):
         kinds.check(far, work, block, w, spans, parts)
+
+
+def test_instructions_run_on_registers_of_any_width_and_are_looked_at_before():
+    run_by = machine.machine()
+    if run_by is None:
+        pytest.skip("no compiler here")
+    ops = {name: code for code, name in enumerate(graph.OPERATIONS)}
+    code = np.array([[ops["add"], 2, 0, 1, 0], [ops["tanh"], 3, 2, 2, 2]], dtype=np.int64)
+    for lanes in (1, 5, 64, 130):
+        r = np.zeros((4, lanes))
+        run = run_by.execution(code, 0, 2, r)
+        for seed in range(2):
+            r[:2] = np.random.default_rng(seed).normal(size=(2, lanes))
+            run()
+            np.testing.assert_allclose(r[3], np.tanh(r[0] + r[1]), rtol=1e-14)
+    held = np.zeros((4, 8))
+    run_by.execution(code, 1, 1, held)()
+    assert not held.any(), "of no instruction nothing comes"
+    wrong = code.copy()
+    wrong[1, 1] = 4
+    for bad in (
+        lambda: run_by.execution(wrong, 0, 2, held),
+        lambda: run_by.execution(code, 0, 3, held),
+        lambda: run_by.execution(code, 0, 2, held[:, ::2]),
+        lambda: run_by.execution(code.astype(np.int32), 0, 2, held),
+    ):
+        with pytest.raises(ValueError, match="not for these registers"):
+            bad()

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bench.gap.causes.rules import helps, is_missed
+from bench.gap.causes.rules import NOTICED, explains, helps, is_alike, is_missed
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import Remains
 from bench.gap.measure import HeldOutRuns, Measured
@@ -58,7 +58,7 @@ class Trial:
         """
         while model.names and model.names in self.measured:
             smaller = self._smaller(search, model)
-            idle = [m for m in smaller if not self._helps(m, model)]
+            idle = [m for m in smaller if not self._helps(search, m, model)]
             if not idle:
                 return model
             # Of several that could go, the one goes without which held-out runs are best.
@@ -78,14 +78,20 @@ class Trial:
                 smaller.append(other)
         return smaller
 
-    def _helps(self, without: Model, having: Model) -> bool:
-        """Whether the effect by which two models differ makes held-out runs better."""
+    def _helps(self, search: Search, without: Model, having: Model) -> bool:
+        """Whether the effect by which two models differ makes held-out runs better; or explains the
+        fitted ones, where held-out runs hardly show it.
+        """
         before = self.measured[without.names].merit
         after = self.measured[having.names].merit
         # Both are asked: far from the noise a merit alone may be mimicry.
-        excess = self.excess(without.names)
-        left = self.excess(having.names)
-        return helps((before, after), (excess, left))
+        excesses = self.excess(without.names), self.excess(having.names)
+        if helps((before, after), excesses):
+            return True
+        # A limit that no held-out run comes near has no voice there: chance would speak for it.
+        faint = max(excesses) < NOTICED and is_alike(before - after)
+        left, closed = search.excess(without), search.excess(having)
+        return faint and left > NOTICED and explains((left - closed) / left)
 
     def misses(self, model: Model, left: Remains) -> bool:
         """Whether held-out runs show a gap that the model does not close: something acts there that

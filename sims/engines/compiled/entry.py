@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from sims.engines.compiled.advance import advance
+from sims.engines.compiled.evaluate import execute
 from sims.engines.compiled.kinds import ROWS, WHOLE, WIDTH, Block, Program, Work
 from sims.engines.compiled.lockstep import march
 from sims.engines.compiled.pace import divide
@@ -46,8 +47,12 @@ def integrate(
     spans_at: Any,
     parts_at: Any,
 ) -> None:
-    """`divide`, `advance` or `march`, with arrays by their addresses."""
+    """`divide`, `advance`, `march` or `execute`, with arrays by their addresses."""
     sizes = carray(sizes_at, (SIZES,))
+    if sizes[0] == 3:
+        code, r = carray(code_at, (sizes[4], 5)), carray(r_at, (sizes[11], sizes[12]))
+        execute(code, sizes[1], sizes[2], r, sizes[12])
+        return
     reals = carray(reals_at, (2,))
     lanes = sizes[1]
     chosen = sizes[2]

@@ -9,14 +9,17 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import importlib.util
+import inspect
 import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from threading import Lock
 
+import numpy as np
+
 from sims.engines.compiled import entry, kept, native
-from sims.engines.compiled.kinds import Array, Block, Numbers, Program, Work, check
+from sims.engines.compiled.kinds import Array, Block, Numbers, Program, Table, Work, check
 
 PARTS = (
     *("advance", "build", "clock", "dynamics", "entry", "evaluate", "events", "graph", "kinds"),
@@ -55,6 +58,36 @@ class Machine:
         """See `sims.engines.compiled.lockstep`."""
         self._call(2, program, work, block, w, work.mass, 1.0, work.mass)
 
+    def execution(self, code: Table, first: int, last: int, r: Numbers) -> Callable[[], None]:
+        """What runs instructions first to last - 1 on registers, whatever these hold by then.
+
+        Args:
+            code: (n, 5), see `Program`.
+            first: see above.
+            last: see above.
+            r: (registers, lanes).
+
+        Raises:
+            ValueError: the instructions reach beyond the registers.
+        """
+        whole = code.flags.c_contiguous and code.dtype == np.int64 and code.shape[1:] == (5,)
+        real = r.flags.c_contiguous and r.dtype == np.float64 and r.ndim == 2
+        inside = 0 <= first <= last <= len(code) and code[:, 1:].max(initial=0) < len(r)
+        if not (whole and real and inside and code.min(initial=0) >= 0):
+            raise ValueError("the instructions are not for these registers")
+        sizes = [3, first, last, 1, len(code), *[0] * 6, *r.shape]
+        keep = (ctypes.c_int64 * entry.SIZES)(*sizes), code, r
+        addresses: list[int | None] = [None] * (entry.ARRAYS + 1)
+        addresses[0] = ctypes.addressof(keep[0])
+        addresses[_CODE], addresses[_REGISTERS] = _address(code), _address(r)
+        pointers = [ctypes.c_void_p(address) for address in addresses]
+
+        def run() -> None:
+            assert keep  # what the pointers point at
+            self._function(*pointers)
+
+        return run
+
     def _call(
         self, what: int, program: Program, work: Work, block: Block, w: int, spans: Numbers,
         turn: float, parts: Numbers,
@@ -81,6 +114,8 @@ class Machine:
 
 
 _Nothing = ctypes.c_char * 0
+_names = list(inspect.signature(entry.integrate).parameters)
+_CODE, _REGISTERS = _names.index("code_at"), _names.index("r_at")
 
 
 def _address(array: Array) -> int:

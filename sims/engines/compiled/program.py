@@ -12,7 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.engines.compiled.graph import CODES, IMPACT, LANE, MOMENT, Graph, Node
-from sims.engines.compiled.kinds import DRY, GUIDED, LARGEST, WIDTH, Block, Numbers, Program, room
+from sims.engines.compiled.kinds import (
+    DRY,
+    GUIDED,
+    LARGEST,
+    WIDTH,
+    Block,
+    Numbers,
+    Program,
+    Table,
+    room,
+)
 from sims.engines.compiled.nodes import UntracedError, constants
 from sims.engines.compiled.traced import Traced
 from sims.system import Contact, Effect, Force, Friction, Moment, System
@@ -90,17 +100,17 @@ class Tracing:
         self.bounces = system.bounces
         self.bends = system.bends
         self.guided = system.guided or names.coordinates
-        self.t = _vector(graph, 1, MOMENT)
-        self.x = _vector(graph, names.coordinates, MOMENT)
-        self.v = _vector(graph, names.coordinates, MOMENT)
-        self.u: dict[str, Any] = {name: _vector(graph, 1, MOMENT) for name in names.inputs}
-        theta = _vector(graph, names.parameters, LANE)
-        constants: dict[str, Any] = {name: _vector(graph, 1, LANE) for name in names.constants}
+        self.t = vector(graph, 1, MOMENT)
+        self.x = vector(graph, names.coordinates, MOMENT)
+        self.v = vector(graph, names.coordinates, MOMENT)
+        self.u: dict[str, Any] = {name: vector(graph, 1, MOMENT) for name in names.inputs}
+        theta = vector(graph, names.parameters, LANE)
+        constants: dict[str, Any] = {name: vector(graph, 1, LANE) for name in names.constants}
         self.e: Any
         self.mu: Any
         self.speed: Any
-        self.e, self.mu, self.speed = (_vector(graph, 1, IMPACT) for _ in range(3))
-        self.parameters = _nodes(theta, *constants.values())
+        self.e, self.mu, self.speed = (vector(graph, 1, IMPACT) for _ in range(3))
+        self.parameters = nodes_of(theta, *constants.values())
         self._moment = Moment(system, theta, constants, self.t, self.x, self.v, self.u)
         self._shape = 1, names.coordinates
         self._force = self._shaped(system.force(self._moment), self._shape)
@@ -117,7 +127,7 @@ class Tracing:
         if key not in self._models:
             if len(self._models) == MODELS:
                 self._models.clear()
-            self._models[key] = _Writer(self._composed(effects)).model()
+            self._models[key] = _model(self._composed(effects))
         return self._models[key]
 
     def piece(self, effect: Effect) -> Piece:
@@ -129,7 +139,7 @@ class Tracing:
         kind = type(effect)
         if kind not in self._pieces:
             count = len(effect.coefficients)
-            c = _vector(self.graph, count, LANE).T[:, :, None]
+            c = vector(self.graph, count, LANE).T[:, :, None]
             force = limit = None
             if isinstance(effect, Force):
                 force = self._shaped(effect.force(c, self._moment), self._shape)
@@ -146,7 +156,7 @@ class Tracing:
         parameters = list(self.parameters)
         for effect in effects:
             c, own, rubs = self.piece(effect)
-            parameters += _nodes(c)
+            parameters += nodes_of(c)
             if own is not None:
                 force = force + own
             if rubs is not None:
@@ -157,12 +167,12 @@ class Tracing:
         has = [any(isinstance(effect, kind) for effect in effects) for kind in (Friction, Force)]
         return _Composed(
             inputs=[
-                *(_nodes(self.t), _nodes(self.x), _nodes(self.v), _nodes(*self.u.values())),
-                *(parameters, _nodes(self.e), _nodes(self.mu), _nodes(self.speed)),
+                *(nodes_of(self.t), nodes_of(self.x), nodes_of(self.v), nodes_of(*self.u.values())),
+                *(parameters, nodes_of(self.e), nodes_of(self.mu), nodes_of(self.speed)),
             ],
-            force=_nodes(force),
-            limit=[] if limit is None else _nodes(limit),
-            impact=_nodes(e, mu),
+            force=nodes_of(force),
+            limit=[] if limit is None else nodes_of(limit),
+            impact=nodes_of(e, mu),
             flags=[self._shape[1], has[0], has[1] or self.bends, self.bounces, self.guided],
         )
 
@@ -183,55 +193,77 @@ class _Composed(NamedTuple):
     flags: list[int]
 
 
-class _Writer:
-    """Lays expressions out as instructions."""
+def _model(composed: _Composed) -> Model:
+    """What is composed, as a program."""
+    outputs = [*composed.force, *composed.limit, *composed.impact]
+    written = laid_out(composed.inputs, outputs)
+    limit = written.place[composed.limit[0]] if composed.limit else -1
+    rows = [*written.rows, limit, *(written.place[node] for node in composed.impact)]
+    program = Program(
+        code=written.code,
+        ends=written.ends,
+        rows=np.array(rows, dtype=np.int64),
+        out=np.array([written.place[node] for node in composed.force], dtype=np.int64),
+        flags=np.array(composed.flags, dtype=np.int64),
+    )
+    constants = np.repeat(written.values[:, None], WIDTH, axis=1)
+    return Model(program, constants, written.first, len(written.place))
 
-    def __init__(self, composed: _Composed) -> None:
-        self.given = composed
-        self.place: dict[Node, int] = {}
-        self.rows: list[int] = []
-        for group in composed.inputs:
-            self.rows.append(len(self.place))
-            for node in group:
-                self.place[node] = len(self.place)
-        self.first = len(self.place)
-        self.values: list[float] = []
-        self.parts: dict[int, list[list[int]]] = {LANE: [], MOMENT: [], IMPACT: []}
 
-    def model(self) -> Model:
-        """The program."""
-        given = self.given
-        outputs = [*given.force, *given.limit, *given.impact]
-        order = _ordered(outputs)
-        # Constants lie together, so that they are set by one assignment.
-        for node in order:
-            if node.operation == "constant":
-                self.place[node] = len(self.place)
-                self.values.append(node.value)
-        for node in order:
-            if node.args:
-                self._write(node)
-        if len(self.place) > MOST:
-            raise UntracedError("it computes too much")
-        limit = self.place[given.limit[0]] if given.limit else -1
-        rows = [*self.rows, limit, *(self.place[node] for node in given.impact)]
-        lines = [line for part in self.parts.values() for line in part]
-        ends = np.cumsum([0, *(len(part) for part in self.parts.values())])
-        program = Program(
-            code=np.array(lines, dtype=np.int64).reshape(-1, 5),
-            ends=ends.astype(np.int64),
-            rows=np.array(rows, dtype=np.int64),
-            out=np.array([self.place[node] for node in given.force], dtype=np.int64),
-            flags=np.array(given.flags, dtype=np.int64),
-        )
-        constants = np.repeat(np.array(self.values).reshape(-1, 1), WIDTH, axis=1)
-        return Model(program, constants, self.first, len(self.place))
+class Written(NamedTuple):
+    """Expressions as instructions on registers.
 
-    def _write(self, node: Node) -> None:
-        self.place[node] = len(self.place)
-        args = [self.place[arg] for arg in node.args]
-        args += [args[0]] * (3 - len(args))
-        self.parts[node.changes].append([CODES[node.operation], self.place[node], *args])
+    Attributes:
+        code: (n, 5) operation, result, three arguments.
+        ends: (4,) where what changes from lane to lane begins and ends, then what changes from
+            instant to instant, then what does at impacts.
+        rows: the first register of each group of inputs.
+        place: register of each node.
+        first: the first register of constants.
+        values: (C,) of these.
+    """
+
+    code: Table
+    ends: Table
+    rows: list[int]
+    place: dict[Node, int]
+    first: int
+    values: Numbers
+
+
+def laid_out(groups: Sequence[Sequence[Node]], outputs: Sequence[Node]) -> Written:
+    """Instructions that compute the outputs from groups of inputs, each of which lies together.
+
+    Raises:
+        UntracedError: there are too many.
+    """
+    place: dict[Node, int] = {}
+    rows = []
+    for group in groups:
+        rows.append(len(place))
+        for node in group:
+            place[node] = len(place)
+    first = len(place)
+    order = _ordered(outputs)
+    # Constants lie together, so that they are set by one assignment.
+    values = []
+    for node in order:
+        if node.operation == "constant":
+            place[node] = len(place)
+            values.append(node.value)
+    parts: dict[int, list[list[int]]] = {LANE: [], MOMENT: [], IMPACT: []}
+    for node in order:
+        if node.args:
+            place[node] = len(place)
+            args = [place[arg] for arg in node.args]
+            args += [args[0]] * (3 - len(args))
+            parts[node.changes].append([CODES[node.operation], place[node], *args])
+    if len(place) > MOST:
+        raise UntracedError("it computes too much")
+    lines = [line for part in parts.values() for line in part]
+    ends = np.cumsum([0, *(len(part) for part in parts.values())])
+    code = np.array(lines, dtype=np.int64).reshape(-1, 5)
+    return Written(code, ends.astype(np.int64), rows, place, first, np.array(values))
 
 
 def _ordered(outputs: Sequence[Node]) -> list[Node]:
@@ -248,7 +280,7 @@ def _ordered(outputs: Sequence[Node]) -> list[Node]:
     return list(order)
 
 
-def _vector(graph: Graph, size: int, changes: int) -> Any:
+def vector(graph: Graph, size: int, changes: int) -> Any:
     """(1, size) inputs, in the place of arrays."""
     nodes = np.empty((1, size), dtype=object)
     for k in range(size):
@@ -256,5 +288,6 @@ def _vector(graph: Graph, size: int, changes: int) -> Any:
     return Traced(graph, nodes)
 
 
-def _nodes(*arrays: Traced) -> list[Node]:
+def nodes_of(*arrays: Traced) -> list[Node]:
+    """All nodes of what is traced, in order."""
     return [node for array in arrays for node in array.nodes.ravel()]

@@ -31,6 +31,26 @@ def test_effects_that_do_not_help_go(left, stands):
     assert trial.without_idle(search_of(BASE, A, B, BOTH), BOTH).names == stands
 
 
+@pytest.mark.parametrize(
+    ("fitted", "left", "stays"),
+    [
+        # a limit that no held-out run comes near: the fitted runs decide
+        ({(): 3.2, ("a",): 0.0}, {(): 1.02, ("a",): 1.03}, True),
+        # held-out runs speak against it
+        ({(): 3.2, ("a",): 0.0}, {(): 1.02, ("a",): 1.12}, False),
+        # the fitted runs are no clear case
+        ({(): 3.2, ("a",): 2.0}, {(): 1.02, ("a",): 1.03}, False),
+        ({(): 0.3, ("a",): 0.0}, {(): 1.02, ("a",): 1.03}, False),
+        # much is left of the held-out ones, of which nothing is known
+        ({(): 3.2, ("a",): 0.0}, {(): 2.02, ("a",): 2.03}, False),
+    ],
+)
+def test_what_held_out_runs_hardly_show_is_decided_by_the_fitted_ones(fitted, left, stays):
+    trial = Trial(*held_out(left))
+    search = search_of(BASE, A, excess=fitted)
+    assert trial.without_idle(search, A).names == (("a",) if stays else ())
+
+
 @pytest.mark.parametrize(("structure", "missed"), [(True, True), (False, False)])
 def test_what_is_left_is_noise_where_it_has_no_structure(structure, missed):
     trial = Trial(*held_out({(): 9.0, ("a",): 2.0}))

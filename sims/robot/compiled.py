@@ -1,0 +1,292 @@
+"""Forces of effects on lanes of a robot as one program, which the compiled engine runs.
+
+numpy asks effect by effect and takes longer than MuJoCo takes for the step. What effects compute is
+traced once, as for the systems of `sims.engines.compiled`, and written as instructions on
+registers, a column for each lane. Effects that do not trace, or that give other numbers then, are
+asked by numpy as ever.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.base import Array
+from sims.engines.compiled.graph import LANE, MOMENT, Graph
+from sims.engines.compiled.machine import Machine, machine
+from sims.engines.compiled.nodes import UntracedError
+from sims.engines.compiled.program import Written, laid_out, nodes_of, vector
+from sims.robot.forces import Forces, moment_of, pushed, remembered, rubbed
+from sims.robot.system import RobotSystem
+from sims.system import Effect, Hidden, State
+
+TOLERANCE = 1e-9
+"""Share of the largest number by which a program may differ from what it was traced from."""
+INSTANTS = 16
+"""At which it is compared."""
+KEPT = 500
+"""Programs of a robot that are kept."""
+
+_tracings: dict[tuple[type[RobotSystem], tuple[str, ...]], _Tracing] = {}
+
+
+class _Asked(NamedTuple):
+    """An effect as it is traced.
+
+    Attributes:
+        effect: itself.
+        c: (K, 1, 1) its coefficients.
+        state: of an effect that has one.
+    """
+
+    effect: Effect
+    c: Any
+    state: State | None
+
+
+class _Program(NamedTuple):
+    """What effects exert, as instructions.
+
+    Attributes:
+        written: them, on groups of registers: time, step, positions, velocities, drive, bias,
+            inputs, stiffness, coefficients, states.
+        force: (D,) registers of the forces.
+        limit: (D,) of the limits of dry friction.
+        states: (2 H,) of the states after the step.
+    """
+
+    written: Written
+    force: NDArray[np.intp]
+    limit: NDArray[np.intp]
+    states: NDArray[np.intp]
+
+
+class _Tracing:
+    """A robot's instant, and the effects that are asked for at it.
+
+    Args:
+        system: the robot's.
+        inputs: their names.
+    """
+
+    def __init__(self, system: RobotSystem, inputs: tuple[str, ...]) -> None:
+        graph = Graph()
+        joints = len(system.coordinates)
+        self._graph = graph
+        self._t, self._step = (vector(graph, 1, MOMENT) for _ in range(2))
+        parts = [vector(graph, joints, MOMENT) for _ in range(4)]
+        self._motion = parts
+        self._inputs = {name: vector(graph, 1, MOMENT) for name in inputs}
+        self._stiffness = vector(graph, joints, LANE)
+        x, v, drive, bias = parts
+        carried = np.stack([drive, bias])
+        inputs_of = dict(self._inputs)
+        self._moment = moment_of(system, self._t, x, v, inputs_of, carried, self._stiffness)
+        self._asked: dict[tuple[type[Effect], int], _Asked] = {}
+        self._programs: dict[tuple[type[Effect], ...], _Program] = {}
+        self.known: dict[type[Effect], bool] = {}
+
+    def program(self, effects: Sequence[Sequence[Effect]]) -> _Program:
+        """What these effects exert: those that push, those that rub, those with states.
+
+        Raises:
+            UntracedError: one cannot be traced, or there are too many.
+        """
+        key = tuple(type(effect) for group in effects for effect in group)
+        if key not in self._programs:
+            if len(self._programs) == KEPT:
+                self._programs.clear()
+            self._programs[key] = self._composed(effects)
+        return self._programs[key]
+
+    def _composed(self, effects: Sequence[Sequence[Effect]]) -> _Program:
+        before: Counter[type[Effect]] = Counter()
+        asked: list[list[_Asked]] = []
+        for group in effects:
+            asked.append([])
+            for effect in group:
+                # One that acts alone acts in a family besides, in other lanes.
+                asked[-1].append(self._of(effect, before[type(effect)]))
+                before[type(effect)] += 1
+        forces, frictions, hidden = ([(one.effect, one.c) for one in group] for group in asked)
+        states = [one.state for one in asked[2] if one.state is not None]
+        force: Any = pushed(forces, self._moment)  # type: ignore[arg-type]
+        later: list[State] = []
+        if hidden:
+            more, later = remembered(hidden, self._moment, states, self._step)  # type: ignore[arg-type]
+            force = force + more
+        limit: Any = rubbed(frictions, self._moment)  # type: ignore[arg-type]
+        after: Any = [part for state in later for part in (state.x, state.v)]
+        outputs = [self._nodes(values) for values in (force, limit, *after)]
+        begun: Any = [part for state in states for part in (state.x, state.v)]
+        coefficients = [one.c for group in asked for one in group]
+        groups = [(self._t,), (self._step,), *((part,) for part in self._motion)]
+        groups += [tuple(self._inputs.values()), (self._stiffness,), tuple(coefficients)]
+        groups.append(tuple(begun))
+        written = laid_out(
+            [nodes_of(*group) for group in groups], [node for nodes in outputs for node in nodes]
+        )
+        places = [
+            np.array([written.place[node] for node in nodes], dtype=np.intp) for nodes in outputs
+        ]
+        after_all = np.concatenate([np.empty(0, dtype=np.intp), *places[2:]])
+        return _Program(written, places[0], places[1], after_all)
+
+    def _of(self, effect: Effect, number: int) -> _Asked:
+        """An effect, for the first time in a program or once more."""
+        kind = type(effect), number
+        if kind not in self._asked:
+            if getattr(effect, "__dict__", None):
+                raise UntracedError("it has a state of its own")
+            c = vector(self._graph, len(effect.coefficients), LANE).T[:, :, None]
+            state = None
+            if isinstance(effect, Hidden):
+                state = State(*(vector(self._graph, 1, MOMENT) for _ in range(2)))
+            self._asked[kind] = _Asked(effect, c, state)
+        return self._asked[kind]
+
+    @staticmethod
+    def _nodes(values: Any) -> list[Any]:
+        """Nodes of what is traced; a state may have come out as another shape."""
+        if not hasattr(values, "nodes"):
+            raise UntracedError("it gives numbers that hang on nothing")
+        return nodes_of(values)
+
+
+class CompiledForces:
+    """As `sims.robot.forces.Forces`, by a program.
+
+    Attributes:
+        rubs: see there.
+        addresses: see there.
+
+    Args:
+        forces: what is asked for.
+        program: of it.
+        run_by: the compiled functions.
+    """
+
+    def __init__(self, forces: Forces, program: _Program, run_by: Machine) -> None:
+        self.rubs = forces.rubs
+        self.addresses = forces.addresses
+        self._of = forces
+        self._program = program
+        written = program.written
+        lanes, joints = forces.stiffness.shape
+        self._r = r = np.zeros((len(written.place), lanes))
+        r[written.first : written.first + written.values.size] = written.values[:, None]
+        self._t, self._step, x, v, drive, bias, u, stiffness, c, states = written.rows
+        self._motion = [slice(first, first + joints) for first in (x, v, drive, bias)]
+        self._u = slice(u, stiffness)
+        self._states = slice(states, written.first)
+        r[stiffness:c] = forces.stiffness.T
+        coefficients = [own[:, :, 0] for _, own in _effects(forces)]
+        r[c:states] = np.concatenate(coefficients)
+        first, moment, end, _ = written.ends.tolist()
+        run_by.execution(written.code, first, moment, r)()
+        self._run = run_by.execution(written.code, moment, end, r)
+
+    @cached_property
+    def _felt(self) -> Array:
+        """(S, U, L)."""
+        return np.ascontiguousarray(np.stack(list(self._of.felt.values())).transpose(2, 0, 1))
+
+    def at(self, k: int, x: Array, v: Array, drive: Array, bias: Array) -> tuple[Array, Array]:
+        """See `Forces.at`."""
+        r = self._r
+        for rows, values in zip(self._motion, (x, v, drive, bias), strict=True):
+            r[rows] = values.T
+        r[self._t] = k * self._of.step
+        if self._of.felt:
+            r[self._u] = self._felt[k]
+        hidden = self._of.hidden
+        if hidden and k < 2:
+            r[self._step] = self._of.step if k else 0.5 * self._of.step
+        if hidden and not k:
+            r[self._states] = np.concatenate(self._begun(x, v, drive, bias), axis=1).T
+        self._run()
+        if hidden:
+            r[self._states] = r[self._program.states]
+        return r[self._program.force].T, r[self._program.limit].T
+
+    def _begun(self, x: Array, v: Array, drive: Array, bias: Array) -> list[Array]:
+        """(L, 1) each: the states as the run begins."""
+        of = self._of
+        inputs = {name: u[:, 0, None] for name, u in of.felt.items()}
+        now = np.zeros((len(x), 1))
+        moment = moment_of(of.system, now, x, v, inputs, np.stack([drive, bias]), of.stiffness)
+        states = [effect.begin(c, moment) for effect, c in of.hidden]
+        return [part for state in states for part in (state.x, state.v)]
+
+
+def compiled(forces: Forces) -> CompiledForces | None:
+    """The same, compiled; None where it does not compile."""
+    run_by = machine()
+    groups = [[effect for effect, _ in group] for group in _groups(forces)]
+    if run_by is None or not any(groups):
+        return None
+    key = type(forces.system), tuple(forces.felt)
+    if key not in _tracings:
+        _tracings[key] = _Tracing(forces.system, key[1])
+    tracing = _tracings[key]
+    if not all(_compiles(tracing, forces, effect, run_by) for effect, _ in _effects(forces)):
+        return None
+    try:
+        return CompiledForces(forces, tracing.program(groups), run_by)
+    except UntracedError:  # too much at once; nothing is wrong with the effects
+        return None
+
+
+def _compiles(tracing: _Tracing, forces: Forces, effect: Effect, run_by: Machine) -> bool:
+    """Whether an effect does, which is told once where it does not."""
+    kind = type(effect)
+    if kind not in tracing.known:
+        tracing.known[kind] = False
+        try:
+            _check(tracing, _alone(forces, effect), run_by)
+            tracing.known[kind] = True
+        # Whatever a user's effect raises when it is asked with what is no array.
+        except Exception as reason:
+            text = str(reason) or type(reason).__name__
+            sys.stderr.write(
+                f"simgap: effect {effect.name} is asked without the compiler: {text}\n"
+            )
+    return tracing.known[kind]
+
+
+def _check(tracing: _Tracing, forces: Forces, run_by: Machine) -> None:
+    """See that an effect's program gives what numpy does, on a way that no robot takes.
+
+    Raises:
+        UntracedError: it does not.
+    """
+    program = tracing.program([[effect for effect, _ in group] for group in _groups(forces)])
+    quick = CompiledForces(forces, program, run_by)
+    rng = np.random.default_rng(0)
+    steps = min([INSTANTS, *(u.shape[1] for u in forces.felt.values())])
+    for k in range(steps):
+        motion = rng.normal(size=(4, *forces.stiffness.shape)) * rng.choice([0.01, 1.0, 10.0])
+        for found, expected in zip(quick.at(k, *motion), forces.at(k, *motion), strict=True):
+            close = TOLERANCE * np.abs(expected[np.isfinite(expected)]).max(initial=0.0)
+            if not np.allclose(found, expected, rtol=TOLERANCE, atol=close, equal_nan=True):
+                raise UntracedError("compiled it gives other numbers")
+
+
+def _groups(forces: Forces) -> list[Sequence[tuple[Effect, Array]]]:
+    return [forces.forces, forces.frictions, forces.hidden]
+
+
+def _effects(forces: Forces) -> list[tuple[Effect, Array]]:
+    return [pair for group in _groups(forces) for pair in group]
+
+
+def _alone(forces: Forces, effect: Effect) -> Forces:
+    """One of the effects without the others."""
+    own = tuple(pair for pair in _effects(forces) if pair[0] is effect)
+    return Forces(forces.system, own, forces.felt, forces.addresses, forces.stiffness, forces.step)
