@@ -105,6 +105,12 @@ class Moment:
         return self.system.drive(self)[:, place], self.system.passive(self)[:, place]
 
     @property
+    def drawn(self) -> Array:
+        """(L, 1) sizes of the forces of all drives that share the supply of this one."""
+        drawn: Array = np.abs(self.sides[0])
+        return drawn
+
+    @property
     def error(self) -> Array:
         """(L, 1) of the servo: how far its set point is from where it is."""
         error: Array = self.inputs[self.system.servo] - self.primary

@@ -165,9 +165,13 @@ def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
 
 def _written(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
     """Model fields that it changes, each with the places of the numbers in it."""
+    from sims.robot.coupled import ANY as COUPLED
     from sims.robot.native import FIELDS
+    from sims.robot.series import in_series
 
     robot, native = kind.robot, FIELDS[effect.of]  # type: ignore[attr-defined]
+    if effect.of == COUPLED[1]:
+        robot = in_series(robot, (COUPLED,))
     fields, changes = {}, []
     for name in native.fields:
         owner, _, field = name.rpartition(".")

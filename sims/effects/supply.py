@@ -7,8 +7,12 @@ resistance takes that much of V away:
 * F = U (1 - c |F|), so that F = U / (1 + c |U|), and U c |U| / (1 + c |U|) is lost        (1)
 
 c is the share of the voltage that a unit of force costs; 1 / c is a force that is never reached. A
-negative share is none. The current is that of a drive at standstill: what its own motion induces,
-and what others draw from the same supply, is not in it.
+negative share is none. Where several drives share the supply all of their forces count:
+
+* F_i = U_i (1 - c S), S = |F_1| + |F_2| + ..., so that S = D / (1 + c D), D = |U_1| + |U_2| + ...,
+  and U_i c D / (1 + c D) is lost                                                        (2)
+
+The current is that of a drive at standstill: what its own motion induces is not in it.
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ _SHARE = ((0, 0), (0, 0.2), (0, 2))
 
 
 class Sag(Force):
-    """The drive falls short of its force by what its own current takes of the supply's voltage."""
+    """The drive falls short of its force by what current takes of the supply's voltage."""
 
     name = "supply.sag"
     noun = "a supply that sags"
@@ -36,5 +40,5 @@ class Sag(Force):
     def force(self, c: Array, moment: Moment) -> Array:
         """Against the drive."""
         drive, _ = moment.sides
-        lost = np.maximum(c[0], 0.0) * np.abs(drive)
-        return moment.along_primary(-drive * lost / (1.0 + lost))  # (1)
+        lost = np.maximum(c[0], 0.0) * moment.drawn
+        return moment.along_primary(-drive * lost / (1.0 + lost))  # (1), (2)

@@ -15,6 +15,10 @@ between,
 
 The rest of the library acts on x, where the drive does.
 
+* (5) coupling: a motor whose shaft runs past the joint before, as in a wrist, turns q + c p, with q
+  its own joint and p the one before; so its torque t acts there, too, as c t, and its servo follows
+  q + c p (by virtual work)
+
 In a robot the model file states the inertia of the links, and as armature that of the drive. There
 the element between them has numbers of its own, those of `between`: how far it yields to a force
 (the inverse of its stiffness), or its gap. Where the file states no armature the drive's inertia is
@@ -30,7 +34,7 @@ from typing import ClassVar
 import numpy as np
 
 from sims.base import Array
-from sims.system import Coefficient, Element, Hidden, Moment, State
+from sims.system import Coefficient, Element, Hidden, Moment, State, Value
 
 CONTACT = 150.0
 """rad/s with which two masses would swing on each other through closed flanks without damping: far
@@ -43,6 +47,10 @@ _LEAST = 1e-12
 """rad/(N m) or m/N; a compliance that stands for none."""
 _ELASTIC = "M. W. Spong, J. Dyn. Syst. Meas. Control 109(4), 310 (1987), doi:10.1115/1.3143860"
 _PLAY = "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
+_WRIST = (
+    "P. I. Corke, B. Armstrong-Helouvry, Proc. IEEE ICRA, 1608 (1994),"
+    " doi:10.1109/ROBOT.1994.351360: the wrist of the Puma 560"
+)
 _PURE = ("1", "1", "1")
 """A pure number, on every kind of system."""
 _ANY_SHARE = ((0, 0.9), (0, 0.9), (0, 0.9))
@@ -136,6 +144,15 @@ class Flexibility(Carried):
         """The spring's and the damper's."""
         damped = 2.0 * c[2] * (moment.v[:, :1] - state.v)
         return c[1] * (c[1] * (moment.primary - state.x) + damped)  # (3)
+
+
+class Coupling(Value):
+    """The drive of a joint turns the joint before it as well, c times as much."""
+
+    name, noun = "joint.coupling", "a coupled drive"
+    says = "the joint's drive also acts on the joint before it, as where motors share an axis"
+    source, at = _WRIST, "joint"
+    coefficients = (Coefficient("coefficient", _PURE, ((-1, 1), (-1, 1), (-1, 1))),)  # (5)
 
 
 class Play(Carried):

@@ -16,6 +16,8 @@ from sims import effects as library
 from sims.extended import Number
 from sims.robot.causes import Cause, one_by_one
 from sims.robot.commands import COMMANDS, order
+from sims.robot.coupled import EFFECT as COUPLED
+from sims.robot.coupled import coupled
 from sims.robot.model import Robot
 from sims.robot.native import FIELDS
 from sims.robot.series import element, gives, in_series, is_series, second_of, together, with_flanks
@@ -49,6 +51,8 @@ _NOTES = {
     "begins at zero in the file; damping is a share of the critical one",
     "joint.backlash": "joint.backlash: the joint has a second one in series, which begins in the "
     "middle of its gap in the file",
+    "joint.coupling": "joint.coupling: the joint's actuator drives a tendon, the joint with 1 and "
+    "the one before it with the coefficient",
     "friction.coulomb": "friction.coulomb: dry friction is stiff in the file (solreffriction, "
     "solimpfriction), or it would creep",
 }
@@ -92,6 +96,8 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
     """
     found = one_by_one(robot, causes)
     said = []
+    couplings = {c.place: float(c.coefficients[0]) for c in found if c.effect == COUPLED}
+    robot = coupled(robot, couplings) if couplings else robot
     series = _in_series(found)
     if series:
         said += [KEYLESS] if robot.compiled.nkey else []
@@ -118,6 +124,10 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
             changed += [] if second in changed else [second]
         for one in changed:
             comments.setdefault(one, []).append(cause.told(recording))
+        if cause.effect == COUPLED:
+            for actuator in (a for a in robot.actuators if a.joint == cause.place):
+                element = Element("actuator", actuator.id)
+                comments.setdefault(element, []).append(cause.told(recording))
     spec, model = _compiled(robot, wanted)
     if any(gives(made)[0] for made in series.values()):
         # What a limit takes for a spring hangs on all that acts.
@@ -148,6 +158,9 @@ def _write(
     wanted: Fields, robot: Robot, cause: Cause, series: Mapping[str, Transmission]
 ) -> str | None:
     """Let a cause change the fields; those in `series` are still to be written."""
+    # A coupling is an element of its own, which the robot has by now.
+    if cause.effect == COUPLED:
+        return None
     if cause.effect in FIELDS:
         FIELDS[cause.effect].write(wanted, robot, cause.place, cause.coefficients[:, None])
         return None

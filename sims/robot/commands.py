@@ -187,13 +187,15 @@ def _force(fields: Fields, robot: Robot, cause: Cause) -> Answer:
     """A constant force at a joint: its spring rests elsewhere, or its actuator has a bias."""
     joint, (force,) = robot.joint(cause.place), cause.coefficients
     stiffness = fields["jnt_stiffness"][0, joint.id]
-    plain = not fields["jnt_stiffnesspoly"][0, joint.id].any() and not robot.compiled.ntendon
+    stated = robot.compiled.ntendon - len(robot.coupled)
+    plain = not fields["jnt_stiffnesspoly"][0, joint.id].any() and not stated
     if joint.single and stiffness > 0 and plain and not robot.compiled.jnt_springyield[joint.id]:
         fields["qpos_spring"][0, joint.position] += force / stiffness
         return None
     for driving in robot.actuators:
         actuator = _Actuator(fields, robot, driving.name)
-        unlimited = driving.force is None and joint.effort is None
+        alone = joint.name not in robot.coupled
+        unlimited = driving.force is None and joint.effort is None and alone
         if driving.joint == joint.name and actuator.single and actuator.steady and unlimited:
             gear = robot.compiled.actuator_gear[actuator.id]
             if not fields["actuator_forcelimited"][0, actuator.id] and gear[0]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sims.base import Array
 from sims.robot.floating import Afloat, Floating
 from sims.robot.model import Robot
-from sims.robot.native import FIELDS, SOLIMP, lanes_spec, stiff_of
+from sims.robot.native import COUPLING, FIELDS, SOLIMP, lanes_spec, stiff_of
 from sims.robot.quiet import quiet
 from sims.robot.series import FIELDS as SERIES
 from sims.robot.series import WRITTEN, hung, is_series, press
@@ -160,6 +160,7 @@ class Bench:
             for field in native.fields
         }
         names |= set(SERIES) if robot.series else set()
+        names -= set() if robot.coupled else {COUPLING}
         self.fields: dict[str, Any] = {name: self.batch.expand(name) for name in sorted(names)}
         self._stated = {name: values[:1].copy() for name, values in self.fields.items()}
         self._changed: set[str] = set()

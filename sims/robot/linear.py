@@ -198,7 +198,8 @@ class Linear:
         if key not in self._known:
             acting = (*self._work.acting, (effect, c))
             with quiet():
-                self._known[key] = self._tangent.by_numbers(0, acting, 1.0)
+                bench = self._simulator.wide(acting)
+                self._known[key] = self._tangent.by_numbers(0, acting, 1.0, bench)
         return [self._known[key]._replace(owner=owner)]
 
     def _springs(self, name: str, joint: int | None) -> bool:

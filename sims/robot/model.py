@@ -22,6 +22,12 @@ KINDS: tuple[Kind, ...] = ("free", "ball", "slide", "hinge")
 """In the order of MuJoCo's mjtJoint."""
 
 
+TENDON = "_coupling"
+"""What the tendon of a drive that is coupled to two joints is called, behind its own joint's
+name.
+"""
+
+
 @dataclass(frozen=True)
 class Joint:
     """A joint.
@@ -124,6 +130,7 @@ class Robot:
         speeds: of joints, the fastest that a URDF allows, rad/s or m/s; an MJCF states none.
         series: of joints that were put in series with others (`sims.robot.series`), by name, the
             inertia about them, kg or kg m^2; no other joint is in this model alone.
+        coupled: joints whose drives turn the joint before as well (`sims.robot.coupled`).
     """
 
     path: Path
@@ -137,6 +144,7 @@ class Robot:
     engine_table: Mapping[str, Any] = field(default_factory=dict)
     speeds: Mapping[str, float] = field(default_factory=dict)
     series: Mapping[str, float] = field(default_factory=dict)
+    coupled: tuple[str, ...] = ()
 
     @cached_property
     def compiled(self) -> Any:
@@ -186,6 +194,10 @@ class Robot:
         drives = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
         if int(model.actuator_trntype[i]) in drives:
             joint = self.joints[int(model.actuator_trnid[i, 0])].name
+        if self.coupled and int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON):
+            tendon = model.tendon(int(model.actuator_trnid[i, 0])).name
+            own = tendon.removesuffix(TENDON)
+            joint = own if own in self.coupled else None
         control, controls = i, 1
         if hasattr(model, "actuator_ctrladr"):
             control, controls = int(model.actuator_ctrladr[i]), int(model.actuator_ctrlnum[i])

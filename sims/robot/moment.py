@@ -53,12 +53,20 @@ class JointMoment(Moment):
         goal: (L, 1) set point of its position servo; NaN without one.
         stiffness: (L, 1) what that exerts for each unit of its error.
         gear: by how much it turns for each unit of the joint's position.
+        shared: (L, 1) sizes of the forces of all drives of the robot; None where its drive has a
+            supply of its own.
     """
 
     carried: Array = field(default_factory=lambda: np.zeros((2, 0, 1)))
     goal: Array = field(default_factory=lambda: np.zeros((0, 1)))
     stiffness: Array = field(default_factory=lambda: np.zeros((0, 1)))
     gear: float = 1.0
+    shared: Array | None = None
+
+    @property
+    def drawn(self) -> Array:
+        """See `Moment`."""
+        return super().drawn if self.shared is None else self.shared
 
     @property
     def load(self) -> Array:

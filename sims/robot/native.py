@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sims.base import Array
-from sims.robot.model import Robot
+from sims.robot.model import TENDON, Robot
 
 SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Of dry friction: as hard as MuJoCo allows, everywhere; what is stuck then hardly creeps."""
@@ -191,6 +191,18 @@ def _tilt_gravity(fields: Fields, robot: Robot, place: str, c: Array) -> None:  
     fields["opt.gravity"][:, :2] += size * c.T  # (4)
 
 
+def arm_of(robot: Robot, place: str) -> int:
+    """Where in `wrap_prm` a robot whose drives are coupled has by how much that of a joint turns
+    the joint before.
+    """
+    model = robot.compiled
+    return int(model.tendon_adr[model.tendon(place + TENDON).id]) + 1
+
+
+def _couple(fields: Fields, robot: Robot, place: str, c: Array) -> None:
+    fields["wrap_prm"][:, arm_of(robot, place)] = c[0]
+
+
 def _limit_force(fields: Fields, robot: Robot, place: str, c: Array) -> None:
     number = robot.actuator(place).id
     limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
@@ -203,6 +215,8 @@ def _limit_force(fields: Fields, robot: Robot, place: str, c: Array) -> None:
     limited[limits, number] = True
 
 
+COUPLING = "wrap_prm"
+"""Of the fields the one that a model without tendons lacks."""
 _SERVO = ("actuator_gainprm", "actuator_biasprm")
 
 FIELDS: Mapping[str, Native] = {
@@ -219,6 +233,7 @@ FIELDS: Mapping[str, Native] = {
     "actuator.damping": Native(_SERVO, _scale_damping),
     "gravity.scale": Native(("opt.gravity",), _scale_gravity),
     "gravity.tilt": Native(("opt.gravity",), _tilt_gravity),
+    "joint.coupling": Native((COUPLING,), _couple),
     "actuator.limit": Native(("actuator_forcelimited", "actuator_forcerange"), _limit_force),
 }
 """Native effects by name, each at a place of its kind; the world's take any place, as ``""``."""

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from sims.base import Array
+from sims.robot.coupled import places as coupled_places
 from sims.robot.model import Robot
 from sims.robot.moment import RobotMoment
 from sims.system import (
@@ -41,6 +42,7 @@ ALONE = frozenset(
         "force.ripple",
         "input.power",
         "joint.backlash",
+        "joint.coupling",
         "joint.flexibility",
         "friction.direction",
         "friction.hysteresis",
@@ -55,6 +57,8 @@ ALONE = frozenset(
     }
 )
 """Effects without a family: what shapes them differs from place to place."""
+COMMON = frozenset({"supply.sag"})
+"""Effects at actuators that they may have in common, as a battery: the world's, by one number."""
 ENCODERS = frozenset({"sensor.slip"})
 """Effects on what counts a position, and on no other channel."""
 TYPICAL = {"hinge": 0.5, "slide": 5.0}
@@ -95,6 +99,7 @@ class Spot(NamedTuple):
         words: how a sentence calls it.
         servo: whether it is an actuator that follows a set point of its position.
         last: whether it is a joint, the last one of its body.
+        coupled: whether it is a joint whose drive may be coupled to the joint before.
     """
 
     name: str
@@ -108,6 +113,7 @@ class Spot(NamedTuple):
     words: str
     servo: bool = False
     last: bool = False
+    coupled: bool = False
 
 
 def at_world(effect: type[Effect]) -> type[Effect]:
@@ -143,6 +149,36 @@ def _force_of(effect: type[Force]) -> Callable[[Force, Array, Moment], Array]:
         alone = cast(RobotMoment, moment).of_joint(joint)
         result = np.zeros_like(moment.x)
         result[:, joint] = effect.force(self, c, alone)[:, 0]
+        return result
+
+    return force
+
+
+def at_all(effect: type[Effect], drives: Sequence[Spot]) -> Iterator[type[Effect]]:
+    """The effect as all drives have it in common, where they are of one kind."""
+    joints = {one.coordinate: one for one in drives}
+    kinds = {one.kind for one in drives}
+    if len(joints) < 2 or len(kinds) > 1 or not issubclass(effect, Force):
+        return
+    whole = drives[0]._replace(size=sum(one.size for one in joints.values()))
+    coefficients = [_of_spot(effect, c, whole) for c in effect.coefficients]
+    changed: dict[str, Any] = {
+        "at": "world",
+        "says": f"{effect.says} (of one supply that all drives share)",
+        "force": _force_of_all(effect, [cast(int, joint) for joint in joints]),
+    }
+    yield _made(effect, effect.name, "", coefficients, changed)
+
+
+def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., Array]:
+    def force(self: Force, c: Array, moment: Moment) -> Array:
+        """(L, D) along the joints, each with what all draw."""
+        robot = cast(RobotMoment, moment)
+        drawn = sum(np.abs(robot.carried[0][:, joint : joint + 1]) for joint in joints)
+        result = np.zeros_like(moment.x)
+        for joint in joints:
+            alone = replace(robot.of_joint(joint), shared=drawn)
+            result[:, joint] = effect.force(self, c, alone)[:, 0]
         return result
 
     return force
@@ -285,6 +321,7 @@ def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[S
     sizes = scales(robot)
     found: dict[str, list[Spot]] = {"joint": [], "actuator": [], "body": [], "channel": []}
     numbers: dict[str, int] = {}
+    may_be_coupled = coupled_places(robot)
     bodies = robot.compiled.jnt_bodyid
     lasts = {int(body): i for i, body in enumerate(bodies)}
     for number, joint in enumerate(j for j in robot.joints if j.single):
@@ -301,6 +338,7 @@ def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[S
                 _stated(robot, joint.velocity, joint.id),
                 f"joint {joint.name}",
                 last=lasts[int(bodies[joint.id])] == joint.id,
+                coupled=joint.name in may_be_coupled,
             )
         )
     for actuator in robot.actuators:
@@ -378,6 +416,8 @@ def classes(
     alike = [m for m in members if effect.at != "channel" or m.place.startswith("q.")]
     if len(alike) > 1 and effect.name not in ALONE:
         yield family(effect, alike)
+    if len(alike) > 1 and effect.name in COMMON:
+        yield from at_all(effect, found["actuator"])
 
 
 def _for_one(effect: type[Effect]) -> bool:
@@ -402,6 +442,8 @@ def _acts_at(effect: type[Effect], spot: Spot, found: Mapping[str, Sequence[Spot
         # Between what drives a joint and what it carries.
         return spot.last and any(one.coordinate == spot.coordinate for one in found["actuator"])
     if effect.needs == "servo" and not spot.servo:
+        return False
+    if effect.name == "joint.coupling" and not spot.coupled:
         return False
     # A set point has no power.
     if effect.name == "input.power" and not spot.unit.startswith(("N", "1")):

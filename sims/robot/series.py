@@ -36,9 +36,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.base import Array
+from sims.robot.coupled import ANY, EFFECT, named
+from sims.robot.coupled import coupled as coupled_robot
+from sims.robot.coupled import places as coupled_places
 from sims.robot.model import Robot
 from sims.robot.native import RK4
-from sims.robot.quiet import quiet
 from sims.system import Acting, Effect, Element, Hidden
 
 LIGHTEST = 0.01
@@ -87,8 +89,14 @@ def by_series(acting: Acting, count: int) -> dict[Added, list[int]]:
     """Lanes by what acts in series with joints in them."""
     lanes: dict[Added, list[int]] = {}
     there = [(e, (c[0] > 0)[:, 0]) for e, c in acting if is_series(e)]
+    coupled = np.zeros(count, dtype=bool)
+    for e, c in acting:
+        if e.of == EFFECT:
+            coupled |= (c[0] != 0)[:, 0]
     for lane in range(count):
         added = tuple((e.place, e.of) for e, on in there if on[lane])
+        if coupled[lane]:
+            added += (ANY,)
         lanes.setdefault(added, []).append(lane)
     return lanes
 
@@ -99,15 +107,18 @@ def in_series(robot: Robot, added: Added) -> Robot:
 
     Args:
         robot: that was read.
-        added: joints, each the last one of its body, and the effect that each has in series.
+        added: joints, each the last one of its body, and the effect that each has in series; and
+            whether drives are coupled.
     """
     import mujoco
 
-    with quiet():
-        spec = robot.spec.copy()
-        spec.compile()
-    joints = {joint.id: joint for joint in spec.joints}
-    _named(spec, robot, joints)
+    if ANY in added:
+        robot = coupled_robot(robot, dict.fromkeys(coupled_places(robot), 0.0))
+        added = tuple(one for one in added if one != ANY)
+    if not added:
+        return robot
+    spec = robot.spec.copy()
+    joints = named(spec, robot)
     inertias = _inertias(robot)
     for name, effects in by_joint(added).items():
         first = joints[robot.joint(name).id]
@@ -144,14 +155,6 @@ def _inertias(robot: Robot) -> dict[str, float]:
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, whole)
     return {j.name: float(whole[j.velocity, j.velocity]) for j in robot.joints if j.single}
-
-
-def _named(spec: Any, robot: Robot, joints: Mapping[int, Any]) -> None:
-    """Write down the names of what has none: they count, and counts change."""
-    for joint in robot.joints:
-        joints[joint.id].name = joint.name
-    for actuator in spec.actuators:
-        actuator.name = robot.actuators[actuator.id].name
 
 
 def is_series(effect: Effect | type[Effect]) -> bool:

@@ -19,12 +19,14 @@ from sims.base import Array, InputError, Scenario, unknown
 from sims.plan import Runs, make_runs
 from sims.robot.acting import derives, filled, is_asked, lanes_with, natives, part_of
 from sims.robot.compiled import compiled
+from sims.robot.coupled import before as joint_before
 from sims.robot.felt import INSTANT, SHARE
 from sims.robot.felt import felt as felt_over
 from sims.robot.floating import Afloat, Floating
 from sims.robot.forces import Forces, over_time
 from sims.robot.lanes import LANES, Addresses, Bench, Mask, Places
 from sims.robot.model import Actuator, Robot
+from sims.robot.native import COUPLING, arm_of
 from sims.robot.numerics import INTEGRATORS, Numerics, RobotEngine, own_numerics
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
@@ -327,9 +329,15 @@ class RobotSimulator(Simulated):
             if actuator.joint not in bench.drives or not apart.any():
                 continue
             column = readings[:, :, bench.drives[actuator.joint]]
+            before = column.copy()
             column += apart * self.by_control(actuator, bench)[:n, None]
             limits = self._limits(actuator)
             np.clip(column, *limits, out=column)
+            if actuator.joint in bench.robot.coupled:
+                first = joint_before(self.robot, actuator.joint)
+                assert first is not None
+                arms: Array = bench.fields[COUPLING][:n, arm_of(bench.robot, actuator.joint)]
+                readings[:, :, bench.drives[first.name]] += arms[:, None] * (column - before)
 
     def by_control(self, actuator: Actuator, bench: Bench) -> Array:
         """(LANES,) what one unit of an actuator's control exerts on its joint at once."""

@@ -21,6 +21,7 @@ likewise, with their own quotients.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -342,15 +343,33 @@ class Tangent:
 
     # -- changes
 
-    def by_numbers(self, owner: int, acting: Acting, change: float) -> Change:
-        """The change that other numbers of the model make, as (2) has it, per `change`."""
-        accelerations, readings = self._accelerated(acting, self._meant)
-        if self._outputs:
-            _, readings = self._accelerated(acting)
+    def by_numbers(self, owner: int, acting: Acting, change: float, bench: Bench) -> Change:
+        """The change that other numbers of the model make, as (2) has it, per `change`; `bench` has
+        the elements that they are of.
+        """
+        meant = self._meant
+        with self._on(bench):
+            accelerations, readings = self._accelerated(acting, meant)
+            if self._outputs:
+                _, readings = self._accelerated(acting)
         # What accelerates the robot by so much more is a force, and acts as one.
         apart = (accelerations - self.accelerations[self._looks]) / change
         force = np.einsum("nij,nj->ni", self._inertias, apart)
         return Change(owner, forces=force, readings=(readings - self._still[1]) / change)
+
+    @contextmanager
+    def _on(self, bench: Bench) -> Iterator[None]:
+        """Look at the instants in other lanes, of the same coordinates."""
+        own = self._bench, self._fresh
+        if bench is not self._bench:
+            for name in ("qacc", *SIDES, *dict(self._outputs)):
+                bench.batch.bind(name)
+            bench.batch.reset(stage=0)
+            self._bench, self._fresh = bench, bench.batch.state.copy()
+        try:
+            yield
+        finally:
+            self._bench, self._fresh = own
 
     @cached_property
     def _meant(self) -> Array:

@@ -14,10 +14,12 @@ from typing import Any
 from sims.extended import Number
 from sims.robot.causes import one_by_one
 from sims.robot.changes import CLOSE, KEPT, ROUNDS, Applied, apply
+from sims.robot.coupled import before
 from sims.robot.document import Document
-from sims.robot.markup import UnfitError, heading, numbers
+from sims.robot.markup import UnfitError, heading, number, numbers
 from sims.robot.mjcf_out import Writer
-from sims.robot.model import Robot
+from sims.robot.model import TENDON, Robot
+from sims.robot.native import arm_of
 from sims.robot.precise import saved, unlike
 from sims.robot.quiet import quiet
 from sims.robot.stated import Statement, lacking
@@ -76,12 +78,16 @@ def written(robot: Robot, causes: Causes, recording: str = "") -> Written:
 
 
 def with_series(applied: Applied) -> bytes:
-    """The text of a robot's file, with the joints that are in series with its own."""
+    """The text of a robot's file, with the joints that are in series with its own, and tendons of
+    drives that are coupled.
+    """
     robot = applied.robot
     text = robot.path.read_bytes()
-    if not robot.series:
+    if not robot.series and not robot.coupled:
         return text
     document = Document(text, robot.path)
+    if robot.coupled:
+        _couple(document, applied)
     tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
     for second in (joint for joint in robot.spec.joints if joint.name in robot.series):
         first = tags.get(second.name.rpartition("_")[0])
@@ -89,6 +95,27 @@ def with_series(applied: Applied) -> bytes:
             raise UnfitError(f"no joint of its text is in series with {second.name}")
         first.after.append(_joint(second))
     return document.written().encode()
+
+
+def _couple(document: Document, applied: Applied) -> None:
+    """State tendons, and let actuators drive them in place of their joints."""
+    robot, model = applied.robot, applied.model
+    tags = [child for tag in document.under("actuator") for child in document.children(tag)]
+    if len(tags) != len(robot.actuators):
+        raise UnfitError("the compiled model has other actuators")
+    for name in robot.coupled:
+        first = before(robot, name)
+        assert first is not None
+        known = {tag.attributes.get("name") for tag in document.walk() if tag.name == "joint"}
+        if not {name, first.name} <= known:
+            raise UnfitError(f"no joint of its text is called {name} or {first.name}")
+        c = number(float(model.wrap_prm[arm_of(robot, name)]))
+        joints = f'<joint joint="{name}" coef="1"/><joint joint="{first.name}" coef="{c}"/>'
+        tendon = f'<fixed name="{name}{TENDON}">{joints}</fixed>'
+        document.root.within.append(([], f"<tendon>{tendon}</tendon>"))
+        for actuator in (a for a in robot.actuators if a.joint == name):
+            tags[actuator.id].removed |= {"joint", "jointinparent"}
+            tags[actuator.id].new["tendon"] = f"{name}{TENDON}"
 
 
 def _joint(second: Any) -> str:

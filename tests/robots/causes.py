@@ -11,7 +11,7 @@ JOINT = (
     "inertia.armature", "force.bias", "force.ripple", "friction.direction",
     "friction.position", "friction.warming",
     "friction.load", "friction.load_direction", "friction.load_quadratic", "state.limit",
-    "friction.hysteresis", "joint.flexibility", "joint.backlash",
+    "friction.hysteresis", "joint.flexibility", "joint.backlash", "joint.coupling",
 )  # fmt: skip
 BODY = ("mass.scale", "mass.offset", "inertia.scale")
 BOTH = ("input.gain", "input.bias", "input.delay", "input.lag", "input.rate", "supply.sag")
@@ -33,13 +33,14 @@ SIMPLER = {
 SIGNED = (
     "force.bias", "mass.scale", "inertia.scale", "input.gain", "input.bias", "sensor.bias",
     "sensor.gain", "clock.skew", "gravity.scale", "actuator.stiffness", "actuator.damping",
+    "joint.coupling",
 )  # fmt: skip
 FAR = {  # of effects that need no scale of the motion
     "mass.scale": 0.5, "inertia.scale": 0.9, "input.gain": 0.4, "input.delay": 0.1,
     "input.lag": 0.2, "sensor.bias": 0.2, "sensor.gain": 0.3, "sensor.delay": 0.1,
     "clock.skew": 0.06, "gravity.scale": 0.3, "actuator.stiffness": 0.5, "actuator.damping": 0.8,
     "gravity.tilt": 0.2, "mass.offset": 0.1, "servo.derivative": 0.1,
-    "friction.load": 0.5,
+    "friction.load": 0.5, "joint.coupling": 1.0,
 }  # fmt: skip
 
 
@@ -51,6 +52,8 @@ def effects(drive):
 
 def places(machine, effect):
     """Where an effect can be."""
+    if effect == "joint.coupling":
+        return [machine.joints[joint] for joint in machine.driven if machine.before(joint) >= 0]
     if effect.startswith(("friction.load", "joint.")):
         return [machine.joints[joint] for joint in machine.driven]
     if effect in JOINT:
@@ -61,7 +64,10 @@ def places(machine, effect):
         return [f"q.{joint}" for joint in machine.joints if machine.unit(joint) == "rad"]
     if effect in CHANNEL:
         return [f"q.{joint}" for joint in machine.joints]
-    return [""] if effect in WORLD else [drive.name for drive in machine.drives]
+    if effect in WORLD:
+        return [""]
+    shared = [""] * (effect == "supply.sag" and len(machine.drives) > 1)
+    return [drive.name for drive in machine.drives] + shared
 
 
 def named(effect, place):
@@ -96,13 +102,20 @@ def _per_force(bottom):
     return far
 
 
+def _drawn(place, setting):
+    """A typical force of a drive, or of all."""
+    if place:
+        return _at(setting, place)["force"]
+    return float(setting.typical["force"][setting.machine.driven].sum())
+
+
 SCALES = {
     "friction.coulomb": _per_force(lambda typical: 2.0),
     "drag.linear": _per_force(lambda typical: typical["speed"]),
     "drag.quadratic": _per_force(lambda typical: typical["speed"] ** 2),
     "spring.linear": _per_force(lambda typical: typical["position"] + 0.05),
     "force.bias": _per_force(lambda typical: 1.0),
-    "supply.sag": lambda place, setting: 1.0 / _at(setting, place)["force"],
+    "supply.sag": lambda place, setting: 1.0 / _drawn(place, setting),
     "inertia.armature": lambda place, setting: 2.0 * _at(setting, place)["inertia"],
     "input.bias": lambda place, setting: float(np.ptp(_command(setting, place))) / 2,
     "servo.deadband": lambda place, setting: float(np.ptp(_command(setting, place))) / 8,

@@ -55,7 +55,7 @@ class Rivals:
         machine = self.setting.machine
         known = causes.effects("servo" if machine.drives[0].kp else "motor")
         places = causes.places(machine, effect) if effect in known else []
-        chosen = places if place == "*" else [p for p in places if p == place]
+        chosen = [p for p in places if (p if place == "*" else p == place)]
         draws = SHAPES if effect in causes.SHAPES else 1
         for draw in range(draws if chosen else 0):
             rng = rng_of("rival", f"{name} {draw}")

@@ -120,6 +120,8 @@ def _drawn_effect(item, effect, rng):
 def _sized(item, effect, setting, rng, taken=()):
     """({effect@place: coefficients}, size) of a place that is drawn; None if it cannot show."""
     places = [p for p in causes.places(setting.machine, effect) if p not in taken]
+    if not places:
+        return None
     wanted = _wanted(rng)
     place = str(rng.choice(places))
     of, name = causes.shape(effect, place, setting, rng), causes.named(effect, place)

@@ -70,6 +70,12 @@ class Machine:
         """Indices of the joints that have an actuator, in the actuators' order."""
         return [self.joints.index(drive.joint) for drive in self.drives]
 
+    def before(self, joint):
+        """Index of the joint that carries the one of this index; -1 where none of its kind does."""
+        index = int(self.model().parents[joint + 1]) - 1
+        kinds = [self.unit(self.joints[k]) for k in (index, joint)] if index >= 0 else [0, 1]
+        return index if kinds[0] == kinds[1] else -1
+
     def unit(self, joint):
         """Of a joint's position."""
         return "m" if self._joint(joint).get("type") == "prismatic" else "rad"

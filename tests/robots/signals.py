@@ -10,6 +10,7 @@ SIGNALS = (
     "input.gain", "input.bias", "input.deadband", "input.saturation", "input.delay", "input.lag",
     "input.rate", "servo.derivative", "input.power",
 )  # fmt: skip
+COUPLING = "joint.coupling@"
 
 
 @dataclass
@@ -92,7 +93,8 @@ def felt(machine, times, commands, effects):
 class Drives:
     """Forces of all actuators: clip(gain u - kp q - kv v, within +-limit) by joint, (N,); a servo
     does nothing about an error u - q that is below `dead`; of a force U a supply leaves
-    U / (1 + sag |U|).
+    U / (1 + sag |U|), one that all share U_i / (1 + battery (|U_1| + |U_2| + ...)). A shaft turns
+    with q_i + sum of `shafts`_ij q_j, and pushes those joints likewise.
     """
 
     gain: np.ndarray
@@ -101,16 +103,18 @@ class Drives:
     limit: np.ndarray
     dead: np.ndarray
     sag: np.ndarray
+    battery: float = 0.0
+    shafts: np.ndarray | None = None
 
     @classmethod
     def of(cls, machine, effects=None):
         """Of a machine, with what is hidden in its servos."""
-        count = len(machine.joints)
+        count, effects = len(machine.joints), effects or {}
         gain, kp, kv, limit, dead, sag = np.zeros((6, count))
         for joint, drive in zip(machine.driven, machine.drives, strict=True):
             change = {
                 name.partition("@")[0]: c[0]
-                for name, c in (effects or {}).items()
+                for name, c in effects.items()
                 if name.partition("@")[2] == drive.name
             }
             limit[joint] = drive.force
@@ -122,12 +126,31 @@ class Drives:
             kv[joint] = drive.kv * (1 + change.get("actuator.damping", 0.0))
             gain[joint] = kp[joint]
             dead[joint] = change.get("servo.deadband", 0.0)
-        return cls(gain, kp, kv, limit, dead, sag)
+        (battery,) = effects.get("supply.sag", (0.0,))
+        return cls(gain, kp, kv, limit, dead, sag, battery, _shafts(machine, effects))
 
     def forces(self, u, q, v):
         """For commands u by joint."""
+        if self.shafts is not None:
+            q, v = q + q @ self.shafts.T, v + v @ self.shafts.T
         wanted = self.gain * u - self.kp * q - self.kv * v
         if self.dead.any():
             wanted -= self.kp * np.clip(u - q, -self.dead, self.dead)
         force = np.minimum(np.maximum(wanted, -self.limit), self.limit)  # np.clip takes three times
-        return force / (1 + self.sag * np.abs(force)) if self.sag.any() else force
+        if self.sag.any() or self.battery:
+            drawn = np.abs(force)
+            force = force / (1 + self.sag * drawn + self.battery * drawn.sum(-1, keepdims=True))
+        return force if self.shafts is None else force + force @ self.shafts
+
+
+def _shafts(machine, effects):
+    """(N, N) by how much the drive of a joint (row) turns with others; None where none does."""
+    pairs = {n.partition("@")[2]: c for n, (c, *_) in effects.items() if n.startswith(COUPLING)}
+    if not pairs:
+        return None
+    above = machine.model()
+    shafts = np.zeros((above.nv, above.nv))
+    for joint, c in pairs.items():
+        row = machine.joints.index(joint)
+        shafts[row, above.parents[row + 1] - 1] = c
+    return shafts

@@ -10,6 +10,7 @@ from tests.robots import reference, robots
 from tests.robots.friction import held
 from tests.robots.machines import Drive, Machine
 from tests.robots.plant import Binding, Cogging, Heated
+from tests.robots.signals import Drives
 from tests.robots.world import Run, World, _Course
 
 pytest.importorskip("pinocchio", reason="pin has no wheel here")
@@ -234,22 +235,62 @@ def test_the_library_moves_as_this_world_does(effect, c, close, tmp_path):
     by how much motions differ, as a share of what the effect changes.
     """
     machine = robots.machine("arm2-motor", np.random.default_rng(5))
-    run = driven(machine, 0.5, stamps=np.arange(101) / 100)
-    name = f"{effect}@{machine.joints[1]}"
+    off, changed = differs(machine, f"{effect}@{machine.joints[1]}", c, 0.5, tmp_path)
+    assert changed > 1e-3
+    assert off < close
+
+
+@pytest.mark.parametrize("robot", ["arm2-motor", "arm2-servo", "ur5-servo"])
+@pytest.mark.parametrize(
+    ("effect", "c", "close"), [("joint.coupling", -0.3, 1e-3), ("supply.sag", 0.02, 0.03)]
+)
+def test_what_drives_have_in_common_the_library_moves_as_this_world_does(
+    robot, effect, c, close, tmp_path
+):
+    """A drive that turns the joint before as well, and one battery for all; what it takes is told
+    of the last step, to first order in its length.
+    """
+    machine = robots.machine(robot, np.random.default_rng(5))
+    place = f"@{machine.joints[-1]}" if effect.startswith("joint") else ""
+    moves = 0.5 if robot.endswith("motor") else 0.2
+    off, changed = differs(machine, effect + place, (c,), moves, tmp_path)
+    assert changed > 1e-4
+    assert off < close
+
+
+def differs(machine, name, c, moves, folder):
+    """How far motions of the library are from those of the world, as a share of what an effect
+    changes; and that.
+    """
+    run = driven(machine, moves, stamps=np.arange(101) / 100)
     bare, hidden = (World(machine, of).move(run, run.times).q for of in ({}, {name: c}))
-    (tmp_path / "robot.urdf").write_text(machine.urdf)
-    motors = {
+    (folder / "robot.urdf").write_text(machine.urdf)
+    drives = {
         d.name: {"joint": d.joint, "kind": d.kind, "force_range": [-d.force, d.force]}
+        | ({"kp": d.kp, "kv": d.kv} if d.kind == "position" else {})
         for d in machine.drives
     }
     engine = {"timestep": machine.step, "integrator": machine.integrator}
-    kind = robot_simulator(read(tmp_path / "robot.urdf", actuators=motors, engine=engine))
+    kind = robot_simulator(read(folder / "robot.urdf", actuators=drives, engine=engine))
     simulator = kind(observe=[f"q.{joint}" for joint in machine.joints], effects=[name])
     initial = {f"q.{joint}": q for joint, q in zip(machine.joints, run.q, strict=True)}
-    inputs = {f"u.{motor}": u for motor, u in run.commands.items()}
+    inputs = {f"u.{drive}": u for drive, u in run.commands.items()}
     seen = simulator.simulate(np.array([c]), Scenario(run.times, initial, inputs))[0]
-    assert np.sqrt(np.mean((hidden - bare) ** 2)) > 1e-3
-    assert np.linalg.norm(seen - hidden) < close * np.linalg.norm(hidden - bare)
+    changed = np.linalg.norm(hidden - bare)
+    return np.linalg.norm(seen - hidden) / changed, np.sqrt(np.mean((hidden - bare) ** 2))
+
+
+def test_a_shaft_turns_two_joints_and_one_battery_serves_all_drives():
+    machine = robots.machine("arm2-servo", np.random.default_rng(5))
+    q, v, u = np.array([0.3, -0.2]), np.array([1.0, 2.0]), np.array([0.5, 0.4])
+    (first, second), c = machine.drives, 0.4
+    turned = second.kp * (u[1] - q[1] - c * q[0]) - second.kv * (v[1] + c * v[0])
+    own = first.kp * (u[0] - q[0]) - first.kv * v[0]
+    coupled = Drives.of(machine, {f"joint.coupling@{second.joint}": (c,)})
+    np.testing.assert_allclose(coupled.forces(u, q, v), [own + c * turned, turned])
+    bare = Drives.of(machine).forces(u, q, v)
+    left = Drives.of(machine, {"supply.sag": (0.05,)}).forces(u, q, v)
+    np.testing.assert_allclose(left, bare * (1 - 0.05 * np.abs(left).sum()))
 
 
 def test_a_joint_is_rubbed_by_what_another_ones_drive_has_done():

@@ -9,7 +9,9 @@ import pytest
 from mujoco.batch import Batch
 
 from sims.robot import native
+from sims.robot.coupled import ANY
 from sims.robot.model import Robot
+from sims.robot.series import in_series
 from tests.sims.robot.arms import ARM, robot
 
 ELBOW = 'damping="0.1" frictionloss="0.05" stiffness="0.5"'
@@ -20,6 +22,11 @@ MOVED = (
     '<inertial pos="0.02 0 0.03" mass="0.2" diaginertia="0.000131666666666666 0.00013166666666666'
 )
 MOVED += '6 0.00025"/>' + WHEEL
+DRIVES = """<actuator>
+    <position name="m_shoulder" joint="shoulder" kp="60" kv="3"/>
+    <motor name="m_elbow" joint="elbow" gear"""
+TENDON = """<tendon><fixed name="t"><joint joint="elbow" coef="1"/><joint joint="shoulder"
+    coef="-0.3"/></fixed></tendon>"""
 STATED = {
     ("drag.linear", "shoulder", (0.3,)): ('damping="0.2 0.05 0"', 'damping="0.5 0.05 0"'),
     ("drag.linear", "elbow", (-0.3,)): ('damping="0.1"', 'damping="0"'),
@@ -46,6 +53,10 @@ STATED = {
     ("gravity.tilt", "", (0.1, -0.05)): ("0 0 -9.81", "0.981 -0.4905 -9.81"),
     ("actuator.limit", "m_elbow", (1.5,)): ("-1 4", "-1 1.5"),
     ("actuator.limit", "m_spin", (0.02,)): ('kv="0.05"', 'kv="0.05" forcerange="-0.02 0.02"'),
+    ("joint.coupling", "elbow", (-0.3,)): (
+        DRIVES,
+        TENDON + DRIVES.replace('joint="elbow"', 'tendon="t"'),
+    ),
 }
 """By effect, place and coefficients: what stands in the file, and what says the same."""
 
@@ -55,6 +66,8 @@ CONTROL = (0.7, 1.8, 6.0)
 def lanes(robot: Robot, effect: str, place: str, c: tuple[float, ...]) -> Any:
     """(2, nq) positions after 0.4 s: a lane without the effect, one with it."""
     of = native.FIELDS[effect]
+    if effect == ANY[1]:
+        robot = in_series(robot, (ANY,))
     batch = Batch(native.lanes_model(robot), 2, 1)
     fields = {name: batch.expand(name) for name in of.fields}
     of.write(fields, robot, place, np.array([[0.0, value] for value in c]))

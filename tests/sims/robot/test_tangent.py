@@ -37,7 +37,7 @@ ALIKE = {
     "drag.linear": 1e-4, "drag.quadratic": 1e-4, "force.bias": 1e-4, "force.ripple": 1e-4,
     "friction.coulomb": 1e-4, "friction.direction": 1e-3, "gravity.tilt": 1e-4,
     "friction.position": 1e-4, "friction.warming": 1e-4, "friction.load_direction": 1e-3,
-    "inertia.armature": 1e-4,
+    "inertia.armature": 1e-4, "joint.coupling": 1e-3,
     "input.bias": 1e-4, "input.gain": 1e-4, "input.lag": 1e-3, "mass.scale": 1e-3,
     "mass.offset": 1e-3, "sensor.bias": 1e-4, "sensor.delay": 1e-3, "sensor.gain": 1e-4,
     "sensor.eccentricity": 1e-3, "servo.deadband": 1e-4, "servo.derivative": 1e-2,
