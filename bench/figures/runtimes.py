@@ -23,7 +23,7 @@ from bench.analysis.runtimes import percentile_interval, resampled
 from bench.analysis.statistics import Statistics
 from bench.analysis.table import checkpoints
 from bench.figures.errors import simulations_axis
-from bench.figures.style import INK, TITLES, Styles, blank, canvas, finish, titled
+from bench.figures.style import INK, TITLES, Styles, blank, canvas, colour, finish, titled
 from bench.problem.experiment import Experiment
 from sims.base import Array
 
@@ -181,7 +181,13 @@ def rank_figure(ranked: pd.DataFrame, p_values: pd.DataFrame, friedman: float) -
 
     figure, axes = blank(1, 1, (8.5, 1.6 + 0.28 * ranked.shape[1]))
     axis = axes[0, 0]
-    critical_difference_diagram(ranked.mean(axis=0), p_values, ax=axis, label_props={"fontsize": 9})
+    # Each tuner in the colour that it has in every other figure; a light one would be no text.
+    colours = {str(name): colour(place) for place, name in enumerate(ranked.columns)}
+    drawn = critical_difference_diagram(
+        ranked.mean(axis=0), p_values, ax=axis, label_props={"fontsize": 9}, color_palette=colours
+    )
+    for label in drawn["labels"]:
+        label.set_color(INK)
     tests = f"Friedman p = {friedman:.2g}; bars: Nemenyi p > 0.05"
     axis.set_title(f"Mean rank over {len(ranked)} problems, 1 is best ({tests})", fontsize=10)
     return figure

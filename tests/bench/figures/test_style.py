@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib import pyplot
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import bench
@@ -131,3 +132,10 @@ def test_a_folder_that_cannot_be_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="file: cannot be written"):
         save(loss(), tmp_path / "file" / "loss")
+
+
+def test_a_tuner_has_its_colour_in_the_diagram_of_ranks_too():
+    figure = rank()
+    dots = {tuple(dot) for one in figure.axes[0].collections for dot in one.get_facecolors()}
+    assert {to_hex(dot).upper() for dot in dots} == {style.colour(place) for place in range(4)}
+    assert {to_hex(text.get_color()).upper() for text in figure.axes[0].texts} == {style.INK}

@@ -1,0 +1,45 @@
+"""The pages that lie beside reference results have the numbers of the tables beside them."""
+
+import io
+import json
+import re
+
+import pandas as pd
+import pytest
+
+from bench.pages.page import _policy
+from tests.docs.pages import ROOT
+
+REFERENCE = ROOT / "results" / "reference"
+PAGES = sorted(page.parent for page in REFERENCE.rglob("report.html"))
+COMPARED = [folder for folder in PAGES if not (folder / "verdict.json").exists()]
+DATA = re.compile(r'<script type="application/json" id="data">(.*?)</script>', re.S)
+
+
+def tables(folder):
+    """The tables of a page by name."""
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    kept = json.loads(DATA.search(text)[1])["tables"]
+    return {name: pd.read_csv(io.StringIO(csv)) for name, csv in kept.items()}
+
+
+@pytest.mark.parametrize("folder", COMPARED, ids=lambda f: f.relative_to(REFERENCE).as_posix())
+def test_a_kept_page_has_the_numbers_of_the_tables_beside_it(folder):
+    compared = 0
+    for name, shown in tables(folder).items():
+        path = folder / f"{name}.csv"
+        if path.exists():
+            beside = pd.read_csv(path)
+            # Tables of before tuners were sealed have a column less.
+            common = [column for column in beside if column in shown]
+            assert len(common) >= len(beside.columns) - 1
+            pd.testing.assert_frame_equal(shown[common], beside[common], rtol=1e-5)
+            compared += 1
+    assert compared >= 1
+
+
+@pytest.mark.parametrize("folder", COMPARED, ids=lambda f: f.relative_to(REFERENCE).as_posix())
+def test_a_kept_page_asks_nobody_and_runs_its_own_script_alone(folder):
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    script = re.findall(r"<script>(.*?)</script>", text, re.S)[-1]
+    assert f'content="{_policy(script)}"' in text
