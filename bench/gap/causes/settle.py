@@ -13,6 +13,7 @@ from bench.gap.causes.search import Search
 from bench.gap.causes.structure import remains
 from bench.gap.model.models import Model
 from bench.gap.model.noise import Noise
+from bench.gap.model.problem import Start
 
 NEAR = 30.0
 """Rivals this near in twice the log likelihood are fitted once more before they are judged."""
@@ -43,6 +44,7 @@ def settle(search: Search, model: Model) -> Model:
         judged = [m for m in near if abs(model.merit - m.merit) < NEAR] or [model]
     starts = [m.fit.start() for m in near]
     starts += [m.fit.start() for m in parts]
+    starts += [_in_its_place(search, model, m) for m in judged if _differs_in_one(model, m)]
     search.refit([*starts, *around], noise)
     # A refit that ends worse than before is not kept, so the table holds the best of each.
     refitted = [search.models[frozenset(m.names)] for m in judged]
@@ -63,6 +65,23 @@ def _among_all(search: Search, model: Model) -> Model:
         if other.merit > best.merit:
             best = other
     return best
+
+
+def _differs_in_one(model: Model, other: Model) -> bool:
+    """Whether it has one other effect, and shares others."""
+    return len(model.names) > 1 and len(set(model.names) - set(other.names)) == 1
+
+
+def _in_its_place(search: Search, model: Model, other: Model) -> Start:
+    """Where a rival begins with all that it shares as the model has it: a law of several numbers
+    ends a little elsewhere each time, and what is alike would be told apart by that.
+    """
+    (own,), (gone,) = (set(m.names) - set(n.names) for m, n in ((other, model), (model, other)))
+    slots = search.world.slots
+    theta = model.fit.theta.copy()
+    theta[slots[gone]] = 0.0
+    theta[slots[own]] = other.fit.theta[slots[own]]
+    return Start(other.names, theta, model.fit.states)
 
 
 def rivals(search: Search, model: Model) -> list[Model]:
