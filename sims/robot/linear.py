@@ -118,6 +118,7 @@ class Linear:
             outputs,
             np.concatenate([sizes, sizes[second], floating_forces(simulator.robot)]),
             bench.whole,
+            all(name.startswith("tau.") for name in self._names),
         )
 
     def _joint(self, second: str) -> int:

@@ -138,6 +138,8 @@ class Tangent:
         places: addresses of the joints.
         outputs: names of MuJoCo's data and their columns that are read, beside the state.
         sizes: (E,) typical forces.
+        of_drives: whether all that is read is what drives exert, which no force from outside
+            changes at once.
     """
 
     def __init__(
@@ -149,7 +151,9 @@ class Tangent:
         outputs: Sequence[tuple[str, int]],
         sizes: Array,
         places: Addresses,
+        of_drives: bool = False,
     ) -> None:
+        self._of_drives = of_drives
         self._bench, self._system, self._motion = bench, system, motion
         self._acting = acting
         self._outputs = tuple(outputs)
@@ -350,7 +354,7 @@ class Tangent:
         meant = self._meant
         with self._on(bench):
             accelerations, readings = self._accelerated(acting, meant)
-            if self._outputs:
+            if self._outputs and not self._of_drives:
                 _, readings = self._accelerated(acting)
         # What accelerates the robot by so much more is a force, and acts as one.
         apart = (accelerations - self.accelerations[self._looks]) / change
