@@ -13,6 +13,9 @@ from tests.docs.pages import ROOT
 REFERENCE = ROOT / "results" / "reference"
 PAGES = sorted(page.parent for page in REFERENCE.rglob("report.html"))
 COMPARED = [folder for folder in PAGES if not (folder / "verdict.json").exists()]
+_OLDER = ("ball_drops/blue_basketball", "smartphone_fall/fall", "emps/explained", "so101/explained")
+"""Explanations below real/ that are older than today's page: their README says so."""
+TODAY = [folder for folder in PAGES if folder not in {REFERENCE / "real" / each for each in _OLDER}]
 DATA = re.compile(r'<script type="application/json" id="data">(.*?)</script>', re.S)
 
 
@@ -38,7 +41,7 @@ def test_a_kept_page_has_the_numbers_of_the_tables_beside_it(folder):
     assert compared >= 1
 
 
-@pytest.mark.parametrize("folder", COMPARED, ids=lambda f: f.relative_to(REFERENCE).as_posix())
+@pytest.mark.parametrize("folder", TODAY, ids=lambda f: f.relative_to(REFERENCE).as_posix())
 def test_a_kept_page_asks_nobody_and_runs_its_own_script_alone(folder):
     text = (folder / "report.html").read_text(encoding="utf-8")
     script = re.findall(r"<script>(.*?)</script>", text, re.S)[-1]

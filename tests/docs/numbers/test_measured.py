@@ -90,6 +90,9 @@ def summary():
     page.says("as published; {} m/s²", fall["rmse_extended"])
     page.known("a quick fit gave 0.071", ELSEWHERE)
     page.known("(0.0034 rad)", ELSEWHERE)
+    page.known("Asked on 23 November with 54 effects", "the version")
+    page.known("beside drag, 0.119 m) and", ELSEWHERE)
+    page.known("beside quadratic drag, 0.037 m/s²)", ELSEWHERE)
     page.known("Open loop over 25 s", "the recording")
     page.known("one drop of some 40 samples", "the recording")
     page.known(
