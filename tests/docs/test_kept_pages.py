@@ -3,7 +3,6 @@
 import io
 import json
 import re
-from numbers import Real
 
 import pandas as pd
 import pytest
@@ -27,11 +26,6 @@ def tables(folder):
     return {name: pd.read_csv(io.StringIO(csv)) for name, csv in kept.items()}
 
 
-def short(cell):
-    """A cell as text, numbers with five digits."""
-    return f"{cell:.5g}" if isinstance(cell, Real) else str(cell)
-
-
 @pytest.mark.parametrize("folder", COMPARED, ids=lambda f: f.relative_to(REFERENCE).as_posix())
 def test_a_kept_page_has_the_numbers_of_the_tables_beside_it(folder):
     compared = 0
@@ -42,14 +36,9 @@ def test_a_kept_page_has_the_numbers_of_the_tables_beside_it(folder):
             # Tables of before tuners were sealed have a column less.
             common = [column for column in beside if column in shown]
             assert len(common) >= len(beside.columns) - 1
-            if len(shown) > len(beside):
-                # A chart's table may have lines to compare with besides, as what is ideal.
-                texts = [
-                    frame[common].map(short).agg("|".join, axis=1) for frame in (beside, shown)
-                ]
-                assert set(texts[0]) <= set(texts[1])
-            else:
-                pd.testing.assert_frame_equal(shown[common], beside[common], rtol=1e-5)
+            # Behind them a chart's table may have lines to compare with, as what is ideal.
+            shown = shown[common].head(len(beside))
+            pd.testing.assert_frame_equal(shown, beside[common], rtol=1e-5, check_dtype=False)
             compared += 1
     assert compared >= 1
 
