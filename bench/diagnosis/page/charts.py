@@ -58,7 +58,8 @@ def board_chart(shown: Shown, page: Page) -> str:
         f"left and high. {_WILSON}"
     )
     still = shown.still("board", "False alarms of each diagnoser against what it names.")
-    return page.chart(Chart("board", "Who names, and who cries wolf", caption, (panel,), still))
+    title = "False alarms against what is named"
+    return page.chart(Chart("board", title, caption, (panel,), still))
 
 
 def shares_chart(shown: Shown, page: Page) -> str:
