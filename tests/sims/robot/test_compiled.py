@@ -31,10 +31,10 @@ def arm(tmp_path):
 
 
 def asked(kind):
-    """Every effect of the library that is asked in every step, one at each place."""
+    """Every effect of the library that is asked in every step, at each place that has it."""
     placed = (one for name in library.names() for one in kind.system.placed(library.get(name)))
     found = [effect() for effect in placed]
-    return [e for e in found if is_asked(e) and e.place not in ("", "*")]
+    return [e for e in found if is_asked(e) and e.place != "*"]
 
 
 def by_numpy(monkeypatch):
