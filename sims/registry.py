@@ -11,11 +11,12 @@ import importlib.util
 import inspect
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
 from sims.base import InputError, unknown
 
@@ -42,7 +43,8 @@ class SkippedError(InputError):
         return SkippedError, self._given
 
 
-class Added(NamedTuple, Generic[T]):
+@dataclass(frozen=True)
+class Added(Generic[T]):
     """A part that no installed package brings, and the file that it stands in; None for a class
     from Python.
     """

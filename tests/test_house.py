@@ -2,6 +2,7 @@
 circle.
 """
 
+import re
 import shutil
 import subprocess
 import sys
@@ -96,3 +97,15 @@ def test_an_import_that_climbs_is_found(module, line, contract, tmp_path):
     assert said.returncode == 1
     broken = [title for title in said.stdout.splitlines() if title.endswith("BROKEN")]
     assert any(contract in title for title in broken), said.stdout
+
+
+GENERIC = re.compile(r"^class \w+\([^)]*\bNamedTuple\b[^)]*\bGeneric\b", re.M)
+"""What Python 3.10 refuses at import, and no checker of later versions sees."""
+
+
+def test_no_named_tuple_is_generic_which_python_3_10_refuses():
+    rooms = [ROOT / name for name in ("bench", "methods", "sims")]
+    files = [path for room in rooms for path in room.rglob("*.py")]
+    assert len(files) > 300
+    assert [path for path in files if GENERIC.search(path.read_text(encoding="utf-8"))] == []
+    assert GENERIC.search("class Added(NamedTuple, Generic[T]):")
