@@ -35,6 +35,7 @@ from bench.recordings.joined import load_all
 from bench.recordings.pieces import cut
 from bench.recordings.size import check_recording
 from bench.recordings.stamps import refuse_odd
+from bench.runs.threads import one_thread
 from sims import extended as extend
 from sims.base import Array, InputError
 from sims.extended import Extended
@@ -231,6 +232,8 @@ class _Explainer:
                     f"{channel.scale:g} {channel.unit}, found {largest:.3g}; is the unit right?"
                 )
 
+    # Small products: with a thread for each core they take five times as long where others compute.
+    @one_thread()
     def run(self) -> Explanation:
         self.say("fitting the base model")
         base = self._base()

@@ -16,13 +16,13 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from concurrent.futures import TimeoutError as FutureTimeoutError
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol
 
 from bench.runs.births import HeldBackContext
 from bench.runs.guard import initialise
+from bench.runs.threads import THREADS, one_thread
 from bench.sealing.ended import how_it_ended
 from sims.base import InputError
 from sims.engines import stepping
@@ -46,9 +46,6 @@ _FUTILE = 10
 """Workers that may die one after another before they do anything; then it is not chance."""
 _SHORT = 1.0
 """Seconds below which a worker is given its next call ahead of time."""
-
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""What tells numerical libraries how many threads they may have."""
 
 Call = tuple[Callable[..., Any], tuple[Any, ...]]
 
@@ -120,7 +117,7 @@ class InProcessPool:
 
         What a call raises is said on stderr too, while the person who wrote it is looking.
         """
-        with _one_thread():
+        with one_thread():
             for place in range(len(calls)):
                 function, arguments = calls[place]
                 try:
@@ -134,18 +131,6 @@ class InProcessPool:
                     traceback.print_exc()
                     result = DeathError(f"it asked to exit with {error.code!r}")
                 yield place, result
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Within the block arithmetic has one thread, as in a worker: sums come out the same."""
-    from threadpoolctl import threadpool_limits
-
-    # For libraries that are loaded within the block; threadpoolctl knows those that are there.
-    for name in THREADS:
-        os.environ.setdefault(name, "1")
-    with threadpool_limits(limits=1):
-        yield
 
 
 @dataclass

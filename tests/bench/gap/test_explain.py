@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
+from bench.gap import explain as explaining
 from bench.gap.explain import explain
 from bench.gap.verdict import Verdict
 from bench.recordings.simulate import make
@@ -324,3 +326,21 @@ def test_a_parameter_that_ends_at_its_border_is_told(tmp_path):
     assert found.answer.causes[0].coefficients["coefficient"].value == pytest.approx(
         10 / mass - 1, abs=1e-3
     )
+
+
+def test_arithmetic_has_one_thread_meanwhile_and_what_it_had_afterwards(tmp_path, monkeypatch):
+    threads = []
+
+    def count(*_, **__):
+        threads.extend(pool["num_threads"] for pool in threadpool_info())
+        raise InputError("enough")
+
+    monkeypatch.setattr(explaining, "fit_base", count)
+    path = table(tmp_path, swings(), noise=NOISE)
+    with threadpool_limits(2):
+        pools = threadpool_info()
+        with pytest.raises(InputError, match="enough"):
+            explain(path)
+        assert threadpool_info() == pools
+    assert threads
+    assert set(threads) == {1}
