@@ -15,7 +15,7 @@ from sims.robot.native import FIELDS
 from sims.robot.remembered import advanced
 from sims.robot.series import is_series
 from sims.robot.system import RobotSystem
-from sims.system import Acting, Force, Friction, Hidden, State
+from sims.system import Acting, Effect, Force, Friction, Hidden, State
 
 OVER_TIME = frozenset({"force.bias", "force.periodic"})
 """Effects whose force hangs on nothing but time."""
@@ -133,6 +133,16 @@ class Forces:
             more, self._states = remembered(self.hidden, moment, self._states, step)
             force += more
         return force, rubbed(self.frictions, moment)
+
+
+def is_in_drive(effect: Effect) -> bool:
+    """Whether its force is the drive's own, and a sensor of what drives exert shows it."""
+    return isinstance(effect, Force) and effect.at == "actuator"
+
+
+def exerted(acting: Acting, moment: RobotMoment) -> Array:
+    """(L, D) what effects in drives add to what these exert."""
+    return pushed([(e, c) for e, c in acting if isinstance(e, Force) and is_in_drive(e)], moment)
 
 
 def pushed(forces: Sequence[tuple[Force, Array]], moment: RobotMoment) -> Array:

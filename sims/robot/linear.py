@@ -118,8 +118,13 @@ class Linear:
             outputs,
             np.concatenate([sizes, sizes[second], floating_forces(simulator.robot)]),
             bench.whole,
-            all(name.startswith("tau.") for name in self._names),
+            [self._driven_joint(name) for name in self._names],
         )
+
+    def _driven_joint(self, channel: str) -> int:
+        """The number of the joint of which a channel shows what drives exert; -1 of others."""
+        kind, _, joint = channel.partition(".")
+        return self._simulator.system.coordinates.index(f"q.{joint}") if kind == "tau" else -1
 
     def _joint(self, second: str) -> int:
         """The number of the joint with which one is in series."""

@@ -19,14 +19,13 @@ from sims.base import Array, InputError, Scenario, unknown
 from sims.plan import Runs, make_runs
 from sims.robot.acting import derives, filled, is_asked, lanes_with, natives, part_of
 from sims.robot.compiled import compiled
-from sims.robot.coupled import before as joint_before
+from sims.robot.drives import Shown
 from sims.robot.felt import INSTANT, SHARE
 from sims.robot.felt import felt as felt_over
 from sims.robot.floating import Afloat, Floating
 from sims.robot.forces import Forces, over_time
 from sims.robot.lanes import LANES, Addresses, Bench, Mask, Places
-from sims.robot.model import Actuator, Robot
-from sims.robot.native import COUPLING, arm_of
+from sims.robot.model import Robot
 from sims.robot.numerics import INTEGRATORS, Numerics, RobotEngine, own_numerics
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
@@ -311,48 +310,15 @@ class RobotSimulator(Simulated):
         v = np.concatenate([start.v[:, None], done["qvel"][:, :, places.velocities]], axis=1)
         x[bench.failed] = np.nan
         if self._drives:
-            self._as_given(done["sensordata"], bench, given)
+            shown = Shown(self.robot, self.robotic, bench, given, self.step)
+            shown.as_given(done["sensordata"])
+            shown.as_exerted(done["sensordata"], x, v, start.acting)
         after = done["qpos"][:, :, second.positions], done["qvel"][:, :, second.velocities]
         hidden = [
             np.concatenate([first[:, None], rest], axis=1)
             for first, rest in zip(behind, after, strict=True)
         ]
         return Made(x, v, done, begun, bench.failed, (hidden[0], hidden[1]))
-
-    def _as_given(self, readings: Array, bench: Bench, given: Given) -> None:
-        """Let what actuators exert (n, S, k) be that of the command when each step begins, in place
-        of its mean over the step.
-        """
-        n = len(readings)
-        for actuator in self.robot.actuators:
-            apart = given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
-            if actuator.joint not in bench.drives or not apart.any():
-                continue
-            column = readings[:, :, bench.drives[actuator.joint]]
-            before = column.copy()
-            column += apart * self.by_control(actuator, bench)[:n, None]
-            limits = self._limits(actuator)
-            np.clip(column, *limits, out=column)
-            if actuator.joint in bench.robot.coupled:
-                first = joint_before(self.robot, actuator.joint)
-                assert first is not None
-                arms: Array = bench.fields[COUPLING][:n, arm_of(bench.robot, actuator.joint)]
-                readings[:, :, bench.drives[first.name]] += arms[:, None] * (column - before)
-
-    def by_control(self, actuator: Actuator, bench: Bench) -> Array:
-        """(LANES,) what one unit of an actuator's control exerts on its joint at once."""
-        gear = float(self.robot.compiled.actuator_gear[actuator.id, 0])
-        gain: Array = bench.fields["actuator_gainprm"][:, actuator.id, 0]
-        direct = actuator.kind in ("motor", "position", "velocity")
-        return gear * gain if direct else np.zeros_like(gain)
-
-    def _limits(self, actuator: Actuator) -> tuple[float, float]:
-        """Of what it exerts on its joint, as far as the file states them."""
-        gear = abs(float(self.robot.compiled.actuator_gear[actuator.id, 0]))
-        low, high = actuator.force or (-np.inf, np.inf)
-        assert actuator.joint is not None
-        effort = self.robot.joint(actuator.joint).effort or np.inf
-        return max(gear * low, -effort), min(gear * high, effort)
 
     def _bench(self, derived: bool, count: int, series: Added = ()) -> Bench:
         key = derived, count, series

@@ -31,7 +31,7 @@ import numpy as np
 from sims.base import Array
 from sims.robot.acting import is_asked, natives
 from sims.robot.floating import Afloat
-from sims.robot.forces import LOADED, moment_of
+from sims.robot.forces import LOADED, exerted, is_in_drive, moment_of
 from sims.robot.lanes import Addresses, Bench, Mask, Places
 from sims.robot.moment import RobotMoment
 from sims.robot.remembered import advanced, along
@@ -138,8 +138,8 @@ class Tangent:
         places: addresses of the joints.
         outputs: names of MuJoCo's data and their columns that are read, beside the state.
         sizes: (E,) typical forces.
-        of_drives: whether all that is read is what drives exert, which no force from outside
-            changes at once.
+        drives: of each output the number of the joint of which it is what drives exert; -1 of
+            others.
     """
 
     def __init__(
@@ -151,9 +151,10 @@ class Tangent:
         outputs: Sequence[tuple[str, int]],
         sizes: Array,
         places: Addresses,
-        of_drives: bool = False,
+        drives: Sequence[int] = (),
     ) -> None:
-        self._of_drives = of_drives
+        self._drives = tuple(drives) or (-1,) * len(outputs)
+        self._exerted = np.zeros((0, 0))
         self._bench, self._system, self._motion = bench, system, motion
         self._acting = acting
         self._outputs = tuple(outputs)
@@ -234,7 +235,13 @@ class Tangent:
         """(n, O) of the lanes, as they are now."""
         bind = self._bench.batch.bind
         rows = [bind(name)[:n, column, None] for name, column in self._outputs]
-        return np.concatenate(rows, axis=1) if rows else np.zeros((n, 0))
+        if not rows:
+            return np.zeros((n, 0))
+        read = np.concatenate(rows, axis=1)
+        if self._exerted.size:
+            of = np.array(self._drives)
+            read[:, of >= 0] += self._exerted[:, of[of >= 0]]
+        return read
 
     def _placed(
         self, moved: Mapping[str, tuple[int, float]], acting: Acting
@@ -296,6 +303,8 @@ class Tangent:
             self._bench.batch.forward(None if n == self._bench.count else np.arange(n))
             carried = np.stack([bind(name)[:n, places.velocities] for name in SIDES])
         moment = moment_of(self._system, t, x, v, inputs, carried, self._stiff(n))
+        own_of = [(e, np.repeat(c, n, axis=1)) for e, c in self._asked if is_in_drive(e)]
+        self._exerted = exerted(tuple(own_of), moment) if own_of else np.zeros((0, 0))
         for k, (effect, c) in enumerate(self._asked):
             own = np.repeat(c, n, axis=1)
             if isinstance(effect, Hidden):
@@ -354,7 +363,8 @@ class Tangent:
         meant = self._meant
         with self._on(bench):
             accelerations, readings = self._accelerated(acting, meant)
-            if self._outputs and not self._of_drives:
+            # What drives exert no force from outside changes at once.
+            if min(self._drives, default=0) < 0:
                 _, readings = self._accelerated(acting)
         # What accelerates the robot by so much more is a force, and acts as one.
         apart = (accelerations - self.accelerations[self._looks]) / change
@@ -416,7 +426,25 @@ class Tangent:
         else:
             force = _force(effect, own, self.moment)
         joints = np.flatnonzero(np.abs(force).max(axis=0) > 0)
-        return [Change(owner, joint=int(j), series=force[:, j]) for j in joints]
+        changes = [Change(owner, joint=int(j), series=force[:, j]) for j in joints]
+        if is_in_drive(effect) and max(self._drives, default=-1) >= 0:
+            changes.append(Change(owner, readings=self._shown(effect, c)))
+        return changes
+
+    def _shown(self, effect: Effect, c: Array) -> Array:
+        """(N, O) what an effect in a drive changes about readings of the drives at each instant."""
+        motion, at = self._motion, self._looks
+        of = np.array(self._drives, dtype=np.intp)
+        # Of drives that are read it is known when the step begins, and not somewhere within.
+        carried = motion.carried[:, at].copy()
+        carried[0][:, of[of >= 0]] = self._read[:, of >= 0]
+        inputs = {name: u[at, None] for name, u in motion.inputs.items()}
+        t: Array = motion.step * at[:, None].astype(np.float64)
+        x, v, stiff = motion.x[at], motion.v[at], self._stiff(at.size)
+        moment = moment_of(self._system, t, x, v, inputs, carried, stiff)
+        force = exerted(((effect, np.repeat(c, at.size, axis=1)),), moment)
+        result: Array = np.where(of >= 0, force[:, of], 0.0)
+        return result
 
     def _gone(self, effect: Effect, c: Array) -> State:
         """States (S + 1, 1) of an effect along the motion, where it has any."""

@@ -135,3 +135,22 @@ def test_a_set_point_that_is_taken_in_now_and_then_is_a_delay_on_average(phase):
     rest = np.abs(seldom - delayed)[20:].max()
     assert np.abs(seldom - plain)[20:].max() == pytest.approx(0.0164, rel=1e-2)
     assert rest < 6e-4
+
+
+@pytest.mark.parametrize(
+    ("effects", "within"),
+    [({}, 1e-3), ({"servo.deadband@m": 0.06}, 1e-3), ({"supply.sag@m": 0.05}, 1e-3)],
+)
+def test_a_sensor_of_the_drive_shows_what_it_exerts_and_not_what_it_would(effects, within):
+    """What a dead zone or a weak supply takes is taken from the drive: at rest it holds the arm."""
+    kind = kind_of(ARM)
+    placed = [kind.system.effect(name) for name in effects]
+    simulator = kind(observe=["q.hinge", "tau.hinge"], effects=placed)
+    given = {c.name: np.zeros(TIMES.size) for c in simulator.inputs}
+    given["u.m"] = np.full(TIMES.size, 1.6)
+    theta = np.array([[*effects.values()], [0.0] * len(effects)])
+    q, tau = simulator.simulate(theta, Scenario(TIMES, {"q.hinge": 0.7}, given))[0, -1]
+    assert tau == pytest.approx(MASS * 9.81 * LENGTH * np.sin(q), rel=within)
+    # and what the law without them says is another number
+    plain = 2 * KP * (1.6 - 2 * q)
+    assert (plain == pytest.approx(tau, rel=0.01)) == (not effects)
