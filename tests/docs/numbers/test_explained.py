@@ -37,7 +37,8 @@ def exam():
     sizes = dict(zip(amiss.question.str.split("/").str[3], amiss["size"], strict=True))
     page.says("a flexible joint at {} times", sizes["joint.flexibility"])
     page.says("a ripple at {}, a slip at {},", sizes["force.ripple"], sizes["sensor.slip"])
-    page.known("All 873 questions, asked of one version (bfcb99b, 54 effects) in 10", "of that day")
+    page.says("a limit of the input's rate at {}", sizes["input.rate"])
+    page.known("All 873 questions, asked of one version (d4ff51a, 55 effects) in 10", "of that day")
     page.known("It is 100 more than with 42", "of the sheet before")
     for before in ("(98.9 %", "(43 before)", "s (0.4 before)", "s (2.8)"):
         page.known(before, "of the exam before, which is not kept")
