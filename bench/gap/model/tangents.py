@@ -15,7 +15,7 @@ from sims.robot.linear import Linear
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
 
-ENDLESS = 1e60
+ENDLESS = 1e30
 """A change beyond it is none: the motion explodes."""
 LAST = 0.1
 """Share of a run that is its end."""
@@ -28,7 +28,8 @@ SMALL = 1.0
 def responses(
     world: World, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
 ) -> Array:
-    """What one more effect changes about the runs, to first order: (K, R, T, C).
+    """What one more effect changes about the runs, to first order: (K, R, T, C), in single precision,
+    since it is the largest array of explain by far and a derivative.
 
     Args:
         world: the runs, of a robot.
@@ -37,13 +38,15 @@ def responses(
         added: K effects with their coefficients.
     """
     runs, length, channels = world.observed.shape
-    result = np.full((len(added), runs, length, channels), np.nan)
+    result: Array = np.full((len(added), runs, length, channels), np.nan, dtype=np.float32)
     kept = world.simulated
     keys = [(name, c.tobytes()) for name, c in added]
     asked = [i for i, key in enumerate(keys) if key not in kept]
     calls = [(run, theta, states[run], [added[i] for i in asked]) for run in range(runs)]
     for run, (values, looks) in world.crew.each(world, _responses, calls):
-        result[asked, run, : values.shape[1]] = values
+        # what explodes is infinite then
+        with np.errstate(over="ignore"):
+            result[asked, run, : values.shape[1]] = values
         world.simulations += looks
     # what explodes says nothing of a model near the data
     result[~(np.abs(result) < ENDLESS)] = np.nan
