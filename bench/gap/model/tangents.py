@@ -28,8 +28,8 @@ SMALL = 1.0
 def responses(
     world: World, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
 ) -> Array:
-    """What one more effect changes about the runs, to first order: (K, R, T, C), in single precision,
-    since it is the largest array of explain by far and a derivative.
+    """What one more effect changes about the runs, to first order: (K, R, T, C). In single
+    precision, since it is the largest array of explain by far, and a derivative.
 
     Args:
         world: the runs, of a robot.
