@@ -12,6 +12,7 @@ from sims.base import Array
 from sims.robot.lanes import Addresses, Mask
 from sims.robot.moment import RobotMoment
 from sims.robot.native import FIELDS
+from sims.robot.places import COMMON
 from sims.robot.remembered import advanced
 from sims.robot.series import is_series
 from sims.robot.system import RobotSystem
@@ -137,7 +138,7 @@ class Forces:
 
 def is_in_drive(effect: Effect) -> bool:
     """Whether its force is the drive's own, and a sensor of what drives exert shows it."""
-    return isinstance(effect, Force) and effect.at == "actuator"
+    return isinstance(effect, Force) and (effect.at == "actuator" or effect.of in COMMON)
 
 
 def exerted(acting: Acting, moment: RobotMoment) -> Array:

@@ -133,3 +133,12 @@ def test_an_effect_alone_and_the_same_one_in_its_family_act_side_by_side(arm, mo
     np.testing.assert_allclose(quick, made.simulate(theta, SCENARIO), rtol=1e-9, atol=1e-11)
     lane = [p.name for p in made.parameters].index("friction.load@*.coefficient@elbow")
     np.testing.assert_array_equal(quick[0], quick[lane])
+
+
+def test_a_sensor_of_the_drives_shows_what_one_battery_leaves_to_each(arm):
+    battery = arm.system.effect("supply.sag")
+    made = arm(effects=[battery], observe=["q.shoulder", "tau.shoulder", "tau.elbow"])
+    inputs = {"u.m_shoulder": np.full(60, 0.05), "u.m_elbow": np.ones(60)}
+    shown = made.simulate(np.array([[0.3], [0.0]]), Scenario(TIMES, {}, inputs))[:, 0, 1:]
+    np.testing.assert_allclose(shown[1], [60 * 0.05, 2.0])
+    np.testing.assert_allclose(shown[0], np.array([3.0, 2.0]) / (1 + 0.3 * 5.0))
