@@ -303,8 +303,7 @@ class Tangent:
             self._bench.batch.forward(None if n == self._bench.count else np.arange(n))
             carried = np.stack([bind(name)[:n, places.velocities] for name in SIDES])
         moment = moment_of(self._system, t, x, v, inputs, carried, self._stiff(n))
-        own_of = [(e, np.repeat(c, n, axis=1)) for e, c in self._asked if is_in_drive(e)]
-        self._exerted = exerted(tuple(own_of), moment) if own_of else np.zeros((0, 0))
+        self._exerted = np.zeros_like(x)
         for k, (effect, c) in enumerate(self._asked):
             own = np.repeat(c, n, axis=1)
             if isinstance(effect, Hidden):
@@ -319,7 +318,10 @@ class Tangent:
                 limit = np.maximum(effect.limit(own, moment)[:, 0], 0.0)
                 self._bench.rub(n, int(places.velocities[effect.coordinate]), limit)
             elif isinstance(effect, Force):
-                bind("qfrc_applied")[:n, places.velocities] += effect.force(own, moment)
+                force = effect.force(own, moment)
+                bind("qfrc_applied")[:n, places.velocities] += force
+                if is_in_drive(effect):
+                    self._exerted += force
 
     def _stiff(self, count: int) -> Array:
         """(count, D) of the servos, at so many instants."""
