@@ -86,7 +86,7 @@ class Hybrid(TuneNet):
 
     def _approach(self, run: History, task: Task) -> Simulates[bool]:
         """TuneNet's own steps, while they pay; returns whether they did to the end."""
-        estimate = self.fitted().estimator(task)
+        estimate = self.fitted().suited(task).estimator(task)
         search = RootSearch(task)
         guess = task.start
         lowest = np.inf

@@ -102,7 +102,7 @@ class TuneNet(PairTuner):
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
         """Algorithm 1, one simulation an iteration."""
-        estimate = self.fitted().estimator(task)
+        estimate = self.fitted().suited(task).estimator(task)
         search = RootSearch(task)
         guess = task.start
         while True:
@@ -150,7 +150,7 @@ class TuneNetPublished(PairTuner):
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
         """Algorithm 1; guesses are kept from falling below zero, and from nothing else."""
-        estimate = self.fitted().estimator(task)
+        estimate = self.fitted().suited(task).estimator(task)
         guess = task.start
         while True:
             evaluation = yield Ask(guess, recommend=guess)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -50,11 +51,21 @@ class TooFewError(ValueError):
     """A training budget that does not last for what is learned from it."""
 
 
+def uniform(simulator: Practice, rng: np.random.Generator, count: int) -> Array:
+    """Points (count, dim) drawn evenly from the training range."""
+    return simulator.sample(rng, count)
+
+
 def rehearse(
-    simulator: Practice, rng: np.random.Generator, budget: int, scenarios: int, each: int
+    simulator: Practice,
+    rng: np.random.Generator,
+    budget: int,
+    scenarios: int,
+    each: int,
+    drawn: Callable[[Practice, np.random.Generator, int], Array] = uniform,
 ) -> Rehearsal:
-    """Simulate `each` uniformly drawn points in each of `scenarios` scenarios, fewer scenarios if
-    the budget is small.
+    """Simulate `each` points, drawn by `drawn`, in each of `scenarios` scenarios, fewer scenarios
+    if the budget is small.
 
     Raises:
         TooFewError: the budget does not last for two scenarios.
@@ -69,7 +80,7 @@ def rehearse(
     observations = []
     scenes = []
     for _ in range(count):
-        points = simulator.sample(rng, each)
+        points = drawn(simulator, rng, each)
         simulated = simulator.simulate(rng, points)
         # a scenario with a failed simulation goes as a whole: arrays need as many in each
         if np.isfinite(simulated).all():

@@ -86,6 +86,8 @@ class FilmedBall(Simulator):
             packages.require()  # now, with one message, and not in the middle of a training
         self._tracked = film == "tracked"
         self._ball = Ball(self._of_ball(self.constant_values), ["x", "y", "z"], **settings)
+        # with the coefficients of effects that are not fixed
+        self.parameters = self._ball.parameters
 
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
         """Simulate each row of `theta` (n, 1); returns (n, T, C). See `Simulator.simulate`."""

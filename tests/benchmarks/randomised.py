@@ -27,7 +27,7 @@ from bench.runs.training import Lesson, train
 from bench.runs.worker import Order, perform
 from sims.files import write
 
-TUNERS = ("regressor", "tunenet")
+TUNERS = ("regressor", "tunenet", "in_context")
 TARGETS, CALIBRATION, BUDGET = 20, 60, 12
 COVERED = 0.9
 

@@ -22,7 +22,7 @@ from bench.problem.seeds import rng_for
 from bench.runs.drive import drive
 from bench.runs.evaluate import Evaluator
 from methods.base import NOTHING, Ask, Task
-from methods.learning.pair_fit import Fitted, PairTuner, Prepared
+from methods.learning.pair_fit import Fitted, PairTuner
 from methods.learning.pair_network import PUBLISHED, Design
 from methods.learning.reader import Reading
 from methods.learning.rehearsal import rehearse
@@ -56,13 +56,10 @@ class Variant(PairTuner):
     def reading(self):
         return self.reads
 
-    def learn(self, data, rng):
-        self._fitted = Prepared.train(self.built, data, rng, self.reads)
-
     def estimator(self, task):
         if not self.members:
-            return self.fitted().estimator(task)
-        each = [Prepared(m, m, np.full(1, np.inf)).estimator(task) for m in self.members]
+            return self.fitted().suited(task).estimator(task)
+        each = [m.estimator(task) for m in self.members]
         return lambda seen: np.mean([estimate(seen) for estimate in each], axis=0)
 
     def tune(self, task, rng):
@@ -233,7 +230,7 @@ def ensemble(study):
         study.problem.cube.training, 1,
                     (len(side.observed),))  # fmt: skip
         seen = study.problem.simulate(target.sealed.start[None], side.scenarios)
-        h = np.array([m.fitted().estimator(task)(seen)[0] for m in members])
+        h = np.array([m.fitted().suited(task).estimator(task)(seen)[0] for m in members])
         off = abs(h.mean() - (truth[0] - target.sealed.start[0]))
         spread.append((target.sealed.range, h.std(ddof=1), off))
     return pd.DataFrame(rows), pd.DataFrame(spread, columns=["range", "spread", "error"])

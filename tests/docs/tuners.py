@@ -12,6 +12,9 @@ import re
 from tests.docs.pages import ROOT
 
 SET = {
+    "e_i = P(e_j, a_j, s_j, r_j for j = i - k ... i - 1)": (
+        r"e_i = P\left(e_j, a_j, s_j, r_j \text{ for } j = i - k, \ldots, i - 1\right)"
+    ),
     "zeta_k = zeta_{k-1} + h(o_P, o_T)": r"\zeta_k = \zeta_{k-1} + h(o_P, o_T)",
     "s = -B^-1 h, at first B = -1, which is (1)": (
         r"s = -B^{-1} h, \quad \text{at first } B = -1, \text{ which is (1)}"

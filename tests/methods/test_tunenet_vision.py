@@ -64,7 +64,11 @@ def test_gaps_are_bridged_by_the_proposed_model(tuner):
             toy.lengths,
             toy.known(scenario),
         )
-        return abs(tuner.fitted().estimator(task)(toy.observe(np.array([[0.55]]), scenario))[0])
+        return abs(
+            tuner.fitted()
+            .suited(task)
+            .estimator(task)(toy.observe(np.array([[0.55]]), scenario))[0]
+        )
 
     hidden, held = target.copy(), target.copy()
     hidden[:20, 1], held[:20, 1] = np.nan, target[20, 1]
@@ -88,7 +92,7 @@ def test_sides_read_their_own_channels(tuner):
             toy.lengths,
             toy.known(scenario),
         )
-        return tuner.fitted().estimator(task)(shown)[0]
+        return tuner.fitted().suited(task).estimator(task)(shown)[0]
 
     blind, deaf = target.copy(), proposed.copy()
     blind[..., 0], deaf[..., 1] = 7.0, -7.0

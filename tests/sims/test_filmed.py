@@ -76,3 +76,14 @@ def test_an_unknown_film_and_missing_packages_are_one_line(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r'pip install -e "\.\[vision\]"'):
         FilmedBall(film="tracked")
+
+
+def test_free_effects_act_on_the_ball_before_the_camera():
+    fall = Scenario(TIMES, {"z": 4.0}, {}, {"camera_distance": 7.0})
+    free = FilmedBall(CONSTANTS, effects=["drag.quadratic"])
+    assert [parameter.name for parameter in free.parameters] == ["restitution", "drag.quadratic"]
+    seen = free.simulate(np.array([[0.6, 0.0], [0.6, 0.1]]), fall)
+    fixed = FilmedBall(CONSTANTS, fixed={"drag.quadratic": [0.1]})
+    assert np.array_equal(seen[1], fixed.simulate(np.array([[0.6]]), fall)[0])
+    assert np.array_equal(seen[0], FilmedBall(CONSTANTS).simulate(np.array([[0.6]]), fall)[0])
+    assert np.abs(seen[1] - seen[0])[:, 0].max() > 0.1

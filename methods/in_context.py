@@ -1,0 +1,245 @@
+"""A network that sees the whole history of a tuning and proposes what to try next.
+
+The idea is CAPTURE's: X. Zhang, S. Liu, P. Huang, W. J. Han, Y. Lyu, M. Xu, D. Zhao, Dynamics as
+Prompts: In-Context Learning for Sim-to-Real System Identifications, IEEE Robotics and Automation
+Letters, 2025, arXiv 2410.20357. There a causal transformer P reads the last k iterations with their
+parameters e, actions a, simulated and real trajectories s and r,
+
+    (1)  e_i = P(e_j, a_j, s_j, r_j for j = i - k ... i - 1)
+
+and learns to continue randomised binary searches (its Algorithm 1), whose targets are known, so
+that it goes on searching where none is. It needs no gradient and no training on the target.
+
+What is kept: the history as context, the causal transformer, histories made by Algorithm 1 from the
+training range, the last k simulations as the window. What is not: the policy that chooses a new
+action at each step, since a target here is one observation. What is changed, because it measured
+better (docs/tunenet.md): the target's parameters are learned and not the search's next point; every
+simulation of a scenario serves as the target of the others, in any order; what is proposed is a
+step from the last simulation that vanishes with the difference of what they show; a first guess is
+made from the target alone. `published` takes these changes back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+
+from methods.base import Array, Ask, Practice, Steps, Task, Tuner
+from methods.learning.histories import Histories, binary_search, in_order, shuffled
+from methods.learning.prepared import Prepared, checked, heard
+from methods.learning.reader import Reader, Reading
+from methods.learning.rehearsal import Rehearsal, rehearse
+from methods.learning.sequence_network import Design, proposals, shapes
+from methods.learning.sequence_training import Material, Watched, train
+from methods.tunenet import SETTLED
+
+_BOX = "box"
+"""Name of the array that holds the training range."""
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A trained network together with what it reads.
+
+    Attributes:
+        design: how the network is built.
+        read: observations and scenes to input rows.
+        weights: the network's arrays by name.
+        box: (2, dim) the training range, unit cube.
+    """
+
+    design: Design
+    read: Reader
+    weights: dict[str, Array]
+    box: Array
+
+    def seen(self, rows: Array) -> Array:
+        """Input rows (n, D) through W (n, d)."""
+        return rows @ self.weights["seen.weight"]
+
+    def following(self, target: Array, shown: list[Array], tried: list[Array]) -> Array:
+        """What to try next (dim,), unit cube, of a target and simulations (d,) at points (dim,)."""
+        window = self.design.window
+        half = (self.box[1] - self.box[0]) / 2.0
+        middle = self.box.mean(axis=0)
+        seen = np.array(shown[-window:]).reshape(-1, target.size)
+        points = np.array(tried[-window:]).reshape(-1, half.size)
+        out = proposals(np, self.weights, self.design, target, seen, (points - middle) / half)
+        following: Array = np.clip(middle + half * out[-1], 0.0, 1.0)
+        return following
+
+    def state(self) -> dict[str, Array]:
+        """Everything as plain arrays."""
+        return self.read.state() | self.weights | {_BOX: self.box}
+
+    @classmethod
+    def restored(cls, state: dict[str, Array], design: Design, reading: Reading) -> Learned:
+        """The inverse of `state`.
+
+        Raises:
+            ValueError: arrays of other names or shapes, or numbers that are not finite.
+        """
+        read, arrays = Reader.restored(state, reading)
+        dim = arrays.get("guess.bias", np.empty(0)).size
+        expected = shapes(read.size, dim, design) | {_BOX: (2, dim)}
+        weights = checked(arrays, expected)
+        return cls(design, read, weights, weights.pop(_BOX))
+
+
+@dataclass(eq=False)
+class InContext(Tuner):
+    """A causal transformer, trained on simulated tuning histories, reads what was tried and seen
+    and proposes the next point; it recommends its newest.
+
+    The first proposal comes from the target alone. A simulation that failed is left out of the
+    history.
+
+    Attributes:
+        published: the published aim: it learns the next point of a randomised binary search, from
+            histories in their order, and begins at the start it is given.
+        window: simulations of the history that it looks back at.
+        scenarios: training scenarios, at most as many as the budget allows.
+        each: simulations in each scenario, at least 2 (dim + 1): a target and a search for it.
+        points: points to which each run is resampled.
+        inputs: inputs kept of those an observation offers.
+        strictness: see `methods.learning.pair_inputs.weighed_inputs`.
+        noise: as in `methods.tunenet.TuneNet`.
+        epochs: passes over the training scenarios.
+        rate: learning rate at the beginning.
+        weight_decay: times the squared norm of the weights, added to the loss.
+        told: as in `methods.tunenet.TuneNet`.
+        channels: first and last channel that is read, by number; None for all.
+        clean: as in `methods.tunenet.TuneNet`.
+    """
+
+    name: ClassVar[str] = "in_context"
+    requires: ClassVar[tuple[str, ...]] = ("torch",)
+    stochastic: ClassVar[bool] = False
+    learned: ClassVar[bool] = True
+
+    published: bool = False
+    window: int = 7
+    scenarios: int = 100
+    each: int = 8
+    points: int = 400
+    inputs: int = 400
+    strictness: float = 1000.0
+    noise: float = 0.01
+    epochs: int = 80
+    rate: float = 3e-3
+    weight_decay: float = 1e-5
+    told: bool = True
+    channels: tuple[int, int] | None = None
+    clean: bool = True
+
+    _prepared: Prepared[Learned] | None = None
+
+    def design(self) -> Design:
+        """How the network is built and trained."""
+        return Design(
+            self.window,
+            published=self.published,
+            epochs=self.epochs,
+            rate=self.rate,
+            weight_decay=self.weight_decay,
+        )
+
+    def reading(self) -> Reading:
+        """What it reads."""
+        return Reading(
+            self.points,
+            self.inputs,
+            self.strictness,
+            self.noise,
+            told=self.told,
+            channels=self.channels,
+            clean=self.clean,
+        )
+
+    def fit(self, simulator: Practice, rng: np.random.Generator, budget: int) -> None:
+        """Train on at most `budget` simulations of the training range.
+
+        Raises:
+            ValueError: a budget of less than two scenarios.
+        """
+        each = max(self.each, 2 * (simulator.dim + 1))
+        data = rehearse(simulator, rng, budget, self.scenarios, each, binary_search)
+        watch = self.watch
+        apart = None
+        if watch is not None:
+            ground = watch.ground
+            # simulations of their own, from a stream of their own: training does not notice
+            stream = np.random.default_rng(0)
+            apart = rehearse(ground, stream, ground.budget, self.scenarios, each, binary_search)
+        box = np.array(simulator.training, dtype=np.float64)
+
+        def learned(stage: str, shown: Rehearsal, noise: Array | None) -> Learned:
+            read = Reader.learned(shown, self.reading())
+            watched = None
+            if watch is not None and apart is not None:
+                material = _material(read, heard(apart, noise), box)
+                watched = Watched(material, partial(watch.epoch, stage))
+            design = self.design()
+            material = _material(read, shown, box)
+            weights = train(material, partial(self._histories, each), design, rng, watched)
+            return Learned(design, read, weights, box)
+
+        self._prepared = Prepared.train(data, rng, self.reading(), learned)
+
+    def _histories(self, each: int, rng: np.random.Generator) -> Histories:
+        """Of a batch, from so many simulations in each scenario."""
+        window = min(self.window, each - 1)
+        return in_order(each, window) if self.published else shuffled(rng, each, window)
+
+    def state(self) -> dict[str, Array]:
+        """The network's weights and what it reads, by name; empty before `fit`."""
+        return {} if self._prepared is None else self._prepared.state()
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Take back what `state` gave.
+
+        Raises:
+            ValueError: arrays of other names or shapes, or numbers that are not finite.
+        """
+        design, reading = self.design(), self.reading()
+        self._prepared = Prepared.restored(
+            state, reading, lambda part: Learned.restored(part, design, reading)
+        )
+
+    def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
+        """One simulation an iteration, until the proposal no longer changes."""
+        if self._prepared is None:
+            raise RuntimeError("in_context has not been trained; call fit or restore first")
+        network = self._prepared.suited(task)
+        missing = np.isnan(task.observed)
+        row = network.read(task.observed[None], task.lengths, task.scene, missing)
+        target = network.seen(row)[0]
+        shown: list[Array] = []
+        tried: list[Array] = []
+        guess = task.start if self.published else network.following(target, shown, tried)
+        while True:
+            evaluation = yield Ask(guess, recommend=guess)
+            point = evaluation.proposals[0]
+            if np.isfinite(evaluation.observations).all():
+                row = network.read(evaluation.observations, task.lengths, task.scene, missing)
+                shown.append(network.seen(row)[0])
+                tried.append(point)
+                guess = network.following(target, shown, tried)
+                if np.abs(guess - point).max() <= SETTLED:
+                    return "the proposal no longer changes"
+            else:
+                # half the way back to where one succeeded, or should
+                refuge = tried[-1] if tried else task.training.mean(axis=0)
+                guess = (point + refuge) / 2.0
+
+
+def _material(read: Reader, data: Rehearsal, box: Array) -> Material:
+    """What is learned from: histories see simulations as they are, targets through the sensor."""
+    half = (box[1] - box[0]) / 2.0
+    parameters = (data.parameters - box.mean(axis=0)) / half
+    target = read.table(data)
+    shown = target if data.unspoilt is None else read.table(data.pure)
+    return Material(shown, target, parameters)
