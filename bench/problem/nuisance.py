@@ -42,21 +42,25 @@ class Randomised(Protocol):
 
 
 class Nuisance:
-    """The simulator of a problem with further effects, whose coefficients are drawn.
+    """The simulator of a problem with further effects, whose coefficients are drawn; those that it
+    has already with a fixed coefficient are left as they are.
 
     Args:
         problem: what is trained on.
 
     Raises:
-        InputError: an effect that the simulator cannot have, or has already.
+        InputError: an effect that the simulator cannot have, or that is tuned.
     """
 
     def __init__(self, problem: Randomised) -> None:
         self._problem = problem
         experiment = problem.experiment
         ranges = dict(experiment.nuisance)
-        names = list(dict.fromkeys(_effect(name) for name in ranges))
         settings: dict[str, Any] = dict(experiment.settings)
+        # what it was extended with is known, and acts as it is
+        known = settings.get("fixed", {})
+        ranges = {name: ends for name, ends in ranges.items() if _effect(name) not in known}
+        names = list(dict.fromkeys(_effect(name) for name in ranges))
         settings["effects"] = [*settings.get("effects", ()), *names]
         observe = [channel.name for channel in problem.channels]
         who = f"experiment {experiment.name}: nuisance"
@@ -105,5 +109,5 @@ def _in_order(
     for name in ranges:
         if name not in names:
             raise InputError(f"{who}: expected one of {', '.join(names)}, found {name}")
-    ends = np.array([ranges.get(name, (0.0, 0.0)) for name in names])
+    ends = np.array([ranges.get(name, (0.0, 0.0)) for name in names]).reshape(-1, 2)
     return ends[:, 0], ends[:, 1]

@@ -12,7 +12,7 @@ import numpy as np
 
 from sims.ball.simulator import Ball
 from sims.ball.system import BallSystem
-from sims.base import Array, Channel, Constant, InputError, Scenario, Simulator
+from sims.base import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator
 from sims.camera import packages
 from sims.camera.camera import Camera
 from sims.limits import LENGTH, PIXELS, TURN
@@ -45,7 +45,7 @@ class FilmedBall(Simulator):
 
     name = "ball-filmed"
     says = "a bouncing ball before a fixed camera"
-    parameters = BallSystem.parameters
+    parameters: tuple[Parameter, ...] = BallSystem.parameters
     channels = (
         Channel("z", "m", says="height of the centre above the ground"),
         Channel("v", "px", says="pixel row of the middle of the ball's outline, down from the top"),

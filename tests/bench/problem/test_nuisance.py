@@ -75,3 +75,18 @@ def test_what_it_cannot_train_over_is_refused():
         Nuisance(Problem(replace(SHOT, nuisance={"drag.cubic": (0.0, 1.0)})))
     with pytest.raises(InputError, match=r"expected one of wind.drag, wind.x, .*found wind.up"):
         Nuisance(Problem(replace(load("ball-drop"), nuisance={"wind.up": (0.0, 1.0)})))
+
+
+def test_what_the_simulator_was_extended_with_acts_as_it_is_known():
+    settings = {**SHOT.settings, "fixed": {"restitution.speed": [-0.1]}}
+    both = {**SHOT.nuisance, "drag.quadratic": (0.05, 0.1)}
+    extended = replace(SHOT, settings=settings, nuisance=both)
+    problem = Problem(extended)
+    point, rng = np.full((9, 1), 0.6), np.random.default_rng(0)
+    scenarios = problem.scenarios(rng)
+    seen = Nuisance(problem).simulate(rng, point, scenarios)
+    assert len(np.unique(seen[:, -1, 0])) > 1, "the others are still drawn"
+    alone = replace(extended, nuisance={"restitution.speed": (-0.2, 0.0)})
+    seen = Nuisance(Problem(alone)).simulate(rng, point, scenarios)
+    assert np.array_equal(seen, problem.simulate(point, scenarios))
+    assert not np.array_equal(seen, Problem(SHOT).simulate(point, scenarios))
