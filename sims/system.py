@@ -218,8 +218,9 @@ class System(ABC):
         rates: state names of the generalised velocity, in order.
         states: defaults of both.
         bounces: whether its last coordinate strikes ground at `floor`.
-        floats: whether bodies of it have poses that are no coordinates: where a run begins with
-            them is known, and where a part of one does is not.
+        afloat: units by name of the states that are poses and velocities of bodies that float, and
+            no coordinates: where a run begins with them is known, and where a part of one does is
+            not.
         sensed: channels that sensor effects may act on, in order of preference.
         primary: index of the coordinate that biases and springs act on.
         servo: input that is the set point of a servo's primary coordinate; empty where none is.
@@ -249,7 +250,7 @@ class System(ABC):
     primary: ClassVar[int] = 0
     servo: ClassVar[str] = ""
     bounces: ClassVar[bool] = False
-    floats: ClassVar[bool] = False
+    afloat: ClassVar[Mapping[str, str]] = {}
     uniform: ClassVar[bool] = False
     guided: ClassVar[int] = 0
     bends: ClassVar[bool] = False

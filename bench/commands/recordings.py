@@ -147,6 +147,7 @@ def _simulate(options: argparse.Namespace, say: Say) -> Answer:
 def _inspect(options: argparse.Namespace, say: Say) -> Answer:
     from bench.figures.recording import draw
     from bench.recordings import facts, robotic
+    from bench.recordings.afloat import unplaced
     from bench.recordings.census.census import census
     from bench.recordings.inspection import load, summary
     from bench.recordings.stamps import oddities
@@ -158,7 +159,8 @@ def _inspect(options: argparse.Namespace, say: Say) -> Answer:
         raise InputError("--free says what --check asks about; give --check besides")
     recording, kind = load(options.recording, options.system, options.model)
     about = list(robotic.about(kind))
-    odd = [*(o.text for o in oddities(recording, kind)), *robotic.odd(recording, kind)]
+    found = [*oddities(recording, kind), *unplaced(recording, kind)]
+    odd = [*(o.text for o in found), *robotic.odd(recording, kind)]
     findings = list(census(recording, kind))
     for line in (
         *about,

@@ -78,12 +78,14 @@ def _end(model: Any, data: Any, body: int, begin: Array) -> Array:
 
 
 def _bases(robot: Robot, data: Any) -> list[Array]:
-    """(3,) each: where what moves is fixed to what does not."""
+    """(3,) each: where what moves is fixed to what does not; what floats is fixed to nothing."""
     model = robot.compiled
+    afloat = {int(model.jnt_bodyid[joint.id]) for joint in robot.joints if joint.kind == "free"}
     found = []
     for body in range(1, model.nbody):
         parent = int(model.body_parentid[body])
-        if int(model.body_weldid[body]) and not int(model.body_weldid[parent]):
+        still = not int(model.body_weldid[parent])
+        if int(model.body_weldid[body]) and still and body not in afloat:
             found.append(np.array(data.xpos[parent]) if parent else _begin(model, data, body))
     return found
 

@@ -90,7 +90,7 @@ def view(robot: Robot, data: Any) -> View:
     azimuth, elevation = _direction(robot, data)
     axes = _axes(azimuth, elevation)
     moving, still = outlines(robot.compiled, data)
-    points = np.concatenate([data.xanchor, moving]) @ axes.T
+    points = np.concatenate([data.xanchor, moving, _tips(robot.compiled, data)]) @ axes.T
     low, high = points.min(axis=0), points.max(axis=0)
     if len(still):
         # A floor or a long rail would make the robot small.
@@ -101,6 +101,16 @@ def view(robot: Robot, data: Any) -> View:
     width, height = np.maximum((high - low)[:2], LEAST) * (1 + 2 * MARGIN)
     width, height = max(width, SLIMMEST * height), max(height, SLIMMEST * width)
     return View(azimuth, elevation, (low + high) / 2 @ axes, float(width), float(height))
+
+
+def _tips(model: Any, data: Any) -> Array:
+    """(N, 3) how far bodies without shapes are drawn that carry no other: as far behind their
+    centre of mass as that is from their joint.
+    """
+    bare = set(range(1, model.nbody)) - {*model.geom_bodyid.tolist(), *model.body_parentid.tolist()}
+    jointed = [body for body in sorted(bare) if int(model.body_jntadr[body]) >= 0]
+    tips: Array = 2 * data.xipos[jointed] - data.xanchor[model.body_jntadr[jointed]]
+    return tips
 
 
 def _direction(robot: Robot, data: Any) -> tuple[float, float]:

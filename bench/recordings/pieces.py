@@ -64,7 +64,7 @@ def cut(
     if seconds is None and (whole or not kind.has_model):
         return Cut(recording, "")
     robot: Any = kind
-    floats = kind.has_model and robot.system.floats
+    floats = kind.has_model and bool(robot.system.afloat)
     if floats and seconds is not None:
         raise InputError(
             f"{recording.path}: expected no --pieces: bodies of {recording.system} float, and "

@@ -20,7 +20,7 @@ from bench.registry import robot, simulators
 from sims import effects as library
 from sims.base import Array, InputError, Scenario, Simulator
 from sims.limits import BRIEFEST, FASTEST, LARGEST, cut, is_number
-from sims.recording.description import ModelFile
+from sims.recording.description import ModelFile, afloat
 from sims.recording.recording import Recording, Run
 from sims.recording.write import refuse_existing, write_recording
 from sims.simulated import Simulated
@@ -223,7 +223,10 @@ class _Maker:
             rng = self._rng("noise", name, number)
             channels[name] = values + sigma * rng.standard_normal(values.size)
         held_out = number > self.wish.runs - self.held_out
-        return Run(str(number), self.times, channels, scenario.inputs, {}, {}, held_out)
+        # where a body floats nobody estimates, so that it is no secret
+        states = {**self.kind.states, **scenario.initial}
+        begun = {name: states[name] for name in afloat(self.kind)}
+        return Run(str(number), self.times, channels, scenario.inputs, {}, begun, held_out)
 
     def _rng(self, what: str, name: str, number: int) -> np.random.Generator:
         return rng_for("simulate", self.name, what, name, self.wish.seed, number)

@@ -22,6 +22,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bench.recordings import poses
+from bench.recordings.afloat import unplaced
 from bench.recordings.oddity import Oddity
 from bench.sizes import INSIST
 from sims.base import Array, InputError, Simulator
@@ -59,7 +60,11 @@ def refuse_odd(recording: Recording, kind: type[Simulator], force: bool = False)
         InputError: they cannot be, in one line.
     """
     # Positions of a wrong unit make stamps look odd, and not the other way round.
-    found = [*poses.odd_poses(recording, kind), *oddities(recording, kind)]
+    found = [
+        *poses.odd_poses(recording, kind),
+        *oddities(recording, kind),
+        *unplaced(recording, kind),
+    ]
     for oddity in found:
         if oddity.certain and not force:
             raise InputError(f"{recording.path}: {oddity.text}, {INSIST}")

@@ -71,6 +71,8 @@ class Description:
         constants: known numbers, SI units.
         runs: by name, only those the description mentions.
         extra: units of columns that belong to no channel or input, as written.
+        begins: how those of them become SI that are states of what floats, which no channel shows:
+            a run begins as their first cells say.
         linear: inputs that go straight from one sample to the next.
         sources: where the columns stand.
     """
@@ -83,6 +85,7 @@ class Description:
     constants: Mapping[str, float]
     runs: Mapping[str, RunMarks]
     extra: Mapping[str, str]
+    begins: Mapping[str, Scale]
     linear: frozenset[str]
     sources: Sources
 
@@ -170,6 +173,7 @@ def read_description(path: Path, declared: Declared) -> Description:
     if "free" in meta and "model" not in meta:
         raise fault(path, "free", "it with model = FILE alone (else --free A,B)", meta["free"])
     title = text(path, "title", meta.get("title", path.stem))
+    _refuse_poses(path, meta, declared)
     channels = _columns(path, "channel", meta, declared.channels)
     inputs = _columns(path, "input", meta, declared.inputs)
     if not channels:
@@ -181,6 +185,7 @@ def read_description(path: Path, declared: Declared) -> Description:
     runs = {name: _run(path, name, own, declared) for name, own in marks.items()}
     # A robot has no name of a system: its model file stands for it.
     robotic = declared.has_model
+    extra = _extra(path, meta, declared)
     return Description(
         system=declared.name if robotic else _system(path, meta),
         title=title,
@@ -189,7 +194,8 @@ def read_description(path: Path, declared: Declared) -> Description:
         noise=_noises(path, channels, declared),
         constants=constants,
         runs=runs,
-        extra=_extra(path, meta, declared),
+        extra=extra,
+        begins=_begins(path, extra, declared),
         linear=frozenset(name for name, column in inputs.items() if _hold(path, name, column)),
         sources=read_sources(
             path,
@@ -217,6 +223,24 @@ def _system(path: Path, meta: Mapping[str, Any]) -> str:
     if not isinstance(system, str):
         raise fault(path, "", 'system = "NAME"', system)
     return system
+
+
+def afloat(declared: Declared) -> Mapping[str, str]:
+    """Units of the states of what floats, by name; none of what is no robot."""
+    system = getattr(declared, "system", declared)
+    units: Mapping[str, str] = getattr(system, "afloat", {})
+    return units
+
+
+def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: Declared) -> None:
+    """Refuse what floats among the channels, and say where it belongs."""
+    units = afloat(declared)
+    given = _dotted(table(path, "channels", meta.get("channels", {})), units)
+    for name in (name for name in units if name in given):
+        raise InputError(
+            f"{path}: channel {name}: expected a joint or a sensor, found where a body floats; as "
+            f'[extra."{name}"] the column\'s first cell says where a run begins'
+        )
 
 
 def _columns(
@@ -304,6 +328,18 @@ def _extra(path: Path, meta: Mapping[str, Any], declared: Declared) -> dict[str,
         _known(path, f"extra.{name}", entry, ("unit",))
         units[name] = unit
     return units
+
+
+def _begins(path: Path, extra: Mapping[str, str], declared: Declared) -> dict[str, Scale]:
+    """How columns become SI that say where what floats is."""
+    begins = {}
+    for name, unit in afloat(declared).items():
+        if name in extra:
+            try:
+                begins[name] = scale(extra[name], unit)
+            except InputError as error:
+                raise InputError(f"{path}: extra {name}: {error}") from None
+    return begins
 
 
 def _run(path: Path, name: str, value: Any, declared: Declared) -> RunMarks:

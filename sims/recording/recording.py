@@ -181,13 +181,15 @@ def _run(table: Path, part: TableRun, about: Description) -> Run:
     inputs = {n: _converted(table, part, n, s) for n, s in about.inputs.items()}
     # no system reads them, so they keep their unit; of logs nobody has asked for any
     extra = {name: part.columns[name] for name in about.extra if name in part.columns}
+    first = {n: s.gain * extra[n][0] + s.offset for n, s in about.begins.items() if n in extra}
+    begins = {name: float(value) for name, value in first.items() if np.isfinite(value)}
     return Run(
         part.name,
         part.times,
         channels,
         inputs,
         marks.constants,
-        marks.initial,
+        {**begins, **marks.initial},
         bool(marks.held_out),
         extra,
         about.linear,

@@ -79,6 +79,16 @@ class Floating:
         velocities = [f"qd.{name}.{axis}" for name, own in axes for axis in own + SPIN]
         return positions, velocities
 
+    def units(self) -> dict[str, str]:
+        """Of both, by name: m and m/s by the world's axes, 1 of a quaternion, rad/s."""
+        units: dict[str, str] = {}
+        for joint in self.joints:
+            units |= {f"q.{joint.name}.{axis}": "m" for axis in _axes(joint)}
+            units |= {f"q.{joint.name}.{axis}": "1" for axis in TURN}
+            units |= {f"qd.{joint.name}.{axis}": "m/s" for axis in _axes(joint)}
+            units |= {f"qd.{joint.name}.{axis}": "rad/s" for axis in SPIN}
+        return units
+
     def states(self, model: Any) -> dict[str, float]:
         """What the file has, by name."""
         positions, velocities = self.names()

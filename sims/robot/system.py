@@ -189,7 +189,7 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
         "states": MappingProxyType(states),
         "sensed": tuple(c.name for c in channels),
         "robot": robot,
-        "floats": bool(floating),
+        "afloat": MappingProxyType(floating.units()),
         "spots": places.spots(robot, [(c.name, c.unit) for c in channels]),
         "alone": tuple(OneJoint() if j.kind == "hinge" else Slide() for j in joints),
         "drives": drives,

@@ -40,7 +40,7 @@ def pieces(world: World) -> World | None:
     to rest is searched for a minimum among hundreds of small bounces (minutes, on the exam's
     updrafts).
     """
-    if world.simulator.system.bounces or world.simulator.system.floats:
+    if world.simulator.system.bounces or world.simulator.system.afloat:
         return None
     runs = [piece for run in world.runs for piece in _cut(run)]
     if len(runs) == len(world.runs):

@@ -65,9 +65,11 @@ def tracked(
     constants = {**recording.constants, **run.constants}
     guesses = _guessed(run, simulator)
     fixed = {*run.initial, *_hidden(simulator)}
+    # what is none of the states, as the pose of what floats, is no lane's own
+    begun = {name: value for name, value in run.initial.items() if name not in states}
     return Track(
         name=run.name,
-        scenario=Scenario(run.times, {}, run.inputs, constants, run.linear, run.offset),
+        scenario=Scenario(run.times, begun, run.inputs, constants, run.linear, run.offset),
         observed=np.stack(columns, axis=1),
         guess=np.array([guesses[name] for name in states]),
         known=np.array([name in fixed for name in states]),

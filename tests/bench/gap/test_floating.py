@@ -3,11 +3,16 @@
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
+from bench.cli import main
 from bench.gap.explain import explain
+from bench.recordings.inspection import load
+from bench.recordings.stamps import refuse_odd
 from sims.base import InputError, Scenario
+from sims.recording.recording import read_recording
 from tests.sims.robot.test_floating import SATELLITE
 from tests.sims.robot.test_motion import kind_of
 
@@ -61,17 +66,22 @@ def motion(run):
     return np.array([b - a for a, b, *_ in states])
 
 
-def recorded(tmp_path):
+STATED = "".join(f'[runs.{k}.initial]\n"qd.base.wz" = {spin}\n' for k, spin in enumerate(SPINS))
+TURNING = '[extra."qd.base.wz"]\nunit = "deg/s"\n'
+"""The spin as a column of the log."""
+
+
+def recorded(tmp_path, toml=TOML + STATED, runs=3, spins=False):
     rng = np.random.default_rng(4)
-    lines = ["run,t,u.m_boom,q.boom"]
-    for run in range(3):
+    lines = ["run,t,u.m_boom,q.boom" + ",qd.base.wz" * spins]
+    for run in range(runs):
         seen = motion(run) + rng.normal(0.0, 1e-3, TIMES.size)
+        more = f",{np.rad2deg(SPINS[run]):.9g}" * spins
         columns = zip(TIMES, commands(run), seen, strict=True)
-        lines += [f"{run},{t:.9g},{u:.9g},{q:.9g}" for t, u, q in columns]
-    begins = [f'[runs.{k}.initial]\n"qd.base.wz" = {spin}\n' for k, spin in enumerate(SPINS)]
+        lines += [f"{run},{t:.9g},{u:.9g},{q:.9g}{more}" for t, u, q in columns]
     (tmp_path / "satellite.xml").write_text(MODEL)
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
-    (tmp_path / "log.toml").write_text(TOML + "".join(begins))
+    (tmp_path / "log.toml").write_text(toml)
     return tmp_path / "log.csv"
 
 
@@ -86,3 +96,84 @@ def test_a_hull_that_spins_swings_its_boom_as_two_bodies_in_a_plane(run):
 def test_pieces_of_what_floats_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"log\.csv: expected no --pieces: .* leave it out"):
         explain(recorded(tmp_path), pieces=1.0)
+
+
+def test_a_column_says_where_a_run_begins(tmp_path):
+    path = recorded(tmp_path, TOML + TURNING, spins=True)
+    recording, kind = load(path)
+    found = [run.initial["qd.base.wz"] for run in recording.runs]
+    np.testing.assert_allclose(found, SPINS, rtol=1e-6)
+    assert refuse_odd(recording, kind) == []
+    path.with_suffix(".toml").write_text(TOML + TURNING + '[runs.0.initial]\n"qd.base.wz" = 7.0\n')
+    assert read_recording(path, kind).runs[0].initial == {"qd.base.wz": 7.0}, "stated in its place"
+
+
+SINGLE = TOML.partition("[runs")[0]
+BAD = {
+    "nothing said": (
+        TOML, 3, False,
+        r"run 0: nothing says where base begins; state \[runs\.0\.initial\], of q\.base\.x, .*, "
+        r"qd\.base\.wz \(what is left out is as in the model file, at rest\), or insist",
+    ),
+    "one run without": (
+        TOML + STATED.partition("[runs.2")[0], 3, False,
+        r"run 2: nothing says where base begins; state \[runs\.2\.initial\]",
+    ),
+    "a single run": (
+        SINGLE + STATED.partition("[runs.1")[0], 1, False,
+        r"run 0: nothing says where base is when the last third of a single run begins; record",
+    ),
+    "a channel": (
+        TOML + STATED + TURNING.replace("extra", "channels"), 3, True,
+        r'channel qd\.base\.wz: expected a joint or a sensor, .*; as \[extra\."qd\.base\.wz"\]',
+    ),
+    "a unit": (
+        TOML + TURNING.replace("deg/s", "m/s"), 3, True,
+        r"extra qd\.base\.wz: expected a unit that converts to rad/s, found 'm/s'",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_where_it_begins_is_asked_for_in_one_line(name, tmp_path):
+    toml, runs, spins, message = BAD[name]
+    path = recorded(tmp_path, toml, runs, spins)
+    with pytest.raises(InputError, match=rf"log\.(csv|toml): {message}") as raised:
+        refuse_odd(*load(path))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_simulated_log_says_where_its_runs_began(tmp_path):
+    (tmp_path / "satellite.xml").write_text(MODEL)
+    given = ["simulate", "--model", str(tmp_path / "satellite.xml"), "--runs", "2"]
+    given += ["--seconds", "0.5", "--initial", "qd.base.wz=-1:1", "--out"]
+    assert main([*given, str(tmp_path / "made.csv")]) == 0
+    recording, kind = load(tmp_path / "made.csv")
+    one, other = (run.initial["qd.base.wz"] for run in recording.runs)
+    assert one != other
+    assert refuse_odd(recording, kind) == []
+
+
+def compared(tmp_path, *given):
+    """The last row of every run of least squares on it."""
+    free = ["--free", "damping@boom", "--tuners", "least_squares", "--targets", "1", "--seeds", "1"]
+    size = ["--budget", "12", "--jobs", "0", "--trust", "--out", str(tmp_path / "out")]
+    assert main(["compare", *given, *free, *size]) == 0
+    rows = pd.read_parquet(tmp_path / "out" / "runs.parquet").sort_values("k")
+    return rows.groupby("target").last()
+
+
+def test_a_log_of_what_floats_is_tuned_to(tmp_path):
+    last = compared(tmp_path, "--recording", str(recorded(tmp_path)))
+    found = last["recommendation_drag.linear@boom"].to_numpy()
+    assert found == pytest.approx(TRUE, rel=0.02), "from the spins that the log states"
+    assert last["heldout_error_q.boom"].to_numpy() < 2e-3
+
+
+def test_what_floats_is_tuned_to_simulations_of_itself(tmp_path):
+    (tmp_path / "satellite.xml").write_text(MODEL)
+    last = compared(tmp_path, "--model", str(tmp_path / "satellite.xml"))
+    truth = last["true_drag.linear@boom"].to_numpy()
+    assert len(set(truth.tolist())) > 1
+    found = last["recommendation_drag.linear@boom"].to_numpy()
+    np.testing.assert_allclose(found, truth, atol=1e-3)

@@ -1,0 +1,32 @@
+"""Whether a recording says where bodies that float begin: nothing of that is estimated, and from
+elsewhere the same commands make another motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from bench.recordings.oddity import Oddity
+from sims.base import Simulator
+from sims.recording.description import afloat
+from sims.recording.recording import Recording
+
+
+def unplaced(recording: Recording, kind: type[Simulator]) -> Iterator[Oddity]:
+    """Joints of what floats of which a run states nothing; its first such run stands for all."""
+    own: dict[str, list[str]] = {}
+    for name in afloat(kind):
+        joint = name.split(".", 1)[1].rpartition(".")[0]
+        own.setdefault(joint, []).append(name)
+    for joint, states in own.items():
+        found = (run for run in recording.runs if run.initial.keys().isdisjoint(states))
+        run = next(found, None)
+        if run is None:
+            continue
+        names = [other.name for other in recording.runs]
+        if names.count(run.name) > 1:
+            what = f"where {joint} is when the last third of a single run begins; record another"
+        else:
+            what = f"where {joint} begins; state [runs.{run.name}.initial], of {', '.join(states)}"
+            what = f"{what} (what is left out is as in the model file, at rest)"
+        yield Oddity(f"run {run.name}: nothing says {what}", True)
