@@ -46,6 +46,7 @@ def tunenet():
     _marks(page)
     _cost(page)
     _misspecified(page)
+    _history(page)
     return page
 
 
@@ -155,6 +156,42 @@ def _misspecified(page):
             for system in ("shot", "ball")
         ),
     )
+
+
+def _history(page):
+    """A network that reads the history."""
+
+    def error(experiment, kind, k, *tuners):
+        """Means, in training widths."""
+        where = {"experiment": experiment, "range": kind, "simulations": k}
+        return [one("history/errors.csv", "mean", tuner=tuner, **where) for tuner in tuners]
+
+    def mended(tuner, model):
+        """Means on shot and ball, before or after explain."""
+        where = {"tuner": tuner, "model": model, "metric": "param_error"}
+        return [
+            one("history/missing.csv", "mean", experiment=f"misspecified-{system}", **where)
+            for system in ("shot", "ball")
+        ]
+
+    drop, swing = "ball-drop", "pendulum-swing"
+    both = "in_context", "tunenet"
+    page.says("in range {} against `tunenet`'s {}, on", *error(drop, "in", 1, *both))
+    page.says("on `pendulum-swing` {} against {}, outside", *error(swing, "in", 1, *both))
+    page.says("outside its range {} against {}; on", *error(swing, "wide", 1, *both))
+    page.says("range it loses, {} against {}.", *error(drop, "wide", 1, *both))
+    page.says(
+        "`hybrid` is at {} after 20 simulations of the pendulum where it is at {}.",
+        *error(swing, "in", 20, "hybrid", "in_context"),
+    )
+    windows = "window-1", "in_context"
+    page.says("as good: {} against {} after three", *error(drop, "in", 3, *windows))
+    page.says("of `ball-drop`, {} against {} on", *error(swing, "in", 3, *windows))
+    ends = [error(name, "in", 20, "published-3")[0] for name in (drop, swing)]
+    page.says("most of it**: {} and {} after 20", *ends)
+    page.says("{} widths on the shot and {} on the ball; ", *mended("in_context", "plain"))
+    page.says("makes that {} and {}, and", *mended("in_context", "extended"))
+    page.says("there errs by {} and {}.", *mended("least_squares", "extended"))
 
 
 def performance():
