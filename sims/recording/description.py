@@ -318,7 +318,8 @@ def _extra(path: Path, meta: Mapping[str, Any], declared: Declared) -> dict[str,
     # A channel left out by mistake must not pass for a column that nobody uses.
     taken = ["run", "t", *(signal.name for signal in (*declared.channels, *declared.inputs))]
     units = {}
-    for name, entry in table(path, "extra", meta.get("extra", {})).items():
+    given = _dotted(table(path, "extra", meta.get("extra", {})), afloat(declared))
+    for name, entry in given.items():
         if name in taken:
             remedy = "declare it as channel or input"
             raise InputError(f"{path}: extra.{name}: is a column of its own right; {remedy}")

@@ -99,7 +99,7 @@ def test_pieces_of_what_floats_are_refused(tmp_path):
 
 
 def test_a_column_says_where_a_run_begins(tmp_path):
-    path = recorded(tmp_path, TOML + TURNING, spins=True)
+    path = recorded(tmp_path, TOML + TURNING.replace('"', "", 2), spins=True)
     recording, kind = load(path)
     found = [run.initial["qd.base.wz"] for run in recording.runs]
     np.testing.assert_allclose(found, SPINS, rtol=1e-6)
