@@ -147,10 +147,9 @@ class Assessor:
         """The whole library with its evidence about the base model, the strongest first; a score is
         less what numbers beyond the first cost, so that a law comes before those that contain it.
         """
-        scanned = search.scanned.get(frozenset())
-        if scanned is None:
+        scores = search.scored.get(frozenset())
+        if scores is None:
             return ()
-        scores = scanned.scores
         base = search.base.likelihood.value
         rows = []
         for i, effect in enumerate(scores.effects):

@@ -91,10 +91,10 @@ class Alternatives:
         """Chance of such a gain, or of the best score of all, about the model without it."""
         search = self.search
         key = frozenset(rest.names)
-        known = search.scanned.get(key)
+        known = search.scored.get(key)
         if known is None and not self.simulates:
             return search.tests.get(key, 1.0)
-        scores = search.scan(rest) if known is None else known.scores
+        scores = known or search.scan(rest)
         chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         # The score is linear and the gain of a fit is not; either may see more.
         excess = gain - chances.get(effect, 0.0)

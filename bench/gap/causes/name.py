@@ -228,7 +228,11 @@ def _preferred(
 
 
 def _is_unexplained(search: Search, model: Model, left: Remains) -> bool:
-    chance = search.tests.get(frozenset(model.names), 1.0)
+    chance = search.tests.get(frozenset(model.names))
+    # What is loud was not scored while the search had no need of it.
+    if chance is None:
+        loud = not left.structure and not search.quiet(model)
+        chance = search.scan(model).p_value if loud else 1.0
     return rules.is_unexplained(left.structure, chance)
 
 

@@ -35,7 +35,10 @@ FORGOT = 0.01
 this.
 """
 
-
+HELD = 400e6
+"""Bytes of directions that are held besides the base model's; what was scored longest ago makes
+room, and is scored again in the rare case that somebody asks for it once more.
+"""
 SILENT = 0.02
 """Excess over the noise below which nothing richer is fitted before something asks for it."""
 UNMOVED = 0.1
@@ -60,11 +63,13 @@ class Scored(Models):
     """Models, and what has been scored about them.
 
     Attributes:
-        scanned: of each model that was scored, by its effects.
+        scored: of each model that was, by its effects, the scores.
+        scanned: of the base model and those that were scored last, all of it.
         tests: the p value of the best score about each, by its effects.
         former: what was scored about models that have been fitted better since.
     """
 
+    scored: dict[frozenset[str], Scores] = field(default_factory=dict)
     scanned: dict[frozenset[str], Scanned] = field(default_factory=dict)
     tests: dict[frozenset[str], float] = field(default_factory=dict)
     former: dict[frozenset[str], Scanned] = field(default_factory=dict)
@@ -76,6 +81,7 @@ class Scored(Models):
 
     def replaced(self, key: frozenset[str]) -> None:
         """What was scored about the model before holds no longer."""
+        self.scored.pop(key, None)
         if key in self.scanned:
             self.former[key] = self.scanned.pop(key)
 
@@ -87,10 +93,11 @@ class Scored(Models):
             against: (R, T, C) a residual for surrogates; the model's own if None.
         """
         key = frozenset(model.names)
-        known = self.scanned.get(key)
-        if known is None:
+        if against is None and key in self.scored:
+            return self.scored[key]
+        if key not in self.scanned:
             self._survey([model])
-            known = self.scanned[key]
+        known = self.scanned[key]
         if against is None:
             return known.scores
         self._look(model)
@@ -102,8 +109,10 @@ class Scored(Models):
         self._take(key, known._replace(scores=scores))
         return scores
 
-    def _survey(self, models: Sequence[Model]) -> None:
-        """Score every effect that models lack, each for itself."""
+    def _survey(self, models: Sequence[Model], beside: Sequence[Model] = ()) -> None:
+        """Score every effect that models lack, each for itself; what is known of those beside them
+        is held.
+        """
         calls, keys = [], []
         for model in models:
             self._look(model)
@@ -122,15 +131,28 @@ class Scored(Models):
             )
         found = self.world.crew.map(self.world, _scanned, calls)
         for key, scanned in zip(keys, found, strict=True):
-            self._take(key, scanned)
+            # What had made room is as it was.
+            self._take(key, scanned._replace(scores=self.scored.get(key, scanned.scores)))
+        self._make_room([*keys, *(frozenset(model.names) for model in beside)])
 
     def _look(self, model: Model) -> None:
         about = " + ".join(model.names) or "the base model"
         self.world.watch.look(f"scores of the library about {about}")
 
+    def _make_room(self, asked: Sequence[frozenset[str]]) -> None:
+        """Let go what was scored longest ago, but for the base model and what is asked now."""
+        for kept in (self.former, self.scanned):
+            for key in [k for k in kept if k and k not in asked]:
+                held = [*self.former.items(), *self.scanned.items()]
+                if sum(one.directions.values.nbytes for k, one in held if k) <= HELD:
+                    return
+                del kept[key]
+
     def _take(self, key: frozenset[str], scanned: Scanned) -> None:
+        # The last stands behind the others.
+        self.scanned.pop(key, None)
         self.scanned[key] = scanned
-        scores = scanned.scores
+        scores = self.scored[key] = scanned.scores
         self.tests[key] = scores.p_value
         # Kept from the first scan, so that merits stay comparable when a better base fit turns up.
         if not key and not self.chances:
@@ -156,7 +178,8 @@ class Scored(Models):
         starts = []
         models = list(beam)
         # A better fit since then has taken the scores of some away.
-        self._survey([model for model in models if frozenset(model.names) not in self.scanned])
+        lost = [model for model in models if frozenset(model.names) not in self.scanned]
+        self._survey(lost, beside=models)
         for model in models:
             key = frozenset(model.names)
             known = self.scanned[key]

@@ -9,6 +9,7 @@ Regression, 2nd ed., 2002, doi:10.1201/9781420035933, chapter 3).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -122,12 +123,12 @@ class Search(Moves):
         """
         best = self.models[frozenset((self.supported or self.base).names)]
         larger = [m for m in self.models.values() if len(m.names) > len(best.names)]
-        scanned = self.scanned.get(frozenset(best.names))
-        if scanned is None or not larger:
+        scores = self.scored.get(frozenset(best.names))
+        if scores is None or not larger:
             return best
         found = max(larger, key=lambda model: model.merit)
         gain = found.likelihood.value - best.likelihood.value
-        real = self.gained(scanned.scores, found, gain) <= ALPHA
+        real = self.gained(scores, found, gain) <= ALPHA
         return found if real and found.merit > best.merit else best
 
     def _larger(self, best: Model, size: int) -> Model | None:
@@ -148,22 +149,38 @@ class Search(Moves):
         """
         smaller = beam(self, size - 1)
         self.extend(smaller[:1], NOMINATED)
-        first = self.best(size)
-        # What the step leaves of friction, say, would be taken for more that is missing.
-        if first is not None and self.world.linear and self.excess(first) < FAR:
-            first = self._corrected(first)
         # Each further means costs more simulations, so none is used where the data are explained.
-        if first is not None and self.plain(first, ALPHA):
-            return first
+        if self._explained_by(size):
+            return self.best(size)
         self.from_pieces(size)
-        first = self.best(size)
-        if first is not None and self.plain(first, ALPHA):
-            return first
+        if self._explained_by(size):
+            return self.best(size)
         if size == 1:
             self.extend(smaller, NOMINATED, patient=True)
         else:
-            self.extend(smaller[1:], NOMINATED)
+            for members in self._turns(smaller[1:]):
+                self.extend(members, NOMINATED)
+                if self._explained_by(size):
+                    break
         return self.best(size)
+
+    def _explained_by(self, size: int) -> bool:
+        """Whether the best model of so many effects leaves nothing to explain; what is loud is not
+        scored to know it.
+        """
+        model = self.best(size)
+        if model is None:
+            return False
+        # What the step leaves of friction, say, would be taken for more that is missing.
+        if self.world.linear and self.excess(model) < FAR:
+            model = self._corrected(model)
+        return self.quiet(model) and self.plain(model, ALPHA)
+
+    def _turns(self, rivals: Sequence[Model]) -> Sequence[Sequence[Model]]:
+        """Which of them are extended at once: where a simulation costs much, one after the other,
+        until the data are explained.
+        """
+        return [[rival] for rival in rivals] if self.world.linear else [rivals]
 
     def from_pieces(self, size: int) -> None:
         """Refit the models of so many effects that explain short pieces of the runs best."""

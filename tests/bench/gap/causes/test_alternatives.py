@@ -25,7 +25,7 @@ def evidence(
         effects=("a", "b", "c"), chance=np.full(3, luck), by_chance=np.zeros((3, 40))
     )
     search = search_of(model(), BEST, ALIKE, BEHIND, excess={(n,): e for n, e in excess.items()})
-    search.scanned = {frozenset(): SimpleNamespace(scores=scores)}
+    search.scored = {frozenset(): scores}
     search.tests = {frozenset(): best}
     slots = {name: slice(0, size) for name, size in zip("abc", sizes, strict=True)}
     effects = {name: placed() for name in "abc"}

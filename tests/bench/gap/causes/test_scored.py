@@ -50,3 +50,32 @@ def test_scores_of_a_model_do_not_hang_on_what_was_scored_before():
         chances.append([*search.scan(base).chance, *search.scan(larger).chance])
         chances[-1].append(remains(search, larger).p_value)
     assert chances[0] == chances[1]
+
+
+def test_what_was_scored_longest_ago_makes_room_and_is_scored_again_alike(monkeypatch):
+    recorded = recording(
+        "slider", effects=["friction.coulomb=0.1"], noise=["0.01"], observe=["x"], runs=2, rate=50.0
+    )
+    names = ["drag.linear", "spring.linear"]
+    search, base = searched(recorded, 0.01, candidates=["friction.coulomb", *names])
+    search.refit([replace(base.fit.start(), effects=(name,)) for name in names])
+    first, second = (search.models[frozenset([name])] for name in names)
+    search.scan(base)
+    before = search.scan(first)
+    held = {frozenset(), frozenset(first.names)}
+    assert set(search.scanned) == held
+
+    # Room for one of them beside the base model's.
+    size = search.scanned[frozenset(first.names)].directions.values.nbytes
+    monkeypatch.setattr("bench.gap.causes.scored.HELD", 1.5 * size)
+    search.scan(second)
+    assert set(search.scanned) == {frozenset(), frozenset(second.names)}
+    once = search.world.simulations
+    assert search.scan(first) is before
+    assert search.world.simulations == once
+
+    # Who extends both has both, the one that was gone among them.
+    search.extend([first, second], 3)
+    assert search.scored[frozenset(first.names)] is before
+    known = {frozenset([*one, "friction.coulomb"]) for one in (first.names, second.names)}
+    assert known <= set(search.models)
