@@ -74,8 +74,9 @@ class Board:
             cells = []
             for metric in ("named", "no false alarm"):
                 row = table.loc[(metric, name)]
-                cells += [row["only_simgap"], row["only_other"], f"{row['p_holm']:.2g}"]
-            lines.append(f"| {name} | {' | '.join(map(str, cells))} |")
+                counts = f"{row['only_simgap']:.0f} | {row['only_other']:.0f}"
+                cells.append(f"{counts} | {row['p_holm']:.2g}")
+            lines.append(f"| {name} | {' | '.join(cells)} |")
         return "\n".join(lines)
 
     def failures(self):
@@ -103,7 +104,7 @@ class Board:
             return "seen and not named (`unknown`)"
         if row["outcome"] == "missed":
             return "not seen (`adequate`)"
-        return f"{row['outcome']}: {names}"
+        return f"{row['outcome']}: {names.replace('|', ', ')}"
 
 
 def written(page, parts):

@@ -67,7 +67,7 @@ def _leading(shown: Shown) -> Iterator[str]:
     if line["high"] > WANTED_ALARMS:
         yield (
             f"That {safe(best, 60)} stays below {limit} these {int(line['of'])} clean recordings "
-            f"cannot show: {int(line['count'])} alarms leave up to {percent(line['high'])}."
+            f"cannot show: {_alarms(int(line['count']))} up to {percent(line['high'])}."
         )
 
 
@@ -132,3 +132,7 @@ def _names(names: list[str]) -> str:
 def _share(line: dict[str, Any] | pd.Series[Any]) -> str:
     ends = f"95 % interval {percent(line['low'])} to {percent(line['high'])}"
     return f"{int(line['count'])} of {int(line['of'])}, {percent(line['share'])} ({ends})"
+
+
+def _alarms(count: int) -> str:
+    return "1 alarm leaves" if count == 1 else f"{count} alarms leave"

@@ -196,7 +196,8 @@ class Search(Moves):
         sketch = self._sketch
         sketch.extend(beam(sketch, size - 1), NOMINATED)
         best = of_size(sketch, size)[:TRANSFERRED]
-        self.refit([whole(self.world, model.fit) for model in best])
+        if best:
+            self.refit([whole(self.world, model.fit) for model in best])
 
     @cached_property
     def _forgets(self) -> bool:

@@ -3,6 +3,7 @@
 import re
 
 import pytest
+from scipy.stats import beta
 
 from bench.diagnosis.columns import read_table
 from bench.diagnosis.confusion import families
@@ -77,11 +78,14 @@ def test_what_simgap_gets_wrong_comes_first(opened):
     first = opened.page.locator(".conclusion li").all_inner_texts()[0]
     assert first.startswith(f"simgap fails on {len(wrong)} of ")
     assert opened.page.locator("nav a").all_inner_texts()[0] == "Where simgap fails"
-    assert {row[1] for row in grid(opened, "wrong")} == wrong
+    assert {row[1] for row in grid(opened, "wrong")} <= wrong
+    assert opened.text("#wrong .count").startswith(f"{len(wrong)} of ")
     said = opened.page.locator(".conclusion li").all_inner_texts()
     clean = rows[(rows["diagnoser"] == "simgap") & (rows["kind"] == "clean")]
-    top = 1 - 0.025 ** (1 / len(clean))  # Clopper and Pearson's end where none of n is counted
-    assert any(f"0 alarms leave up to {percent(top)}" in text for text in said)
+    alarms = int(clean["alarm"].sum())
+    top = beta.ppf(0.975, alarms + 1, len(clean) - alarms)  # Clopper and Pearson's end
+    counted = "1 alarm leaves" if alarms == 1 else f"{alarms} alarms leave"
+    assert any(f"{counted} up to {percent(top)}" in text for text in said)
 
 
 def test_the_view_is_in_the_address(browser, opened, page):
@@ -120,7 +124,10 @@ def test_on_a_phone_and_without_a_script(browser, page):
         assert one.overflow() <= 0
         assert one.page.locator("#power img.still").is_visible()
         assert one.page.locator("#confusion-figure img.still").is_visible()
-        assert len(grid(one, "wrong")) == len(wrong_of(answers(), "simgap"))
+        wrong = wrong_of(answers(), "simgap")
+        shown = {row[1] for row in grid(one, "wrong")}
+        assert shown <= wrong
+        assert f"{len(wrong) - len(shown)} more rows." in one.text("#wrong")
 
 
 def test_one_who_is_better_than_simgap_is_said_to_be():
@@ -167,4 +174,9 @@ def test_the_confusion_of_families_counts_each_recording_once():
     shares = panel.images[0].get_array()
     place = labels.index(f"friction {len(friction)}")
     assert shares[place].sum() == pytest.approx(100.0)
-    assert shares[place, place] == pytest.approx(100 * friction["found_class"].mean())
+    # What is told as another of its family is told as that family.
+    told = friction["found_class"] | friction["named"].astype(str).str.startswith("friction.")
+    told &= (friction["verdict"] != "unknown") & ~friction["named"].astype(str).str.contains(
+        "+", regex=False
+    )
+    assert shares[place, place] == pytest.approx(100 * told.mean())

@@ -8,6 +8,7 @@ import pytest
 from bench.gap.causes.search import Search
 from bench.gap.model.noise import Likelihood
 from tests.bench.gap.causes.models import model
+from tests.bench.gap.made import recording, searched
 
 BASE, LARGER = model(merit=10.0), model("a", merit=30.0)
 
@@ -105,3 +106,16 @@ def test_what_is_left_may_be_noise_up_to_the_floor_or_if_it_forgets(
     made.stated = np.array([stated])
     asked = SimpleNamespace(fit=None, likelihood=Likelihood(0.0, 2.0 * np.array([sigma]), None))
     assert made.quiet(asked) is quiet
+
+
+def test_pieces_that_explain_nothing_leave_nothing_to_refit(monkeypatch):
+    """A sketch that was begun for fewer effects may have no model of so many."""
+    recorded = recording("pendulum", noise=["0.01"], observe=["q"], runs=2, seconds=4.0, rate=50.0)
+    made, _ = searched(recorded, 0.01, candidates=["friction.coulomb", "gravity.tilt"])
+    made.from_pieces(1)
+    known = set(made.models)
+    assert {len(names) for names in known} == {0, 1}, "the pieces are searched"
+
+    monkeypatch.setattr(Search, "extend", lambda *args: None)
+    made.from_pieces(2)
+    assert set(made.models) == known
