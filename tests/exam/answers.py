@@ -4,19 +4,15 @@ Runs in a worker.
 
 from __future__ import annotations
 
-import importlib
-import tempfile
-import time
-import traceback
 from dataclasses import asdict
 
 from bench.diagnosis.marks import Mark, marked
 from bench.diagnosis.worlds import rivals, sizing
 from bench.diagnosis.worlds.items import Item, realise, setting_of
+from tests.exam.explained import EXPLAIN, explained
 from tests.exam.questions import Question
 
 MOST_RIVALS = 6
-EXPLAIN = "bench.gap.explain:explain"
 
 
 def answered(question, offset, known=None, explain=EXPLAIN):
@@ -37,24 +33,17 @@ def answered(question, offset, known=None, explain=EXPLAIN):
 
 
 def _answer(item, explain):
-    module, function = explain.split(":")
-    row = {"verdict": None, "seconds": None, "error": ""}
-    with tempfile.TemporaryDirectory() as folder:
-        path = realise(item, folder, truth=False)
-        path = path.rename(path.with_name("recording.csv"))  # the name tells what is hidden
-        path.with_name(f"{item.name}.toml").rename(path.with_suffix(".toml"))
-        begin = time.perf_counter()
-        try:
-            found = getattr(importlib.import_module(module), function)(
-                path, system=None, engine="batch"
-            ).answer.document()
-            row["verdict"] = {name: value for name, value in found.items() if name != "candidates"}
-        except Exception:
-            row["error"] = traceback.format_exc(limit=-4)
-        row["seconds"] = time.perf_counter() - begin
+    row = explained(lambda folder: _written(item, folder), explain, system=None, engine="batch")
     mark = marked(item, row["verdict"])
     row["mark"] = asdict(mark) | {"found": mark.found, "found_class": mark.found_class}
     return row | {"rivals": _rivals(item, row["verdict"], mark)}
+
+
+def _written(item, folder):
+    path = realise(item, folder, truth=False)
+    path = path.rename(path.with_name("recording.csv"))  # the name tells what is hidden
+    path.with_name(f"{item.name}.toml").rename(path.with_suffix(".toml"))
+    return path
 
 
 def lost(question, known, error):

@@ -4,19 +4,15 @@ Runs in a worker.
 
 from __future__ import annotations
 
-import importlib
-import tempfile
-import time
-import traceback
 from dataclasses import replace
 
+from tests.exam.explained import EXPLAIN, explained
 from tests.robots.equivalence import Rivals
 from tests.robots.items import Item, setting_of
 from tests.robots.questions import Question
 from tests.robots.recording import realise, recorded
 from tests.robots.score import Mark, marked, sets_of
 
-EXPLAIN = "bench.gap.explain:explain"
 MOST_RIVALS = 6
 
 
@@ -39,19 +35,7 @@ def answered(question, offset, known=None, explain=EXPLAIN, equal=True):
 
 
 def _answer(item, explain, equal):
-    module, function = explain.split(":")
-    row = {"verdict": None, "seconds": None, "error": ""}
-    with tempfile.TemporaryDirectory() as folder:
-        path = realise(item, folder)
-        begin, busy = time.perf_counter(), time.process_time()
-        try:
-            explained = getattr(importlib.import_module(module), function)(path)
-            document = explained.answer.document()
-            row["verdict"] = {key: v for key, v in document.items() if key != "candidates"}
-        except Exception:
-            row["error"] = traceback.format_exc(limit=-4)
-        row["seconds"] = time.perf_counter() - begin
-        row["processor"] = time.process_time() - busy
+    row = explained(lambda folder: realise(item, folder), explain)
     mark = marked(item, row["verdict"])
     if equal and mark.outcome == "set":
         mark = replace(mark, equal=_equal(item, row["verdict"]))

@@ -93,13 +93,11 @@ class Scored(Models):
             against: (R, T, C) a residual for surrogates; the model's own if None.
         """
         key = frozenset(model.names)
-        if against is None and key in self.scored:
-            return self.scored[key]
-        if key not in self.scanned:
+        if key not in (self.scored if against is None else self.scanned):
             self._survey([model])
-        known = self.scanned[key]
         if against is None:
-            return known.scores
+            return self.scored[key]
+        known = self.scanned[key]
         self._look(model)
         # Directions cost a simulation of each candidate; other surrogates need no new ones. The
         # colour of noise is best known from a model that leaves less structure.

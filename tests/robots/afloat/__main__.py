@@ -8,12 +8,10 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import tempfile
-import time
-import traceback
 from collections import Counter
 from pathlib import Path
 
+from tests.exam.explained import explained
 from tests.robots.afloat import items
 from tests.robots.score import marked
 
@@ -45,29 +43,13 @@ def main(arguments=None):
 
 def answered(kind, robot, effect, index):
     """A row about a question: the item, the verdict, the mark."""
-    from bench.gap.explain import explain
-
     found = items.drawn(kind, robot, effect, index)
     row = {"kind": kind, "robot": robot, "effect": effect, "item": None, "mark": None}
     if found is None:
         return row
     item, made = found
-    verdict, error = None, ""
-    with tempfile.TemporaryDirectory() as folder:
-        path = items.written(item, made, folder)
-        begun = time.process_time()
-        try:
-            verdict = explain(path).answer.document()
-        except Exception:
-            error = traceback.format_exc(limit=-4)
-    seconds = time.process_time() - begun
-    mark = marked(item, verdict)
-    if verdict:
-        verdict.pop("candidates", None)
-    return row | {
-        "item": item.json(), "mark": mark.json(), "verdict": verdict, "error": error,
-        "processor": seconds,
-    }  # fmt: skip
+    row |= explained(lambda folder: items.written(item, made, folder))
+    return row | {"item": item.json(), "mark": marked(item, row["verdict"]).json()}
 
 
 def table(rows):
