@@ -357,6 +357,7 @@ Of = Literal[
     "",
     "input",
     "input/s",
+    "input/s^2",
     "error",
     "reading",
     "reading/s",
@@ -381,7 +382,8 @@ class Coefficient:
         plausible: the range one would expect, in the same order.
         of: whose unit it has where `units` are only the usual ones: ``input`` the first input's,
             ``error`` the same, where it is compared with a servo's error, ``reading`` that of the
-            channel it acts on, ``input/s`` and ``reading/s`` the same per second; ``level`` that
+            channel it acts on, ``input/s`` and ``reading/s`` the same per second,
+            ``input/s^2`` per second and second; ``level`` that
             of what is stored; ``stop`` is the stiffness of one that stands where coefficient
             ``place`` says;
             ``drive`` is a limit of the drive's force and ``travel`` a part of the way that it

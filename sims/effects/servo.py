@@ -7,8 +7,11 @@ drive exerts besides
 * (2) derivative: K (u(t) - u(t - c)): the servo's D term acts on the rate of the error, not of q
   alone; c is the D gain over the P gain, and the rate is taken over as long, so that of a jump
   the servo feels a kick of its height and not an impulse
+* (3) profile: what the servo follows is not u but p, which moves to u as fast as |d2p/dt2| <= c
+  lets it and arrives at rest: d2p/dt2 = c sign(u - p - |dp/dt| dp/dt / (2 c)), and none when it is
+  there
 
-A negative width is none.
+A negative width or limit is none.
 """
 
 from __future__ import annotations
@@ -24,6 +27,10 @@ _WIDTH = ((0, 1), (0, 0.05), (0, 0.2))
 """Plausible half widths of a dead zone, in the units of `_USUAL`."""
 _TIME = ("s", "s", "s")
 """Seconds, on every kind of system."""
+_ACCELERATION = ("m/s^4", "m/s^2", "rad/s^2")
+"""Units of `_USUAL`, per second and second."""
+_REACHED = ((0, 500), (0, 50), (0, 200))
+"""Plausible limits of a set point's acceleration, in the units of `_ACCELERATION`."""
 
 
 class Deadband(Force):
@@ -59,6 +66,47 @@ class Derivative(Input):
         return np.where(
             lead > 0, 2.0 * signal.values - _earlier(signal, lead), signal.values
         )  # (2)
+
+
+class Profile(Input):
+    """The set point moves to the command with an acceleration of at most c; zero is no limit."""
+
+    name = "servo.profile"
+    noun = "a servo's motion profile"
+    says = "the servo's set point moves to the command with limited acceleration"
+    source = "L. Biagiotti, C. Melchiorri, Trajectory Planning (2008), section 4.6"
+    needs = "servo"
+    coefficients = (Coefficient("coefficient", _ACCELERATION, _REACHED, of="input/s^2"),)
+
+    def feel(self, c: Array, signal: Signal) -> Array:
+        """The mean over each step of what is reached at the limit."""
+        limit = np.where(c[0] > 0, c[0], np.inf)
+        return np.where(c[0] > 0, _profiled(signal, limit), signal.values)
+
+
+def _profiled(signal: Signal, limit: Array) -> Array:
+    """Means (L, S) over each step of (3), `limit` (L, 1) of the acceleration, endless where there
+    is none.
+
+    A speed w at the end of a step is chosen such that what is left can be stopped in: w h / 2
+    where one more step of length h will do, w^2 / (2 c) where it takes longer.
+    """
+    most = np.where(np.isfinite(limit), limit, 0.0)[:, 0]
+    wanted, steps = np.ascontiguousarray(signal.values.T), np.ascontiguousarray(signal.steps.T)
+    means = np.empty_like(wanted)
+    place, speed = signal.start[:, 0].copy(), np.zeros(wanted.shape[1])
+    for row, h, mean in zip(wanted, steps, means, strict=True):
+        gain = most * h
+        way = np.copysign(1.0, row - place)
+        left, now = way * (row - place), way * speed
+        short = np.divide(left - 0.5 * now * h, h, out=np.zeros_like(h), where=h > 0)
+        root = np.maximum(0.25 * gain**2 + most * (2.0 * left - now * h), 0.0)
+        long = np.maximum(np.sqrt(root) - 0.5 * gain, gain)
+        next_speed = way * np.clip(np.minimum(short, long), now - gain, now + gain)
+        mean[:] = place + h * (speed / 3.0 + next_speed / 6.0)
+        place = place + 0.5 * h * (speed + next_speed)
+        speed = next_speed
+    return means.T
 
 
 def _earlier(signal: Signal, late: Array) -> Array:

@@ -16,7 +16,9 @@ JOINT = (
 BODY = ("mass.scale", "mass.offset", "inertia.scale")
 BOTH = ("input.gain", "input.bias", "input.delay", "input.lag", "input.rate", "supply.sag")
 MOTOR = ("input.deadband", "input.saturation", "input.power")
-SERVO = ("actuator.stiffness", "actuator.damping", "servo.deadband", "servo.derivative")
+SERVO = (
+    "actuator.stiffness", "actuator.damping", "servo.deadband", "servo.derivative", "servo.profile",
+)  # fmt: skip
 CHANNEL = ("sensor.bias", "sensor.gain", "sensor.delay", "sensor.eccentricity", "sensor.slip")
 WORLD = ("gravity.tilt", "gravity.scale", "clock.skew")
 STIFFEST = 10.0  # Hz, of a link on its elastic joint at strength 1/10
@@ -160,6 +162,12 @@ def _rate(place, setting, rng):
     return lambda s: (range_ / s,)
 
 
+def _profile(place, setting, rng):
+    """A jump over the command's range takes from two samples to a second."""
+    range_, least = float(np.ptp(_command(setting, place))), 2 * setting.fitted[0].times[1]
+    return lambda s: (4.0 * range_ / float(least + s) ** 2,)
+
+
 def _power(place, setting, rng):
     """Up to the square and beyond; at the command's peak it does what the command alone would."""
     peak = float(np.abs(_command(setting, place)).max())
@@ -266,6 +274,7 @@ SHAPES = {
     "friction.position": _uneven,
     "friction.warming": _warming,
     "input.rate": _rate,
+    "servo.profile": _profile,
     "input.power": _power,
     "sensor.eccentricity": _eccentric,
     "friction.stribeck": _stribeck,

@@ -8,7 +8,7 @@ import numpy as np
 
 SIGNALS = (
     "input.gain", "input.bias", "input.deadband", "input.saturation", "input.delay", "input.lag",
-    "input.rate", "servo.derivative", "input.power",
+    "input.rate", "servo.derivative", "servo.profile", "input.power",
 )  # fmt: skip
 COUPLING = "joint.coupling@"
 
@@ -17,9 +17,9 @@ COUPLING = "joint.coupling@"
 class Felt:
     """A command on its way to an actuator.
 
-    It passes gain, power, bias, dead band, saturation, a limit of its rate, delay, a servo's D term
-    and lag, in this order; it is constant from one stamp to the next, and before the first it has
-    the first value.
+    It passes gain, power, bias, dead band, saturation, a limit of its rate, delay, a servo's motion
+    profile, its D term and lag, in this order; it is constant from one stamp to the next, and
+    before the first it has the first value.
     """
 
     times: np.ndarray
@@ -32,6 +32,7 @@ class Felt:
     lag: float = 0.0
     rate: float = 0.0
     derivative: float = 0.0
+    profile: float = 0.0
     power: tuple = (0.0, 0.0)
     values: np.ndarray = field(init=False)
     begins: np.ndarray = field(init=False)
@@ -47,6 +48,8 @@ class Felt:
         if self.rate:
             values, begins = _slewed(values, begins, self.rate)
         begins = begins + self.delay
+        if self.profile:
+            values, begins = profiled(values, begins, self.profile)
         if self.derivative:
             # what a D term makes of a jump lasts as long as its rate is taken over
             both = np.unique(np.concatenate([begins, begins + self.derivative]))
@@ -74,6 +77,35 @@ def _slewed(values, times, most):
         risen.append(state + moved - 0.5 * abs(moved) / (most * 1e-3) * moved)
         state += moved
     return np.array(risen), fine
+
+
+def profiled(values, times, most):
+    """What goes to each value in the shortest time with accelerations of `most`, and arrives at
+    rest; held over a millisecond each, at its middle.
+    """
+    fine = np.arange(times[0], times[-1] + 1.0, 1e-3)
+    place, speed, went = values[0], 0.0, []
+    ends = [*times[1:].tolist(), np.inf]
+    for value, begin, end in zip(values.tolist(), times.tolist(), ends, strict=True):
+        middles = fine[(fine >= begin - 1e-9) & (fine < end - 1e-9)] + 5e-4
+        lasting = end if np.isfinite(end) else begin + 1.0
+        t = np.append(middles, lasting) - begin
+        x, v = _shortest(place - value, speed, most, t)
+        went.extend((value + x[:-1]).tolist())
+        place, speed = value + x[-1], v[-1]
+    return np.array(went), fine[: len(went)]
+
+
+def _shortest(x, v, most, t):
+    """A double integrator's way to rest at zero in the shortest time, and its speed, at t."""
+    way = -np.sign(x + v * abs(v) / (2 * most)) or -np.sign(v) or 1.0
+    x, v = way * x, way * v
+    peak = np.sqrt(max(v**2 / 2 - most * x, 0.0))
+    first, last = (peak - v) / most, (2 * peak - v) / most
+    left = np.maximum(last - t, 0.0)
+    gaining = t < first
+    where = np.where(gaining, x + v * t + most * t**2 / 2, -most * left**2 / 2)
+    return way * where, way * np.where(gaining, v + most * t, most * left)
 
 
 def felt(machine, times, commands, effects):

@@ -65,6 +65,7 @@ COEFFICIENTS = {
     "sensor.slip": (None, (0.05, 0.605), (0.05, 0.605)),
     "servo.deadband": (None, None, 0.05),
     "servo.derivative": (None, None, 0.02),
+    "servo.profile": (None, None, 20.0),
     "state.limit": (None, (-8.0, -0.2, 0.2), (-0.02, -0.2, 0.05)),
     "spring.cubic": (None, 2.0, 0.05),
     "spring.linear": (None, 3.0, 0.1),

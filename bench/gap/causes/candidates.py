@@ -43,12 +43,14 @@ WAYS = (0.003, 0.01, 0.03, 0.1, 0.3)
 """The same of how far a run goes, for gaps."""
 GIVES = (0.01, 0.09, 0.6)
 """Shares of the largest plausible compliance of a joint."""
-LIMITED = ("drive", "input/s", "level", "travel", "stop", "give")
+LIMITED = ("drive", "input/s", "input/s^2", "level", "travel", "stop", "give")
 """What a coefficient is a part of where no small size is like a large one: a limit's takes all
 away, and in a gap nothing is passed on.
 """
 RATES = (0.015, 0.05, 0.12, 0.3, 0.6, 0.9)
 """The same of what is largest for a moment alone: the rate of a command, the error of a servo."""
+SPANS = (1.0, 0.25, 0.06, 0.016, 0.004)
+"""The same of an acceleration, which takes a command twice as long at a quarter of it."""
 NOTHING = 1e-11
 """Share of the largest observation below which a change is rounding."""
 SHAPES = 12
@@ -180,7 +182,7 @@ def _limits(world: World, name: str, group: int, shapes: Array | None) -> Iterat
     if not largest.any():
         return
     # A servo's error is largest for a moment after a jump, as a command's rate is.
-    seldom = {"input/s": RATES, "error": RATES, "travel": WAYS, "give": GIVES}
+    seldom = {"input/s": RATES, "input/s^2": SPANS, "error": RATES, "travel": WAYS, "give": GIVES}
     of = world.effects[name].coefficients[0].of
     levels = seldom.get(of, LEVELS)
     if of == "travel" and world.linear:

@@ -24,6 +24,8 @@ FIRMER = (0.25, 0.5, 2.0, 4.0)
 """Times as hard as a stop that was found, of others that turn back at the same place."""
 INSTANTS = 24
 """Instants tried of what happens once."""
+BRIEF = 0.05
+"""Seconds for which it hardly shows that a servo plans its own way to a command."""
 FINER = 16
 """Stamps between two of them that are tried where a fit begins, at most."""
 
@@ -48,7 +50,7 @@ def reach(world: World, name: str) -> Array:
         return np.array([p.bounds[1] for p in parameters_of(world, name)])
     if of == "travel":
         return np.array([world.travel_of(name)])
-    found = {"input/s": _fastest, "error": _farthest, "level": _fullest}
+    found = {"input/s": _fastest, "input/s^2": _hardest, "error": _farthest, "level": _fullest}
     most = found.get(of, _largest)
     return np.array([max(most(world, t, one) for t in world.tracks) for one in members])
 
@@ -70,6 +72,11 @@ def _fastest(world: World, track: Track, effect: Effect) -> float:  # noqa: ARG0
     """Of a run, from sample to sample of the input, a second."""
     risen = np.abs(np.diff(_command(track, effect)))
     return float((risen / np.diff(track.scenario.times)).max(initial=0.0))
+
+
+def _hardest(world: World, track: Track, effect: Effect) -> float:  # noqa: ARG001
+    """Of a run, the acceleration that takes the input over its range and to rest in `BRIEF`."""
+    return 4.0 * float(np.ptp(_command(track, effect))) / BRIEF**2
 
 
 def _recorded(world: World, effect: Effect) -> str:

@@ -113,7 +113,7 @@ def test_what_fits_what():
     }
     begins = ("input.", "friction.load")
     inputs = {name for name in NAMES if name.startswith(begins)} | {"backlash", "supply.sag"}
-    servo = {"servo.deadband", "servo.derivative"}
+    servo = {"servo.deadband", "servo.derivative", "servo.profile"}
     mechanical = set(NAMES) - {"state.overflow"}
     joint = mechanical - impact - flight
     assert there["ball"] == mechanical - guided - inputs - servo

@@ -5,6 +5,7 @@ import pytest
 
 from sims import effects
 from sims.system import Signal
+from tests.robots.signals import profiled
 from tests.sims.effects.worlds import lanes
 
 
@@ -40,6 +41,7 @@ RAMP = np.array([-2.0, -1.0, 0.0, 0.5, 1.0, 2.0])
         ("input.lag", -0.1, RAMP),
         ("input.rate", -0.1, RAMP),
         ("servo.derivative", -0.1, RAMP),
+        ("servo.profile", -0.1, RAMP),
         # a value that is held arrives twice for as long as the rate is taken over
         ("servo.derivative", 0.1, [-4.0, 0.0, 1.0, 1.0, 1.5, 3.0]),
         ("servo.derivative", 0.2, [-4.0, -2.0, 2.0, 2.0, 2.0, 3.5]),
@@ -123,7 +125,8 @@ def test_lags_stand_still_while_a_lane_waits(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["input.lag", "sensor.lag", "input.deadband", "backlash", "input.saturation"]
+    "name",
+    ["input.lag", "sensor.lag", "input.deadband", "backlash", "input.saturation", "servo.profile"],
 )
 def test_lanes_that_are_off_keep_every_bit_beside_lanes_that_are_on(name):
     effect = effects.get(name)()
@@ -147,3 +150,43 @@ def test_a_limit_of_the_rate_rises_straight_and_stays():
     assert through("input.rate", 5.0, [0.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.9]) == pytest.approx(
         [0.0, 0.25, 0.75, 1.25, 1.75, 2.0, 1.91]
     )
+
+
+def test_a_motion_profile_speeds_up_and_brakes_evenly():
+    """A jump of 1 at 16 a second and second takes 0.5 s: half of it each way."""
+    h, t = 0.002, 0.002 * (np.arange(400) + 0.5)
+    left = np.maximum(0.5 - t, 0.0)
+    wanted = np.where(t < 0.25, 8 * t**2, 1 - 8 * left**2)
+    went = through("servo.profile", 16.0, np.ones(400), h, start=0.0)
+    assert went == pytest.approx(wanted, abs=3e-6)
+    assert np.diff(went, 2).max() == pytest.approx(16 * h**2, rel=1e-6)
+
+
+@pytest.mark.parametrize("limit", [3.0, 12.0, 60.0])
+def test_a_motion_profile_is_the_shortest_way_to_commands_that_change(limit):
+    """Against the double integrator's own solution, which is exact between commands."""
+    h = 0.001
+    rng = np.random.default_rng(7)
+    stamps, values = np.arange(0, 4, 0.125), np.repeat(rng.uniform(-1, 1, 8), 4)
+    values[9:20] += rng.uniform(-0.3, 0.3, 11)
+    wanted, fine = profiled(values, stamps, limit)
+    commanded = values[np.searchsorted(stamps, fine + 1e-9, side="right") - 1]
+    went = through("servo.profile", limit, commanded, h, start=values[0])
+    assert went == pytest.approx(wanted, abs=2 * limit * h**2)
+    assert np.abs(went - commanded).max() > 0.1
+
+
+def test_a_motion_profile_follows_what_asks_for_less_and_falls_behind_what_asks_for_more():
+    t = 0.001 * np.arange(4000)
+    slow, fast = 0.1 * np.sin(10 * t), 0.1 * np.sin(40 * t)
+    within = through("servo.profile", 40.0, slow, 0.001) - slow
+    beyond = through("servo.profile", 40.0, fast, 0.001) - fast
+    # it arrives at rest, and so is behind by the way that braking from the command's speed takes
+    assert np.abs(within[500:]).max() == pytest.approx(1.0**2 / (2 * 40.0), rel=0.03)
+    assert np.abs(beyond[500:]).max() > 0.05
+
+
+def test_a_motion_profile_stands_still_while_a_lane_waits():
+    steps = np.array([0.1, 0.1, 0.0, 0.0, 0.1])
+    went = through("servo.profile", 2.0, np.ones(5), steps)
+    assert went == pytest.approx([0.01 / 3, 0.07 / 3, 0.04, 0.04, 0.19 / 3])

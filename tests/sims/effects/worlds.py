@@ -62,6 +62,7 @@ NAMES = [
     "sensor.slip",
     "servo.deadband",
     "servo.derivative",
+    "servo.profile",
     "clock.skew",
     "state.overflow",
     "friction.hysteresis",

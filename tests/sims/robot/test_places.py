@@ -81,6 +81,7 @@ def test_names_are_those_of_the_model(arm):
         "state.limit": joints,
         "servo.deadband": ("m_shoulder",),
         "servo.derivative": ("m_shoulder",),
+        "servo.profile": ("m_shoulder",),
         "gravity.tilt": ("",),
         "clock.skew": ("",),
         "lift.magnus": (),

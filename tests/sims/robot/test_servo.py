@@ -1,4 +1,4 @@
-"""The law of a servo in a robot: a dead zone, a D term on the error, a limited rate."""
+"""The law of a servo in a robot: dead zone, D term on the error, limited rate, motion profile."""
 
 import numpy as np
 import pytest
@@ -70,6 +70,14 @@ def test_a_limit_of_the_rate_makes_the_servo_follow_a_ramp():
     limited = seen({"input.rate@m": 2.0}, step, FREE)
     # the command of the ramp is held from sample to sample: late by half of one
     assert limited == pytest.approx(seen({"input.delay@m": -0.005}, ramp, FREE), abs=2e-4)
+
+
+def test_a_motion_profile_makes_the_servo_follow_a_ramp_that_bends():
+    """A jump of 1 at 4 a second and second: half a second of speeding up, half of braking."""
+    begun = np.clip(TIMES - 0.5, 0.0, 1.0)
+    bent = np.where(begun < 0.5, 2 * begun**2, 1 - 2 * (1 - begun) ** 2)
+    profiled = seen({"servo.profile@m": 4.0}, np.where(TIMES >= 0.5, 1.0, 0.0), FREE)
+    assert profiled == pytest.approx(seen({"input.delay@m": -0.005}, bent, FREE), abs=2e-4)
 
 
 WAVE = 0.9 * np.sin(2.5 * TIMES)
