@@ -30,7 +30,6 @@ def summarised(rows):
     asked = [row for row in rows if row.get("mark")]
     of = {kind: [r for r in asked if r["kind"] == kind] for kind in KINDS}
     covered = [held for r in asked for held in r["mark"]["covered"].values() if held is not None]
-    seconds = [row["seconds"] for row in asked if row["seconds"] is not None]
     return {
         "items": len(asked),
         "outcomes": {
@@ -42,14 +41,21 @@ def summarised(rows):
         "alarms": share(of["clean"], lambda r: r["mark"]["outcome"] != "right", exact=True),
         "foreign": share(of["foreign"], _is("strict")),
         "coverage": share(covered, bool),
-        "seconds": {
-            name: float(np.quantile(seconds, q)) if seconds else None
-            for name, q in (("median", 0.5), ("p95", 0.95), ("max", 1.0))
-        },
+        "seconds": _quantiles(asked, "seconds"),
+        "processor": _quantiles(asked, "processor"),
         "by": {key: _by(asked, key) for key in ("effect", "robot", "noise")},
         "confusion": [[*pair, count] for pair, count in sorted(confusion(asked).items())],
         "cannot show": sorted(row["question"] for row in rows if not row.get("mark")),
         "failed": sorted(r["question"] for r in asked if r["mark"]["outcome"] == "failed"),
+    }
+
+
+def _quantiles(asked, key):
+    """Of the seconds that answers took."""
+    seconds = [row[key] for row in asked if row.get(key) is not None]
+    return {
+        name: float(np.quantile(seconds, q)) if seconds else None
+        for name, q in (("median", 0.5), ("p95", 0.95), ("max", 1.0))
     }
 
 
@@ -139,11 +145,17 @@ def _ratio(got):
 
 
 def _times(summary):
-    times = summary["seconds"]
-    if times["median"] is None:
+    if summary["seconds"]["median"] is None:
         return "no times"
-    middle, high, most = (f"{times[name]:.1f}" for name in ("median", "p95", "max"))
-    return f"seconds a question: median {middle}, 95th percentile {high}, most {most}"
+    return "; ".join(
+        f"{what}: median {times['median']:.1f}, 95th percentile {times['p95']:.1f},"
+        f" most {times['max']:.1f}"
+        for what, times in (
+            ("seconds a question", summary["seconds"]),
+            ("of a processor", summary["processor"]),
+        )
+        if times["median"] is not None
+    )
 
 
 def page(summary):

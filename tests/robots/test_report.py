@@ -40,6 +40,8 @@ def test_shares_count_what_was_asked(rows):
     assert summary["failed"] == ["single/arm2-motor/friction.coulomb/4"]
     assert ["friction.coulomb", "drag.linear", 1] in summary["confusion"]
     assert summary["by"]["effect"]["friction.coulomb motor"]["any"]["count"] == 2
+    assert summary["seconds"] == pytest.approx({"median": 5.0, "p95": 7.7, "max": 8.0})
+    assert summary["processor"] == {"median": 1.0, "p95": 1.0, "max": 1.0}
 
 
 def test_what_is_written_can_be_read_again(rows, tmp_path):
