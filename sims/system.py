@@ -383,12 +383,11 @@ class Coefficient:
         of: whose unit it has where `units` are only the usual ones: ``input`` the first input's,
             ``error`` the same, where it is compared with a servo's error, ``reading`` that of the
             channel it acts on, ``input/s`` and ``reading/s`` the same per second,
-            ``input/s^2`` per second and second; ``level`` that
-            of what is stored; ``stop`` is the stiffness of one that stands where coefficient
-            ``place`` says;
-            ``drive`` is a limit of the drive's force and ``travel`` a part of the way that it
-            goes, with units of their own; ``give`` is how far something yields to a force;
-            ``rotor`` is an inertia that a model file may state itself.
+            ``input/s^2`` per second and second; ``level`` that of what is stored; ``stop`` is the
+            stiffness of one that stands where coefficient ``place`` says; ``drive`` is a limit of
+            the drive's force and ``travel`` a part of the way that it goes, with units of their
+            own; ``give`` is how far something yields to a force; ``rotor`` is an inertia that a
+            model file may state itself.
         least: what a fit may not go below, where that is not a matter of plausibility.
         most: what it may not exceed, likewise.
         tried: sizes from which a search for it begins, where evenly spread ones would be too many.

@@ -80,18 +80,16 @@ class Profile(Input):
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """The mean over each step of what is reached at the limit."""
-        limit = np.where(c[0] > 0, c[0], np.inf)
-        return np.where(c[0] > 0, _profiled(signal, limit), signal.values)
+        limit = np.maximum(c[0], 0.0)
+        return np.where(limit > 0, _profiled(signal, limit[:, 0]), signal.values)
 
 
-def _profiled(signal: Signal, limit: Array) -> Array:
-    """Means (L, S) over each step of (3), `limit` (L, 1) of the acceleration, endless where there
-    is none.
+def _profiled(signal: Signal, most: Array) -> Array:
+    """Means (L, S) over each step of (3) with accelerations of at most `most` (L,).
 
     A speed w at the end of a step is chosen such that what is left can be stopped in: w h / 2
     where one more step of length h will do, w^2 / (2 c) where it takes longer.
     """
-    most = np.where(np.isfinite(limit), limit, 0.0)[:, 0]
     wanted, steps = np.ascontiguousarray(signal.values.T), np.ascontiguousarray(signal.steps.T)
     means = np.empty_like(wanted)
     place, speed = signal.start[:, 0].copy(), np.zeros(wanted.shape[1])

@@ -85,11 +85,10 @@ def profiled(values, times, most):
     """
     fine = np.arange(times[0], times[-1] + 1.0, 1e-3)
     place, speed, went = values[0], 0.0, []
-    ends = [*times[1:].tolist(), np.inf]
+    ends = [*times[1:].tolist(), times[-1] + 1.0]
     for value, begin, end in zip(values.tolist(), times.tolist(), ends, strict=True):
         middles = fine[(fine >= begin - 1e-9) & (fine < end - 1e-9)] + 5e-4
-        lasting = end if np.isfinite(end) else begin + 1.0
-        t = np.append(middles, lasting) - begin
+        t = np.append(middles, end) - begin
         x, v = _shortest(place - value, speed, most, t)
         went.extend((value + x[:-1]).tolist())
         place, speed = value + x[-1], v[-1]
