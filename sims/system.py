@@ -135,6 +135,11 @@ class Moment:
         """(L, 1) the coordinate that biases, springs and ripples act on."""
         return self.x[:, self.system.primary, None]
 
+    @property
+    def primary_rate(self) -> Array:
+        """(L, 1) velocity of that coordinate."""
+        return self.v[:, self.system.primary, None]
+
     def along_primary(self, force: Array) -> Array:
         """(L, D) generalised force: `force` (L, 1) along the primary coordinate, zero along the
         others.

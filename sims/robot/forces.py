@@ -22,7 +22,13 @@ OVER_TIME = frozenset({"force.bias", "force.periodic"})
 """Effects whose force hangs on nothing but time."""
 
 LOADED = frozenset(
-    {"friction.load", "friction.load_direction", "friction.load_quadratic", "supply.sag"}
+    {
+        "friction.load",
+        "friction.load_direction",
+        "friction.load_quadratic",
+        "supply.braking",
+        "supply.sag",
+    }
 )
 """Effects that look at what transmissions carry."""
 

@@ -14,7 +14,10 @@ JOINT = (
     "friction.hysteresis", "joint.flexibility", "joint.backlash", "joint.coupling",
 )  # fmt: skip
 BODY = ("mass.scale", "mass.offset", "inertia.scale")
-BOTH = ("input.gain", "input.bias", "input.delay", "input.lag", "input.rate", "supply.sag")
+BOTH = (
+    "input.gain", "input.bias", "input.delay", "input.lag", "input.rate", "supply.braking",
+    "supply.sag",
+)  # fmt: skip
 MOTOR = ("input.deadband", "input.saturation", "input.power")
 SERVO = (
     "actuator.stiffness", "actuator.damping", "servo.deadband", "servo.derivative", "servo.profile",
@@ -42,7 +45,7 @@ FAR = {  # of effects that need no scale of the motion
     "input.lag": 0.2, "sensor.bias": 0.2, "sensor.gain": 0.3, "sensor.delay": 0.1,
     "clock.skew": 0.06, "gravity.scale": 0.3, "actuator.stiffness": 0.5, "actuator.damping": 0.8,
     "gravity.tilt": 0.2, "mass.offset": 0.1, "servo.derivative": 0.1,
-    "friction.load": 0.5, "joint.coupling": 1.0,
+    "friction.load": 0.5, "joint.coupling": 1.0, "supply.braking": 1.0,
 }  # fmt: skip
 
 

@@ -134,6 +134,7 @@ class Drives:
     limit: np.ndarray
     dead: np.ndarray
     sag: np.ndarray
+    lost: np.ndarray
     battery: float = 0.0
     shafts: np.ndarray | None = None
 
@@ -141,7 +142,7 @@ class Drives:
     def of(cls, machine, effects=None):
         """Of a machine, with what is hidden in its servos."""
         count, effects = len(machine.joints), effects or {}
-        gain, kp, kv, limit, dead, sag = np.zeros((6, count))
+        gain, kp, kv, limit, dead, sag, lost = np.zeros((7, count))
         for joint, drive in zip(machine.driven, machine.drives, strict=True):
             change = {
                 name.partition("@")[0]: c[0]
@@ -150,6 +151,7 @@ class Drives:
             }
             limit[joint] = drive.force
             sag[joint] = change.get("supply.sag", 0.0)
+            lost[joint] = change.get("supply.braking", 0.0)
             if drive.kind == "motor":
                 gain[joint] = 1.0
                 continue
@@ -158,7 +160,7 @@ class Drives:
             gain[joint] = kp[joint]
             dead[joint] = change.get("servo.deadband", 0.0)
         (battery,) = effects.get("supply.sag", (0.0,))
-        return cls(gain, kp, kv, limit, dead, sag, battery, _shafts(machine, effects))
+        return cls(gain, kp, kv, limit, dead, sag, lost, battery, _shafts(machine, effects))
 
     def forces(self, u, q, v):
         """For commands u by joint."""
@@ -171,6 +173,8 @@ class Drives:
         if self.sag.any() or self.battery:
             drawn = np.abs(force)
             force = force / (1 + self.sag * drawn + self.battery * drawn.sum(-1, keepdims=True))
+        if self.lost.any():
+            force = force * (1 - self.lost * (force * v < 0))
         return force if self.shafts is None else force + force @ self.shafts
 
 

@@ -69,6 +69,7 @@ COEFFICIENTS = {
     "state.limit": (None, (-8.0, -0.2, 0.2), (-0.02, -0.2, 0.05)),
     "spring.cubic": (None, 2.0, 0.05),
     "spring.linear": (None, 3.0, 0.1),
+    "supply.braking": (None, 0.6, 0.3),
     "supply.sag": (None, 0.1, 1.0),
     "wind": ((0.05, 3.0, -2.0), (0.3, 2.0), None),
 }

@@ -307,6 +307,7 @@ FORCES: dict[str, Callable[[Joint, list[float]], Law]] = {
     "supply.sag": lambda j, c: (
         lambda t, x, v: j.piece.at(t) * (1 / (1 + c[0] * abs(j.piece.at(t))) - 1)
     ),
+    "supply.braking": lambda j, c: lambda t, x, v: -c[0] * j.piece.at(t) * (j.piece.at(t) * v < 0),
     "spring.linear": lambda j, c: lambda t, x, v: -c[0] * x,
     "spring.cubic": lambda j, c: lambda t, x, v: -c[0] * x**3,
     "force.bias": lambda j, c: lambda t, x, v: c[0],

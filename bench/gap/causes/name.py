@@ -106,15 +106,19 @@ class _Inquiry:
         self._model = sought(search)
         self._watch.begin("rivals")
         self._model = search.plainer(settle(search, self._model))
+        self._model = search.to_the_end(self._model)
+        told = self._model.names
         self._try()
         self._watch.begin("structure")
         left = remains(search, self._model)
         self._watch.begin("alternatives")
         model, causes = _preferred(search, self._trial, self._model, left)
         trial = self._trial
-        if trial is not None and model.names not in trial.measured:
-            trial.measure([model])
-            self._watch.check()
+        if model.names != told:
+            model = search.to_the_end(model)
+            if trial is not None:
+                trial.measure([model])
+        self._watch.check()
         state = State(
             causes=len(causes),
             alternatives=any(cause.alternatives for cause in causes),

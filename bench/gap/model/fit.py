@@ -18,7 +18,7 @@ from bench.gap.model.arrow import arrow_step
 from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.differences import FIRST_STATE_STEP, FIRST_STEP, difference_steps, displaced
 from bench.gap.model.noise import Mask, Noise, whitened
-from bench.gap.model.problem import ENOUGH, LARGEST_DAMPING, SHARE, Fit, Point, Problem, Start
+from bench.gap.model.problem import LARGEST_DAMPING, Fit, Point, Problem, Start
 from bench.gap.model.race import RACED, Leg, give_up, legs
 from bench.gap.model.world import FEWEST_LANES, Indices, World
 from sims.base import Array
@@ -47,6 +47,7 @@ class Fitter:
         frozen: parameters that are not fitted, as the data do not show them.
         share: only this first share of each run counts.
         parameters: False to fit initial states alone.
+        exact: whether fits go on until nothing is left to gain, as where their numbers are told.
     """
 
     world: World
@@ -54,6 +55,7 @@ class Fitter:
     frozen: frozenset[int] = frozenset()
     share: float = 1.0
     parameters: bool = True
+    exact: bool = False
 
     def fit(
         self,
@@ -87,7 +89,7 @@ class Fitter:
 
     def _terms(self) -> tuple[Any, ...]:
         """All but the world."""
-        return self.noise, self.frozen, self.share, self.parameters
+        return self.noise, self.frozen, self.share, self.parameters, self.exact
 
     def _groups(self, problems: Sequence[Problem], going: Sequence[int]) -> list[list[int]]:
         """Those that go on, in groups of about `GROUP` samples to simulate, of one kind each as far
@@ -202,6 +204,7 @@ class Fitter:
             high=high,
             widths=widths,
             steps=np.concatenate([FIRST_STEP * widths, state_steps]),
+            exact=self.exact,
         )
 
     def _points(self, trials: Sequence[_Trial], seen: Mask) -> list[Point]:
@@ -311,6 +314,10 @@ class Fitter:
         drift: Array = (states - self.world.guess) / prior_of(self.world)
         return drift
 
+    def cost(self, fit: Fit) -> float:
+        """What a fit costs by this noise."""
+        return self._cost(fit.simulated, fit.states, self.world.counted(self.share))
+
     def _cost(self, simulated: Array, states: Array, seen: Mask) -> float:
         """The cost of eq. (1) of `arrow`; infinite where the simulator gave up."""
         residual = self._residual(simulated, seen)
@@ -358,7 +365,7 @@ class Fitter:
         # converged, or no step is short enough; where numbers overflow none is known
         if (
             not np.isfinite(step.promised)
-            or step.promised < ENOUGH + SHARE * at.cost
+            or step.promised < problem.enough(at.cost)
             or problem.damping > LARGEST_DAMPING
         ):
             problem.finish()

@@ -31,6 +31,12 @@ SIFTED = (12, 8)
 """Of models that are fitted with patience so many go on from each horizon to the next."""
 STEPS = 24
 """Steps of each fit, at most."""
+LEAST = 1e-3
+"""Share of a channel's noise that it is taken to have at least."""
+ROUNDS = 4
+"""Fits of the model that is told, at most, each weighed by what the one before has left."""
+AGAIN = 3.0
+"""Merit gained by one of them with which another is worth its while."""
 LARGEST_DRAWN = 2**62
 """Whole numbers below it tell streams of random numbers apart."""
 FEWEST = 2
@@ -105,6 +111,16 @@ class Models:
 
     def enter(self, fit: Fit) -> Model:
         """Take a fit into account; the better of two fits of the same effects is kept."""
+        model = self._of(fit)
+        # the order in which effects were added makes no difference
+        key = frozenset(fit.effects)
+        if key not in self.models or model.merit > self.models[key].merit:
+            self.models[key] = model
+            self.replaced(key)
+        return self.models[key]
+
+    def _of(self, fit: Fit) -> Model:
+        """A fit with its likelihood and its merit."""
         free = fit.free.size + freedom(self.world, fit, self.noise)
         # one that could not be simulated is entered, too: it need not be tried again
         found = _LOST
@@ -112,13 +128,7 @@ class Models:
             found = likelihood(self.residual(fit), self.seen, free)
         chance = sum(self.chance_of(name) for name in fit.effects)
         merit = found.value - free * self.price - chance  # (1)
-
-        # the order in which effects were added makes no difference
-        key = frozenset(fit.effects)
-        if key not in self.models or merit > self.models[key].merit:
-            self.models[key] = Model(fit, found, merit)
-            self.replaced(key)
-        return self.models[key]
+        return Model(fit, found, merit)
 
     def replaced(self, key: frozenset[str]) -> None:
         """Called when a model has taken the place of another."""
@@ -180,6 +190,35 @@ class Models:
         if known is model:
             self.models[frozenset(model.names)] = result
         return result
+
+    def to_the_end(self, model: Model) -> Model:
+        """The model fitted until nothing is left to gain, with what it leaves for its noise.
+
+        Where that remembers, generalised least squares is what intervals are for; and far from the
+        data its other weights lead on where the fit was caught, so that it is done again until they
+        change nothing.
+        """
+        for _ in range(ROUNDS):
+            left = model.likelihood
+            if not np.isfinite(model.fit.cost):
+                break
+            # A channel without samples has no noise, and one without any of it no weight.
+            sigma = np.where(np.isfinite(left.sigma), left.sigma, self.noise.sigma)
+            noise = Noise(np.maximum(sigma, LEAST * self.noise.sigma), left.phi)
+            fitter = Fitter(self.world, noise, self.frozen, exact=True)
+            (fit,) = fitter.fit([model.fit.start()], STEPS)
+            if self.world.watch.left():
+                break
+            other = self._of(replace(fit, cost=Fitter(self.world, self.noise).cost(fit)))
+            gain = other.merit - model.merit
+            if gain >= AGAIN:
+                model = self.enter(other.fit)
+                continue
+            if gain > 0:
+                # So near, what was scored about it holds as ever.
+                model = self.models[frozenset(other.names)] = other
+            break
+        return model
 
     def _sifted(self, starts: Sequence[Start], noise: Noise) -> list[Start]:
         """Where the best stand after all horizons but the last, which is the whole of the runs."""

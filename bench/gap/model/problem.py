@@ -39,6 +39,10 @@ this and the share below of it.
 """
 SHARE = 1e-4
 """The share."""
+EXACT = 0.002
+"""The same of a fit whose numbers are told: so far from the lowest sum of squares, they are off by
+a twentieth of what noise makes of them.
+"""
 
 FIRST_DAMPING = 1e-3
 """Where the λ of (2) begins."""
@@ -145,6 +149,7 @@ class Problem:
         here: whether the point's derivatives are its own, and not those of another one.
         stale: whether they have to be taken anew before it goes on.
         waits: whether that can wait until it is known that it is not far behind.
+        exact: whether it goes on until `EXACT`.
     """
 
     point: Point
@@ -160,6 +165,11 @@ class Problem:
     here: bool = True
     stale: bool = False
     waits: bool = False
+    exact: bool = False
+
+    def enough(self, cost: float) -> float:
+        """By less than this a step need not lower the cost."""
+        return EXACT if self.exact else ENOUGH + SHARE * cost
 
     def fit(self) -> Fit:
         """What has been fitted by now."""
@@ -217,7 +227,7 @@ class Problem:
         self.damping = max(self.damping * factor, LEAST_DAMPING)  # (2)
         self.growth = GROWTH
         # With derivatives of its own it has converged; with others it may have.
-        if gained < ENOUGH + SHARE * cost:
+        if gained < self.enough(cost):
             self.finish()
 
     def refused(self) -> None:

@@ -119,6 +119,24 @@ def test_a_servo_whose_supply_sags_hangs_lower():
     assert wanted / (1 + c * wanted) == pytest.approx(0.49 * 9.81 * 0.1 * np.sin(q), rel=1e-5)
 
 
+@pytest.mark.parametrize("c", [0.3, 0.75, -0.5, 0.0])
+def test_a_drive_that_hardly_brakes_turns_round_late_and_starts_as_ever(c):
+    """Of a force against the motion 1 - c is left: the way back is as fast as without."""
+    times, mass, v0, u = np.arange(0, 6, 0.01), 2.0, 1.5, -2.0
+    _, v = slide(times, {"supply.braking": c}, mass, u, v=v0)
+    braked = u * (1 - max(c, 0.0)) / mass
+    turned = -v0 / braked
+    wanted = np.where(times < turned, v0 + braked * times, u / mass * (times - turned))
+    assert v == pytest.approx(wanted, abs=1e-6)
+
+
+def test_a_drive_that_does_not_brake_at_all_lets_things_roll_on():
+    times = np.arange(0, 2, 0.01)
+    for c in (1.0, 1.4):
+        _, v = slide(times, {"supply.braking": c}, 2.0, -2.0, v=1.5)
+        assert v == pytest.approx(np.full(times.size, 1.5), abs=1e-9), "no more than all is lost"
+
+
 @pytest.mark.parametrize(("u", "force"), [(2.0, 6.0), (-2.0, -6.0), (1.0, 1.5), (0.0, 0.0)])
 def test_a_propeller_pulls_with_the_square_of_its_input(u, force):
     times = np.arange(0, 1, 0.01)

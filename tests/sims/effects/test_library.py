@@ -111,8 +111,8 @@ def test_what_fits_what():
         "joint.backlash",
         "joint.flexibility",
     }
-    begins = ("input.", "friction.load")
-    inputs = {name for name in NAMES if name.startswith(begins)} | {"backlash", "supply.sag"}
+    begins = ("input.", "friction.load", "supply.")
+    inputs = {name for name in NAMES if name.startswith(begins)} | {"backlash"}
     servo = {"servo.deadband", "servo.derivative", "servo.profile"}
     mechanical = set(NAMES) - {"state.overflow"}
     joint = mechanical - impact - flight

@@ -58,6 +58,7 @@ NAMES = [
     "sensor.lag",
     "sensor.drift",
     "sensor.eccentricity",
+    "supply.braking",
     "supply.sag",
     "sensor.slip",
     "servo.deadband",

@@ -72,6 +72,7 @@ def test_names_are_those_of_the_model(arm):
         "friction.direction": joints,
         "friction.load_direction": joints,
         "friction.position": joints,
+        "supply.braking": ("m_shoulder", "m_elbow", "m_spin", "*"),
         "supply.sag": ("m_shoulder", "m_elbow", "m_spin", "*", ""),
         "joint.coupling": ("elbow", "spin"),
         "input.power": ("m_elbow",),

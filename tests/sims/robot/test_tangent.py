@@ -42,7 +42,7 @@ ALIKE = {
     "mass.offset": 1e-3, "sensor.bias": 1e-4, "sensor.delay": 1e-3, "sensor.gain": 1e-4,
     "sensor.eccentricity": 1e-3, "servo.deadband": 1e-4, "servo.derivative": 1e-2,
     "spring.linear": 1e-4,
-    "supply.sag": 1e-3,
+    "supply.braking": 1e-3, "supply.sag": 1e-3,
 }  # fmt: skip
 """Shares of plausible ranges that are small."""
 
