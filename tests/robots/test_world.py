@@ -242,16 +242,16 @@ def test_the_library_moves_as_this_world_does(effect, c, close, tmp_path):
 
 @pytest.mark.parametrize("robot", ["arm2-motor", "arm2-servo", "ur5-servo"])
 @pytest.mark.parametrize(
-    ("effect", "c", "close"), [("joint.coupling", -0.3, 1e-3), ("supply.sag", 0.02, 0.03)]
+    ("effect", "c", "close"),
+    [("joint.coupling", -0.3, 1e-3), ("supply.sag", 0.02, 0.03), ("supply.braking", 0.5, 0.11)],
 )
-def test_what_drives_have_in_common_the_library_moves_as_this_world_does(
-    robot, effect, c, close, tmp_path
-):
-    """A drive that turns the joint before as well, and one battery for all; what it takes is told
-    of the last step, to first order in its length.
+def test_drives_of_the_library_move_as_those_of_this_world_do(robot, effect, c, close, tmp_path):
+    """A drive that turns the joint before as well, one battery for all, and a drive that hardly
+    brakes; what these take is told of the last step, to first order in its length.
     """
     machine = robots.machine(robot, np.random.default_rng(5))
-    place = f"@{machine.joints[-1]}" if effect.startswith("joint") else ""
+    last = {"joint.coupling": machine.joints[-1], "supply.braking": machine.drives[-1].name}
+    place = f"@{last[effect]}" if effect in last else ""
     moves = 0.5 if robot.endswith("motor") else 0.2
     off, changed = differs(machine, effect + place, (c,), moves, tmp_path)
     assert changed > 1e-4
@@ -291,6 +291,16 @@ def test_a_shaft_turns_two_joints_and_one_battery_serves_all_drives():
     bare = Drives.of(machine).forces(u, q, v)
     left = Drives.of(machine, {"supply.sag": (0.05,)}).forces(u, q, v)
     np.testing.assert_allclose(left, bare * (1 - 0.05 * np.abs(left).sum()))
+    slack = Drives.of(machine, {f"supply.braking@{second.name}": (0.6,)})
+    for way in (1, -1):
+        whole = bare_with(machine, u, q, way * v)
+        share = np.where(whole * way * v < 0, [1.0, 0.4], 1.0)
+        np.testing.assert_allclose(slack.forces(u, q, way * v), share * whole)
+
+
+def bare_with(machine, u, q, v):
+    """What drives exert with nothing hidden."""
+    return Drives.of(machine).forces(u, q, v)
 
 
 def test_a_joint_is_rubbed_by_what_another_ones_drive_has_done():
