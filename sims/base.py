@@ -160,6 +160,9 @@ class Scenario:
         constants: constants that differ from the simulator's own in this run.
         linear: inputs that go straight from one sample to the next instead.
         offset: seconds by which inputs act later than their stamps say.
+        before: inputs before the run, by name where they are known: instants in seconds from
+            ``times[0]``, negative and increasing, and values, (2, K). Else they had their first
+            value.
     """
 
     times: Array
@@ -168,6 +171,7 @@ class Scenario:
     constants: Mapping[str, float] = field(default_factory=dict)
     linear: frozenset[str] = frozenset()
     offset: float = 0.0
+    before: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         # Copies that nobody can write to: scenarios are shared by lanes and by methods.
@@ -184,7 +188,14 @@ class Scenario:
                     f"input '{name}' has shape {signal.shape}, the scenario has {times.size}"
                     " samples"
                 )
+        before = {name: frozen(signal) for name, signal in self.before.items() if signal.size}
+        for name, (stamps, _) in before.items():
+            if not (np.diff(stamps, append=0.0) > 0).all():
+                raise InputError(
+                    f"input '{name}' before the run: its instants must be negative and increasing"
+                )
         # The class is frozen; this is how it sets its own fields.
+        object.__setattr__(self, "before", before)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "inputs", inputs)
         object.__setattr__(self, "initial", {k: float(v) for k, v in self.initial.items()})

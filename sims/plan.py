@@ -37,6 +37,9 @@ from sims.system import Acting, Effect, Input, Sensor, Signal
 _ROUNDING = 1e-6
 """Share of a step by which an interval may exceed a whole number of steps."""
 
+FINE = 2e-3
+"""Seconds of a step before the run, where no step within it is longer."""
+
 Indices = NDArray[np.intp]
 Number = TypeVar("Number", np.float64, np.intp)
 
@@ -90,7 +93,8 @@ def make_runs(scenarios: Sequence[Scenario]) -> Runs:
     groups = []
     for scenario in objects:
         signals = sorted(scenario.inputs.items())
-        read = tuple(sorted(scenario.linear)), scenario.offset
+        earlier = tuple((name, u.tobytes()) for name, u in sorted(scenario.before.items()))
+        read = tuple(sorted(scenario.linear)), scenario.offset, earlier
         content = scenario.times.tobytes(), read, *((name, u.tobytes()) for name, u in signals)
         group = by_content.setdefault(content, len(distinct))
         if group == len(distinct):
@@ -160,7 +164,9 @@ def _changes(runs: Runs, commands: Commands, shifting: Sequence[tuple[Effect, Ar
         for s, u in zip(runs.distinct, commands, strict=True):
             changed = np.diff(u[name]) != 0
             later = np.maximum(_commanded(s)[1:], 0.0)
-            rows.append(later[changed])
+            # What was commanded before the run may be felt within it.
+            earlier = _instants(s, name)[: -s.times.size]
+            rows.append(np.concatenate([earlier, later[changed]]))
         size = max(row.size for row in rows)
         padded = [np.concatenate([row, np.zeros(size - row.size)]) for row in rows]
         felt = np.stack(padded)[runs.of]
@@ -228,6 +234,21 @@ def _commanded(scenario: Scenario) -> Array:
     return seconds
 
 
+def _instants(scenario: Scenario, name: str) -> Array:
+    """(K + T,) the same of an input that is known before the run, too."""
+    commanded = _commanded(scenario)
+    if name not in scenario.before:
+        return commanded
+    return np.concatenate([scenario.before[name][0] + scenario.offset, commanded])
+
+
+def _signal(scenario: Scenario, name: str, values: Array) -> Array:
+    """(K + T,) the values at these instants, from those in the run (T,)."""
+    if name not in scenario.before:
+        return values
+    return np.concatenate([scenario.before[name][1], values])
+
+
 def _padded(values: Array, size: int) -> Array:
     """`values` and their last one, over and over, up to this size."""
     more = np.full(size - values.size, values[-1])
@@ -239,7 +260,8 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
     through the effects.
 
     A command holds its value from one recorded sample to the next, and had its first value before
-    the first. Effects act on the first input.
+    the first, unless more is known. Effects act on the first input; those with a memory begin where
+    it is known first.
 
     Args:
         plan: the steps.
@@ -248,15 +270,20 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
         acting: input effects in the order in which the signal passes them.
     """
     effects = tuple((effect, c, acts(c)) for effect, c in acting if c.any())
-    begin = _before(plan.ends)
+    begin, end, steps = _before(plan.ends), plan.ends, plan.steps
     first, *others = commands[0]
     felt = {}
     for name in others if effects else (first, *others):
-        felt[name] = _felt(runs, name, commands, begin, plan.ends, plan.alike)
+        felt[name] = _felt(runs, name, commands, begin, end, plan.alike)
     if not effects:
         return felt
+    lead = _led(runs, first, max(float(steps.max(initial=0.0)), FINE))
+    if lead.size:
+        earlier = lead[:, runs.of]
+        begin, end = np.hstack([earlier[0], begin]), np.hstack([earlier[1], end])
+        steps = np.hstack([earlier[1] - earlier[0], steps])
+    ends = end
     # Back from the plant to the command: the last effect asks the one before it for its instants.
-    end = plan.ends
     for effect, c, on in reversed(effects):
         assert isinstance(effect, Input)
         # Most effects leave instants as they are, and then nothing is asked of every single lane.
@@ -270,13 +297,34 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
         if isinstance(effect, Input) and effect.between:
             other = _felt(runs, first, commands, begin, end, plan.alike, other=True)
             means = np.where(on, means + c[0] * (other - means), means)
-    beginnings = np.array([u[first][0] for u in commands])
-    return {first: _passed(effects, plan, means, beginnings[runs.of, None]), **felt}
+    pairs = zip(runs.distinct, commands, strict=True)
+    beginnings = np.array([_signal(s, first, u[first])[0] for s, u in pairs])
+    passed = _passed(effects, steps, ends, means, beginnings[runs.of, None])
+    return {first: passed[:, lead.shape[2] :], **felt}
+
+
+def _led(runs: Runs, name: str, largest: float) -> Array:
+    """(2, N, K) beginnings and ends of steps before the runs, in which an input is known: none is
+    longer than `largest`, and those of a run with fewer have no length.
+    """
+    edges = []
+    for scenario in runs.distinct:
+        stamps = _instants(scenario, name)[: -scenario.times.size]
+        marks = np.append(stamps[stamps < 0], 0.0)
+        counts = np.ceil(np.diff(marks) / largest - _ROUNDING).astype(np.intp)
+        starts = np.repeat(marks[:-1], counts)
+        lengths = np.repeat(np.diff(marks) / np.maximum(counts, 1), counts)
+        number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        edges.append(np.append(starts + number * lengths, 0.0))
+    size = max(row.size for row in edges)
+    padded = np.stack([np.concatenate([np.full(size - e.size, e[0]), e]) for e in edges])
+    return np.stack([padded[:, :-1], padded[:, 1:]])
 
 
 def _passed(
     effects: Sequence[tuple[Effect, Array, NDArray[np.bool_]]],
-    plan: Plan,
+    steps: Array,
+    ends: Array,
     means: Array,
     start: Array,
 ) -> Array:
@@ -284,11 +332,12 @@ def _passed(
 
     Args:
         effects: with their coefficients, and where they act, (L, 1).
-        plan: the steps.
+        steps: (L, S) lengths.
+        ends: (L, S) their ends.
         means: of the command over each step.
-        start: (L, 1) the command's first value, which has always been there before the run.
+        start: (L, 1) the command's first value, which has always been there before the first step.
     """
-    lasting = _lasting(plan.steps)
+    lasting = _lasting(steps)
     values = np.take_along_axis(means, lasting, axis=1)
     start = start.copy()
     for effect, c, on in effects:
@@ -297,7 +346,7 @@ def _passed(
         lanes = np.flatnonzero(on)
         own, begin = c[:, lanes], start[lanes]
         nothing = np.zeros_like(begin)
-        signal = Signal(values[lanes], plan.steps[lanes], begin, plan.ends[lanes])
+        signal = Signal(values[lanes], steps[lanes], begin, ends[lanes])
         passed = effect.feel(own, signal)
         values[lanes] = np.take_along_axis(passed, lasting[lanes], axis=1)
         start[lanes] = effect.feel(own, Signal(begin, nothing, begin, nothing))
@@ -345,7 +394,8 @@ def _felt(
         scenario = runs.distinct[run]
         means = _straight_means if (name in scenario.linear) != other else _means
         to, of = (slice(run, run + 1), lanes[:1]) if alike else (lanes, lanes)
-        result[to] = means(_commanded(scenario), commands[run][name], begin[of], end[of])
+        signal = _signal(scenario, name, commands[run][name])
+        result[to] = means(_instants(scenario, name), signal, begin[of], end[of])
     return runs.spread(result) if alike else result
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from math import copysign
 
 import numpy as np
 
@@ -78,13 +79,15 @@ class Asked(Felt):
         moment.t.fill(t)
         moment.x.fill(x)
         moment.v[0, 0] = v
-        moment.v[1, 0] = v + NUDGE
+        # Away from rest, where forces may jump.
+        nudge = copysign(NUDGE, v)
+        moment.v[1, 0] = v + nudge
         force, nudged = self._ask.force()[:, 0].tolist()
         self.weight = self._gravity(x)
         self.limit = self._ask.limit()
         self._at = v
         self._force = self.weight + force
-        self._slope = (nudged - force) / NUDGE
+        self._slope = (nudged - force) / nudge
 
 
 class Known(Felt):

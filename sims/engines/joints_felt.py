@@ -124,12 +124,14 @@ class Asked(Felt):
             moment.t[half, 0] = t
             moment.x[half, 0] = x
             moment.v[half, 0] = v
-        moment.v[count:, 0] += NUDGE
+        # Away from rest, where forces may jump.
+        nudge = np.copysign(NUDGE, v)
+        moment.v[count:, 0] += nudge
         both = self._ask.force()[:, 0]
         force, nudged = both[:count], both[count:]
         weight = self._gravity(x)
         limit = self._ask.limits() if self._ask.rubs else None
-        return weight, limit, weight + force, (nudged - force) / NUDGE
+        return weight, limit, weight + force, (nudged - force) / nudge
 
 
 class Known(Felt):

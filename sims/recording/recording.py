@@ -33,6 +33,12 @@ from sims.recording.units import SAME, Scale
 __all__ = ["Declared", "Recording", "Run", "read_recording", "system_of"]
 
 
+REMEMBERED = 2.0
+"""Seconds before a part of a run of which its inputs are kept: what lags, limits of the rate and
+motion profiles know of them is over by then.
+"""
+
+
 @dataclass(frozen=True, repr=False)
 class Run:
     """One run of a recording.
@@ -50,6 +56,7 @@ class Run:
         linear: inputs that go straight from one sample to the next; the others hold.
         offset: seconds by which inputs act later than their stamps say.
         log: that it is of, where several recordings were joined.
+        before: of a part of a run, inputs before it, as in `Scenario`.
     """
 
     name: str
@@ -63,6 +70,7 @@ class Run:
     linear: frozenset[str] = frozenset()
     offset: float = 0.0
     log: str = ""
+    before: Mapping[str, Array] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         # A cell of a notebook that ends in a run would print all of its samples.
@@ -85,7 +93,17 @@ class Run:
             # a known initial state is that of the whole run's beginning
             initial={} if rows.start else self.initial,
             extra=cut(self.extra),
+            before={name: self._before(name, rows) for name in self.inputs},
         )
+
+    def _before(self, name: str, rows: slice) -> Array:
+        """(2, K) an input in the last seconds before some of the samples, from their first on."""
+        times, values = self.times[: rows.start or 0], self.inputs[name][: rows.start or 0]
+        earlier = self.before.get(name, np.empty((2, 0)))
+        begin = self.times[rows.start or 0]
+        stamps = np.concatenate([earlier[0] + self.times[0], times]) - begin
+        known = np.stack([stamps, np.concatenate([earlier[1], values])])
+        return known[:, stamps >= -REMEMBERED]
 
 
 @dataclass(frozen=True, repr=False)

@@ -79,7 +79,9 @@ def felt(
     felt = {}
     for name, signal in commands.items():
         given = partial(_given, step, scenario, name, signal, steps, seen)
-        asked = step, steps, usual.tobytes(), name in scenario.linear, scenario.offset
+        earlier = scenario.before[name].tobytes() if name in scenario.before else b""
+        read = name in scenario.linear, scenario.offset, earlier
+        asked = step, steps, usual.tobytes(), *read
         plain = _known.get((*asked, _digest(scenario.times, signal)), partial(given, (), 1, usual))
         values = np.repeat(plain, n, axis=0)
         passed = tuple((e, c) for e, c in acting if isinstance(e, Input) and e.signal == name)

@@ -2,14 +2,18 @@
 by hand.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sims.base import InputError, Scenario
+from sims.effects import get
 from sims.effects.actuation import Backlash, Delay
 from sims.effects.sensing import Delay as Late
 from sims.effects.sensing import Skew
 from sims.plan import Plan, felt_inputs, make_plan, make_runs
+from sims.recording.recording import Run
 from sims.slider.simulator import Slider
 from sims.system import Coefficient, Input, Sensor
 
@@ -202,3 +206,70 @@ def test_sensor_effects_act_on_samples_and_filters_on_every_step():
         np.ones((1, 1)), Scenario(t, {"v": 1.0})
     )[0]
     np.testing.assert_allclose(seen[:, 0], t - lag * (1.0 - np.exp(-t / lag)), atol=1e-13)
+
+
+REMEMBERING = {
+    "input.lag": 0.2,
+    "input.rate": 8.0,
+    "input.delay": 0.13,
+    "servo.derivative": 0.15,
+    "servo.profile": 60.0,
+    "backlash": 0.5,
+}
+STAMPS = np.arange(0, 3, 0.02)
+JUMPS = np.random.default_rng(5).uniform(-1, 1, 30).repeat(5)
+
+
+def part(first, last=None, **more):
+    """Some of a run, which knows what was commanded before."""
+    whole = Run("1", STAMPS, {}, {"u": JUMPS}, {}, {}, False, **more)
+    return whole.part(slice(first, last))
+
+
+def felt_in(run, name, step=0.005):
+    """What a drive with an effect feels over the steps of a run."""
+    scenario = Scenario(run.times, {}, run.inputs, {}, run.linear, run.offset, run.before)
+    runs, acting = make_runs([scenario]), ((get(name)(), coefficients(REMEMBERING[name])),)
+    steps = np.full((1, round((run.times[-1] - run.times[0]) / step)), step)
+    rows = np.zeros((1, run.times.size), dtype=int)
+    plan = Plan(steps, np.cumsum(steps, axis=1), 1, rows, alike=True)
+    return felt_inputs(plan, runs, [dict(scenario.inputs)], acting)["u"][0]
+
+
+@pytest.mark.parametrize("linear", [frozenset(), frozenset({"u"})])
+@pytest.mark.parametrize("offset", [0.0, 0.03, -0.03])
+@pytest.mark.parametrize("name", REMEMBERING)
+def test_a_part_of_a_run_feels_what_was_commanded_before_it(name, offset, linear):
+    whole, later = part(0, linear=linear, offset=offset), part(111, linear=linear, offset=offset)
+    wanted = felt_in(whole, name)[-(later.times.size - 1) * 4 :]
+    # within what it makes of steps of another length
+    close = {"input.lag": 0.03, "servo.profile": 0.01}.get(name, 1e-9)
+    assert felt_in(later, name) == pytest.approx(wanted, abs=close)
+    forgets = felt_in(replace(later, before={}), name)
+    assert np.abs(forgets - wanted).max() > 0.15
+
+
+def test_a_part_of_a_part_remembers_as_much():
+    one, other = part(110, 140), part(60).part(slice(50, 80))
+    np.testing.assert_allclose(other.before["u"], one.before["u"], atol=1e-12)
+    assert one.before["u"][0, [0, -1]] == pytest.approx([-2.0, -0.02])
+    assert not part(0).before["u"].size
+
+
+def test_lanes_that_remember_stand_beside_those_that_do_not():
+    runs = [part(102), part(0, 30), part(20)]
+    own = [felt_in(run, "input.lag") for run in runs]
+    scenarios = [Scenario(r.times, {}, r.inputs, before=r.before) for r in runs]
+    together = make_runs(scenarios)
+    counts = [values.size for values in own]
+    steps = np.array([np.where(np.arange(max(counts)) < n, 0.005, 0.0) for n in counts])
+    plan = Plan(steps, np.cumsum(steps, axis=1), 1, np.zeros((3, 1), dtype=int))
+    acting = ((get("input.lag")(), coefficients(REMEMBERING["input.lag"], 0.2, 0.2)),)
+    felt = felt_inputs(plan, together, [dict(s.inputs) for s in scenarios], acting)["u"]
+    for row, values in zip(felt, own, strict=True):
+        np.testing.assert_allclose(row[: values.size], values, atol=1e-12)
+
+
+def test_instants_before_a_run_lie_before_it():
+    with pytest.raises(InputError, match="must be negative and increasing"):
+        Scenario(STAMPS, {}, {"u": JUMPS}, before={"u": np.array([[-0.1, 0.0], [1.0, 2.0]])})

@@ -69,7 +69,9 @@ def tracked(
     begun = {name: value for name, value in run.initial.items() if name not in states}
     return Track(
         name=run.name,
-        scenario=Scenario(run.times, begun, run.inputs, constants, run.linear, run.offset),
+        scenario=Scenario(
+            run.times, begun, run.inputs, constants, run.linear, run.offset, run.before
+        ),
         observed=np.stack(columns, axis=1),
         guess=np.array([guesses[name] for name in states]),
         known=np.array([name in fixed for name in states]),

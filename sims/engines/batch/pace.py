@@ -78,10 +78,10 @@ def _rates(field: Field, x: Array, v: Array) -> tuple[Array, Array]:
     for d in range(x.shape[1]):
         nudge = np.zeros_like(x)
         nudge[:, d] = NUDGE
-        moved = field.force(t, x + nudge, v)
-        sped = field.force(t, x, v + nudge)
-        for force, largest in ((moved, turning), (sped, decaying)):
-            change = (force - base)[:, d : d + 1]
+        moved = field.force(t, x + nudge, v) - base
+        # Beside rest and not across it: what jumps there decays no faster for it.
+        sped = field.force(t, x, v + nudge + nudge) - field.force(t, x, v + nudge)
+        for change, largest in ((moved[:, d : d + 1], turning), (sped[:, d : d + 1], decaying)):
             slope = np.abs(change / (NUDGE * field.mass))
             np.fmax(largest, slope, out=largest)
     return turning, decaying

@@ -118,6 +118,13 @@ def changed(program: Program, block: Block, w: int, k: int, register: int, to: i
     `register`.
     """
     a = block.a
+    if to == RUBBED:
+        # Beside rest and not across it: what jumps there decays no faster for it.
+        for i in range(w):
+            block.r[register + k, i] += NUDGE
+        execute(program.code, program.ends[1], program.ends[2], block.r, w)
+        for i in range(w):
+            a[K1 + k, i] = block.r[program.out[k], i]
     for i in range(w):
         block.r[register + k, i] += NUDGE
     execute(program.code, program.ends[1], program.ends[2], block.r, w)
