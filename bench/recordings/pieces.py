@@ -7,7 +7,8 @@ A search costs about
     steps x evaluations of a step x (joints + 3)                                                (1)
 
 by what was measured with one joint and with six. Pieces lie evenly over each run and begin where
-its commands have been quiet, so that what was commanded before is over.
+its commands have been quiet, so that hardly anything of what was commanded before is left in the
+motion; what drives may still feel of it goes with them.
 """
 
 from __future__ import annotations
