@@ -373,6 +373,19 @@ def test_a_lane_that_needs_too_many_steps_is_given_up_and_no_other():
     np.testing.assert_array_equal(patient.simulate(theta, scenario), expected)
 
 
+@pytest.mark.parametrize("kind", [Slider, Pendulum])
+def test_a_force_that_jumps_at_rest_is_no_fast_decay(kind):
+    """A drive that hardly brakes takes about as many steps as one that does."""
+    times = np.arange(60) / 50
+    run = Scenario(times, {}, {"u": 0.05 * np.sign(np.sin(7 * times + 0.2))})
+    theta = [1.0] if kind is Slider else [0.003]
+    hasty, patient = (
+        kind(engine="batch", fixed={"supply.braking": 0.5}, patience=p) for p in (4.0, np.inf)
+    )
+    seen, wanted = (simulator.simulate(np.array([theta]), run)[0] for simulator in (hasty, patient))
+    np.testing.assert_array_equal(seen, wanted)
+
+
 @pytest.mark.parametrize(
     ("simple", "rich"), [("friction.coulomb", "friction.stribeck"), ("drag.quadratic", "wind")]
 )
