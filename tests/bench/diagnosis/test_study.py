@@ -257,7 +257,7 @@ def test_the_shipped_sheets_are_as_large_as_they_say():
     names = ("small", "full", "machines")
     small, full, machines = (sheet(settings_of(load(f"diagnosis-{name}"))) for name in names)
     assert len({q.name for q in small}) == len(small) == 56
-    assert len({q.name for q in full}) == len(full) == 654
+    assert len({q.name for q in full}) == len(full) == 662
     assert len({q.name for q in machines}) == len(machines) == 98
     assert {q.system for q in machines} == {"servo", "arm2"}
     assert {q.kind for q in small} == {"clean", "single", "double", "foreign"}
