@@ -147,7 +147,7 @@ class Assessor:
         """The whole library with its evidence about the base model, the strongest first; a score is
         less what numbers beyond the first cost, so that a law comes before those that contain it.
         """
-        scores = search.scored.get(frozenset())
+        scores = search.about_base
         if scores is None:
             return ()
         base = search.base.likelihood.value

@@ -79,6 +79,16 @@ class Scored(Models):
         """The model without any effect."""
         return self.models[frozenset()]
 
+    @property
+    def about_base(self) -> Scores | None:
+        """What was scored about it, or about the one before a better fit was found; None where
+        nothing was.
+        """
+        key: frozenset[str] = frozenset()
+        if key in self.scored or key not in self.former:
+            return self.scored.get(key)
+        return self.former[key].scores
+
     def replaced(self, key: frozenset[str]) -> None:
         """What was scored about the model before holds no longer."""
         self.scored.pop(key, None)

@@ -202,7 +202,7 @@ class Models:
             left = model.likelihood
             if not np.isfinite(model.fit.cost):
                 break
-            # A channel without samples has no noise, and one without any of it no weight.
+            # A channel without samples has no noise, and the weight of one without noise no end.
             sigma = np.where(np.isfinite(left.sigma), left.sigma, self.noise.sigma)
             noise = Noise(np.maximum(sigma, LEAST * self.noise.sigma), left.phi)
             fitter = Fitter(self.world, noise, self.frozen, exact=True)

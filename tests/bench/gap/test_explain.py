@@ -153,6 +153,7 @@ def test_what_does_not_fit_the_system_at_all_is_unknown(tmp_path):
     found = explained(table(tmp_path, runs, noise=NOISE))
     assert found.verdict == "unknown"
     assert any("channel q still misses by" in line for line in found.story.remains)
+    assert found.answer.candidates, "what comes nearest is told all the more"
     assert found.answer.heldout.rmse_extended > 10 * 0.003
 
 

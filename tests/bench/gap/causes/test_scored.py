@@ -31,6 +31,18 @@ def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
     )
 
 
+def test_what_was_scored_about_the_base_model_is_told_when_a_better_fit_has_taken_its_place():
+    recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
+    search, base = searched(recorded, 0.01, candidates=["friction.coulomb", "spring.linear"])
+    assert search.about_base is None
+    scores = search.scan(base)
+    assert search.about_base is scores
+    search.models[frozenset()] = replace(base, merit=-np.inf)
+    search.enter(base.fit)
+    assert frozenset() not in search.scored
+    assert search.about_base is scores
+
+
 def test_scores_of_a_model_do_not_hang_on_what_was_scored_before():
     recorded = recording(
         "slider", effects=["friction.coulomb=0.1"], noise=["0.01"], observe=["x"], runs=2, rate=50.0
