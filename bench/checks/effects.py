@@ -81,7 +81,7 @@ def _scenario(system: type[System]) -> Scenario:
     if system.bounces:
         initial[system.coordinates[-1]] = 2.0
     # Both signs and a change every 0.4 s, so that dead bands, delays and lags all show.
-    inputs = {c.name: np.where(times % 0.8 < 0.4, 0.5, -0.3) + 0.6 for c in system.inputs}
+    inputs = {c.name: np.where(times % 0.8 < 0.4, 1.1, -0.3) for c in system.inputs}
     return Scenario(times, initial, inputs)
 
 
