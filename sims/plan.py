@@ -165,8 +165,7 @@ def _changes(runs: Runs, commands: Commands, shifting: Sequence[tuple[Effect, Ar
             changed = np.diff(u[name]) != 0
             later = np.maximum(_commanded(s)[1:], 0.0)
             # What was commanded before the run may be felt within it.
-            earlier = _instants(s, name)[: -s.times.size]
-            rows.append(np.concatenate([earlier, later[changed]]))
+            rows.append(np.concatenate([_earlier(s, name), later[changed]]))
         size = max(row.size for row in rows)
         padded = [np.concatenate([row, np.zeros(size - row.size)]) for row in rows]
         felt = np.stack(padded)[runs.of]
@@ -234,12 +233,12 @@ def _commanded(scenario: Scenario) -> Array:
     return seconds
 
 
-def _instants(scenario: Scenario, name: str) -> Array:
-    """(K + T,) the same of an input that is known before the run, too."""
-    commanded = _commanded(scenario)
+def _earlier(scenario: Scenario, name: str) -> Array:
+    """(K,) the same of an input before the run, as far as it is known."""
     if name not in scenario.before:
-        return commanded
-    return np.concatenate([scenario.before[name][0] + scenario.offset, commanded])
+        return np.empty(0)
+    earlier: Array = scenario.before[name][0] + scenario.offset
+    return earlier
 
 
 def _signal(scenario: Scenario, name: str, values: Array) -> Array:
@@ -278,10 +277,9 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
     if not effects:
         return felt
     lead = _led(runs, first, max(float(steps.max(initial=0.0)), FINE))
-    if lead.size:
-        earlier = lead[:, runs.of]
-        begin, end = np.hstack([earlier[0], begin]), np.hstack([earlier[1], end])
-        steps = np.hstack([earlier[1] - earlier[0], steps])
+    if lead[0].size:
+        parts = zip(lead, (begin, end, steps), strict=True)
+        begin, end, steps = (np.hstack([before[runs.of], now]) for before, now in parts)
     ends = end
     # Back from the plant to the command: the last effect asks the one before it for its instants.
     for effect, c, on in reversed(effects):
@@ -300,25 +298,23 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
     pairs = zip(runs.distinct, commands, strict=True)
     beginnings = np.array([_signal(s, first, u[first])[0] for s, u in pairs])
     passed = _passed(effects, steps, ends, means, beginnings[runs.of, None])
-    return {first: passed[:, lead.shape[2] :], **felt}
+    return {first: passed[:, lead[0].shape[1] :], **felt}
 
 
-def _led(runs: Runs, name: str, largest: float) -> Array:
-    """(2, N, K) beginnings and ends of steps before the runs, in which an input is known: none is
-    longer than `largest`, and those of a run with fewer have no length.
+def _led(runs: Runs, name: str, largest: float) -> tuple[Array, Array, Array]:
+    """(N, K) each: beginnings, ends and lengths of steps before the runs, in which an input is
+    known; none is longer than `largest`, and they have no length where it is not.
     """
-    edges = []
-    for scenario in runs.distinct:
-        stamps = _instants(scenario, name)[: -scenario.times.size]
-        marks = np.append(stamps[stamps < 0], 0.0)
-        counts = np.ceil(np.diff(marks) / largest - _ROUNDING).astype(np.intp)
-        starts = np.repeat(marks[:-1], counts)
-        lengths = np.repeat(np.diff(marks) / np.maximum(counts, 1), counts)
-        number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-        edges.append(np.append(starts + number * lengths, 0.0))
-    size = max(row.size for row in edges)
-    padded = np.stack([np.concatenate([np.full(size - e.size, e[0]), e]) for e in edges])
-    return np.stack([padded[:, :-1], padded[:, 1:]])
+    marks = [_earlier(s, name) for s in runs.distinct]
+    marks = [np.append(row[row < 0], 0.0) for row in marks]
+    size = max(row.size for row in marks)
+    if size == 1:
+        nothing = np.empty((len(marks), 0))
+        return nothing, nothing, nothing
+    first = np.array([[row[0]] for row in marks])
+    steps, ends, _, _ = _divided(np.stack([_padded(row, size) for row in marks]) - first, largest)
+    ends = ends + first
+    return np.hstack([first, ends[:, :-1]]), ends, steps
 
 
 def _passed(
@@ -394,8 +390,9 @@ def _felt(
         scenario = runs.distinct[run]
         means = _straight_means if (name in scenario.linear) != other else _means
         to, of = (slice(run, run + 1), lanes[:1]) if alike else (lanes, lanes)
+        instants = np.concatenate([_earlier(scenario, name), _commanded(scenario)])
         signal = _signal(scenario, name, commands[run][name])
-        result[to] = means(_instants(scenario, name), signal, begin[of], end[of])
+        result[to] = means(instants, signal, begin[of], end[of])
     return runs.spread(result) if alike else result
 
 

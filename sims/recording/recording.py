@@ -93,16 +93,14 @@ class Run:
             # a known initial state is that of the whole run's beginning
             initial={} if rows.start else self.initial,
             extra=cut(self.extra),
-            before={name: self._before(name, rows) for name in self.inputs},
+            before={name: self._before(name, rows.start or 0) for name in self.inputs},
         )
 
-    def _before(self, name: str, rows: slice) -> Array:
-        """(2, K) an input in the last seconds before some of the samples, from their first on."""
-        times, values = self.times[: rows.start or 0], self.inputs[name][: rows.start or 0]
+    def _before(self, name: str, row: int) -> Array:
+        """(2, K) an input in the last seconds before a sample, from there on."""
         earlier = self.before.get(name, np.empty((2, 0)))
-        begin = self.times[rows.start or 0]
-        stamps = np.concatenate([earlier[0] + self.times[0], times]) - begin
-        known = np.stack([stamps, np.concatenate([earlier[1], values])])
+        stamps = np.concatenate([earlier[0] + self.times[0], self.times[:row]]) - self.times[row]
+        known = np.stack([stamps, np.concatenate([earlier[1], self.inputs[name][:row]])])
         return known[:, stamps >= -REMEMBERED]
 
 

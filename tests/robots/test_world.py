@@ -293,14 +293,9 @@ def test_a_shaft_turns_two_joints_and_one_battery_serves_all_drives():
     np.testing.assert_allclose(left, bare * (1 - 0.05 * np.abs(left).sum()))
     slack = Drives.of(machine, {f"supply.braking@{second.name}": (0.6,)})
     for way in (1, -1):
-        whole = bare_with(machine, u, q, way * v)
+        whole = Drives.of(machine).forces(u, q, way * v)
         share = np.where(whole * way * v < 0, [1.0, 0.4], 1.0)
         np.testing.assert_allclose(slack.forces(u, q, way * v), share * whole)
-
-
-def bare_with(machine, u, q, v):
-    """What drives exert with nothing hidden."""
-    return Drives.of(machine).forces(u, q, v)
 
 
 def test_a_joint_is_rubbed_by_what_another_ones_drive_has_done():

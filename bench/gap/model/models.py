@@ -111,9 +111,12 @@ class Models:
 
     def enter(self, fit: Fit) -> Model:
         """Take a fit into account; the better of two fits of the same effects is kept."""
-        model = self._of(fit)
+        return self._entered(self._of(fit))
+
+    def _entered(self, model: Model) -> Model:
+        """The better of a model and the one of the same effects that there is."""
         # the order in which effects were added makes no difference
-        key = frozenset(fit.effects)
+        key = frozenset(model.names)
         if key not in self.models or model.merit > self.models[key].merit:
             self.models[key] = model
             self.replaced(key)
@@ -211,13 +214,12 @@ class Models:
                 break
             other = self._of(replace(fit, cost=Fitter(self.world, self.noise).cost(fit)))
             gain = other.merit - model.merit
-            if gain >= AGAIN:
-                model = self.enter(other.fit)
-                continue
-            if gain > 0:
-                # So near, what was scored about it holds as ever.
-                model = self.models[frozenset(other.names)] = other
-            break
+            if gain < AGAIN:
+                if gain > 0:
+                    # So near, what was scored about it holds as ever.
+                    model = self.models[frozenset(other.names)] = other
+                break
+            model = self._entered(other)
         return model
 
     def _sifted(self, starts: Sequence[Start], noise: Noise) -> list[Start]:
