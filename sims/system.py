@@ -478,6 +478,12 @@ class Effect(ABC):
         """The effect as the sum of effects at one place each, with their coefficients (K, L, 1)."""
         return ((self, c),)
 
+    def taking(self, c: Array, simpler: str, given: Array) -> Array:  # noqa: ARG002
+        """Coefficients (k,) that do besides what a simpler effect that it contains, which it is to
+        stand for, does with those `given`, as far as one of them says so.
+        """
+        return c
+
     @classmethod
     def fits(cls, system: System | type[System]) -> bool:
         """Whether the system can have this effect."""

@@ -160,12 +160,13 @@ class _Identified:
         probes = [p for p in self.found.probes if world.effects[p.effect].place != FAMILY]
         mine = [world.effects[p.effect].place != FAMILY for p in self.found.probes]
         values = self.found.values[..., mine]
-        shown = np.where(self.seen[..., None], values, 0.0) / self.noise.sigma[:, None]
+        shown = np.where(self.seen[..., None], values, 0.0)
+        shown /= self.noise.sigma[:, None]
         runs, _, _, count = shown.shape
         columns = self._without_states(shown.reshape(runs, -1, count))
         if self.parameters.shape[1]:
             basis, _ = np.linalg.qr(self.parameters)
-            columns = columns - basis @ (basis.T @ columns)
+            columns -= basis @ (basis.T @ columns)
         powers = np.sqrt(np.einsum("nk,nk->k", columns, columns))
         # Of several shapes of a coefficient the one that shows best stands for it.
         best: dict[tuple[str, int], int] = {}
@@ -176,18 +177,19 @@ class _Identified:
             key = probe.effect, probe.place
             if key not in best or powers[k] > powers[best[key]]:
                 best[key] = k
-        units = columns / np.maximum(powers, 1e-300)
+        chosen = list(best.values())
+        units = columns[:, chosen] / np.maximum(powers[chosen], 1e-300)
         alike = np.abs(units.T @ units)
         numbers = []
-        for (name, place), k in best.items():
+        for row, ((name, place), k) in zip(alike, best.items(), strict=True):
             parameter = effect_parameters(
                 world.effects[name], world.simulator.system, world.channels
             )[place]
             probe = probes[k]
             half = Z95 / powers[k] if powers[k] > 0 else np.inf
             mixed = [
-                (other, float(alike[k, j]))
-                for (other, _), j in best.items()
+                (other, float(likeness))
+                for (other, _), j, likeness in zip(best, chosen, row, strict=True)
                 if other != name and powers[j] > 0
             ]
             single = sum(1 for own, _ in best if own == name) == 1

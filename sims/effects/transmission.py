@@ -77,7 +77,7 @@ _GIVE = ((0, 1e-3), (0, 1e-3), (0, 0.1))
 """Plausible compliances, where nothing is known of what is carried."""
 _DRIVE = ((0.01, 1), (0.01, 1), (0.01, 1))
 """Plausible inertias of a drive, as a share of the joint's."""
-_ROTOR = Coefficient("rotor", _PURE, _DRIVE, of="rotor", tried=(0.15,))
+_ROTOR = Coefficient("rotor", _PURE, _DRIVE, of="rotor", tried=(0.03,))
 _SPRING = (
     Coefficient("compliance", _GIVING, _GIVE, of="give"),
     Coefficient("damping", _PURE, _RATIO, tried=(0.05,)),
@@ -103,8 +103,9 @@ class Carried(Hidden):
         """A spring with a damper where it is told how far that gives, else two flanks."""
         numbers = {one.name: values for one, values in zip(self.between, c, strict=True)}
         none = np.zeros_like(c[0])
-        gives = numbers.get("compliance")
-        stiffness = none if gives is None else 1.0 / np.maximum(gives, _LEAST)
+        gives = numbers.get("compliance", none)
+        # What gives nothing is off, and no spring beside one that is on.
+        stiffness = np.where(gives > 0, 1.0 / np.maximum(gives, _LEAST), 0.0)
         gap = np.maximum(numbers.get("gap", none), 0.0)
         return Element(stiffness, numbers.get("damping", none), gap, numbers["rotor"])
 

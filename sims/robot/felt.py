@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from sims.base import Array, Scenario
 from sims.plan import Plan, Runs, felt_inputs
-from sims.robot.acting import Mask, lanes_with, part_of
+from sims.robot.acting import Mask, part_of
+from sims.robot.lanes import Places
 from sims.system import Acting, Input
 
 INSTANT = 1e-6
@@ -23,6 +26,10 @@ KEPT = 64 * 2**20
 """Bytes of answers that are kept."""
 PLAIN: Array = np.array([1.0])
 """The same of a step that is not divided."""
+OWN = "u"
+"""What an input is called that is looked at for itself."""
+TOGETHER = 128
+"""Lanes of inputs that are looked at together, at most."""
 
 
 class _Known:
@@ -76,40 +83,88 @@ def felt(
     usual = PLAIN if aligned else PARTS
     if share < 1.0:
         usual = np.array([share, 1.0])
-    felt = {}
+    felt: dict[str, Array] = {}
+    asked: list[_Asked] = []
     for name, signal in commands.items():
-        given = partial(_given, step, scenario, name, signal, steps, seen)
-        earlier = scenario.before[name].tobytes() if name in scenario.before else b""
-        read = name in scenario.linear, scenario.offset, earlier
-        asked = step, steps, usual.tobytes(), *read
-        plain = _known.get((*asked, _digest(scenario.times, signal)), partial(given, (), 1, usual))
-        values = np.repeat(plain, n, axis=0)
+        own = _alone(scenario, name)
+        earlier = own.before[OWN].tobytes() if own.before else b""
+        key = step, steps, usual.tobytes(), bool(own.linear), own.offset, earlier
+        bare = _Asked(name, own, signal, np.zeros(1, dtype=np.intp), ())
+        given = partial(_given, step, steps, seen, usual, [bare])
+        plain = _known.get((*key, _digest(scenario.times, signal)), given)
+        felt[name] = np.repeat(plain, n, axis=0)
         passed = tuple((e, c) for e, c in acting if isinstance(e, Input) and e.signal == name)
         # What is given to a lane must not hang on the company that it is in.
-        lanes = np.flatnonzero(lanes_with(passed, n, lambda _: True))
-        if lanes.size:
-            cuts = PARTS if usual is PLAIN else usual
-            values[lanes] = given(part_of(passed, lanes), lanes.size, cuts)
-        felt[name] = values
+        asked += [_Asked(name, own, signal, *part) for part in _by_kinds(passed, n)]
+    cuts = PARTS if usual is PLAIN else usual
+    for group in _groups(asked):
+        values = _given(step, steps, seen, cuts, group)
+        ends = np.cumsum([one.lanes.size for one in group])
+        for one, rows in zip(group, np.split(values, ends[:-1]), strict=True):
+            felt[one.name][one.lanes] = rows
     return felt
 
 
-def _given(
-    step: float,
-    scenario: Scenario,
-    name: str,
-    signal: Array,
-    steps: int,
-    seen: Mask,
-    passed: Acting,
-    n: int,
-    cuts: Array,
-) -> Array:
-    """(n, S) what lanes are given of one input in steps that are divided at `cuts`."""
-    runs = Runs((scenario,), np.zeros(n, dtype=np.intp))
-    plan = _parts_of_steps(step, steps, n, cuts, alike=not passed)
-    values = felt_inputs(plan, runs, [{name: signal}], passed)[name]
-    parts = values.reshape(n, steps, cuts.size)
+class _Asked(NamedTuple):
+    """One input, what it is told, and the lanes in which effects act on it."""
+
+    name: str
+    scenario: Scenario
+    signal: Array
+    lanes: Places
+    acting: Acting
+
+
+def _alone(scenario: Scenario, name: str) -> Scenario:
+    """What is known of one input, under the name `OWN`."""
+    return replace(
+        scenario,
+        inputs={},
+        linear=frozenset({OWN} if name in scenario.linear else ()),
+        before={OWN: scenario.before[name]} if name in scenario.before else {},
+    )
+
+
+def _by_kinds(passed: Acting, n: int) -> Iterator[tuple[Places, Acting]]:
+    """Lanes in which the same effects act, and what acts there."""
+    there = np.array([(c != 0).any(axis=(0, 2)) for _, c in passed], dtype=bool).reshape(-1, n)
+    kinds, of = np.unique(there, axis=1, return_inverse=True)
+    for number, kind in enumerate(kinds.T):
+        if kind.any():
+            lanes = np.flatnonzero(of.ravel() == number)
+            yield lanes, part_of(passed, lanes)
+
+
+def _groups(asked: Sequence[_Asked]) -> Iterator[list[_Asked]]:
+    """Those on whose ways the same kinds of effects lie, in the same order: what remembers is
+    stepped, and a step costs alike for few lanes and for many.
+    """
+    alike: dict[tuple[str, ...], list[_Asked]] = {}
+    for one in asked:
+        alike.setdefault(tuple(e.of or e.name for e, _ in one.acting), []).append(one)
+    for group in alike.values():
+        sizes = np.cumsum([one.lanes.size for one in group])
+        parts = (sizes - 1) // TOGETHER
+        for part in np.unique(parts):
+            yield [group[k] for k in np.flatnonzero(parts == part)]
+
+
+def _together(asked: Sequence[_Asked]) -> Acting:
+    """What lies on the ways of a group, for its lanes one after the other."""
+    first = [effect for effect, _ in asked[0].acting]
+    rows = zip(*([c for _, c in one.acting] for one in asked), strict=True)
+    return tuple((effect, np.concatenate(c, axis=1)) for effect, c in zip(first, rows, strict=True))
+
+
+def _given(step: float, steps: int, seen: Mask, cuts: Array, asked: Sequence[_Asked]) -> Array:
+    """(N, S) what the lanes that are asked for are given in steps that are divided at `cuts`."""
+    acting = _together(asked)
+    of = np.repeat(np.arange(len(asked)), [one.lanes.size for one in asked])
+    runs = Runs(tuple(one.scenario for one in asked), of)
+    plan = _parts_of_steps(step, steps, of.size, cuts, alike=not acting)
+    commands = [{OWN: one.signal} for one in asked]
+    values = felt_inputs(plan, runs, commands, acting)[OWN]
+    parts = values.reshape(of.size, steps, cuts.size)
     return parts[:, :, 0] if cuts.size < PARTS.size else moments_kept(parts, seen)
 
 

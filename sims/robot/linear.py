@@ -168,12 +168,16 @@ class Linear:
         return result, 1 + len(apart) + looks // len(self._motion.controls)
 
     def _simulated(self, added: Sequence[Added]) -> Array:
-        """(K, T, C) observations of the run with each of these effects beside its own: what has no
-        small size is simulated.
+        """(K, T, C) observations of the run with each of these effects beside its own, or for those
+        that it contains: what has no small size is simulated.
         """
         count, work = len(added), self._work
         acting = [(e, np.repeat(c, count, axis=1)) for e, c in work.acting]
         for lane, (effect, c) in enumerate(added):
+            for simpler, k in acting[: len(work.acting)]:
+                if simpler.name in effect.contains and k[:, lane].any():
+                    c = effect.taking(c, simpler.name, k[:, lane, 0].copy())
+                    k[:, lane] = 0.0
             own = np.zeros((len(c), count, 1))
             own[:, lane, 0] = c
             acting.append((effect, own))

@@ -137,7 +137,11 @@ def at_place(effect: type[Effect], spot: Spot) -> type[Effect]:
         coefficients = [_tried(_of_spot(effect, c, spot)) for c in declared if not _has(spot, c)]
         own = [f"{other}@{spot.name}" for other in effect.contains]
         # What the drive weighs, where it gives nothing.
-        own += [f"inertia.armature@{spot.name}" for c in coefficients if c.of == "rotor"]
+        drive = f"inertia.armature@{spot.name}"
+        for number, c in enumerate(coefficients):
+            if c.of == "rotor":
+                own.append(drive)
+                changed["taking"] = _taking(drive, spot.inertia, number, c.plausible[0])
         changed["contains"] = tuple(own)
     return _made(effect, f"{effect.name}@{spot.name}", spot.name, coefficients, changed)
 
@@ -197,6 +201,20 @@ def _has(spot: Spot, c: Coefficient) -> bool:
     """Whether the file states what a coefficient is of."""
     stated = spot.stated.get("inertia.armature", 0.0)
     return c.of == "rotor" and stated > c.plausible[0][0] * spot.inertia
+
+
+def _taking(
+    drive: str, inertia: float, number: int, bounds: tuple[float, float]
+) -> Callable[[Effect, Array, str, Array], Array]:
+    def taking(_: Effect, c: Array, simpler: str, given: Array) -> Array:
+        """With the drive's inertia as that of the rotor, a share of the joint's."""
+        if simpler != drive:
+            return c
+        made: Array = c.copy()
+        made[number] = np.clip(given[0] / inertia, *bounds)
+        return made
+
+    return taking
 
 
 def _tried(c: Coefficient) -> Coefficient:

@@ -35,6 +35,8 @@ SIMPLER = {
     "friction.hysteresis": "friction.coulomb", "joint.flexibility": "inertia.armature",
     "joint.backlash": "inertia.armature",
 }  # fmt: skip
+WITH_ROTOR = ("joint.flexibility", "joint.backlash")
+"""Those with an inertia of the drive that no file states, their last coefficient."""
 SIGNED = (
     "force.bias", "mass.scale", "inertia.scale", "input.gain", "input.bias", "sensor.bias",
     "sensor.gain", "clock.skew", "gravity.scale", "actuator.stiffness", "actuator.damping",

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from tests.robots import causes, foreign, sizing
+from tests.robots import causes, foreign, plant, sizing
 from tests.robots.settings import setting as drawn_setting
 from tests.robots.sizing import Gauge
 
@@ -36,7 +36,8 @@ class Item:
             numbers.
         family: whether all of them are one family, one coefficient a place.
         size: RMS of the gap that initial states, refitted, leave in the runs for fitting, in
-            noises; of two causes that of each by itself.
+            noises; of two causes that of each by itself; of what lies between a drive and its
+            links, beyond what the drive's inertia alone makes.
         noise: white, ar1 or quantised.
         channels: what is recorded.
         beyond: what is left of the gap, in noises, with the nearest other answers that were looked
@@ -125,7 +126,11 @@ def _sized(item, effect, setting, rng, taken=()):
     wanted = _wanted(rng)
     place = str(rng.choice(places))
     of, name = causes.shape(effect, place, setting, rng), causes.named(effect, place)
-    found = sizing.sized(lambda s: gauge_of(item.name).gap({name: of(s)}), wanted)
+    gauge, beyond = gauge_of(item.name), ()
+    if effect in causes.WITH_ROTOR:
+        # What gives is small where it hardly gives; its rotor would be there all the same.
+        beyond = gauge.change(plant.stiff(setting.machine, place, of(0.0)[-1]))
+    found = sizing.sized(lambda s: gauge.gap({name: of(s)}, beyond), wanted)
     return found and ({name: of(found[0])}, found[1])
 
 

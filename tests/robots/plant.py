@@ -338,6 +338,12 @@ def _inertia(plant, joint):
     return float(mass[joint, joint])
 
 
+def stiff(machine, place, rotor):
+    """A drive's inertia, a share of the joint's, that is there whether the joint yields or not."""
+    inertia = _inertia(plant(machine), machine.index(place))
+    return {f"inertia.armature@{place}": (rotor * inertia,)}
+
+
 def _flexible(plant, joint, c):
     compliance, ratio, rotor = c
     moved = _inertia(plant, joint)

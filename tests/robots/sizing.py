@@ -14,6 +14,7 @@ from tests.robots.world import COARSE, World
 
 ACCURATE = 0.03  # of the wanted size
 LARGEST, LEAP = 1.0, 8.0
+NARROW = 0.98  # of two strengths, between which nothing more is looked for
 NUDGE = 1e-3  # of an initial state, rad or rad/s: the motion is smooth in it
 SETTLED = 1.2  # seconds after which a servo has forgotten where it began
 
@@ -51,10 +52,14 @@ class Gauge:
         ]
         return [d - basis @ (basis.T @ d) for d, basis in zip(differences, self.free, strict=True)]
 
-    def gap(self, effects):
-        """The gap: root mean square over runs, samples and channels."""
+    def gap(self, effects, beyond=()):
+        """The gap: root mean square over runs, samples and channels; with `beyond`, what another
+        change makes, one (N,) a run, that to this one.
+        """
         try:
-            return rms(np.concatenate(self.change(effects)))
+            changes = self.change(effects)
+            others = beyond or [np.zeros_like(change) for change in changes]
+            return rms(np.concatenate([c - b for c, b in zip(changes, others, strict=True)]))
         except (RuntimeError, ValueError, np.linalg.LinAlgError):
             return np.inf  # it diverged
 
@@ -112,6 +117,8 @@ def sized(gap, wanted, first=0.03):
             low = strength, now
         else:
             high = strength, now
+        if low[0] > NARROW * high[0]:
+            return None  # it jumps: a servo that begins to swing
         strength = float(min(_between(low, high, wanted), LARGEST))
     return None
 

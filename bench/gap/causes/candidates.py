@@ -112,7 +112,7 @@ def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
         at: the model.
         names: effects, none of which the model has.
     """
-    probes = [probe for name in names for probe in _first(world, name)]
+    probes = [probe for name in names for probe in _first(world, at, name)]
     values = _responses(world, at, probes)
     acting = _acting(world, probes, values)
     # Only the first answers say which coefficients modify, and only of effects that act at all.
@@ -129,7 +129,7 @@ def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
     return Directions(tuple(probes), np.moveaxis(values, 0, -1))
 
 
-def _first(world: World, name: str) -> Iterator[Probe]:
+def _first(world: World, at: Fit, name: str) -> Iterator[Probe]:
     """Every coefficient that scales an effect, at every shape, a little of it each."""
     parameters = parameters_of(world, name)
     # A coefficient that cannot be zero does not scale: it says where or how the others act.
@@ -138,7 +138,12 @@ def _first(world: World, name: str) -> Iterator[Probe]:
     scaling = [i for i in range(count) if i not in shaping]
     travel = world.travel_of(name)
     coefficients = world.effects[name].coefficients
-    grids = [_grid(world, parameters[i], coefficients[i].tried, travel) for i in shaping]
+    grids = [
+        parameters[i].bounds[:1]
+        if coefficients[i].of == "rotor" and _stood_for(world, at, name)
+        else _grid(world, parameters[i], coefficients[i].tried, travel)
+        for i in shaping
+    ]
     group = 0
     leading = coefficients[0]
     # Coefficients that scale at one point of the grid act together: a sine with its cosine.
@@ -165,6 +170,14 @@ def _first(world: World, name: str) -> Iterator[Probe]:
     if leading.of in LIMITED or (leading.of in ("input", "error") and least == 0):
         shapes = np.array(list(product(*grids)))
         yield from _limits(world, name, group, shapes if shaping else None)
+
+
+def _stood_for(world: World, at: Fit, name: str) -> bool:
+    """Whether an effect that this one contains acts in the model, by itself or in a family."""
+    contained = set(world.effects[name].contains)
+    there = [own for own, slot in world.slots.items() if at.theta[slot].any()]
+    members = {m.name for own in there for m in getattr(world.effects[own], "members", ())}
+    return bool(contained & (members | set(there)))
 
 
 def _stops(world: World, name: str, first: int) -> Iterator[Probe]:

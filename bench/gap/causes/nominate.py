@@ -105,12 +105,14 @@ def _promising(
 
 def _with(world: World, model: Model, name: str, c: Array) -> Start:
     """The model with one more effect, which takes the place of those that it contains."""
-    contained = world.effects[name].contains
-    theta = model.fit.theta.copy()
-    theta[world.slots[name]] = c
+    effect = world.effects[name]
+    contained, theta = effect.contains, model.fit.theta.copy()
     # Both at once would share what they explain in any way.
-    for part in set(contained) & set(model.names):
-        theta[world.slots[part]] = 0.0
+    for part in sorted(set(contained) & set(model.names)):
+        own = world.slots[part]
+        c = effect.taking(c, part, theta[own])
+        theta[own] = 0.0
+    theta[world.slots[name]] = c
     rest = [n for n in model.names if n not in contained]
     return Start((*rest, name), theta, model.fit.states)
 

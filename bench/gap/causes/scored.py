@@ -41,6 +41,8 @@ room, and is scored again in the rare case that somebody asks for it once more.
 """
 SILENT = 0.02
 """Excess over the noise below which nothing richer is fitted before something asks for it."""
+CAUGHT = 1.0
+"""In twice the log likelihood, what a model may be behind one that it contains."""
 UNMOVED = 0.1
 """A fit that has moved by less than so many sigmas, RMS, since its directions were simulated keeps
 them: they are derivatives, and have changed by as little.
@@ -202,9 +204,7 @@ class Scored(Models):
                 most,
                 patient,
             )
-            for start in further:
-                if patient or frozenset(start.effects) not in self.models:
-                    starts.append(start)
+            starts += [s for s in further if patient or self._is_new(s, newest)]
         if not self.world.linear or patient:
             if starts:
                 self.refit(starts, patient=patient)
@@ -218,6 +218,13 @@ class Scored(Models):
         richer = [s for s in starts if parts[id(s)] and not self._explained(parts[id(s)])]
         if richer:
             self.refit(richer)
+
+    def _is_new(self, start: Start, model: Model) -> bool:
+        """Whether a fit may tell what none of these effects has: there is none, or it was caught
+        behind a model that it contains.
+        """
+        known = self.models.get(frozenset(start.effects))
+        return known is None or known.likelihood.value < model.likelihood.value - CAUGHT
 
     def _contained(self, start: Start) -> set[frozenset[str]]:
         """The models with what one of its effects contains in that one's place."""

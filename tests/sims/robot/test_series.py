@@ -326,3 +326,25 @@ def test_keyframes_that_lack_coordinates_are_left_out_and_said(tmp_path):
     applied = apply(arm(tmp_path, text), CAUSES)
     assert applied.model.nkey == 0
     assert any(line.startswith("keyframes are left out") for line in applied.said)
+
+
+def test_a_spring_behind_a_drive_that_was_found_before_takes_its_inertia_over():
+    """J c of the armature that the model has is the rotor, whatever rotor is asked about: what
+    hardly gives then changes hardly anything.
+    """
+    kind = made(WHEEL.replace(f'armature="{DRIVE}"', ""))
+    run = Scenario(TIMES, {}, {"u.m_axle": 0.4 * np.sin(9.0 * TIMES)})
+    names = ["inertia.armature@axle", "joint.flexibility@axle"]
+    simulator = kind(observe=["q.axle"], effects=names)
+    spring = simulator.effects[1]
+    theta = np.array([DRIVE, 0.0, 0.0, 0.0])
+    about = Linear(simulator, theta, run, np.zeros(1), np.zeros(1))
+    sizes = [np.array([c, 0.05, 0.5]) for c in (1 / STIFF, 1e-4 / STIFF)]
+    (given, slight), _ = about.responses([(spring, c) for c in sizes])
+    lanes = np.array([theta, [0.0, 1 / STIFF, 0.05, DRIVE / LINK]])
+    plain, other = simulator.simulate(lanes, run)
+    np.testing.assert_allclose(given, other - plain, atol=1e-9)
+    assert np.abs(slight).max() < 0.01 * np.abs(given).max()
+    np.testing.assert_array_equal(sizes[0], [1 / STIFF, 0.05, 0.5], "nobody's numbers are changed")
+    taken = spring.taking(sizes[0], "inertia.armature@axle", np.array([DRIVE]))
+    assert taken == pytest.approx([1 / STIFF, 0.05, DRIVE / LINK])
