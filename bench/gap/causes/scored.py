@@ -220,11 +220,14 @@ class Scored(Models):
             self.refit(richer)
 
     def _is_new(self, start: Start, model: Model) -> bool:
-        """Whether a fit may tell what none of these effects has: there is none, or it was caught
-        behind a model that it contains.
+        """Whether a fit may tell what none of these effects has: there is none, or, of a robot,
+        whose effects begin far away, it was caught behind a model that it contains.
         """
         known = self.models.get(frozenset(start.effects))
-        return known is None or known.likelihood.value < model.likelihood.value - CAUGHT
+        if known is None:
+            return True
+        behind = model.likelihood.value - known.likelihood.value
+        return self.world.linear and behind > CAUGHT
 
     def _contained(self, start: Start) -> set[frozenset[str]]:
         """The models with what one of its effects contains in that one's place."""
