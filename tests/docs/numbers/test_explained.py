@@ -65,6 +65,17 @@ def robots():
     assert len(summary["failed"]) == 3
     page.known("end in 900 s", "how it was asked")
     page.known("the library of 24 November", "which has not been asked yet")
+    between = frame("robots/transmission.csv")
+    right, play = between.outcome == "right", between.question.str.contains("backlash")
+    drawn = between.outcome != "not drawn"
+    page.says("{} of the sheet, `transmission.csv`", len(between))
+    page.known("of later on 24 November", "which library it was")
+    page.says("{} of {} right (one cannot be drawn)", right.sum(), drawn.sum())
+    assert len(between) - drawn.sum() == 1
+    page.says("of elastic joints\n{} of {}; before", right[~play].sum(), (~play).sum())
+    page.known("ran into 900 s", "how it was asked")
+    page.says("Of play {} of {} are right", right[play].sum(), (play & drawn).sum())
+    page.says("of {} more it is named, and beside", (between.outcome == "extra").sum())
     return page
 
 
