@@ -86,19 +86,18 @@ def felt(
     felt: dict[str, Array] = {}
     asked: list[_Asked] = []
     for name, signal in commands.items():
-        own = _alone(scenario, name)
-        earlier = own.before[OWN].tobytes() if own.before else b""
-        key = step, steps, usual.tobytes(), bool(own.linear), own.offset, earlier
-        bare = _Asked(name, own, signal, np.zeros(1, dtype=np.intp), ())
-        given = partial(_given, step, steps, seen, usual, [bare])
-        plain = _known.get((*key, _digest(scenario.times, signal)), given)
+        earlier = scenario.before[name].tobytes() if name in scenario.before else b""
+        read = name in scenario.linear, scenario.offset, earlier
+        key = step, steps, usual.tobytes(), *read, _digest(scenario.times, signal)
+        bare = _Asked(name, signal, np.zeros(1, dtype=np.intp), ())
+        plain = _known.get(key, partial(_given, step, scenario, [bare], steps, seen, usual))
         felt[name] = np.repeat(plain, n, axis=0)
         passed = tuple((e, c) for e, c in acting if isinstance(e, Input) and e.signal == name)
         # What is given to a lane must not hang on the company that it is in.
-        asked += [_Asked(name, own, signal, *part) for part in _by_kinds(passed, n)]
+        asked += [_Asked(name, signal, *part) for part in _by_kinds(passed, n)]
     cuts = PARTS if usual is PLAIN else usual
     for group in _groups(asked):
-        values = _given(step, steps, seen, cuts, group)
+        values = _given(step, scenario, group, steps, seen, cuts)
         ends = np.cumsum([one.lanes.size for one in group])
         for one, rows in zip(group, np.split(values, ends[:-1]), strict=True):
             felt[one.name][one.lanes] = rows
@@ -109,7 +108,6 @@ class _Asked(NamedTuple):
     """One input, what it is told, and the lanes in which effects act on it."""
 
     name: str
-    scenario: Scenario
     signal: Array
     lanes: Places
     acting: Acting
@@ -156,11 +154,18 @@ def _together(asked: Sequence[_Asked]) -> Acting:
     return tuple((effect, np.concatenate(c, axis=1)) for effect, c in zip(first, rows, strict=True))
 
 
-def _given(step: float, steps: int, seen: Mask, cuts: Array, asked: Sequence[_Asked]) -> Array:
+def _given(
+    step: float,
+    scenario: Scenario,
+    asked: Sequence[_Asked],
+    steps: int,
+    seen: Mask,
+    cuts: Array,
+) -> Array:
     """(N, S) what the lanes that are asked for are given in steps that are divided at `cuts`."""
     acting = _together(asked)
     of = np.repeat(np.arange(len(asked)), [one.lanes.size for one in asked])
-    runs = Runs(tuple(one.scenario for one in asked), of)
+    runs = Runs(tuple(_alone(scenario, one.name) for one in asked), of)
     plan = _parts_of_steps(step, steps, of.size, cuts, alike=not acting)
     commands = [{OWN: one.signal} for one in asked]
     values = felt_inputs(plan, runs, commands, acting)[OWN]

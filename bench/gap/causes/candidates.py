@@ -173,11 +173,10 @@ def _first(world: World, at: Fit, name: str) -> Iterator[Probe]:
 
 
 def _stood_for(world: World, at: Fit, name: str) -> bool:
-    """Whether an effect that this one contains acts in the model, by itself or in a family."""
-    contained = set(world.effects[name].contains)
-    there = [own for own, slot in world.slots.items() if at.theta[slot].any()]
-    members = {m.name for own in there for m in getattr(world.effects[own], "members", ())}
-    return bool(contained & (members | set(there)))
+    """Whether the model has an effect that this one contains, by itself or in a family."""
+    effects = [world.effects[own] for own in at.effects]
+    there = {m.name for effect in effects for m in getattr(effect, "members", ()) or (effect,)}
+    return bool(there & set(world.effects[name].contains))
 
 
 def _stops(world: World, name: str, first: int) -> Iterator[Probe]:
