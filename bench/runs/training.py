@@ -2,20 +2,18 @@
 tensors.
 
 The file's name is a hash of everything that went in: the code that makes runs, the tuner's and
-simulator's source and options, the training range and scenarios, budget, seed, the versions of the
-packages that compute and the device (`bench.runs.sources`). The file holds the same hash, so that
-one which was put in another's place is noticed. Nothing is ever unpickled.
+simulator's source and options, the training range and scenarios, budget, seed, the versions of the packages
+that compute (`bench.runs.sources`). The file holds the same hash, so that one which was put in
+another's place is noticed. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from time import perf_counter
 
@@ -143,21 +141,10 @@ def key(experiment: Experiment, entry: Entry, seed: int) -> str:
         effect_sources(experiment.settings),
         rooms(),
         versions(),
-        device(),
         *([dict(experiment.nuisance)] if entry.randomised else []),
         length=16,
     )
     return f"{entry.tuner}-{experiment.simulator}-{seed}-{hashed}"
-
-
-@cache
-def device() -> str:
-    """Where networks are trained here: the GPU's name, or cpu."""
-    if importlib.util.find_spec("torch") is None:
-        return "cpu"
-    import torch
-
-    return str(torch.cuda.get_device_name()) if torch.cuda.is_available() else "cpu"
 
 
 @dataclass(frozen=True)

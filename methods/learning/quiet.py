@@ -24,7 +24,7 @@ def quietly(rng: np.random.Generator) -> Iterator[None]:
     seed = int(rng.integers(2**62))
     with (
         torch.random.fork_rng(devices=[]),
-        reproducible("cpu"),
+        reproducible(),
         warnings.catch_warnings(),
         redirect_stdout(io.StringIO()),
     ):

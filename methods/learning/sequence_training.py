@@ -84,8 +84,7 @@ def train(
     """
     import torch
 
-    # sequences of eight small tokens: a GPU would wait for its orders
-    with reproducible("cpu"), torch.enable_grad():
+    with reproducible(), torch.enable_grad():
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         named = shapes(material.shown.shape[-1], material.parameters.shape[-1], design)
         w = _initial(named, generator)
