@@ -2,9 +2,9 @@
 tensors.
 
 The file's name is a hash of everything that went in: the code that makes runs, the tuner's and
-simulator's source and options, the training range and scenarios, budget, seed, the versions of the packages
-that compute (`bench.runs.sources`). The file holds the same hash, so that one which was put in
-another's place is noticed. Nothing is ever unpickled.
+simulator's source and options, the training range and scenarios, budget, seed, the versions of the
+packages that compute (`bench.runs.sources`). The file holds the same hash, so that one which was
+put in another's place is noticed. Nothing is ever unpickled.
 """
 
 from __future__ import annotations

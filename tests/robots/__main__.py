@@ -3,8 +3,9 @@ KIND/ROBOT-DRIVE/EFFECT] [--spread]``.
 
 Recordings of independent worlds, in each a hidden cause or none; every answer is marked. One row a
 question is added to items.jsonl as it is answered, so that what was interrupted goes on where it
-was; tables and figures are made from it at the end. ``--fresh`` asks everything again (what was
-drawn by the same code is kept).
+was, also where it was published (``--out results/reference/robots``), each with a hash of the code
+that answered; tables and figures are made from it at the end. ``--fresh`` asks everything again
+(what was drawn by the same code is kept).
 """
 
 import argparse

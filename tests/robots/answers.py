@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from bench.runs.sources import EXPLAIN_ROOMS, rooms
 from tests.exam.explained import EXPLAIN, explained
 from tests.robots.equivalence import Rivals
 from tests.robots.items import Item, setting_of
@@ -39,7 +40,7 @@ def _answer(item, explain, equal):
     mark = marked(item, row["verdict"])
     if equal and mark.outcome == "set":
         mark = replace(mark, equal=_equal(item, row["verdict"]))
-    return row | {"mark": mark.json()}
+    return row | {"mark": mark.json(), "code": rooms(EXPLAIN_ROOMS)}
 
 
 def _equal(item, verdict):

@@ -326,7 +326,7 @@ def _cold(plant, joint, c):
     plant.cold.append((joint, *c))
 
 
-FLANKS = 600.0  # rad/s on which what is carried swings on a flank, critically damped
+FLANKS = 2000.0  # rad/s on which what is carried swings on a flank, critically damped
 
 
 def _inertia(plant, joint):

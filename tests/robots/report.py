@@ -11,16 +11,20 @@ import numpy as np
 from tests.exam.summary import share
 from tests.robots import figures
 
+ABOUT = "about.md"
 HIDDEN = ("single", "family", "double")
 
 
 def write(folder, rows):
-    """Write all of it into `folder`; returns the summary."""
+    """Write all of it into `folder`; returns the summary. What a person has to say of it stands in
+    ABOUT there, and goes into the page.
+    """
     asked = [row for row in rows if row.get("mark")]
-    summary = summarised(rows)
+    summary, about = summarised(rows), folder / ABOUT
     _items(folder / "items.csv", asked)
     (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-    (folder / "README.md").write_text(page(summary))
+    said = about.read_text() if about.exists() else ""
+    (folder / "README.md").write_text(page(summary, said))
     figures.draw(folder, confusion(asked), _seconds(asked))
     return summary
 
@@ -32,6 +36,7 @@ def summarised(rows):
     covered = [held for r in asked for held in r["mark"]["covered"].values() if held is not None]
     return {
         "items": len(asked),
+        "code": dict(Counter(row.get("code", "unknown") for row in asked)),
         "outcomes": {
             kind: dict(Counter(r["mark"]["outcome"] for r in group)) for kind, group in of.items()
         },
@@ -158,13 +163,15 @@ def _times(summary):
     )
 
 
-def page(summary):
-    """README.md."""
+def page(summary, about=""):
+    """README.md, with what a person says of it."""
     lines = ["# Causes hidden in robots", "", INTRODUCTION, ""]
+    lines += [about.strip(), ""] if about else []
     lines += ["| mark | wanted | reached (95 % interval) | met |", "|---|---|---|---|"]
     for what, wanted, got, met in marks(summary):
         lines.append(f"| {what} | {wanted} | {_ratio(got)} | {_WORDS[met]} |")
-    lines += ["", _times(summary) + ".", ""]
+    code = ", ".join(f"{count} by `{name}`" for name, count in summary["code"].items())
+    lines += ["", _times(summary) + ".", "", f"Answers by version of the code: {code}.", ""]
     for key, groups in summary["by"].items():
         lines += [f"## By {key}", "", f"| | {' | '.join(HOWS)} |", "|---|" + "---|" * len(HOWS)]
         for name, shares in groups.items():

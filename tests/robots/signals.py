@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -162,18 +163,31 @@ class Drives:
         (battery,) = effects.get("supply.sag", (0.0,))
         return cls(gain, kp, kv, limit, dead, sag, lost, battery, _shafts(machine, effects))
 
+    # Asked in every stage of every step, so answered once.
+    @cached_property
+    def dull(self):
+        return bool(self.dead.any())
+
+    @cached_property
+    def sags(self):
+        return bool(self.sag.any() or self.battery)
+
+    @cached_property
+    def loses(self):
+        return bool(self.lost.any())
+
     def forces(self, u, q, v):
         """For commands u by joint."""
         if self.shafts is not None:
             q, v = q + q @ self.shafts.T, v + v @ self.shafts.T
         wanted = self.gain * u - self.kp * q - self.kv * v
-        if self.dead.any():
+        if self.dull:
             wanted -= self.kp * np.clip(u - q, -self.dead, self.dead)
         force = np.minimum(np.maximum(wanted, -self.limit), self.limit)  # np.clip takes three times
-        if self.sag.any() or self.battery:
+        if self.sags:
             drawn = np.abs(force)
             force = force / (1 + self.sag * drawn + self.battery * drawn.sum(-1, keepdims=True))
-        if self.lost.any():
+        if self.loses:
             force = force * (1 - self.lost * (force * v < 0))
         return force if self.shafts is None else force + force @ self.shafts
 

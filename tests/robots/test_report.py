@@ -45,11 +45,15 @@ def test_shares_count_what_was_asked(rows):
 
 
 def test_what_is_written_can_be_read_again(rows, tmp_path):
-    report.write(tmp_path, rows)
+    (tmp_path / report.ABOUT).write_text("Asked <in part>.\n")
+    report.write(tmp_path, [rows[0] | {"code": "0123"}, *rows[1:]])
     with (tmp_path / "items.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert [line["outcome"] for line in lines] == ["right", "set", "wrong", "failed"]
     assert lines[0]["hidden"] == "friction.coulomb@elbow=0.3"
     assert json.loads((tmp_path / "summary.json").read_text())["items"] == 4
-    assert "2/4 = 50.0%" in (tmp_path / "README.md").read_text()
+    page = (tmp_path / "README.md").read_text()
+    assert "2/4 = 50.0%" in page
+    assert "\n\nAsked <in part>.\n\n| mark |" in page
+    assert "1 by `0123`, 3 by `unknown`" in page
     assert (tmp_path / "figures" / "confusion.png").stat().st_size > 0

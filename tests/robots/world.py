@@ -71,6 +71,7 @@ class _Course:
         self.memory = slice(2 * self.count + len(more), None)
         more += [0.0] * len(self.plant.memory)
         more += [0.0] if self.plant.heated else []
+        self.remembers = bool(more)
         self.state = np.concatenate([self.state, more])
         self.tooth = run.q[self.cogging.joint] if self.cogging else 0.0
         self.target, self.lagged = self._arrived(0.0), self._arrived(0.0)
@@ -286,6 +287,8 @@ class _Course:
             if self.world.dry:
                 force = force - self.way * self._limit(t, state)
             a = self.plant.accelerations(q, v, force)
+        if not self.remembers:
+            return np.concatenate((v, a))
         more = []
         if self.elastic:
             more += [self._rotor(state)[1], self._elastic_forces(t, state)[1] / self.elastic.rotor]
