@@ -315,7 +315,7 @@ class _Explainer:
             if not fine.suits(left):
                 continue
             self._enter(fine.kind)
-            other = fit_base(self.fitting, self.noise, self._given())
+            other = fit_base(self.fitting, self.noise, self._nearby(base))
             reached, left = self._judged(other)
             gain = reached - value
             if gain < SWITCH:
@@ -331,6 +331,15 @@ class _Explainer:
                 return other
         self._return(*coarse)
         return base
+
+    def _nearby(self, base: Base) -> Array | None:
+        """Where a fit of finer steps begins: a step moves the best parameters a little, and its
+        fit needs no other starts; None where the coarse one has come to nothing.
+        """
+        if not np.isfinite(base.fit.cost):
+            return self._given()
+        nearby: Array = base.fit.theta[self.fitting.base]
+        return nearby
 
     def _before(self, base: Base, measuring: World | None) -> Array | None:
         """What the file's own step makes of the held-out runs; None where there are none."""
