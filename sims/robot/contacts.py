@@ -1,10 +1,12 @@
 """Contacts that a URDF cannot mean: between the fixed base and what hangs on it, and between parts
-that stand within each other.
+that stand within each other; and whether a model can have any.
 """
 
 from __future__ import annotations
 
 from typing import Any
+
+import numpy as np
 
 from sims.robot.words import listed
 
@@ -46,3 +48,30 @@ def without(spec: Any, model: Any) -> list[str]:
             f"no contacts between parts that overlap at the zero position: {listed(pairs)}"
         )
     return notes
+
+
+def possible(model: Any) -> bool:
+    """Whether any two shapes of a compiled model may ever touch, by MuJoCo's own rules of which are
+    looked at (its documentation, "Computation", collision detection).
+    """
+    import mujoco
+
+    if model.npair or model.nflex:
+        return True
+    weld = np.asarray(model.body_weldid)
+    bodies = np.asarray(model.geom_bodyid)
+    rows = (bodies, model.geom_contype, model.geom_conaffinity)
+    # many shapes of a body have the same masks
+    body, kind, affinity = np.unique(np.stack(rows), axis=1)
+    masks = kind[:, None] & affinity
+    meet = (masks | masks.T) != 0
+    own = weld[body]
+    meet &= own[:, None] != own
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+        # A body and the one that carries it do not touch, but for the world.
+        carrier = weld[np.asarray(model.body_parentid)[own]]
+        carried = (carrier[:, None] == own) & (own != 0) & (own[:, None] != 0)
+        meet &= ~(carried | carried.T)
+    first, second = np.minimum(body[:, None], body), np.maximum(body[:, None], body)
+    meet &= ~np.isin((first << 16) + second, model.exclude_signature)
+    return bool(meet.any())
