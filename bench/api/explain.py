@@ -33,6 +33,7 @@ def explain(
     jobs: int | None = None,
     whole: bool = False,
     pieces: float | None = None,
+    thorough: bool = False,
     say: Callable[[str], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float, str], None] | None = None,
@@ -57,6 +58,8 @@ def explain(
         whole: look at all of a long recording of a robot; else at pieces from all over it.
         pieces: seconds of the pieces that every run is cut into, each with an initial state of its
             own: for motion that drifts or is unstable.
+        thorough: search on where causes are found and something is left over: further causes are
+            taken that held-out runs bear out. Takes about twice as long there.
         say: told what is being done.
         stop: asked between two steps of the search; True ends it as a budget does.
         progress: told the share that is done, as far as can be known, and what is looked at.
@@ -74,7 +77,8 @@ def explain(
         raise InputError(f"pieces: expected a number of seconds above 0, found {pieces!r}")
     watch = Watch(budget, stop, progress)
     given = system, engine, seed, free, tuner, say, force
-    return explaining.explain(sources, *given, watch, jobs or cores(), model, whole, pieces)
+    more = jobs or cores(), model, whole, pieces, thorough
+    return explaining.explain(sources, *given, watch, *more)
 
 
 def sources_of(recording: Source | Sequence[Source]) -> list[str | Path | Recording]:

@@ -23,8 +23,8 @@ _PICTURED = (".html", ".png", ".pdf")
 """Endings of what is for the eye: the report names the pictures."""
 
 _SETTINGS = (
-    "system", "model", "engine", "free", "tuner", "seed", "budget", "whole", "pieces", "force",
-    "plugin",
+    "system", "model", "engine", "free", "tuner", "seed", "budget", "whole", "pieces", "thorough",
+    "force", "plugin",
 )  # fmt: skip
 """Options on which an answer depends."""
 
@@ -97,6 +97,12 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
         "that drifts or is unstable",
     )
     parser.add_argument(
+        "--thorough",
+        action="store_true",
+        help="search on where causes are found and something is left over: further causes are taken "
+        "that held-out runs bear out (about twice as long there)",
+    )
+    parser.add_argument(
         "--each",
         action="store_true",
         help="explain every recording by itself, --jobs of them at once: a folder for each and one "
@@ -167,6 +173,7 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
             jobs=options.jobs,
             whole=options.whole,
             pieces=options.pieces,
+            thorough=options.thorough,
             say=look.say,
             stop=interrupts.asked,
             progress=look.show,
@@ -209,7 +216,8 @@ def _explain_each(options: argparse.Namespace, say: Say) -> Answer:
     settings = {
         name: getattr(options, name)
         for name in (
-            "system", "model", "engine", "tuner", "seed", "force", "budget", "whole", "pieces"
+            "system", "model", "engine", "tuner", "seed", "force", "budget", "whole", "pieces",
+            "thorough",
         )
     } | {"free": tuple(names(options.free))}  # fmt: skip
     out = options.out or stamped(Path("results"), "explain-each")

@@ -66,6 +66,7 @@ def explain(
     model: str | Path | None = None,
     whole: bool = False,
     pieces: float | None = None,
+    thorough: bool = False,
 ) -> Explanation:
     """Explain a recording.
 
@@ -84,6 +85,7 @@ def explain(
         model: take it for this robot, whatever the description says: a model file.
         whole: look at all of a long recording of a robot, not at pieces of it.
         pieces: seconds of the pieces that runs are cut into; None where they are not.
+        thorough: search on where causes are left over, with the held-out runs as judges.
 
     Raises:
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
@@ -93,7 +95,8 @@ def explain(
         sources = [recording] if isinstance(recording, Source) else list(recording)
         subject = _Subject(sources, system, model, whole, pieces)
         given = engine, seed, tuple(free), tuner, say, force
-        with closing(_Explainer(subject, *given, watch or Watch(), crew)) as explainer:
+        explainer = _Explainer(subject, *given, watch or Watch(), crew, thorough)
+        with closing(explainer):
             return explainer.run()
 
 
@@ -152,6 +155,7 @@ class _Explainer:
         force: bool,
         watch: Watch,
         crew: Crew,
+        thorough: bool = False,
     ) -> None:
         self.started = time.perf_counter()
         self.seed = seed
@@ -178,6 +182,7 @@ class _Explainer:
         check_recording(self.recording, kind(engine=self.engine), force)
         self.watch = watch
         self.crew = crew
+        self.thorough = thorough
         self.free = tuple(free)
         self._enter(kind)
         self.coarse: Coarse | None = None
@@ -276,6 +281,7 @@ class _Explainer:
 
     def _search(self, base: Base, rng: np.random.Generator) -> Search:
         search = Search(self.fitting, self.noise, base.frozen, rng, self.floor.stated)
+        search.thorough = self.thorough
         search.enter(base.fit)
         return search
 

@@ -45,6 +45,7 @@ def _foreseen(search: Search, few: World) -> Model:
         return search.run()
     rng = search.drawing("fewer samples")
     sketch = Search(few, search.noise, search.frozen, rng, search.stated)
+    sketch.thorough = search.thorough
     sketch.refit([search.base.fit.start()])
     try:
         found = settle(sketch, sketch.run())

@@ -111,6 +111,8 @@ class _Inquiry:
         self._try()
         self._watch.begin("structure")
         left = remains(search, self._model)
+        if search.thorough and self._fuller(left):
+            left = remains(search, self._model)
         self._watch.begin("alternatives")
         model, causes = _preferred(search, self._trial, self._model, left)
         trial = self._trial
@@ -140,6 +142,20 @@ class _Inquiry:
         self._trial = trial
         # What is left where an idle effect was may have a simpler form, too.
         self._model = self._search.plainer(trial.without_idle(self._search, self._model))
+
+    def _fuller(self, left: Remains) -> bool:
+        """Whether held-out runs bear out an account that has more of what the model leaves; it
+        takes the model's place.
+        """
+        found, trial, search = self._model, self._trial, self._search
+        if found is None or trial is None or not found.names or not left.structure:
+            return False
+        fuller = trial.richer(search, found)
+        if fuller is found:
+            return False
+        self._model = search.plainer(search.to_the_end(fuller))
+        trial.measure([self._model])
+        return True
 
     def so_far(self) -> Finding:
         """The finding where the search had to end: never more than what was answered supports."""

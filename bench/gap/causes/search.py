@@ -64,11 +64,13 @@ class Search(Moves):
         settled: effects of a model that was compared with all its neighbours already, on fewer
             samples.
         corrected: effects of the model of which what the engine's step leaves was taken out last.
+        thorough: whether it goes on while the nearest models come nearer, whichever is built upon.
     """
 
     supported: Model | None = None
     settled: frozenset[str] | None = None
     corrected: frozenset[str] | None = None
+    thorough: bool = False
     _sketch: Search | None = None
 
     def run(self) -> Model:
@@ -246,12 +248,22 @@ def beam(search: Search, size: int) -> list[Model]:
 
 
 def is_hopeless(search: Search, larger: Model) -> bool:
-    """Whether a model of several effects is too far from the data for one more to be tried."""
+    """Whether a model of several effects is too far from the data for one more to be tried; of a
+    thorough search, whether all of as many are.
+    """
     # Two effects that leave as much as the best single one are no way to a third.
-    singles = [search.excess(m) for m in search.models.values() if len(m.names) == 1]
     of_base = HOPELESS * search.excess(search.base)
-    of_single = IDLE * min(singles, default=np.inf)
-    return search.excess(larger) > min(of_base, of_single)
+    of_single = IDLE * min(_excesses(search, 1), default=np.inf)
+    left = search.excess(larger)
+    if search.thorough:
+        # The one that is built upon need not be the nearest: far from the noise merit is misled.
+        left = min(left, *_excesses(search, len(larger.names)))
+    return left > min(of_base, of_single)
+
+
+def _excesses(search: Search, size: int) -> list[float]:
+    """What the models of so many effects leave over the noise."""
+    return [search.excess(m) for m in search.models.values() if len(m.names) == size]
 
 
 def conservative(search: Search, best: Model, larger: Model) -> Model:

@@ -11,12 +11,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bench.gap.causes.rules import NOTICED, explains, helps, is_alike, is_missed
-from bench.gap.causes.search import Search
+from bench.gap.causes.rules import NOTICED, explains, helps, is_alike, is_missed, ratio_of
+from bench.gap.causes.search import IDLE, Search
 from bench.gap.causes.structure import Remains
 from bench.gap.measure import HeldOutRuns, Measured
 from bench.gap.model.models import Model, Names
 from sims.base import Array
+
+RICHER = 8
+"""So many of the nearest models that contain what was found are tried on held-out runs."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,40 @@ class Trial:
             # Of several that could go, the one goes without which held-out runs are best.
             model = max(idle, key=lambda m: self.measured[m.names].merit)
         return model
+
+    def richer(self, search: Search, model: Model) -> Model:
+        """The fullest account that keeps what was found and that the held-out runs bear out; the
+        model itself where there is none.
+
+        Where structure is left, merits say little of what the fitted runs show, since each model
+        mimics what none has. What leaves clearly less of runs that no fit has seen mimics nothing.
+
+        Args:
+            search: with every model that was fitted.
+            model: what was found; it has been measured.
+        """
+        names = set(model.names)
+        fuller = [m for m in search.models.values() if names < set(m.names)]
+        fuller = sorted(fuller, key=lambda m: m.fit.cost)[:RICHER]
+        known = search.models.values()
+        parts = [m for m in known if any(set(m.names) < set(other.names) for other in fuller)]
+        # The model again, so that initial states of all are begun from the same ones.
+        self.measure([model, *fuller, *parts])
+        borne = {m.names: self._share(search, model, m) for m in fuller}
+        best = min(fuller, key=lambda m: borne[m.names], default=model)
+        if best is model or not borne[best.names] < 1.0:
+            return model
+        lean = self.without_idle(search, best)
+        return lean if names < set(lean.names) else model
+
+    def _share(self, search: Search, model: Model, fuller: Model) -> float:
+        """How much a fuller account leaves, by what further effects have to bring: one where it is
+        just enough, on the fitted or the held-out runs, whichever show it less.
+        """
+        enough = IDLE ** (len(fuller.names) - len(model.names))
+        fitted = ratio_of(search.excess(fuller), search.excess(model))
+        unseen = ratio_of(self.excess(fuller.names), self.excess(model.names))
+        return max(fitted, unseen) / enough
 
     def _smaller(self, search: Search, model: Model) -> list[Model]:
         """Models that were tried and lack one of the model's effects."""

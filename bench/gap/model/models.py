@@ -37,6 +37,10 @@ ROUNDS = 4
 """Fits of the model that is told, at most, each weighed by what the one before has left."""
 AGAIN = 3.0
 """Merit gained by one of them with which another is worth its while."""
+MIMICRY = 1.2
+"""A fit that is weighed by what the one before has left may leave so many times the squares, as
+noise that remembers has it; one that leaves more was pulled away by what is no noise.
+"""
 LARGEST_DRAWN = 2**62
 """Whole numbers below it tell streams of random numbers apart."""
 FEWEST = 2
@@ -199,8 +203,10 @@ class Models:
 
         Where that remembers, generalised least squares is what intervals are for; and far from the
         data its other weights lead on where the fit was caught, so that it is done again until they
-        change nothing.
+        change nothing. What it may not is leave clearly more: where structure is left it would
+        rather have that smooth than small.
         """
+        squares = Fitter(self.world, self.noise).cost
         for _ in range(ROUNDS):
             left = model.likelihood
             if not np.isfinite(model.fit.cost):
@@ -212,7 +218,9 @@ class Models:
             (fit,) = fitter.fit([model.fit.start()], STEPS)
             if self.world.watch.left():
                 break
-            other = self._of(replace(fit, cost=Fitter(self.world, self.noise).cost(fit)))
+            other = self._of(replace(fit, cost=squares(fit)))
+            if other.fit.cost > MIMICRY * squares(model.fit):
+                break
             gain = other.merit - model.merit
             if gain < AGAIN:
                 if gain > 0:

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.gap.causes.search import Search
+from bench.gap.causes.search import Search, is_hopeless
 from bench.gap.model.noise import Likelihood
-from tests.bench.gap.causes.models import model
+from tests.bench.gap.causes.models import model, search_of
 from tests.bench.gap.made import recording, searched
 
 BASE, LARGER = model(merit=10.0), model("a", merit=30.0)
@@ -119,3 +119,18 @@ def test_pieces_that_explain_nothing_leave_nothing_to_refit(monkeypatch):
     monkeypatch.setattr(Search, "extend", lambda *args: None)
     made.from_pieces(2)
     assert set(made.models) == known
+
+
+@pytest.mark.parametrize(
+    ("thorough", "nearest", "hopeless"),
+    [(False, 3.0, True), (True, 3.0, False), (True, 4.4, True), (False, 4.4, True)],
+)
+def test_a_thorough_search_goes_on_where_the_nearest_models_come_nearer(
+    thorough, nearest, hopeless
+):
+    """The best single effect leaves 5, of which 0.85 are 4.25; what is built upon leaves 4.9."""
+    left = {(): 20.0, ("a",): 5.0, ("a", "b"): 4.9, ("c", "d"): nearest}
+    models = [model(*names) for names in left]
+    asked = search_of(*models, excess=left)
+    asked.base, asked.thorough = models[0], thorough
+    assert is_hopeless(asked, models[2]) is hopeless

@@ -57,3 +57,40 @@ def test_what_is_left_is_noise_where_it_has_no_structure(structure, missed):
     loud = model("a")
     loud.likelihood.sigma[:] = 2.0
     assert trial.misses(loud, SimpleNamespace(structure=structure)) is missed
+
+
+A_B, A_C, A_B_C, B_C = model("a", "b"), model("a", "c"), model("a", "b", "c"), model("b", "c")
+
+
+@pytest.mark.parametrize(
+    ("fitted", "unseen", "stands"),
+    [
+        # two further effects that leave six tenths of both; with one of them nothing is won
+        ({"a": 9.0, "ab": 8.9, "abc": 5.4}, {"a": 9.0, "ab": 8.9, "abc": 5.4}, "abc"),
+        # only the runs that were fitted are nearer
+        ({"a": 9.0, "ab": 8.9, "abc": 5.4}, {"a": 9.0, "ab": 8.9, "abc": 8.0}, "a"),
+        # only those that were not
+        ({"a": 9.0, "ab": 8.9, "abc": 8.0}, {"a": 9.0, "ab": 8.9, "abc": 5.4}, "a"),
+        # enough for one effect, and not for two
+        ({"a": 9.0, "ab": 8.9, "abc": 7.0}, {"a": 9.0, "ab": 8.9, "abc": 7.0}, "a"),
+        ({"a": 9.0, "ab": 7.0, "abc": 6.9}, {"a": 9.0, "ab": 7.0, "abc": 6.9}, "ab"),
+        # one of the two does nothing on held-out runs: it goes again
+        ({"a": 9.0, "ab": 5.6, "abc": 5.0}, {"a": 9.0, "ab": 5.1, "abc": 5.05}, "ab"),
+        # what was found is not exchanged for something else
+        ({"a": 9.0, "bc": 1.0}, {"a": 9.0, "bc": 1.0}, "a"),
+    ],
+)
+def test_a_fuller_account_is_taken_that_held_out_runs_bear_out(fitted, unseen, stands):
+    """Excesses by effects; those that are not given are far off."""
+    models = [BASE, A, B, model("c"), A_B, A_C, B_C, A_B_C]
+    left = {m.names: fitted.get("".join(m.names), 20.0) for m in models}
+    there = {m.names: 1.0 + unseen.get("".join(m.names), 20.0) for m in models}
+    trial = _Measured(*held_out(there))
+    assert "".join(trial.richer(search_of(*models, excess=left), A).names) == stands
+
+
+class _Measured(Trial):
+    """A trial in which all has been measured."""
+
+    def measure(self, models):
+        assert {m.names for m in models} <= self.measured.keys()

@@ -78,3 +78,21 @@ def test_a_model_that_cannot_be_simulated_stays_as_it_is(there):
     model = entered(search, [MASS, DRAG], 20)
     lost = replace(model, fit=replace(model.fit, cost=np.inf))
     assert search.to_the_end(lost) is lost
+
+
+def test_what_is_left_over_and_is_no_noise_does_not_pull_it_away(there):
+    """A drift that nothing of the model is: weighed as noise that remembers, the fit would rather
+    leave all of it, smooth, with a drag of zero.
+    """
+    search = search_of(there, 0.0)
+    times = np.arange(there.observed.shape[1]) / 60
+    there.observed[...] += 0.5 * (times / times[-1])[None, :, None] ** 3
+    begun = entered(search, [MASS, DRAG], 60, exact=True)
+    noise = white(there, begun.likelihood.sigma[0]).coloured(begun.likelihood.phi)
+    (fit,) = Fitter(there, noise, exact=True).fit([begun.fit.start()], 60)
+    pulled = search._of(replace(fit, cost=Fitter(there, search.noise).cost(fit)))
+    assert pulled.merit > begun.merit
+    assert pulled.fit.cost > 2.0 * begun.fit.cost
+    assert pulled.fit.theta[1] == 0.0
+    told = search.to_the_end(begun)
+    assert told.fit.cost < 1.2 * begun.fit.cost
