@@ -99,8 +99,8 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--thorough",
         action="store_true",
-        help="search on where causes are found and something is left over: further causes are taken "
-        "that held-out runs bear out (about twice as long there)",
+        help="search on where causes are found and something is left over: further causes are "
+        "taken that held-out runs bear out (about twice as long there)",
     )
     parser.add_argument(
         "--each",

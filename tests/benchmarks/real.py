@@ -1,8 +1,9 @@
-"""explain on the measured recordings: ``python -m tests.benchmarks.real [NAME ...] [--out DIR]``.
+"""explain on the measured recordings: ``python -m tests.benchmarks.real [NAME ...] [--thorough]
+[--out DIR]``.
 
-Writes a folder for each recording (verdict, extended simulator, report) and the table of
-results/reference/real. What is published of each, and the held-out errors of a quick independent
-fit, stand in the README of the recordings.
+Writes a folder for each recording (verdict, extended simulator, report; of a thorough search one
+called so) and the table of results/reference/real. What is published of each, and the held-out
+errors of a quick independent fit, stand in the README of the recordings.
 """
 
 import argparse
@@ -25,6 +26,7 @@ DATA = Path(os.environ.get("SIMGAP_DATA", Path(__file__).parents[3] / "shared" /
 PUBLISHED = {
     "pendulum_free_swing/recording": "linear damping",
     "servo_pendulum/recording": "friction that grows with the load, besides viscous friction",
+    "servo_pendulum/thorough": "the same",
     "smartphone_fall/fall": "quadratic air drag, and an offset",
     "smartphone_fall/up_down": "quadratic air drag, and an offset that varies by run",
     "ball_drops/bowling_ball": "nothing measurable",
@@ -41,6 +43,7 @@ HEAD = (
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("names", nargs="*")
+    parser.add_argument("--thorough", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("results/reference/real"))
     options = parser.parse_args()
     paths = sorted(path for path in DATA.glob("*/*.csv") if path.with_suffix(".toml").is_file())
@@ -48,10 +51,10 @@ def main():
         name = f"{path.parent.name}/{path.stem}"
         if options.names and not any(wanted in name for wanted in options.names):
             continue
-        folder = options.out / path.parent.name / path.stem
+        folder = options.out / path.parent.name / ("thorough" if options.thorough else path.stem)
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        explain(path).write(folder)
+        explain(path, thorough=options.thorough).write(folder)
         for figure in folder.glob("*.p*"):  # they stand in the report
             figure.unlink()
         if name.startswith("pendulum"):
@@ -59,7 +62,10 @@ def main():
                 json.dumps(open_loop(folder / "extended.toml", path)) + "\n"
             )
         print(row(options.out, folder), flush=True)
-    folders = sorted(found.parent for found in options.out.glob("*/*/verdict.json"))
+    kinds = sorted({path.parent.name for path in paths})  # robots have a program of their own
+    folders = [
+        found.parent for of in kinds for found in sorted(options.out.glob(f"{of}/*/verdict.json"))
+    ]
     (options.out / "table.md").write_text(
         HEAD + "\n".join(row(options.out, folder) for folder in folders) + "\n"
     )

@@ -170,8 +170,10 @@ def page(summary, about=""):
     lines += ["| mark | wanted | reached (95 % interval) | met |", "|---|---|---|---|"]
     for what, wanted, got, met in marks(summary):
         lines.append(f"| {what} | {wanted} | {_ratio(got)} | {_WORDS[met]} |")
-    code = ", ".join(f"{count} by `{name}`" for name, count in summary["code"].items())
-    lines += ["", _times(summary) + ".", "", f"Answers by version of the code: {code}.", ""]
+    lines += ["", _times(summary) + ".", ""]
+    if "code" in summary:  # exams of before did not say
+        code = ", ".join(f"{count} by `{name}`" for name, count in summary["code"].items())
+        lines += [f"Answers by version of the code: {code}.", ""]
     for key, groups in summary["by"].items():
         lines += [f"## By {key}", "", f"| | {' | '.join(HOWS)} |", "|---|" + "---|" * len(HOWS)]
         for name, shares in groups.items():

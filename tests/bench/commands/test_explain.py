@@ -290,3 +290,17 @@ def test_a_terminal_shows_a_bar_and_a_log_a_line_for_each_part(monkeypatch):
         assert (" 50%|" in told) == ("scores of the library" in told) == stream.isatty()
         assert " 40%|" not in told, "a bar does not go back"
         assert ("left, scores" in told) == stream.isatty()
+
+
+def test_a_thorough_search_changes_nothing_where_nothing_is_left_over(folder, tmp_path):
+    command = ["explain", str(folder / "swing.csv"), "--thorough", "--out", str(tmp_path / "o")]
+    assert main(command) == 0
+    plain, thorough = (
+        json.loads((where / "verdict.json").read_text())
+        for where in (folder / "out", tmp_path / "o")
+    )
+    for document in (plain, thorough):
+        del document["seconds"]
+    assert thorough == plain
+    made = json.loads((tmp_path / "o" / "environment.json").read_text())
+    assert made["settings"]["thorough"] is True

@@ -1,11 +1,14 @@
-"""The share of the gap that a model closes on the fitted runs."""
+"""The share of the gap that a model closes on the fitted runs; and when a fuller account is asked
+for.
+"""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from bench.gap.causes.name import closed
+from bench.gap.causes.name import _Inquiry, closed
+from tests.bench.gap.causes.models import model
 
 SIGMA = 0.1
 
@@ -42,3 +45,40 @@ def test_what_is_left_without_structure_is_noise_and_may_be_more_than_was_estima
     assert share(0.5, 0.2, structure=False, own=0.2) == pytest.approx(1.0)
     assert share(0.5, 0.2, structure=True, own=0.2) == pytest.approx(0.75)
     assert share(0.5, 0.2, structure=False, own=0.01) == pytest.approx(0.75), "no less than stated"
+
+
+BASE, FOUND, FULLER, PLAINER = model(), model("a"), model("a", "b", "c"), model("a", "d")
+
+
+@pytest.mark.parametrize(
+    ("found", "fuller", "structure", "held_out", "stands"),
+    [
+        (FOUND, FULLER, True, True, PLAINER),
+        (FOUND, FOUND, True, True, FOUND),
+        # nothing is left over
+        (FOUND, FULLER, False, True, FOUND),
+        # nobody judges
+        (FOUND, FULLER, True, False, FOUND),
+        # where nothing was found nothing is added to it
+        (BASE, FULLER, True, True, BASE),
+    ],
+)
+def test_a_fuller_account_is_asked_for_where_causes_stand_and_something_is_left(
+    found, fuller, structure, held_out, stands
+):
+    """It is fitted to its end, and told by its simplest laws."""
+    measured = []
+    watch = SimpleNamespace(watch=None)
+    search = SimpleNamespace(
+        world=watch, to_the_end=lambda m: m, plainer=lambda m: PLAINER if m is FULLER else m
+    )
+    inquiry = _Inquiry(search, None)
+    inquiry._model = found
+    if held_out:
+        inquiry._trial = SimpleNamespace(
+            richer=lambda search, model: fuller, measure=measured.extend
+        )
+    taken = inquiry._fuller(SimpleNamespace(structure=structure))
+    assert inquiry._model is stands
+    assert taken is (stands is PLAINER)
+    assert measured == ([PLAINER] if taken else [])
