@@ -77,6 +77,7 @@ class Teller:
             apart=self._apart(),
             track=self._track(),
             logs=max(1, len({run.log for run in recording.runs})),
+            thorough=self.search.thorough,
         )
 
     def _track(self) -> bytes:

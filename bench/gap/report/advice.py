@@ -110,6 +110,12 @@ def _further(story: Story) -> Iterator[str]:
         yield paragraph("The search was ended early; to the end it goes with")
         yield command("simgap", "explain", _recording(story))
     elif verdict in ("partial", "unknown"):
+        if verdict == "partial" and story.held_out is not None and not story.thorough:
+            yield paragraph(
+                "To have the library searched further for what remains, judged by the held-out "
+                "runs (about twice as long):"
+            )
+            yield command("simgap", "explain", _recording(story), "--thorough")
         yield paragraph(
             "If you have an idea what remains, write it as an effect of your own (simgap's "
             "docs/extending.md) and have it tried with the others:"

@@ -143,6 +143,7 @@ class Story:
         apart: what runs, logs and loads say of the numbers by themselves.
         track: the picture of a film's track (PNG), of a recording that was tracked; empty for none.
         logs: recordings that are explained together.
+        thorough: whether all has been searched that can be.
     """
 
     title: str
@@ -164,3 +165,4 @@ class Story:
     apart: Apart = field(default_factory=Apart)
     track: bytes = b""
     logs: int = 1
+    thorough: bool = False

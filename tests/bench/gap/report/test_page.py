@@ -272,6 +272,14 @@ def test_commands_name_the_recording_and_the_folder_as_a_shell_takes_them(figure
     unknown = Reader(page(story("unknown"), figures)).text
     assert "--plugin my_effect.py" in unknown
     assert "--check" in Reader(page(story("unidentifiable"), figures)).text
+    assert "--thorough" not in unknown, "nothing stands that could be added to"
+    partial = story("partial")
+    assert partial.held_out is not None
+    assert "explain swing.csv --thorough" in Reader(page(partial, figures)).text.replace(
+        str(partial.path), "swing.csv"
+    )
+    for more in ({"thorough": True}, {"held_out": None}):
+        assert "--thorough" not in Reader(page(replace(partial, **more), figures)).text
 
 
 def test_in_a_frame_the_page_stays_whole(figures):
