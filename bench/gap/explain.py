@@ -280,8 +280,8 @@ class _Explainer:
         return design(search, finding.model, (), seconds, longest)
 
     def _search(self, base: Base, rng: np.random.Generator) -> Search:
-        search = Search(self.fitting, self.noise, base.frozen, rng, self.floor.stated)
-        search.thorough = self.thorough
+        given = self.fitting, self.noise, base.frozen, rng, self.floor.stated
+        search = Search(*given, thorough=self.thorough)
         search.enter(base.fit)
         return search
 

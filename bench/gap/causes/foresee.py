@@ -44,8 +44,8 @@ def _foreseen(search: Search, few: World) -> Model:
     if search.plain(search.base, UNLIKELY):
         return search.run()
     rng = search.drawing("fewer samples")
-    sketch = Search(few, search.noise, search.frozen, rng, search.stated)
-    sketch.thorough = search.thorough
+    given = few, search.noise, search.frozen, rng, search.stated
+    sketch = Search(*given, thorough=search.thorough)
     sketch.refit([search.base.fit.start()])
     try:
         found = settle(sketch, sketch.run())

@@ -69,8 +69,8 @@ class Trial:
         return model
 
     def richer(self, search: Search, model: Model) -> Model:
-        """The fullest account that keeps what was found and that the held-out runs bear out; the
-        model itself where there is none.
+        """Of the accounts that keep what was found and have more, the one that held-out runs bear
+        out best; the model itself where they bear out none.
 
         Where structure is left, merits say little of what the fitted runs show, since each model
         mimics what none has. What leaves clearly less of runs that no fit has seen mimics nothing.
