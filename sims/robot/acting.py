@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.robot.forces import OVER_TIME
-from sims.robot.lanes import Places
+from sims.robot.midway import Places
 from sims.robot.native import FIELDS
 from sims.robot.series import is_series
 from sims.system import Acting, Effect

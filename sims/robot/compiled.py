@@ -23,6 +23,7 @@ from sims.engines.compiled.machine import Machine, machine
 from sims.engines.compiled.nodes import UntracedError
 from sims.engines.compiled.program import Written, laid_out, nodes_of, vector
 from sims.robot.forces import Forces, moment_of, pushed, remembered, rubbed
+from sims.robot.midway import Look, middle
 from sims.robot.system import RobotSystem
 from sims.system import Effect, Hidden, State
 
@@ -54,8 +55,9 @@ class _Program(NamedTuple):
     """What effects exert, as instructions.
 
     Attributes:
-        written: them, on groups of registers: time, step, positions, velocities, drive, bias,
-            inputs, stiffness, coefficients, states.
+        written: them, on groups of registers: time at the beginning of a step and in its middle,
+            the step, the seconds that states go on, what is seen, inputs, stiffness, coefficients,
+            states.
         force: (D,) registers of the forces.
         limit: (D,) of the limits of dry friction.
         states: (2 H,) of the states after the step.
@@ -79,15 +81,18 @@ class _Tracing:
         graph = Graph()
         joints = len(system.coordinates)
         self._graph = graph
-        self._t, self._step = (vector(graph, 1, MOMENT) for _ in range(2))
-        parts = [vector(graph, joints, MOMENT) for _ in range(4)]
+        self._t, self._after, self._step, self._past = (vector(graph, 1, MOMENT) for _ in range(4))
+        parts = [vector(graph, joints, MOMENT) for _ in Look._fields]
         self._motion = parts
         self._inputs = {name: vector(graph, 1, MOMENT) for name in inputs}
         self._stiffness = vector(graph, joints, LANE)
-        x, v, drive, bias = parts
-        carried = np.stack([drive, bias])
-        inputs_of = dict(self._inputs)
-        self._moment = moment_of(system, self._t, x, v, inputs_of, carried, self._stiffness)
+        look = Look(*parts)
+        instants = [(self._t, look.x, look.v, look.carried)]
+        instants.append((self._after, *middle(look.x, look.v, look.a, self._step), look.later))
+        self._begin, self._middle = (
+            moment_of(system, t, x, v, dict(self._inputs), np.stack(sides), self._stiffness)
+            for t, x, v, sides in instants
+        )
         self._asked: dict[tuple[type[Effect], int], _Asked] = {}
         self._programs: dict[tuple[type[Effect], ...], _Program] = {}
         self.known: dict[type[Effect], bool] = {}
@@ -116,17 +121,19 @@ class _Tracing:
                 before[type(effect)] += 1
         forces, frictions, hidden = ([(one.effect, one.c) for one in group] for group in asked)
         states = [one.state for one in asked[2] if one.state is not None]
-        force: Any = pushed(forces, self._moment)  # type: ignore[arg-type]
+        force: Any = pushed(forces, self._middle)  # type: ignore[arg-type]
         later: list[State] = []
         if hidden:
-            more, later = remembered(hidden, self._moment, states, self._step)  # type: ignore[arg-type]
+            moments = self._begin, self._middle
+            more, later = remembered(hidden, moments, states, self._past)  # type: ignore[arg-type]
             force = force + more
-        limit: Any = rubbed(frictions, self._moment)  # type: ignore[arg-type]
+        limit: Any = rubbed(frictions, self._middle)  # type: ignore[arg-type]
         after: Any = [part for state in later for part in (state.x, state.v)]
         outputs = [self._nodes(values) for values in (force, limit, *after)]
         begun: Any = [part for state in states for part in (state.x, state.v)]
         coefficients = [one.c for group in asked for one in group]
-        groups = [(self._t,), (self._step,), *((part,) for part in self._motion)]
+        clock = self._t, self._after, self._step, self._past
+        groups = [*((part,) for part in clock), *((part,) for part in self._motion)]
         groups += [tuple(self._inputs.values()), (self._stiffness,), tuple(coefficients)]
         groups.append(tuple(begun))
         written = laid_out(
@@ -165,6 +172,7 @@ class CompiledForces:
     Attributes:
         rubs: see there.
         addresses: see there.
+        loaded: see there.
 
     Args:
         forces: what is asked for.
@@ -175,16 +183,19 @@ class CompiledForces:
     def __init__(self, forces: Forces, program: _Program, run_by: Machine) -> None:
         self.rubs = forces.rubs
         self.addresses = forces.addresses
+        self.loaded = forces.loaded
         self._of = forces
         self._program = program
         written = program.written
         lanes, joints = forces.stiffness.shape
         self._r = r = np.zeros((len(written.place), lanes))
         r[written.first : written.first + written.values.size] = written.values[:, None]
-        self._t, self._step, x, v, drive, bias, u, stiffness, c, states = written.rows
-        self._motion = [slice(first, first + joints) for first in (x, v, drive, bias)]
+        *clock, u, stiffness, c, states = written.rows
+        self._t, self._after, step, self._past, *motion = clock
+        self._motion = [slice(first, first + joints) for first in motion]
         self._u = slice(u, stiffness)
         self._states = slice(states, written.first)
+        r[step] = forces.step
         r[stiffness:c] = forces.stiffness.T
         coefficients = [own[:, :, 0] for _, own in _effects(forces)]
         r[c:states] = np.concatenate(coefficients)
@@ -197,32 +208,27 @@ class CompiledForces:
         """(S, U, L)."""
         return np.ascontiguousarray(np.stack(list(self._of.felt.values())).transpose(2, 0, 1))
 
-    def at(self, k: int, x: Array, v: Array, drive: Array, bias: Array) -> tuple[Array, Array]:
+    def at(self, k: int, look: Look) -> tuple[Array, Array]:
         """See `Forces.at`."""
         r = self._r
-        for rows, values in zip(self._motion, (x, v, drive, bias), strict=True):
+        for rows, values in zip(self._motion, look, strict=True):
             r[rows] = values.T
         r[self._t] = k * self._of.step
+        r[self._after] = (k + 0.5) * self._of.step
         if self._of.felt:
             r[self._u] = self._felt[k]
         hidden = self._of.hidden
         if hidden and k < 2:
-            r[self._step] = self._of.step if k else 0.5 * self._of.step
+            r[self._past] = self._of.step if k else 0.5 * self._of.step
         if hidden and not k:
-            r[self._states] = np.concatenate(self._begun(x, v, drive, bias), axis=1).T
+            moment = self._of.begun(0, look)
+            states = [effect.begin(c, moment) for effect, c in hidden]
+            begun = [part for state in states for part in (state.x, state.v)]
+            r[self._states] = np.concatenate(begun, axis=1).T
         self._run()
         if hidden:
             r[self._states] = r[self._program.states]
         return r[self._program.force].T, r[self._program.limit].T
-
-    def _begun(self, x: Array, v: Array, drive: Array, bias: Array) -> list[Array]:
-        """(L, 1) each: the states as the run begins."""
-        of = self._of
-        inputs = {name: u[:, 0, None] for name, u in of.felt.items()}
-        now = np.zeros((len(x), 1))
-        moment = moment_of(of.system, now, x, v, inputs, np.stack([drive, bias]), of.stiffness)
-        states = [effect.begin(c, moment) for effect, c in of.hidden]
-        return [part for state in states for part in (state.x, state.v)]
 
 
 def compiled(forces: Forces) -> CompiledForces | None:
@@ -271,8 +277,9 @@ def _check(tracing: _Tracing, forces: Forces, run_by: Machine) -> None:
     rng = np.random.default_rng(0)
     steps = min([INSTANTS, *(u.shape[1] for u in forces.felt.values())])
     for k in range(steps):
-        motion = rng.normal(size=(4, *forces.stiffness.shape)) * rng.choice([0.01, 1.0, 10.0])
-        for found, expected in zip(quick.at(k, *motion), forces.at(k, *motion), strict=True):
+        seen = (len(Look._fields), *forces.stiffness.shape)
+        look = Look(*(rng.normal(size=seen) * rng.choice([0.01, 1.0, 10.0])))
+        for found, expected in zip(quick.at(k, look), forces.at(k, look), strict=True):
             close = TOLERANCE * np.abs(expected[np.isfinite(expected)]).max(initial=0.0)
             if not np.allclose(found, expected, rtol=TOLERANCE, atol=close, equal_nan=True):
                 raise UntracedError("compiled it gives other numbers")

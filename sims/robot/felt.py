@@ -13,7 +13,7 @@ import numpy as np
 from sims.base import Array, Scenario
 from sims.plan import Plan, Runs, felt_inputs
 from sims.robot.acting import Mask, part_of
-from sims.robot.lanes import Places
+from sims.robot.midway import Places
 from sims.system import Acting, Input
 
 INSTANT = 1e-6

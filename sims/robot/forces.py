@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sims.base import Array
-from sims.robot.lanes import Addresses, Mask
+from sims.robot.lanes import Addresses
+from sims.robot.midway import Look, Mask, middle
 from sims.robot.moment import RobotMoment
 from sims.robot.native import FIELDS
 from sims.robot.places import COMMON
@@ -75,6 +76,7 @@ class Forces:
 
     Attributes:
         rubs: (L, D) where dry friction is among them.
+        loaded: (L,) where one looks at what transmissions carry.
         system: the robot's.
         felt: inputs as they are felt, (L, S) by name.
         addresses: of the joints.
@@ -116,30 +118,41 @@ class Forces:
         for effect, c in self.frictions:
             self.rubs[:, effect.coordinate] |= (c != 0).any(axis=0)[:, 0]
         self.hidden = [(e, c) for e, c in acting if isinstance(e, Hidden) and not is_series(e)]
+        self.loaded: Mask = np.zeros(len(stiffness), dtype=bool)
+        for loading, c in asked:
+            if loading.of in LOADED:
+                self.loaded |= (c != 0).any(axis=0)[:, 0]
         self._states: list[State] = []
 
-    def at(self, k: int, x: Array, v: Array, drive: Array, bias: Array) -> tuple[Array, Array]:
-        """Forces and limits of dry friction (L, D) each, at the beginning of step k.
+    def at(self, k: int, look: Look) -> tuple[Array, Array]:
+        """Forces and limits of dry friction (L, D) each, over step k: those of its middle.
 
         Args:
             k: every step in turn.
-            x: (L, D) positions of the joints.
-            v: (L, D) their velocities.
-            drive: (L, D) what actuators exert on them.
-            bias: (L, D) what comes of gravity and the motion of the other bodies.
+            look: the lanes at its beginning.
         """
-        now = np.full((len(x), 1), k * self.step)
-        inputs = {name: u[:, k, None] for name, u in self.felt.items()}
-        carried = np.stack([drive, bias])
-        moment = moment_of(self.system, now, x, v, inputs, carried, self.stiffness)
+        x, v = middle(look.x, look.v, look.a, self.step)
+        moment = self._moment(k + 0.5, k, (x, v, *look.later))
         force = pushed(self.forces, moment)
         if self.hidden:
-            self._states = self._states or [e.begin(c, moment) for e, c in self.hidden]
+            begun = self.begun(k, look)
+            self._states = self._states or [e.begin(c, begun) for e, c in self.hidden]
             # From the middle of the last step to that of this one.
             step = self.step if k else 0.5 * self.step
-            more, self._states = remembered(self.hidden, moment, self._states, step)
+            more, self._states = remembered(self.hidden, (begun, moment), self._states, step)
             force += more
         return force, rubbed(self.frictions, moment)
+
+    def begun(self, k: int, look: Look) -> RobotMoment:
+        """The instant at which step k begins."""
+        return self._moment(k, k, (look.x, look.v, *look.carried))
+
+    def _moment(self, steps: float, k: int, motion: Sequence[Array]) -> RobotMoment:
+        """The instant after so many steps, with what is felt in step k."""
+        x, v, *sides = motion
+        now = np.full((len(x), 1), steps * self.step)
+        inputs = {name: u[:, k, None] for name, u in self.felt.items()}
+        return moment_of(self.system, now, x, v, inputs, np.stack(sides), self.stiffness)
 
 
 def is_in_drive(effect: Effect) -> bool:
@@ -172,16 +185,24 @@ def rubbed(frictions: Sequence[tuple[Friction, Array]], moment: RobotMoment) -> 
 
 def remembered(
     hidden: Sequence[tuple[Hidden, Array]],
-    moment: RobotMoment,
+    moments: tuple[RobotMoment, RobotMoment],
     states: Sequence[State],
     step: float,
 ) -> tuple[Array, list[State]]:
-    """(L, D) forces of effects with states, and these so many seconds later."""
-    total = np.zeros_like(moment.x)
+    """(L, D) forces of effects with states, and these so many seconds later.
+
+    Args:
+        hidden: the effects with their coefficients.
+        moments: the one in the middle of those seconds, and the one at their end.
+        states: as they begin.
+        step: the seconds.
+    """
+    between, end = moments
+    total = np.zeros_like(end.x)
     later = []
     for (effect, c), state in zip(hidden, states, strict=True):
-        after = advanced(effect, c, moment, state, step)
-        force, _ = effect.act(c, moment, after)
+        after = advanced(effect, c, between, state, step)
+        force, _ = effect.act(c, end, after)
         total = total + np.where(c[0] > 0, force, 0.0)
         later.append(after)
     return total, later

@@ -13,11 +13,11 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sims.base import Array
 from sims.robot import contacts
 from sims.robot.floating import Afloat, Floating
+from sims.robot.midway import Look, Mask, Midway, Places
 from sims.robot.model import Robot
 from sims.robot.native import COUPLING, FIELDS, SOLIMP, lanes_spec, stiff_of
 from sims.robot.quiet import quiet
@@ -32,9 +32,6 @@ SIZES = (1, 8, LANES)
 """Lanes that a batch is made for."""
 INTERRUPTED = 40_000
 """Steps of all lanes together in one call: a fraction of a second, after which Ctrl-C is heard."""
-
-Places = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 class Addresses:
@@ -64,9 +61,10 @@ class Asked(Protocol):
 
     rubs: Mask
     addresses: Addresses
+    loaded: Mask
 
-    def at(self, k: int, x: Array, v: Array, drive: Array, bias: Array) -> tuple[Array, Array]:
-        """Forces and limits of dry friction at the beginning of step k."""
+    def at(self, k: int, look: Look) -> tuple[Array, Array]:
+        """Forces and limits of dry friction over step k."""
         ...
 
 
@@ -299,8 +297,7 @@ class Bench:
         n, steps, _ = controls.shape
         dofs = asking.addresses.velocities
         bind = self.batch.bind
-        qpos, qvel, ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
-        applied, drive, bias = bind("qfrc_applied"), bind("qfrc_actuator"), bind("qfrc_bias")
+        ctrl, applied = bind("ctrl"), bind("qfrc_applied")
         loss = self.fields["dof_frictionloss"]
         own = loss[:n, dofs].copy()
         rubs = bool(asking.rubs.any())
@@ -313,12 +310,15 @@ class Bench:
         result = self._begun(n, steps, record)
         shown = {name: bind(name)[:n] for name in record}
         ids = self._ids(n)
+        # Before MuJoCo looks for the first time: what is bound later would not show it.
+        lanes_at = Midway(self.batch, asking.addresses.positions, dofs, asking.loaded)
+        changes: Mask = np.any(np.diff(controls, axis=1, prepend=controls[:, :1]) != 0, axis=2)
+        of = lanes_at.of
         ctrl[:n] = controls[:, 0]
         self.batch.forward(ids)
-        at, of = _together(asking.addresses.positions), _together(dofs)
         for k in range(steps):
-            force, limit = asking.at(k, qpos[:n, at], qvel[:n, of], drive[:n, of], bias[:n, of])
             ctrl[:n] = controls[:, k]
+            force, limit = asking.at(k, lanes_at.look(changes[:, k]))
             applied[:n] = forces[:, k]
             applied[:n, of] += force
             if rubs:
@@ -371,10 +371,3 @@ class Bench:
         largest = max(INTERRUPTED // max(lanes, 1), 1)
         for begin in range(0, steps, largest):
             yield slice(begin, min(begin + largest, steps))
-
-
-def _together(places: Places) -> Places | slice:
-    """The same places as a slice where they lie side by side, of which numpy copies nothing."""
-    first = int(places[0]) if places.size else 0
-    alike = np.array_equal(places, np.arange(first, first + places.size))
-    return slice(first, first + places.size) if alike else places

@@ -13,6 +13,7 @@ from sims.base import Array, Scenario
 from sims.robot.felt import INSTANT
 from sims.robot.felt import felt as felt_over
 from sims.robot.floating import Afloat
+from sims.robot.midway import ends, midways
 from sims.robot.native import FIELDS
 from sims.robot.quiet import quiet
 from sims.robot.sampling import keeps_time, places, read, sampled
@@ -73,9 +74,12 @@ class Linear:
         given = simulator.controls(self._work, steps)
         more = ("qfrc_actuator", "qfrc_bias", "act")
         made = simulator.stepped(self._work, given, more)
-        dofs = simulator.wide(self._work.acting).whole.velocities
+        wide = simulator.wide(self._work.acting)
+        dofs = wide.whole.velocities
         sides = ("qfrc_actuator", "qfrc_bias")
-        carried = np.stack([made.fields[name][0][:, dofs] for name in sides])
+        controls = given.controls[0]
+        left = np.stack([made.fields[name][0][:, dofs] for name in sides])
+        carried = midways(left, controls) if ends(wide.model) else left
         act = made.fields["act"][0]
         first = made.begun[0][None]
         data = made.fields["sensordata"][0] if self._names else np.zeros((steps, 0))
@@ -84,8 +88,8 @@ class Linear:
             x=np.concatenate([made.x[0], made.series[0][0]], axis=1),
             v=np.concatenate([made.v[0], made.series[1][0]], axis=1),
             act=np.concatenate([first, act[:-1]]),
-            controls=given.controls[0],
-            forces=simulator.wide(self._work.acting).spread(given.forces[0]),
+            controls=controls,
+            forces=wide.spread(given.forces[0]),
             instant=given.instant[0],
             inputs={name: u[0] for name, u in given.felt.items()},
             carried=carried,

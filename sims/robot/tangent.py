@@ -32,7 +32,8 @@ from sims.base import Array
 from sims.robot.acting import is_asked, natives
 from sims.robot.floating import Afloat
 from sims.robot.forces import LOADED, exerted, is_in_drive, moment_of
-from sims.robot.lanes import Addresses, Bench, Mask, Places
+from sims.robot.lanes import Addresses, Bench
+from sims.robot.midway import Mask, Places
 from sims.robot.moment import RobotMoment
 from sims.robot.remembered import advanced, along
 from sims.robot.system import RobotSystem

@@ -12,6 +12,8 @@ BEYOND = 20.0
 DRY = 4.0
 """The same for dry friction: what is stronger only sticks, and sticking divides the engine's steps.
 """
+PER_FORCE = ("1/N", "1/(N")
+"""Units of what grows faster than a force."""
 CYCLES = 1.0
 """What comes and goes must do so about once in the longest run, else any slow change would be
 called periodic.
@@ -53,7 +55,9 @@ def _bounds(
     # a shape: how often, how fast, how sharp
     if low > 0:
         return low, high
-    beyond = DRY if isinstance(effect, Friction) else BEYOND
+    # a part that grows with the square of a force sticks nowhere by itself
+    dry = isinstance(effect, Friction) and not coefficient.unit.startswith(PER_FORCE)
+    beyond = DRY if dry else BEYOND
     # a size whose sign is part of what the effect is
     if low == 0:
         return 0.0, most or beyond * high

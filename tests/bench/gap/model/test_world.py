@@ -93,6 +93,14 @@ def test_effects_may_grow_beyond_what_is_plausible_but_not_change_their_meaning(
     assert coefficient_bounds(there, "drag.linear") == [(0.0, BEYOND * 0.1)]
 
 
+def test_only_what_sticks_by_itself_has_the_narrow_range_of_dry_friction():
+    name = "friction.load_quadratic"
+    there = world(recording("servo", runs=1, seconds=0.5), candidates=[name])
+    (_, share), (_, square) = (p.bounds for p in there.parameters[there.slots[name]])
+    expected = [(0.0, DRY * share), (0.0, BEYOND * square)]
+    assert coefficient_bounds(there, name) == expected
+
+
 @pytest.mark.parametrize(
     ("free", "message"),
     [
