@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sims.robot.forces import OVER_TIME
-from sims.robot.midway import Places
+from sims.robot.midway import Mask, Places
 from sims.robot.native import FIELDS
 from sims.robot.series import is_series
 from sims.system import Acting, Effect
-
-Mask = NDArray[np.bool_]
 
 
 def is_native(effect: Effect) -> bool:

@@ -12,8 +12,8 @@ import numpy as np
 
 from sims.base import Array, Scenario
 from sims.plan import Plan, Runs, felt_inputs
-from sims.robot.acting import Mask, part_of
-from sims.robot.midway import Places
+from sims.robot.acting import part_of
+from sims.robot.midway import Mask, Places
 from sims.system import Acting, Input
 
 INSTANT = 1e-6

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.base import Array
+from sims.robot.native import RK4
 
 Places = NDArray[np.intp]
 Mask = NDArray[np.bool_]
@@ -82,7 +83,6 @@ class Midway:
 
     def __init__(self, batch: Any, positions: Places, velocities: Places, loaded: Mask) -> None:
         self._batch = batch
-        self._step = float(batch.model.opt.timestep)
         self._ends = ends(batch.model)
         self._loaded, self._any = loaded, bool(loaded.any())
         self._first = True
@@ -117,9 +117,9 @@ class Midway:
         """(2, L, D) what transmissions carry at the beginning of a step and in its middle."""
         ended = self._carried()
         begun, last = ended, self._last
+        asked = self._loaded & anew if self._ends else self._loaded
         # At the very beginning MuJoCo has just looked.
-        if not first and (not self._ends or anew.any()):
-            asked = self._loaded & (anew | (not self._ends))
+        if not first and asked.any():
             # Of no other lane, whose numbers shall not hang on its company.
             self._batch.forward(np.flatnonzero(asked))
             begun = self._carried()
@@ -142,9 +142,7 @@ def ends(model: Any) -> bool:
     """Whether forces that MuJoCo leaves of a step are those of its end: Runge-Kutta looks there
     last, the other integrators at its beginning.
     """
-    import mujoco
-
-    return int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
+    return bool(model.opt.integrator == RK4)
 
 
 def midways(ended: Array, controls: Array) -> Array:

@@ -9,9 +9,8 @@ import numpy as np
 
 from sims.base import Array, Scenario
 from sims.plan import Runs
-from sims.robot.acting import Mask
 from sims.robot.floating import Afloat
-from sims.robot.midway import Places
+from sims.robot.midway import Mask, Places
 from sims.system import Acting, Sensor
 
 BEYOND, LATE = 1.1, 0.2
