@@ -18,7 +18,7 @@ import numpy as np
 from bench.gap.causes.moves import NOMINATED, Moves
 from bench.gap.causes.rules import ALPHA
 from bench.gap.model.models import Model, Models
-from bench.gap.model.multiple_shooting import pieces, whole
+from bench.gap.model.multiple_shooting import forgets, pieces, whole
 from bench.gap.model.problem import Start
 
 UNLIKELY = 0.1
@@ -204,12 +204,9 @@ class Search(Moves):
     @cached_property
     def _forgets(self) -> bool:
         """Whether pieces of the runs are no easier to follow than the whole of them."""
-        if not self.world.linear:
-            return False
-        # loaded where there is a robot alone
-        from bench.gap.model.tangents import forgets
-
-        return forgets(self.world, self.noise)
+        fit, world = self.base.fit, self.world
+        by_states = world.derivatives if world.linear else fit.jacobian[..., fit.free.size :]
+        return by_states is not None and forgets(world, self.noise, by_states)
 
     def _simpler(self, single: Model) -> Model:
         """The effect that the single one contains, where structure is left to which the rest of it

@@ -19,9 +19,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.gap.model.noise import Mask
+from bench.gap.model.noise import Mask, Noise
 from bench.gap.model.problem import Fit, Start
 from bench.gap.model.world import World
+from sims.base import Array
 from sims.recording.recording import Run
 
 PIECES = 4
@@ -30,6 +31,10 @@ LEAST = 20
 """Samples of a piece on average, at least."""
 HOLES = 2
 """A single piece may have this many times fewer, as samples may be missing."""
+LAST = 0.1
+"""Share of a run that is its end."""
+FORGOTTEN = 0.1
+"""Share of what an initial state acts on a motion at most, below which it is forgotten."""
 
 
 def pieces(world: World) -> World | None:
@@ -68,3 +73,25 @@ def whole(world: World, found: Fit) -> Start:
     # each run goes on from where its first piece began
     first = np.cumsum([0, *counts])[:-1]
     return Start(found.effects, found.theta, found.states[first])
+
+
+def forgets(world: World, noise: Noise, derivatives: Array) -> bool:
+    """Whether the motion forgets how it began before its runs end: initial states act on the last
+    samples by a small share of what they act on any.
+
+    Then a fit of whole runs has no more minima than one of their pieces.
+
+    Args:
+        world: the runs.
+        noise: of each channel.
+        derivatives: (R, T, C, s) of a model's runs by their initial states; zero where one is
+            known.
+    """
+    seen = np.isfinite(world.observed)[..., None]
+    sizes = np.abs(np.where(seen, derivatives / noise.sigma[:, None], 0.0)).max(axis=2)
+    for run, length in zip(sizes, world.lengths, strict=True):
+        last = run[int((1.0 - LAST) * length) : int(length)]
+        # Of a beginning that is known nothing shows how long it acts.
+        if not run.any() or (last.max(axis=0) > FORGOTTEN * run.max(axis=0)).any():
+            return False
+    return True

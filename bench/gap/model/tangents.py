@@ -17,10 +17,6 @@ from sims.robot.simulator import RobotSimulator
 
 ENDLESS = 1e30
 """A change beyond it is none: the motion explodes."""
-LAST = 0.1
-"""Share of a run that is its end."""
-FORGOTTEN = 0.1
-"""Share of what an initial state acts on a motion at most, below which it is forgotten."""
 SMALL = 1.0
 """RMS, in units of the noise, below which what the engine's step leaves can be taken out."""
 
@@ -90,27 +86,6 @@ def begun(world: World, theta: Array, states: Array, anew: bool = False) -> Arra
         result[~(np.abs(result) < ENDLESS)] = 0.0
         world.derivatives = result
     return world.derivatives
-
-
-def forgets(world: World, noise: Noise) -> bool:
-    """Whether the motion forgets how it began before its runs end: initial states act on the last
-    samples by a small share of what they act on any.
-
-    Then a fit of whole runs has no more minima than one of their pieces.
-
-    Args:
-        world: the runs, of a robot of which a model was fitted.
-        noise: of each channel.
-    """
-    if world.derivatives is None:
-        return False
-    seen = np.isfinite(world.observed)[..., None]
-    sizes = np.abs(np.where(seen, world.derivatives / noise.sigma[:, None], 0.0)).max(axis=2)
-    for run, length in zip(sizes, world.lengths, strict=True):
-        last = run[int((1.0 - LAST) * length) : int(length)]
-        if (last.max(axis=0) > FORGOTTEN * run.max(axis=0)).any():
-            return False
-    return True
 
 
 def _begun(world: World, run: int, theta: Array, states: Array) -> Array:

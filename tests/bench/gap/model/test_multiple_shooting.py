@@ -12,6 +12,7 @@ from bench.gap.model.multiple_shooting import PIECES, pieces, whole
 from bench.gap.model.problem import Start
 from sims.ball.simulator import Ball
 from sims.pendulum.simulator import Pendulum
+from sims.servo.simulator import Servo
 from tests.bench.gap.made import recorded, searched, white, with_runs, world
 
 TIMES = np.arange(0, 12.0, 0.02)
@@ -89,6 +90,21 @@ def test_a_fit_of_pieces_begins_that_of_whole_runs_with_their_first_pieces():
     fits = Fitter(there, white(there, SIGMA)).fit([start, without], 20)
     assert fits[0].theta[0] == pytest.approx(0.0035, rel=1e-3)
     assert fits[1].cost > 100.0 * fits[0].cost
+
+
+@pytest.mark.parametrize(("driven", "cuts"), [(0.0, True), (1.0, False)], ids=["free", "driven"])
+def test_a_search_goes_over_pieces_unless_the_motion_forgets_how_it_began(
+    driven, cuts, monkeypatch
+):
+    asked = []
+    monkeypatch.setattr(search, "pieces", asked.append)
+    times = TIMES[:200]
+    inputs = {"goal": 0.5 * np.sin(2.0 * times), "torque_enable": np.full(times.size, driven)}
+    starts = [({"q": angle}, inputs) for angle in (0.4, -0.2)]
+    swung = recorded(Servo(), [0.5, 4.0, 2e-3], starts, times, noise=1e-3)
+    looking, _ = searched(swung, 1e-3, candidates=["drag.quadratic"])
+    looking.from_pieces(1)
+    assert bool(asked) is cuts
 
 
 def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkeypatch):

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from bench.gap.model.multiple_shooting import forgets
 from bench.gap.model.noise import Noise
-from bench.gap.model.tangents import begun, forgets
+from bench.gap.model.tangents import begun
 from bench.gap.model.world import World
 from bench.recordings.inspection import load
 from sims.base import Scenario
@@ -58,6 +59,7 @@ def test_what_is_held_or_damped_forgets_and_what_swings_or_creeps_does_not(
 ):
     there = world(tmp_path, text)
     noise = Noise(np.array([1e-3]), np.zeros(1))
-    assert forgets(there, noise) is False, "before anything is known of it"
-    begun(there, there.nominal(), there.guess)
-    assert forgets(there, noise) is expected
+    by_states = begun(there, there.nominal(), there.guess)
+    assert forgets(there, noise, by_states) is expected
+    known = np.zeros_like(by_states)
+    assert not forgets(there, noise, known), "what is known shows nothing of how long it acts"
