@@ -5,6 +5,7 @@ import json
 import pytest
 
 from bench.gap.causes.rules import MEANING
+from bench.shot.table import wilson
 from tests.docs.numbers.account import NUMBER, Account
 from tests.docs.numbers.tables import document, frame
 from tests.docs.pages import quoted, section, tables, text_of
@@ -76,7 +77,34 @@ def robots():
     page.known("ran into 900 s", "how it was asked")
     page.says("Of play {} of {} are right", right[play].sum(), (play & drawn).sum())
     page.says("of {} more it is named, and beside", (between.outcome == "extra").sum())
+    asked_again(page)
     return page
+
+
+def asked_again(page):
+    """What the page says of again.csv."""
+    again = frame("robots/again.csv")
+    single = again[(again.kind == "single") & (again.outcome != "not drawn")]
+    rubs = again.question.str.contains("friction")
+    page.known("By the library of 25 November", "which library it was")
+    page.known("with 1,500 s at most", "how it was asked")
+    page.says("effects at joints act as in the middle of a step) {} of the", len(again))
+    page.known("of the 740 questions of today's sheet", "the sheet of that day")
+    page.says("{} s of a processor at the median", again.processor.median())
+    page.says("single causes\n{} of {} are named alone", single.strict.sum(), len(single))
+    page.says("{} alone or in a set of at most", single.few.sum())
+    page.known("a set of at most 4, 151", "`score.FEW`")
+    page.says("{} ({} %) alone or in a set whose", single.fair.sum(), 100 * single.fair.mean())
+    held, count = again.held.sum(), again.intervals.sum()
+    page.says("of {} intervals {} hold ({} %", count, held, 100 * held / count)
+    low, high = (100 * share for share in wilson(int(held), int(count)))
+    page.says("%, {} to {}: the mark", low, high)
+    page.says("frictions {} of {}, where", again[rubs].held.sum(), again[rubs].intervals.sum())
+    page.known("where it had been 78 %", "of the exam before")
+    clean = again[again.kind == "clean"]
+    assert (clean.outcome == "right").all()
+    page.says("Of {} clean recordings none", len(clean))
+    page.known("(7 to 14 and 45 of its standard deviations)", "of verdicts that are not kept")
 
 
 def next_recording():
