@@ -34,8 +34,6 @@ INSTANTS = 16
 KEPT = 500
 """Programs of a robot that are kept."""
 
-_tracings: dict[tuple[type[RobotSystem], tuple[str, ...]], _Tracing] = {}
-
 
 class _Asked(NamedTuple):
     """An effect as it is traced.
@@ -237,10 +235,11 @@ def compiled(forces: Forces) -> CompiledForces | None:
     groups = [[effect for effect, _ in group] for group in _groups(forces)]
     if run_by is None or not any(groups):
         return None
-    key = type(forces.system), tuple(forces.felt)
-    if key not in _tracings:
-        _tracings[key] = _Tracing(forces.system, key[1])
-    tracing = _tracings[key]
+    inputs = tuple(forces.felt)
+    tracings = forces.system.traced
+    if inputs not in tracings:
+        tracings[inputs] = _Tracing(forces.system, inputs)
+    tracing = tracings[inputs]
     if not all(_compiles(tracing, forces, effect, run_by) for effect, _ in _effects(forces)):
         return None
     try:

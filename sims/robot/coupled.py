@@ -14,10 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
-from sims.robot.model import TENDON, Joint, Robot
+from sims.robot.model import TENDON, Joint, Robot, kept_with_robot
 from sims.robot.quiet import quiet
 
 EFFECT = "joint.coupling"
@@ -45,7 +44,7 @@ def before(robot: Robot, name: str) -> Joint | None:
     return None
 
 
-@lru_cache(maxsize=8)
+@kept_with_robot
 def places(robot: Robot) -> tuple[str, ...]:
     """Joints whose drives may be coupled to the joint before."""
     driven = {actuator.joint for actuator in robot.actuators}

@@ -4,11 +4,11 @@ the compiled model.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, wraps
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -131,6 +131,7 @@ class Robot:
         series: of joints that were put in series with others (`sims.robot.series`), by name, the
             inertia about them, kg or kg m^2; no other joint is in this model alone.
         coupled: joints whose drives turn the joint before as well (`sims.robot.coupled`).
+        kept: what functions `kept_with_robot` found of it.
     """
 
     path: Path
@@ -145,6 +146,7 @@ class Robot:
     speeds: Mapping[str, float] = field(default_factory=dict)
     series: Mapping[str, float] = field(default_factory=dict)
     coupled: tuple[str, ...] = ()
+    kept: dict[tuple[Any, ...], Any] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def compiled(self) -> Any:
@@ -285,6 +287,28 @@ class Robot:
             error = unknown(f"{kind} of {self.path.name}", name, list(known) or ["none"])
             raise InputError(str(error))
         return known[name]
+
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+def kept_with_robot(
+    function: Callable[Concatenate[Robot, _P], _T],
+) -> Callable[Concatenate[Robot, _P], _T]:
+    """A function of a robot that is asked once for each robot and arguments: what it finds goes
+    with the robot. A cache of the module would hold every model that a process has read.
+    """
+
+    @wraps(function)
+    def asked(robot: Robot, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        key = (function, *args, *kwargs.items())
+        if key not in robot.kept:
+            robot.kept[key] = function(robot, *args, **kwargs)
+        found: _T = robot.kept[key]
+        return found
+
+    return asked
 
 
 def _limit(values: Any, limited: bool) -> tuple[float, float] | None:

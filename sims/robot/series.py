@@ -29,7 +29,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -39,7 +38,7 @@ from sims.base import Array
 from sims.robot.coupled import ANY, EFFECT, named
 from sims.robot.coupled import coupled as coupled_robot
 from sims.robot.coupled import places as coupled_places
-from sims.robot.model import Robot
+from sims.robot.model import Robot, kept_with_robot
 from sims.robot.native import RK4
 from sims.system import Acting, Effect, Element, Hidden
 
@@ -101,7 +100,7 @@ def by_series(acting: Acting, count: int) -> dict[Added, list[int]]:
     return lanes
 
 
-@lru_cache(maxsize=128)
+@kept_with_robot
 def in_series(robot: Robot, added: Added) -> Robot:
     """The robot with more joints; elements keep the names that the robot has for them.
 
@@ -145,7 +144,7 @@ def in_series(robot: Robot, added: Added) -> Robot:
     return replace(robot, spec=spec, series=series)
 
 
-@lru_cache(maxsize=8)
+@kept_with_robot
 def _inertias(robot: Robot) -> dict[str, float]:
     """About each joint, in the pose that the file states."""
     import mujoco

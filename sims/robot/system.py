@@ -28,6 +28,7 @@ class RobotSystem(System):
         drives: by coordinate, the inputs of its actuators.
         servos: by coordinate, the input that is the set point of its position servo.
         gears: and by how much that turns for each unit of the coordinate.
+        traced: by inputs, the effects that were compiled (`sims.robot.compiled`).
     """
 
     name = "robot"
@@ -49,6 +50,7 @@ class RobotSystem(System):
     gears: ClassVar[Mapping[int, float]]
     freed: ClassVar[frozenset[str]] = frozenset()
     freed_effects: ClassVar[tuple[type[Effect], ...]] = ()
+    traced: ClassVar[dict[tuple[str, ...], Any]]
     _placed: ClassVar[dict[str, tuple[type[Effect], ...]]]
 
     @classmethod
@@ -195,6 +197,7 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
         "drives": drives,
         "servos": servos,
         "gears": gears,
+        "traced": {},
         "_placed": {},
     }
     system: type[RobotSystem] = type("RobotSystemOfFile", (RobotSystem,), declared)
@@ -204,7 +207,7 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
     declared["freed"] = frozenset(effect.name for effect in effects)
     declared["parameters"] = tuple(p for effect in effects for p in _parameters(effect))
     declared["freed_effects"] = tuple(effects)
-    return type("RobotSystemOfFile", (RobotSystem,), {**declared, "_placed": {}})
+    return type("RobotSystemOfFile", (RobotSystem,), {**declared, "traced": {}, "_placed": {}})
 
 
 def freed_effects(system: type[RobotSystem], free: Sequence[str]) -> list[type[Effect]]:

@@ -1,0 +1,74 @@
+"""What is remembered of a robot goes with it: a process that explains many logs does not grow."""
+
+import gc
+import weakref
+
+import numpy as np
+import pytest
+
+import simgap
+from bench.registry import robot
+from sims.base import Scenario
+from sims.robot.model import kept_with_robot
+from sims.robot.system import RobotSystem
+from tests.sims.robot.arms import ARM
+from tests.sims.robot.arms import robot as read
+from tests.sims.robot.test_example import EXAMPLE
+
+TIMES = np.arange(20) / 100.0
+EFFECTS = ["friction.coulomb@shoulder", "drag.quadratic@elbow", "joint.flexibility@elbow"]
+
+
+def used(path):
+    """The class of a robot's file that was simulated with effects that are asked in every step,
+    with one in series with a joint, and with all places looked for; nothing else holds it.
+    """
+    kind = robot(path)
+    made = kind(effects=[*EFFECTS, "joint.coupling@elbow"])
+    theta = np.array([[0.1 * p.bounds[1] for p in made.parameters]])
+    made.simulate(theta, Scenario(TIMES, {}, {}))
+    made.close()
+    return weakref.ref(kind), weakref.ref(kind.robot)
+
+
+def test_a_robot_that_nobody_holds_is_gone(tmp_path):
+    (tmp_path / "arm.xml").write_text(ARM)
+    held = used(tmp_path / "arm.xml")
+    gc.collect()
+    assert [one() for one in held] == [None, None]
+
+
+@pytest.fixture
+def asked():
+    return []
+
+
+@pytest.fixture
+def counted(asked):
+    @kept_with_robot
+    def counted(robot, number):
+        asked.append(number)
+        return robot.name, number
+
+    return counted
+
+
+def test_a_robot_is_asked_once_of_the_same(tmp_path, counted, asked):
+    first, second = read(tmp_path), read(tmp_path)
+    found = [counted(first, 1), counted(first, 2), counted(first, 1), counted(second, 1)]
+    assert found == [("arm", 1), ("arm", 2), ("arm", 1), ("arm", 1)]
+    assert asked == [1, 2, 1]
+
+
+def robots():
+    """Systems of robots' files that are held now."""
+    gc.collect()
+    return sum(1 for _ in RobotSystem.__subclasses__())
+
+
+def test_what_was_explained_is_gone():
+    before = robots()
+    # Long enough that places were searched and causes refitted.
+    cut = simgap.explain(EXAMPLE / "log.csv", budget=5.0).answer.cut
+    assert cut is not None
+    assert robots() == before
