@@ -38,6 +38,7 @@ class Moves(Scored):
     """Scored models, and the moves from one to another."""
 
     _lessened: set[frozenset[str]] = field(default_factory=set)
+    _simplified: set[tuple[frozenset[str], frozenset[str]]] = field(default_factory=set)
 
     def without(self, model: Model, name: str) -> Model:
         """The model with one of its effects taken away."""
@@ -115,11 +116,16 @@ class Moves(Scored):
             yield {members[most].name: own[each * most : each * (most + 1)]}
 
     def _with_parts(self, model: Model, name: str, parts: Parts) -> Model:
-        """The model with simpler effects in the place of a richer one."""
+        """The model with simpler effects in the place of a richer one, fitted from here, known or
+        not.
+        """
         replaced = ([*parts] if n == name else [n] for n in model.names)
         names = tuple(dict.fromkeys(chain.from_iterable(replaced)))
-        key = frozenset(names)
-        if key not in self.models:
+        key, step = frozenset(names), (frozenset(model.names), frozenset(names))
+        # A known one may be caught where its own way up has led it; one that is ahead is not.
+        behind = key not in self.models or self.models[key].merit < model.merit
+        if behind and step not in self._simplified:
+            self._simplified.add(step)
             theta = model.fit.theta.copy()
             theta[self.world.slots[name]] = 0.0
             for part, c in parts.items():

@@ -82,3 +82,16 @@ def test_what_is_far_from_the_data_is_told_by_the_shorter_account(monkeypatch):
         monkeypatch.setattr(made, "excess", lambda m, excess=excess: excess[m.names])
         better = type(model)(model.fit, model.likelihood, part.merit + 5.0)
         assert made.plainer(better).names == names
+
+
+def test_a_simpler_law_that_is_known_and_caught_is_fitted_from_the_richer_one():
+    """The way up may end where a joint sticks a sample longer than it should."""
+    made = search({"friction.coulomb": 0.7, "force.bias": 0.4})
+    values = {"friction.coulomb": 0.5, "friction.stribeck": (0.7, 0.0, 0.2), "force.bias": 0.4}
+    part = fitted(made, ("force.bias", "friction.coulomb"), values)
+    caught = type(part)(part.fit, part.likelihood, part.merit - 50.0)
+    made.models[frozenset(part.names)] = caught
+    richer = fitted(made, ("force.bias", "friction.stribeck"), values)
+    plainer = made.plainer(richer)
+    assert set(plainer.names) == {"force.bias", "friction.coulomb"}
+    assert plainer.merit > caught.merit + 45.0
