@@ -53,6 +53,11 @@ class RobotSystem(System):
     traced: ClassVar[dict[tuple[str, ...], Any]]
     _placed: ClassVar[dict[str, tuple[type[Effect], ...]]]
 
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        # What is found of one robot is not of another, nor of the same with numbers freed.
+        cls.traced, cls._placed = {}, {}
+
     @classmethod
     def gear(cls, coordinate: int) -> float:
         """See `System`."""
@@ -197,8 +202,6 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
         "drives": drives,
         "servos": servos,
         "gears": gears,
-        "traced": {},
-        "_placed": {},
     }
     system: type[RobotSystem] = type("RobotSystemOfFile", (RobotSystem,), declared)
     if not free:
@@ -207,7 +210,7 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
     declared["freed"] = frozenset(effect.name for effect in effects)
     declared["parameters"] = tuple(p for effect in effects for p in _parameters(effect))
     declared["freed_effects"] = tuple(effects)
-    return type("RobotSystemOfFile", (RobotSystem,), {**declared, "traced": {}, "_placed": {}})
+    return type("RobotSystemOfFile", (RobotSystem,), declared)
 
 
 def freed_effects(system: type[RobotSystem], free: Sequence[str]) -> list[type[Effect]]:
