@@ -104,7 +104,8 @@ def tree(files: Files, path: Path) -> Element:
     except expat.ExpatError as error:
         what = expat.ErrorString(error.code)
         line = error.lineno + above
-        raise InputError(f"{path}:{line}: not well-formed XML: {what}") from None
+        wanted = "a robot's model file is MJCF or URDF"
+        raise InputError(f"{path}:{line}: not well-formed XML: {what}; {wanted}") from None
     except (ValueError, LookupError) as error:  # an encoding that does not exist
         raise InputError(f"{path}: not XML: {error}") from None
     return grown.root

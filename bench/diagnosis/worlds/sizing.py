@@ -18,6 +18,7 @@ from sims.base import Array
 ACCURATE = 0.03  # of the wanted size
 LEAP = 8.0  # strength grows by no more at once, so that the fit can follow
 NUDGE = 1e-5  # of a fitted number's scale, for its derivative
+ENDLESS = 1e30  # of the noise: the motion explodes
 
 
 @dataclass(frozen=True)
@@ -122,8 +123,8 @@ class Fitter:
         for r in range(runs):
             slope[r, :, :count] = slopes[r, :count].T
             slope[r, :, count + r * states : count + (r + 1) * states] = slopes[r, count:].T
-        bad = not np.isfinite(seen).all()
-        return rest.ravel() if not bad else np.full(rest.size, np.inf), slope.reshape(rest.size, -1)
+        good = (np.abs(seen) < ENDLESS).all()
+        return rest.ravel() if good else np.full(rest.size, np.inf), slope.reshape(rest.size, -1)
 
 
 def observed_by_batch(setting: Setting, effects: Effects) -> Array:

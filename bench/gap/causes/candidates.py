@@ -29,6 +29,7 @@ from bench.gap.causes.reaches import (
     stopping,
 )
 from bench.gap.model.bounds import CYCLES, coefficient_bounds, is_instant
+from bench.gap.model.differences import followed
 from bench.gap.model.noise import Mask
 from bench.gap.model.problem import Fit, Start
 from bench.gap.model.world import World
@@ -362,10 +363,10 @@ def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
     added = [(probe.effect, probe.c) for probe in probes]
     # These are the largest arrays of a search, so all is done in place.
     values = changes_by(world, at, added)
-    followed = np.isfinite(values)
+    near = followed(values)
     # A probe that the simulator cannot follow is a direction that changes nothing.
-    if not followed.all():
-        values[~followed] = 0.0
+    if not near.all():
+        values[~near] = 0.0
     values /= _sizes(probes)[:, None, None, None]  # (1)
     return values
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.gap.model.noise import Noise
+from bench.gap.model.noise import Mask, Noise
 from bench.gap.model.problem import Start
 from bench.gap.model.world import Indices
 from sims.base import Array
@@ -21,6 +21,17 @@ LARGEST_STEP = 1e-2
 """The largest one, as a share of a parameter's bounds; of an initial state, SI units."""
 SMALLEST_STEP = 1e-5
 """The smallest one, as a share of the largest: below it rounding is in the quotient."""
+ENDLESS = 1e30
+"""A change beyond it is none: the motion explodes, and says nothing of one near the data. Its
+square is a number still.
+"""
+
+
+def followed(changes: Array) -> Mask:
+    """Where a change is one that the simulator can follow; neither NaN nor infinite are."""
+    # two masks, where a modulus would be a copy of the largest arrays there are
+    near: Mask = (changes > -ENDLESS) & (changes < ENDLESS)
+    return near
 
 
 def displaced(start: Start, free: Indices, steps: Array, unknown: Indices) -> tuple[Array, Array]:

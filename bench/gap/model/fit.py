@@ -16,7 +16,13 @@ import numpy as np
 
 from bench.gap.model.arrow import arrow_step
 from bench.gap.model.bounds import coefficient_bounds
-from bench.gap.model.differences import FIRST_STATE_STEP, FIRST_STEP, difference_steps, displaced
+from bench.gap.model.differences import (
+    FIRST_STATE_STEP,
+    FIRST_STEP,
+    difference_steps,
+    displaced,
+    followed,
+)
 from bench.gap.model.noise import Mask, Noise, whitened
 from bench.gap.model.problem import LARGEST_DAMPING, Fit, Point, Problem, Start
 from bench.gap.model.race import RACED, Leg, give_up, legs
@@ -290,7 +296,7 @@ class Fitter:
         # a lane that was given up is NaN, and tells nothing of how its unknown acts
         with np.errstate(all="ignore"):
             quotients = np.moveaxis(part[1:] - part[0], 0, -1) / steps[columns]
-        jacobian: Array = np.nan_to_num(quotients, nan=0.0, posinf=0.0, neginf=0.0)
+        jacobian: Array = np.where(followed(quotients), quotients, 0.0)
         if columns.size == steps.size:
             return jacobian
         quotients, jacobian = jacobian, np.zeros((*part.shape[1:], steps.size))

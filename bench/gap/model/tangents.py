@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bench.gap.model.differences import followed
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
 from sims.base import Array
@@ -15,8 +16,6 @@ from sims.robot.linear import Linear
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
 
-ENDLESS = 1e30
-"""A change beyond it is none: the motion explodes."""
 SMALL = 1.0
 """RMS, in units of the noise, below which what the engine's step leaves can be taken out."""
 
@@ -44,8 +43,7 @@ def responses(
         with np.errstate(over="ignore"):
             result[asked, run, : values.shape[1]] = values
         world.simulations += looks
-    # what explodes says nothing of a model near the data
-    result[~(np.abs(result) < ENDLESS)] = np.nan
+    result[~followed(result)] = np.nan
     for i, key in enumerate(keys):
         if key in kept:
             result[i] = kept[key]
@@ -82,8 +80,7 @@ def begun(world: World, theta: Array, states: Array, anew: bool = False) -> Arra
         calls = [(run, theta, states[run]) for run in range(runs)]
         for run, values in world.crew.each(world, _begun, calls):
             result[run, : values.shape[1]] = np.moveaxis(values, 0, -1)
-        # What explodes says nothing of a state near the data.
-        result[~(np.abs(result) < ENDLESS)] = 0.0
+        result[~followed(result)] = 0.0
         world.derivatives = result
     return world.derivatives
 

@@ -25,8 +25,12 @@ OF_MESH = (
 )
 CASES = {
     # XML
-    "": ":1: not well-formed XML: no element found",
-    "<mujoco>\n<worldbody>\n</mujoco>": ":3: not well-formed XML: mismatched tag",
+    "": (
+        ":1: not well-formed XML: no element found; a robot's model file is MJCF or URDF"
+    ),
+    "<mujoco>\n<worldbody>\n</mujoco>": (
+        ":3: not well-formed XML: mismatched tag; a robot's model file is MJCF or URDF"
+    ),
     '\n<!DOCTYPE x [<!ENTITY a "b">]>\n<mujoco>&a;</mujoco>': (
         ":2: document types and entities are not read; remove them"
     ),

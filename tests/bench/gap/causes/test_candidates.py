@@ -20,6 +20,7 @@ from bench.gap.causes.reaches import (
     instants_about,
     stops_about,
 )
+from bench.gap.causes.score_test import score
 from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.fit import Fitter
 from bench.gap.model.problem import Start
@@ -165,6 +166,29 @@ def test_an_effect_added_to_a_model_is_simulated_with_what_the_model_has(swing):
     np.testing.assert_allclose(changed[0][seen], fit.simulated[seen], atol=1e-4)
     q = there.channels.index("q")
     np.testing.assert_allclose((changed[1] - fit.simulated)[..., q], 0.25, atol=1e-4)
+
+
+def test_a_change_that_explodes_is_none_and_multiplies_without_a_warning(swing, monkeypatch):
+    there, fit = swing
+
+    def exploding(world, at, added):
+        changed = simulate_with(world, at, added)
+        # numbers still, of which the products are none
+        changed[0, 0, 10:] = -1e200 * np.arange(1.0, changed.shape[2] - 9)[:, None]
+        changed[0, 1, 10:] = np.nan
+        return changed
+
+    monkeypatch.setattr("bench.gap.causes.candidates.simulate_with", exploding)
+    names = ["drag.linear", "sensor.bias"]
+    found = directions(there, fit, names)
+    first, second = (of(found, name)[0] for name in names)
+    assert np.abs(found.values[..., first]).max() < 1e6
+    assert not found.values[:, 10:, :, first].any()
+    seen = np.isfinite(there.observed)
+    left = np.where(seen, there.observed - fit.simulated, 0.0)
+    scores = score(fit, left, found, seen, white(there, 0.003))
+    assert np.isfinite(scores.score).all()
+    np.testing.assert_allclose(found.values[..., 0, second][seen[..., 0]], 1.0, atol=1e-4)
 
 
 def test_what_happens_once_is_looked_for_on_the_clock_of_the_stamps():
