@@ -13,6 +13,7 @@ from sims.base import Array, Scenario
 from sims.robot.felt import INSTANT
 from sims.robot.felt import felt as felt_over
 from sims.robot.floating import Afloat
+from sims.robot.instants import Instants, Motion
 from sims.robot.midway import ends, midways
 from sims.robot.native import FIELDS
 from sims.robot.quiet import quiet
@@ -20,7 +21,7 @@ from sims.robot.sampling import keeps_time, places, read, sampled
 from sims.robot.scales import floating_forces, scales
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
-from sims.robot.tangent import TOGETHER, Change, Motion, Tangent
+from sims.robot.tangent import TOGETHER, Change, Tangent
 from sims.robot.work import Work
 from sims.simulated import Simulated
 from sims.system import Acting, Effect, Input, Sensor
@@ -114,16 +115,17 @@ class Linear:
         sizes = scales(simulator.robot).force
         # What is in series carries what its joint carries.
         second = [self._joint(name) for name in bench.robot.series]
-        return Tangent(
+        at = Instants(
             bench,
             simulator.robotic,
             self._motion,
             self._work.acting,
             outputs,
-            np.concatenate([sizes, sizes[second], floating_forces(simulator.robot)]),
             bench.whole,
             [self._driven_joint(name) for name in self._names],
         )
+        sizes = np.concatenate([sizes, sizes[second], floating_forces(simulator.robot)])
+        return Tangent(at, self._work.acting, sizes)
 
     def _driven_joint(self, channel: str) -> int:
         """The number of the joint of which a channel shows what drives exert; -1 of others."""

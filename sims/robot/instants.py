@@ -1,0 +1,371 @@
+"""A robot at many instants of one motion, each in another lane of a batch: where a step leads from
+there, how it accelerates, and what effects exert.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sims.base import Array
+from sims.robot.acting import is_asked, natives
+from sims.robot.floating import Afloat
+from sims.robot.forces import LOADED, exerted, is_in_drive, moment_of
+from sims.robot.lanes import Addresses, Bench
+from sims.robot.midway import Places
+from sims.robot.moment import RobotMoment
+from sims.robot.remembered import advanced, along
+from sims.robot.system import RobotSystem
+from sims.system import Acting, Effect, Force, Friction, Hidden, State
+
+HELD = 0.004
+"""Seconds over which what is found at an instant holds: a pose changes little within."""
+SLOW = 1e-3
+"""rad/s or m/s over which dry friction turns its sign along the motion."""
+SIDES = ("qfrc_actuator", "qfrc_bias")
+"""What presses on a joint's transmission from either side, in MuJoCo's data."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One motion of a robot, and all that it was made with.
+
+    Attributes:
+        x, v: (S + 1, D) positions and velocities at the beginnings of steps, and at the end.
+        act: (S, na) activations at the beginnings.
+        controls: (S, nu).
+        instant: (S, nu) the same when each step begins.
+        forces: (S, nv) generalised, known beforehand.
+        inputs: (S,) what is felt of each input, by name.
+        carried: (2, S, D) what transmissions carry, from either side.
+        afloat: (S + 1, P) poses and (S + 1, F) velocities of what floats.
+        step: seconds.
+    """
+
+    x: Array
+    v: Array
+    act: Array
+    controls: Array
+    instant: Array
+    forces: Array
+    inputs: Mapping[str, Array]
+    carried: Array
+    afloat: Afloat
+    step: float
+
+    @property
+    def rates(self) -> Array:
+        """(S + 1, D + F) all velocities."""
+        return np.concatenate([self.v, self.afloat.rate], axis=1)
+
+
+class Instants:
+    """The instants of one motion that are looked at.
+
+    Args:
+        bench: lanes of the robot, as many as instants are looked at side by side.
+        system: the robot's.
+        motion: of which.
+        acting: effects that act in it, with coefficients (K, 1, 1).
+        outputs: names of MuJoCo's data and their columns that are read, beside the state.
+        places: addresses of the joints.
+        drives: of each output the number of the joint of which it is what drives exert; -1 of
+            others.
+
+    Attributes:
+        motion: as given.
+        numbers: (N,) the steps that begin at them.
+        of: (S,) for each step which of them holds there.
+        every: steps between two of them while nothing changes in between.
+        seen: how many lanes have been placed so far.
+        remembering: numbers of the effects that remember, in the order of their columns of states.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        system: RobotSystem,
+        motion: Motion,
+        acting: Acting,
+        outputs: Sequence[tuple[str, int]],
+        places: Addresses,
+        drives: Sequence[int] = (),
+    ) -> None:
+        self.motion = motion
+        self._bench, self._system = bench, system
+        self._outputs = tuple(outputs)
+        self._places = places
+        self._drives = np.array(tuple(drives) or (-1,) * len(self._outputs), dtype=np.intp)
+        self._exerted = np.zeros((0, 0))
+        self._floating = bench.floating
+        self._dofs = np.append(places.velocities, self._floating.velocities)
+        self.every = max(round(HELD / motion.step), 1)
+        self.numbers, self.of = _looked_at(motion, self.every)
+        # What is bound after a call is not there before the next one.
+        self._bind(bench)
+        self.seen = 0
+        self._asked = [(e, c) for e, c in acting if is_asked(e)]
+        bench.load(_repeated(acting, bench.count))
+        self._stiffness = bench.stiffness(places)[:1]
+        self._states = [self.gone(effect, c) for effect, c in self._asked]
+        self.remembering = [k for k, (e, _) in enumerate(self._asked) if isinstance(e, Hidden)]
+        self._after: dict[int, State] = {}
+        bench.batch.reset(stage=0)
+        self._fresh = bench.batch.state.copy()
+
+    def _bind(self, bench: Bench) -> None:
+        for name in ("qacc", *SIDES, *dict(self._outputs)):
+            bench.batch.bind(name)
+
+    @property
+    def reads_drives(self) -> bool:
+        """Whether what a drive exerts is read."""
+        return bool((self._drives >= 0).any())
+
+    @property
+    def reads_others(self) -> bool:
+        """Whether anything else is, beside the state."""
+        return bool((self._drives < 0).any())
+
+    def reached(
+        self, moved: Mapping[str, tuple[int, float]], acting: Acting
+    ) -> tuple[Array, Array]:
+        """States (N, Z) and readings (N, O) after a step from each instant.
+
+        Args:
+            moved: one column of what it begins with, and by how much.
+            acting: effects whose elements are in the model.
+        """
+        states, readings = [], []
+        bind, places, floating = self._bench.batch.bind, self._places, self._floating
+        begin = 0
+        for n, ids in self._placed(moved, acting):
+            self._bench.batch.step(ids)
+            parts = [bind("qpos")[:n, places.positions], bind("qvel")[:n, places.velocities]]
+            if self.motion.act.shape[1]:
+                parts.append(bind("act")[:n])
+            parts += [state.v for state in self._after.values()]
+            if floating:
+                reached = self.motion.afloat.pose[self.numbers[begin : begin + n] + 1]
+                parts.append(floating.apart(bind("qpos")[:n, floating.positions], reached))
+                parts.append(bind("qvel")[:n, floating.velocities])
+            begin += n
+            states.append(np.concatenate(parts, axis=1))
+            readings.append(self._readings(n))
+        return np.concatenate(states), np.concatenate(readings)
+
+    def accelerated(self, acting: Acting, more: Array | None = None) -> tuple[Array, Array]:
+        """Accelerations (N, E) at each instant, and readings (N, O); with more forces (N, E)."""
+        accelerations, readings = [], []
+        applied = self._bench.batch.bind("qfrc_applied")
+        dofs, begin = self._dofs, 0
+        for n, ids in self._placed({}, acting):
+            if more is not None:
+                applied[:n, dofs] += more[begin : begin + n]
+                begin += n
+            self._bench.batch.forward(ids)
+            accelerations.append(self._bench.batch.bind("qacc")[:n, dofs].copy())
+            readings.append(self._readings(n))
+        return np.concatenate(accelerations), np.concatenate(readings)
+
+    def _readings(self, n: int) -> Array:
+        """(n, O) of the lanes, as they are now."""
+        bind = self._bench.batch.bind
+        rows = [bind(name)[:n, column, None] for name, column in self._outputs]
+        if not rows:
+            return np.zeros((n, 0))
+        read = np.concatenate(rows, axis=1)
+        if self._exerted.size:
+            of = self._drives
+            read[:, of >= 0] += self._exerted[:, of[of >= 0]]
+        return read
+
+    def _placed(
+        self, moved: Mapping[str, tuple[int, float]], acting: Acting
+    ) -> Iterator[tuple[int, Places | None]]:
+        """Put the lanes at the instants, batch after batch: how many there are, and which."""
+        motion, places, floating = self.motion, self._places, self._floating
+        count = self._bench.count
+        self.seen += self.numbers.size
+        self._bench.load(_repeated(acting, count))
+        batch = self._bench.batch
+        bind = batch.bind
+        qpos, qvel, ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
+        applied = bind("qfrc_applied")
+        na = motion.act.shape[1]
+        targets = {
+            "q": lambda k: qpos[:, places.positions[k]],
+            "v": lambda k: qvel[:, places.velocities[k]],
+            "f": lambda k: applied[:, self._dofs[k]],
+            "u": lambda k: ctrl[:, k],
+            "a": lambda k: bind("act")[:, k],
+            "r": lambda k: qvel[:, floating.velocities[k]],
+        }
+        for begin in range(0, self.numbers.size, count):
+            at = self.numbers[begin : begin + count]
+            n = at.size
+            batch.state[:] = self._fresh
+            qpos[:n, places.positions] = motion.x[at]
+            qvel[:n, places.velocities] = motion.v[at]
+            qpos[:n, floating.positions] = motion.afloat.pose[at]
+            qvel[:n, floating.velocities] = motion.afloat.rate[at]
+            ctrl[:n] = motion.controls[at]
+            applied[:n] = motion.forces[at]
+            if na:
+                bind("act")[:n] = motion.act[at]
+            for name, (k, size) in moved.items():
+                if name == "p":
+                    poses = floating.moved(motion.afloat.pose[at], k, size)
+                    qpos[:n, floating.positions] = poses
+                elif name != "w":
+                    targets[name](k)[:n] += size
+            self._ask(at, n, dict([moved["w"]]) if "w" in moved else {})
+            yield n, None if n == count else np.arange(n)
+
+    def _ask(self, at: Places, n: int, remembered: Mapping[int, float]) -> None:
+        """Add the forces of effects that hang on where the robot is, at the lanes' own states; what
+        some of them remember is moved, by their numbers.
+        """
+        if not self._asked:
+            return
+        bind, places = self._bench.batch.bind, self._places
+        motion = self.motion
+        x = bind("qpos")[:n, places.positions]
+        v = bind("qvel")[:n, places.velocities]
+        inputs = {name: u[at][:, None] for name, u in motion.inputs.items()}
+        t: Array = motion.step * at[:, None].astype(np.float64)
+        carried = motion.carried[:, at]
+        if any(effect.of in LOADED for effect, _ in self._asked):
+            # A servo's drive moves with the state as it does in the simulation.
+            self._bench.batch.forward(None if n == self._bench.count else np.arange(n))
+            carried = np.stack([bind(name)[:n, places.velocities] for name in SIDES])
+        moment = moment_of(self._system, t, x, v, inputs, carried, self.stiff(n))
+        self._exerted = np.zeros_like(x)
+        for k, (effect, c) in enumerate(self._asked):
+            own = np.repeat(c, n, axis=1)
+            if isinstance(effect, Hidden):
+                known = self._states[k]
+                state = State(known.x[at], known.v[at] + remembered.get(k, 0.0))
+                ahead = advanced(effect, own, moment, state, 0.5 * motion.step)
+                self._after[k] = advanced(effect, own, moment, state, motion.step)
+                force, _ = effect.act(own, moment, ahead)
+                bind("qfrc_applied")[:n, places.velocities] += force
+            elif isinstance(effect, Friction):
+                assert effect.coordinate is not None
+                limit = np.maximum(effect.limit(own, moment)[:, 0], 0.0)
+                self._bench.rub(n, int(places.velocities[effect.coordinate]), limit)
+            elif isinstance(effect, Force):
+                force = effect.force(own, moment)
+                bind("qfrc_applied")[:n, places.velocities] += force
+                if is_in_drive(effect):
+                    self._exerted += force
+
+    def stiff(self, count: int) -> Array:
+        """(count, D) of the servos, at so many instants."""
+        return np.repeat(self._stiffness, count, axis=0)
+
+    @contextmanager
+    def on(self, bench: Bench) -> Iterator[None]:
+        """Look at the instants in other lanes, of the same coordinates."""
+        own = self._bench, self._fresh
+        if bench is not self._bench:
+            self._bind(bench)
+            bench.batch.reset(stage=0)
+            self._bench, self._fresh = bench, bench.batch.state.copy()
+        try:
+            yield
+        finally:
+            self._bench, self._fresh = own
+
+    def inertias(self, acting: Acting) -> Array:
+        """(N, E, E) of all that moves at each instant that is looked at."""
+        import mujoco
+
+        self._bench.load(_repeated(acting, self._bench.count))
+        model = self._bench.batch.get_model(0)
+        data = mujoco.MjData(model)
+        places = self._places
+        whole = np.zeros((model.nv, model.nv))
+        found = []
+        poses = self.motion.afloat.pose[self.numbers]
+        for x, pose in zip(self.motion.x[self.numbers], poses, strict=True):
+            data.qpos[places.positions] = x
+            data.qpos[self._floating.positions] = pose
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_crb(model, data)
+            mujoco.mj_fullM(model, data, whole)
+            found.append(whole[np.ix_(self._dofs, self._dofs)])
+        return np.array(found)
+
+    def shown(self, effect: Effect, c: Array, read: Array) -> Array:
+        """(N, O) what an effect in a drive changes about readings (N, O) of the drives."""
+        motion, at, of = self.motion, self.numbers, self._drives
+        # Of drives that are read it is known when the step begins, and not somewhere within.
+        carried = motion.carried[:, at].copy()
+        carried[0][:, of[of >= 0]] = read[:, of >= 0]
+        inputs = {name: u[at, None] for name, u in motion.inputs.items()}
+        t: Array = motion.step * at[:, None].astype(np.float64)
+        x, v, stiff = motion.x[at], motion.v[at], self.stiff(at.size)
+        moment = moment_of(self._system, t, x, v, inputs, carried, stiff)
+        force = exerted(((effect, np.repeat(c, at.size, axis=1)),), moment)
+        result: Array = np.where(of >= 0, force[:, of], 0.0)
+        return result
+
+    def force(self, effect: Effect, c: Array) -> Array:
+        """(S, D) what an effect exerts in the middle of each step."""
+        own = np.repeat(c, len(self.motion.controls), axis=1)
+        if isinstance(effect, Hidden):
+            state = self.gone(effect, c)
+            ahead = State(*(0.5 * (u[1:] + u[:-1]) for u in (state.x, state.v)))
+            return effect.act(own, self.moment, ahead)[0]
+        if isinstance(effect, Force):
+            return effect.force(own, self.moment)
+        assert isinstance(effect, Friction)
+        assert effect.coordinate is not None
+        limit = effect.limit(own, self.moment)[:, 0]
+        v = self.moment.v[:, effect.coordinate]
+        result = np.zeros_like(self.moment.x)
+        result[:, effect.coordinate] = -limit * v / (np.abs(v) + SLOW)
+        return result
+
+    def gone(self, effect: Effect, c: Array) -> State:
+        """States (S + 1, 1) of an effect along the motion, where it has any."""
+        if not isinstance(effect, Hidden):
+            return State(np.zeros((0, 1)), np.zeros((0, 1)))
+        return along(effect, c, self.moment, self.motion.step)
+
+    @cached_property
+    def moment(self) -> RobotMoment:
+        """All instants of the motion as one moment of S lanes, in the middle of each step."""
+        motion = self.motion
+        steps = len(motion.controls)
+        t: Array = motion.step * (np.arange(float(steps)) + 0.5)
+        inputs = {name: u[:, None] for name, u in motion.inputs.items()}
+        x = 0.5 * (motion.x[:-1] + motion.x[1:])[:steps]
+        v = 0.5 * (motion.v[:-1] + motion.v[1:])[:steps]
+        return moment_of(self._system, t[:, None], x, v, inputs, motion.carried, self.stiff(steps))
+
+
+def _looked_at(motion: Motion, every: int) -> tuple[Places, Places]:
+    """Steps in which quotients are taken (N,), and for each step which of them hold there (S,)."""
+    steps = len(motion.controls)
+    changes = np.ones(steps, dtype=bool)
+    changes[1:] = (np.diff(motion.controls, axis=0) != 0).any(axis=1)
+    # A command that holds for a while is looked at anew when it changes; one that never holds is
+    # as smooth as the motion.
+    if changes.mean() > 1.0 / every:
+        changes[1:] = False
+    numbers = np.arange(steps)
+    begins = np.maximum.accumulate(np.where(changes, numbers, 0))
+    looked = (numbers - begins) % every == 0
+    return np.flatnonzero(looked), np.cumsum(looked) - 1
+
+
+def _repeated(acting: Acting, count: int) -> Acting:
+    """One lane's coefficients for all lanes of a batch; of native effects alone."""
+    return tuple((e, np.repeat(c, count, axis=1)) for e, c in natives(acting))
