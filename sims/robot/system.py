@@ -14,6 +14,7 @@ from sims.robot.floating import Floating
 from sims.robot.model import Robot
 from sims.robot.moment import OneJoint, Slide
 from sims.robot.native import FIELDS
+from sims.robot.spots import WORDS, Spot, spots
 from sims.robot.usual import Usual
 from sims.system import FAMILY, Effect, Kind, Moment, System
 
@@ -43,7 +44,7 @@ class RobotSystem(System):
     has_model = True
     usual_recording = Usual()
     robot: ClassVar[Robot]
-    spots: ClassVar[Mapping[str, Sequence[places.Spot]]]
+    spots: ClassVar[Mapping[str, Sequence[Spot]]]
     alone: ClassVar[tuple[System, ...]]
     drives: ClassVar[Mapping[int, tuple[str, ...]]]
     servos: ClassVar[Mapping[int, str]]
@@ -114,7 +115,7 @@ class RobotSystem(System):
         MuJoCo's words or ``drag.linear@elbow``; ``@*`` is every place.
         """
         base, _, place = word.partition("@")
-        name = places.WORDS.get(base, base)
+        name = WORDS.get(base, base)
         if name not in library.names():
             there = [*cls.words(), *(other for other in library.names() if cls._has(other))]
             raise unknown(f"number of robot {cls.name}", base, there)
@@ -127,7 +128,7 @@ class RobotSystem(System):
     @classmethod
     def words(cls) -> list[str]:
         """MuJoCo's words for numbers that its file states."""
-        return [word for word, name in places.WORDS.items() if cls._has(name)]
+        return [word for word, name in WORDS.items() if cls._has(name)]
 
     @classmethod
     def _has(cls, name: str) -> bool:
@@ -197,7 +198,7 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
         "sensed": tuple(c.name for c in channels),
         "robot": robot,
         "afloat": MappingProxyType(floating.units()),
-        "spots": places.spots(robot, [(c.name, c.unit) for c in channels]),
+        "spots": spots(robot, [(c.name, c.unit) for c in channels]),
         "alone": tuple(OneJoint() if j.kind == "hinge" else Slide() for j in joints),
         "drives": drives,
         "servos": servos,
