@@ -25,9 +25,7 @@ OF_MESH = (
 )
 CASES = {
     # XML
-    "": (
-        ":1: not well-formed XML: no element found; a robot's model file is MJCF or URDF"
-    ),
+    "": (":1: not well-formed XML: no element found; a robot's model file is MJCF or URDF"),
     "<mujoco>\n<worldbody>\n</mujoco>": (
         ":3: not well-formed XML: mismatched tag; a robot's model file is MJCF or URDF"
     ),
