@@ -77,7 +77,7 @@ class Instants:
             others.
 
     Attributes:
-        motion: as given.
+        motion, acting: as given.
         numbers: (N,) the steps that begin at them.
         of: (S,) for each step which of them holds there.
         every: steps between two of them while nothing changes in between.
@@ -95,7 +95,7 @@ class Instants:
         places: Addresses,
         drives: Sequence[int] = (),
     ) -> None:
-        self.motion = motion
+        self.motion, self.acting = motion, acting
         self._bench, self._system = bench, system
         self._outputs = tuple(outputs)
         self._places = places
@@ -281,11 +281,11 @@ class Instants:
         finally:
             self._bench, self._fresh = own
 
-    def inertias(self, acting: Acting) -> Array:
+    def inertias(self) -> Array:
         """(N, E, E) of all that moves at each instant that is looked at."""
         import mujoco
 
-        self._bench.load(_repeated(acting, self._bench.count))
+        self._bench.load(_repeated(self.acting, self._bench.count))
         model = self._bench.batch.get_model(0)
         data = mujoco.MjData(model)
         places = self._places

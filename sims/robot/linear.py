@@ -125,7 +125,7 @@ class Linear:
             [self._driven_joint(name) for name in self._names],
         )
         sizes = np.concatenate([sizes, sizes[second], floating_forces(simulator.robot)])
-        return Tangent(at, self._work.acting, sizes)
+        return Tangent(at, sizes)
 
     def _driven_joint(self, channel: str) -> int:
         """The number of the joint of which a channel shows what drives exert; -1 of others."""

@@ -88,22 +88,20 @@ class Tangent:
 
     Args:
         at: its instants.
-        acting: effects that act in it, with coefficients (K, 1, 1).
         sizes: (E,) typical forces.
     """
 
-    def __init__(self, at: Instants, acting: Acting, sizes: Array) -> None:
+    def __init__(self, at: Instants, sizes: Array) -> None:
         self._at, self._motion = at, at.motion
-        self._acting = acting
         self._sizes = sizes
         self._steps = len(at.motion.controls)
         numbers = np.arange(self._steps)
         self._share: Array = (numbers - at.numbers[at.of]) / at.every
         self._earlier, self._later = _neighbours(at.numbers, at.every)[:, at.of]
-        self._base, self._read = at.reached({}, acting)
+        self._base, self._read = at.reached({}, at.acting)
         self.quotients = self._quotients()
         # Accelerations and readings of the motion itself.
-        self._still = at.accelerated(acting)
+        self._still = at.accelerated(at.acting)
 
     @property
     def looks(self) -> int:
@@ -135,7 +133,7 @@ class Tangent:
         for kind, columns in moves.items():
             states, readings = [], []
             for name, j, by in columns:
-                state, reading = self._at.reached({name: (j, by)}, self._acting)
+                state, reading = self._at.reached({name: (j, by)}, self._at.acting)
                 states.append((state - self._base) / by)
                 readings.append((reading - self._read) / by)
             rows = self._at.numbers.size
@@ -182,7 +180,7 @@ class Tangent:
 
     @cached_property
     def _inertias(self) -> Array:
-        return self._at.inertias(self._acting)
+        return self._at.inertias()
 
     @cached_property
     def accelerations(self) -> Array:
