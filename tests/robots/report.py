@@ -21,7 +21,7 @@ def write(folder, rows):
     """
     asked = [row for row in rows if row.get("mark")]
     summary, about = summarised(rows), folder / ABOUT
-    _items(folder / "items.csv", asked)
+    listed(folder / "items.csv", asked)
     (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     said = about.read_text() if about.exists() else ""
     (folder / "README.md").write_text(page(summary, said))
@@ -189,7 +189,8 @@ def page(summary, about=""):
     return "\n".join(lines) + "\n"
 
 
-def _items(path, asked):
+def listed(path, asked):
+    """Write a table of answers: a line for each, what was hidden, told, and how well it was."""
     lines = [_line(row) for row in sorted(asked, key=lambda row: row["question"])]
     with path.open("w", newline="") as file:
         names = list(lines[0]) if lines else []

@@ -1,6 +1,7 @@
 """Causes hidden in robots that float: ``python -m tests.robots.afloat --out DIR [--only TEXT]``.
 
 One row a question is added to items.jsonl as it is answered; what is there is not asked again.
+A table of the answers, items.csv, is made from it at the end.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections import Counter
 from pathlib import Path
 
 from tests.exam.explained import explained
+from tests.robots import report
 from tests.robots.afloat import items
 from tests.robots.score import marked
 
@@ -37,6 +39,7 @@ def main(arguments=None):
         with path.open("a") as file:
             file.write(json.dumps(rows[-1]) + "\n")
         print(name, rows[-1]["mark"] or "does not show", flush=True)
+    report.listed(given.out / "items.csv", [row for row in rows if row["mark"]])
     print(table(rows))
     return 0
 

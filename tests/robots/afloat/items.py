@@ -29,7 +29,7 @@ OWN = {
     "dropped-servo": ("actuator.stiffness", "actuator.damping"),
     "hung-motor": ("gravity.scale", "input.deadband"),
 }
-CLEAN = 6
+CLEAN = 40
 """Of each robot."""
 ATTEMPTS = 4
 FOREIGN_APART = 1.0

@@ -104,3 +104,16 @@ def test_a_wrong_mass_below_a_ball_joint_is_found_by_the_command(tmp_path):
     assert said["low"] <= truth <= said["high"]
     assert said["high"] - said["low"] < 0.2 * truth
     assert verdict["heldout"]["gap_closed"] > 0.9
+
+
+def test_a_held_out_run_that_is_chaotic_is_no_gap(tmp_path):
+    """It grows 1,400 times what the guess of its beginning is off by: derivatives there lead a fit
+    astray, which leaves twice the noise.
+    """
+    item, made = items.drawn("clean", "hung-motor", "any", 27)
+    log = items.written(item, replace(made, runs=made.runs[3:]), tmp_path)
+    assert main(["explain", str(log), "--out", str(tmp_path / "out")]) == 0
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    heldout = verdict["heldout"]
+    assert verdict["verdict"] == "adequate"
+    assert heldout["rmse_base"] == pytest.approx(heldout["noise_floor"], rel=0.05)
