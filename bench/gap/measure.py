@@ -48,6 +48,8 @@ BENT = 0.3
 """RMS, in units of the noise, by which a motion may miss what derivatives by its initial states
 make of it, before these are taken anew.
 """
+NEARER = 3.0
+"""Decrease of the sum of squares, in units of the noise, by which fits are led on."""
 TWICE = 2.0
 """Models this much farther from held-out runs than the nearest one, as a sum of squares, are fitted
 there once more.
@@ -101,8 +103,7 @@ class HeldOutRuns:
         fits = self._fitted(begun, STAGES)
         nearest = min(fits, key=lambda fit: fit.cost)
         if self._bends(nearest):
-            led = self._led(begun)
-            fits = [min(pair, key=lambda fit: fit.cost) for pair in zip(fits, led, strict=True)]
+            fits = self._led(begun, fits)
             nearest = min(fits, key=lambda fit: fit.cost)
         # Asked this way round, since a fit that failed has a cost that is no number.
         limit = TWICE * nearest.cost
@@ -142,20 +143,31 @@ class HeldOutRuns:
         # Asked this way round, since a guess that cannot be simulated leaves NaN.
         return not float(np.sqrt(np.square(sizes).mean())) < BENT
 
-    def _led(self, starts: Sequence[Start]) -> list[Fit]:
-        """Initial states fitted as by `_fitted`, with derivatives about where the nearest model has
-        come to, taken anew before each stage.
+    def _led(self, starts: Sequence[Start], fits: Sequence[Fit]) -> list[Fit]:
+        """The fits with derivatives about the nearest of them; where these lead any nearer, fitted
+        from the starts again with derivatives that are taken anew before each stage.
         """
+        least = min(fit.cost for fit in fits)
+        found = self._better(fits, self._about(fits, STAGES[-1:]))
+        if least - min(fit.cost for fit in found) < NEARER:
+            return found
+        led = self._fitted(starts, STAGES[:1])
+        for stage in (*STAGES[1:], STAGES[-1]):
+            led = self._about(led, [stage])
+        return self._better(found, led)
+
+    def _about(self, fits: Sequence[Fit], stages: Sequence[tuple[float, int]]) -> list[Fit]:
+        """The fits led on, with derivatives about the nearest of them."""
         # loaded where there is a robot alone
         from bench.gap.model.tangents import begun
 
-        fits: list[Fit] = []
-        for stage in STAGES:
-            fits = self._fitted(starts, [stage])
-            starts = [fit.start() for fit in fits]
-            nearest = min(fits, key=lambda fit: fit.cost)
-            begun(self.world, nearest.theta, nearest.states, anew=True)
-        return self._fitted(starts, STAGES[-1:])
+        nearest = min(fits, key=lambda fit: fit.cost)
+        begun(self.world, nearest.theta, nearest.states, anew=True)
+        return self._fitted([fit.start() for fit in fits], stages)
+
+    def _better(self, fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
+        """Of each model the nearer of two fits."""
+        return [min(pair, key=lambda fit: fit.cost) for pair in zip(fits, others, strict=True)]
 
     def _measured(self, fit: Fit) -> Measured:
         if not np.isfinite(fit.cost):
