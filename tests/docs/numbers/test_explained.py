@@ -1,6 +1,7 @@
 """The pages on how often explain is right say what the summaries beside them say."""
 
 import json
+from operator import not_
 
 import pytest
 
@@ -10,6 +11,7 @@ from tests.docs.numbers.account import NUMBER, Account
 from tests.docs.numbers.tables import document, frame
 from tests.docs.pages import quoted, section, tables, text_of
 from tests.exam import report as exam_report
+from tests.exam.summary import share
 from tests.robots import report as robots_report
 
 
@@ -166,15 +168,20 @@ def next_recording():
 def verdicts():
     """docs/verdicts.md."""
     page = Account("docs/verdicts.md")
-    exam, robots = document("exam/summary.json"), document("robots/summary.json")
-    of = robots["named"]
+    exam, again = document("exam/summary.json"), frame("robots/again.csv")
+    again = again[again.outcome != "not drawn"]
+
+    def of(kind, how="fair"):
+        return share(again[again.kind == kind][how], bool)
+
+    held = [n < row.held for row in again.itertuples() for n in range(row.intervals)]
     counts = {
-        "nothing hidden": (exam["clean"]["alarms"], robots["alarms"]),
-        "one cause: named, or": (exam["single"]["named as data tell"], of["single"]["fair"]),
-        "one cause: named alone": (exam["single"]["named alone"], of["single"]["strict"]),
-        "two causes": (exam["double"]["named as data tell"], of["double"]["any"]),
-        "a cause that": (exam["foreign"]["right"], robots["foreign"]),
-        "95 % intervals": (exam["coverage"]["all"], robots["coverage"]),
+        "nothing hidden": (exam["clean"]["alarms"], share(again[again.kind == "clean"].fair, not_)),
+        "one cause: named, or": (exam["single"]["named as data tell"], of("single")),
+        "one cause: named alone": (exam["single"]["named alone"], of("single", "strict")),
+        "two causes": (exam["double"]["named as data tell"], of("double")),
+        "a cause that": (exam["foreign"]["right"], of("foreign")),
+        "95 % intervals": (exam["coverage"]["all"], share(held, bool)),
     }
 
     def value(row, heading):
@@ -188,6 +195,7 @@ def verdicts():
 
     assert page.table("| [ball", value) == 12 * 2 + 8
     page.known("95 % intervals that hold", "the level")
+    page.known("so far of the library of 25 November", "which library it was")
     page.known("In brackets 95 % intervals", "the level")
     page.known("above 12,000 samples that lie closer than 10 ms", "bench/gap/causes/foresee.py")
     page.known("odds of 33 to 1", "held by the thresholds, below")
