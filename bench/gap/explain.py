@@ -21,7 +21,7 @@ from bench.gap.causes.structure import probes
 from bench.gap.design import Design, design
 from bench.gap.explanation import Explanation
 from bench.gap.freeze import frozen
-from bench.gap.measure import HeldOutRuns
+from bench.gap.held_out import HeldOutRuns
 from bench.gap.model.base_fit import Base, fit_base, without_step
 from bench.gap.model.crew import Crew
 from bench.gap.model.floor import Floor, noise_floor

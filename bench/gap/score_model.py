@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from bench.gap.measure import HeldOutRuns
+from bench.gap.held_out import HeldOutRuns
 from bench.gap.model.floor import noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World

@@ -20,7 +20,8 @@ from bench.gap.causes.search import Search
 from bench.gap.causes.settle import rivals, settle
 from bench.gap.causes.structure import Remains, remains, unasked
 from bench.gap.causes.trial import Trial
-from bench.gap.measure import HeldOutRuns, Measured, covariance
+from bench.gap.held_out import HeldOutRuns, Measured
+from bench.gap.measure import covariance
 from bench.gap.model.models import Model, Names
 from bench.gap.model.watch import Cut, EndedError
 from sims.base import Array

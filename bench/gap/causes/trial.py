@@ -14,7 +14,7 @@ import numpy as np
 from bench.gap.causes.rules import NOTICED, explains, helps, is_alike, is_missed, ratio_of
 from bench.gap.causes.search import IDLE, Search
 from bench.gap.causes.structure import Remains
-from bench.gap.measure import HeldOutRuns, Measured
+from bench.gap.held_out import HeldOutRuns, Measured
 from bench.gap.model.models import Model, Names
 from sims.base import Array
 

@@ -28,8 +28,9 @@ import numpy as np
 
 from bench.gap.apart import Spread, spreads
 from bench.gap.causes.candidates import LIMITED, Directions, Probe, changes_by, directions
+from bench.gap.held_out import HeldOutRuns
 from bench.gap.identify import FAINT, MIXED
-from bench.gap.measure import UNBOUNDED, Z95, HeldOutRuns, curvature, derived, inverted
+from bench.gap.measure import UNBOUNDED, Z95, curvature, derived, inverted
 from bench.gap.model.arrow import schur_complement
 from bench.gap.model.fit import Fitter
 from bench.gap.model.floor import noise_floor

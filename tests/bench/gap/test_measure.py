@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from bench.gap.causes.search import Search
-from bench.gap.measure import HeldOutRuns, central, covariance, gain, intervals
+from bench.gap.held_out import HeldOutRuns
+from bench.gap.measure import central, covariance, gain, intervals
 from bench.gap.model.fit import Fitter
 from bench.gap.model.noise import Noise, likelihood
 from bench.gap.model.problem import Start

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from bench.gap.measure import Measured
+from bench.gap.held_out import Measured
 from bench.gap.model.models import Model
 from bench.gap.model.noise import Likelihood
 from tests.bench.gap.made import linear_fit

@@ -1,0 +1,154 @@
+"""Held-out runs: models on runs of which nothing but initial states is fitted.
+
+Of n samples, with f initial states that the data fix, the merit of a model with log likelihood L is
+that of G. Schwarz (Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136):
+
+    M = 2 log L - f log n                                                                      (1)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.gap.model.fit import Fitter
+from bench.gap.model.models import freedom
+from bench.gap.model.noise import Mask, Noise, likelihood
+from bench.gap.model.problem import Fit, Start
+from bench.gap.model.world import World
+from sims.base import Array
+
+STAGES = ((0.2, 6), (0.45, 6), (0.7, 6), (1.0, 10))
+"""Shares of a run over which its initial state is fitted one after another, and steps of each."""
+BENT = 0.3
+"""RMS, in units of the noise, by which a motion may miss what derivatives by its initial states
+make of it, before these are taken anew.
+"""
+NEARER = 3.0
+"""Decrease of the sum of squares, in units of the noise, by which fits are led on."""
+TWICE = 2.0
+"""Models this much farther from held-out runs than the nearest one, as a sum of squares, are fitted
+there once more.
+"""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Runs simulated with parameters that others gave: (R, T, C), their merit, which counts initial
+    states, and these (R, s).
+    """
+
+    simulated: Array
+    merit: float
+    states: Array
+
+
+class HeldOutRuns:
+    """Runs on which nothing is fitted but their initial states.
+
+    Args:
+        world: the runs, with the effects of the fitted model in the same places.
+        noise: weighs the channels.
+    """
+
+    def __init__(self, world: World, noise: Noise) -> None:
+        self.world = world
+        self.noise = noise
+        self.seen: Mask = np.isfinite(world.observed)
+
+    def measure(self, thetas: Sequence[Array]) -> list[Measured]:
+        """Simulate with each parameter vector (P,), initial states estimated run by run.
+
+        Least squares may end in another minimum for one model than for its neighbour, and luck
+        would then decide between them: every model is fitted again from the states of the nearest
+        one, and the better fit counts.
+        """
+        guess = self.world.guess
+        begun = [Start((), theta, guess) for theta in thetas]
+        fits = self._fitted(begun, STAGES)
+        nearest = min(fits, key=lambda fit: fit.cost)
+        if self._bends(nearest):
+            fits = self._led(begun, fits)
+            nearest = min(fits, key=lambda fit: fit.cost)
+        # Asked this way round, since a fit that failed has a cost that is no number.
+        limit = TWICE * nearest.cost
+        apart = [i for i, fit in enumerate(fits) if not fit.cost < limit]
+        starts = [replace(fits[i].start(), states=nearest.states) for i in apart]
+        # These states are good over the first share of the runs already.
+        again = self._fitted(starts, STAGES[1:])
+        for i, fit in zip(apart, again, strict=True):
+            fits[i] = min(fits[i], fit, key=lambda fit: fit.cost)
+        return [self._measured(fit) for fit in fits]
+
+    def _fitted(self, starts: Sequence[Start], stages: Sequence[tuple[float, int]]) -> list[Fit]:
+        """Initial states fitted over longer and longer parts of the runs."""
+        fits: list[Fit] = []
+        if not starts:
+            return fits
+        for share, iterations in stages:
+            fitter = Fitter(self.world, self.noise, share=share, parameters=False)
+            fits = fitter.fit(starts, iterations)
+            starts = [fit.start() for fit in fits]
+        return fits
+
+    def _bends(self, fit: Fit) -> bool:
+        """Whether the motion is no longer what a robot's derivatives by initial states, which are
+        taken once for all models, make of it. One that is chaotic leaves them where its guess is
+        off by no more than the noise.
+        """
+        world = self.world
+        if not world.linear or not np.isfinite(fit.cost):
+            return False
+        runs = len(world.guess)
+        lanes = np.tile(fit.theta, (runs, 1))
+        begun = world.simulate(lanes, np.arange(runs), world.guess)
+        moved = fit.states - world.guess
+        # A guess that explodes is infinite, or NaN.
+        with np.errstate(over="ignore", invalid="ignore"):
+            missed = fit.simulated - begun - np.einsum("rtcs,rs->rtc", fit.jacobian, moved)
+            sizes = (missed / self.noise.sigma)[self.seen]
+            rms = float(np.sqrt(np.square(sizes).mean()))
+        # Asked this way round, since NaN compares with nothing.
+        return not rms < BENT
+
+    def _led(self, starts: Sequence[Start], fits: Sequence[Fit]) -> list[Fit]:
+        """The fits with derivatives about the nearest of them; where these lead any nearer, fitted
+        from the starts again with derivatives that are taken anew before each stage.
+        """
+        least = min(fit.cost for fit in fits)
+        found = self._better(fits, self._about(fits, STAGES[-1:]))
+        if least - min(fit.cost for fit in found) < NEARER:
+            return found
+        led = self._fitted(starts, STAGES[:1])
+        for stage in (*STAGES[1:], STAGES[-1]):
+            led = self._about(led, [stage])
+        return self._better(found, led)
+
+    def _about(self, fits: Sequence[Fit], stages: Sequence[tuple[float, int]]) -> list[Fit]:
+        """The fits led on, with derivatives about the nearest of them."""
+        # loaded where there is a robot alone
+        from bench.gap.model.tangents import begun
+
+        nearest = min(fits, key=lambda fit: fit.cost)
+        begun(self.world, nearest.theta, nearest.states, anew=True)
+        return self._fitted([fit.start() for fit in fits], stages)
+
+    def _better(self, fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
+        """Of each model the nearer of two fits."""
+        return [min(pair, key=lambda fit: fit.cost) for pair in zip(fits, others, strict=True)]
+
+    def _measured(self, fit: Fit) -> Measured:
+        if not np.isfinite(fit.cost):
+            nothing = np.full_like(self.world.observed, np.nan)
+            return Measured(nothing, -np.inf, fit.states)
+        left = self.world.observed - fit.simulated
+        residual = np.where(self.seen, left, 0.0)
+        # Only initial states were fitted here, so they alone cost merit.
+        free = freedom(self.world, fit, self.noise)
+        count = int(self.seen.sum())
+        price = float(np.log(max(count, 2)))
+        likeliest = likelihood(residual, self.seen, free)
+        merit = likeliest.value - free * price  # (1)
+        return Measured(fit.simulated, merit, fit.states)
