@@ -8,7 +8,7 @@ that of G. Schwarz (Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136):
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,10 +68,9 @@ class HeldOutRuns:
         guess = self.world.guess
         begun = [Start((), theta, guess) for theta in thetas]
         fits = self._fitted(begun, STAGES)
-        nearest = min(fits, key=lambda fit: fit.cost)
-        if self._bends(nearest):
+        if self._bends(_nearest(fits)):
             fits = self._led(begun, fits)
-            nearest = min(fits, key=lambda fit: fit.cost)
+        nearest = _nearest(fits)
         # Asked this way round, since a fit that failed has a cost that is no number.
         limit = TWICE * nearest.cost
         apart = [i for i, fit in enumerate(fits) if not fit.cost < limit]
@@ -79,7 +78,7 @@ class HeldOutRuns:
         # These states are good over the first share of the runs already.
         again = self._fitted(starts, STAGES[1:])
         for i, fit in zip(apart, again, strict=True):
-            fits[i] = min(fits[i], fit, key=lambda fit: fit.cost)
+            fits[i] = _nearest([fits[i], fit])
         return [self._measured(fit) for fit in fits]
 
     def _fitted(self, starts: Sequence[Start], stages: Sequence[tuple[float, int]]) -> list[Fit]:
@@ -117,27 +116,22 @@ class HeldOutRuns:
         """The fits with derivatives about the nearest of them; where these lead any nearer, fitted
         from the starts again with derivatives that are taken anew before each stage.
         """
-        least = min(fit.cost for fit in fits)
-        found = self._better(fits, self._about(fits, STAGES[-1:]))
-        if least - min(fit.cost for fit in found) < NEARER:
+        found = _each_nearer(fits, self._about(fits, STAGES[-1:]))
+        if _nearest(fits).cost - _nearest(found).cost < NEARER:
             return found
         led = self._fitted(starts, STAGES[:1])
         for stage in (*STAGES[1:], STAGES[-1]):
             led = self._about(led, [stage])
-        return self._better(found, led)
+        return _each_nearer(found, led)
 
     def _about(self, fits: Sequence[Fit], stages: Sequence[tuple[float, int]]) -> list[Fit]:
         """The fits led on, with derivatives about the nearest of them."""
         # loaded where there is a robot alone
         from bench.gap.model.tangents import begun
 
-        nearest = min(fits, key=lambda fit: fit.cost)
+        nearest = _nearest(fits)
         begun(self.world, nearest.theta, nearest.states, anew=True)
         return self._fitted([fit.start() for fit in fits], stages)
-
-    def _better(self, fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
-        """Of each model the nearer of two fits."""
-        return [min(pair, key=lambda fit: fit.cost) for pair in zip(fits, others, strict=True)]
 
     def _measured(self, fit: Fit) -> Measured:
         if not np.isfinite(fit.cost):
@@ -152,3 +146,13 @@ class HeldOutRuns:
         likeliest = likelihood(residual, self.seen, free)
         merit = likeliest.value - free * price  # (1)
         return Measured(fit.simulated, merit, fit.states)
+
+
+def _nearest(fits: Iterable[Fit]) -> Fit:
+    """The fit that leaves the least."""
+    return min(fits, key=lambda fit: fit.cost)
+
+
+def _each_nearer(fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
+    """Of each model the nearer of two fits."""
+    return [_nearest(pair) for pair in zip(fits, others, strict=True)]
