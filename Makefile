@@ -1,7 +1,8 @@
 # make compare   a small comparison, from a bare machine to the figure (TARGETS=5 SEEDS=1 is shorter)
 # make explain   a small diagnosis: makes a recording with a hidden cause, finds it, writes the report
 # make robot     the same for a robot: an arm's model file and a log, with friction in the elbow
-# make test      the tests
+# make test      the tests that take a few seconds each (about 6 minutes on two cores)
+# make test-all  these and the slow ones: exams, comparisons, clusters, kills (about 15 minutes)
 # make check     lint, types and import rules
 # make docs      the site, to be read without a network: site/html/index.html (Python 3.11 or newer)
 # make exam      hides causes in hundreds of recordings and has explain find them (about 6 minutes; QUICK=--quick)
@@ -17,7 +18,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: compare explain robot test check exam benchmark chaos malformed mutants reference multi wheel docs install
+.PHONY: compare explain robot test test-all check exam benchmark chaos malformed mutants reference multi wheel docs install
 install: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml
@@ -45,8 +46,13 @@ robot: $(STAMP)
 	$(BIN)/simgap explain examples/robot/log.csv --out results/robot-example
 	$(BIN)/simgap score results/robot-example/extended.toml examples/robot/log.csv --held-out
 
+PYTEST := $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m "not slow"
+
+test-all: $(STAMP)
+	$(PYTEST)
 
 check: $(STAMP)
 	$(BIN)/ruff check .
