@@ -206,12 +206,19 @@ class OwnSimulator(Simulated):
         """
 
     def apply_force(self, force: Array) -> None:
-        """Optional: add a generalised force (D,) along the coordinates, for the next step alone."""
+        """Optional: add a generalised force to the next step, and to that step alone.
+
+        Args:
+            force: (D,) one value for each coordinate: N, N m, or m/s^2 for ``point``.
+        """
         raise NotImplementedError
 
-    def inertia(self) -> float:
-        """Optional: generalised inertia now (kg or kg m^2; 1 for ``point``), with which friction
-        can hold still.
+    def inertia(self) -> float | Array:
+        """Optional: return the generalised inertia now, which dry friction needs to hold still.
+
+        Returns:
+            The inertia matrix (D, D) of the coordinates, or a number where every coordinate has
+            the same inertia and none acts on another; kg, kg m^2, or 1 for ``point``.
         """
         raise NotImplementedError
 

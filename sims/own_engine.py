@@ -1,8 +1,8 @@
 """Steps a user's own simulator, and puts effects that are forces into it.
 
 Dry friction is the force that would stop the motion within the coming step of length h, as far as
-its limit L allows. With inertia M, velocity v, the forces F of effects and the simulator's own pull
-P, which it does not say and which is taken from the step before,
+its limit L allows. With the inertia matrix M (D, D), the velocity v (D,), the forces F (D,) of
+effects and the simulator's own force P, which is unknown and estimated from the step before,
 
     P = M (v - v_before) / h_before - F_before                             (1)
     S = -(M v / h + P + F)                                                 (2)
@@ -46,7 +46,7 @@ class Stepping(Protocol):
 
     def apply_force(self, force: Array) -> None: ...
 
-    def inertia(self) -> float: ...
+    def inertia(self) -> float | Array: ...
 
     def put(self, levels: Mapping[str, float]) -> None: ...
 
@@ -125,15 +125,63 @@ class OwnEngine:
 
     def _row(self, system: System) -> list[float]:
         seen = self.world.observe()
-        return [_seen(self.world, seen, c.name) for c in system.channels]
+        return [observed(self.world, seen, c.name) for c in system.channels]
 
 
-def _seen(world: Stepping, seen: Mapping[str, float], name: str) -> float:
+def observed(world: Stepping, seen: Mapping[str, float], name: str) -> float:
+    """Return one value of what `observe` gave.
+
+    Args:
+        world: the simulator.
+        seen: what its `observe` gave.
+        name: of a channel, a coordinate, a rate or a level.
+
+    Raises:
+        InputError: there is no such value, or it is not a number.
+    """
+    if not isinstance(seen, Mapping):
+        found = type(seen).__name__
+        raise InputError(f"simulator {world.name}: observe(): expected a dictionary, found {found}")
     if name not in seen:
         raise InputError(
             f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(seen)}"
         )
-    return float(seen[name])
+    value = seen[name]
+    if type(value) is float:  # almost always; the general test takes longer than this function
+        return value
+    if shape := np.shape(value):
+        raise InputError(
+            f"simulator {world.name}: observe(), {name}: expected a number, found shape {shape}"
+        )
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"simulator {world.name}: observe(), {name}: expected a number, found {value!r:.40}"
+        ) from None
+
+
+def inertia_matrix(world: Stepping) -> Array:
+    """Return the generalised inertia of a simulator now, as a matrix (D, D).
+
+    Raises:
+        InputError: `inertia` gave neither a number nor an array of this shape.
+    """
+    d = len(world.coordinates)
+    try:
+        given = np.asarray(world.inertia(), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"simulator {world.name}: inertia: expected numbers; {error}") from None
+    if given.shape == (d, d):
+        return given
+    # A number is the inertia along every coordinate.
+    if not given.shape:
+        return given * np.eye(d)
+    joints = ", ".join(world.coordinates)
+    raise InputError(
+        f"simulator {world.name}: inertia: expected shape {(d, d)} (joints × joints; here: "
+        f"{joints}) or a number, found {given.shape}"
+    )
 
 
 class _Rims:
@@ -153,7 +201,7 @@ class _Rims:
             return
         seen = self.world.observe()
         for effect, c, name in self.acting:
-            level = np.array([[_seen(self.world, seen, name)]])
+            level = np.array([[observed(self.world, seen, name)]])
             kept = float(effect.keep(c, level)[0, 0])
             if kept != level[0, 0]:
                 self.world.put({name: kept})
@@ -194,20 +242,20 @@ class _Forces:
 
         What the simulator itself pulls with is taken from the last step.
         """
-        inertia = self.world.inertia()
+        inertia = inertia_matrix(self.world)
         v = moment.v[0]
         own = np.zeros_like(force)
         if self._last is not None:
             before, applied, took = self._last
-            own = inertia * (v - before) / took - applied  # (1)
+            own = inertia @ (v - before) / took - applied  # (1)
         limit = sum(float(effect.limit(c, moment)[0, 0]) for effect, c in self.frictions)
-        stop = -(inertia * v / seconds + own + force)  # (2)
+        stop = -(inertia @ v / seconds + own + force)  # (2)
         size = float(np.linalg.norm(stop))
         friction: Array = stop if size <= limit else stop * (limit / size)  # (3)
         self._last = v, force + friction, seconds
         return friction
 
     def _state(self, seen: Mapping[str, float], names: Sequence[str]) -> Array:
-        values = [_seen(self.world, seen, name) for name in names]
+        values = [observed(self.world, seen, name) for name in names]
         state: Array = np.array([values])
         return state

@@ -119,6 +119,61 @@ def test_friction_holds_against_a_constant_pull_and_lets_go_of_a_greater_one():
     assert friction.simulate(np.array([[2.0]]), pulled)[0, -1, 1] == pytest.approx(2.0, rel=0.02)
 
 
+class Coupled(OwnSimulator):
+    """Two joints whose motion is coupled by their inertia, stepped exactly between forces."""
+
+    name = "coupled"
+    parameters = (Parameter("scale", "1", 1.0, (0.5, 2.0)),)
+    channels = (Channel("q1", "rad"), Channel("q2", "rad"))
+    states = {"q1": 0.0, "q2": 0.0, "w1": 1.0, "w2": -2.0}  # noqa: RUF012
+    kind, coordinates, rates, time_step = "rotary", ("q1", "q2"), ("w1", "w2"), 1e-3
+    given = np.array([[2.0, 0.8], [0.8, 1.0]])
+
+    def reset(self, theta, constants, initial):
+        self.q = np.array([initial["q1"], initial["q2"]])
+        self.w = np.array([initial["w1"], initial["w2"]])
+        self.matrix, self.force = theta["scale"] * Coupled.given, np.zeros(2)
+
+    def step(self, inputs, seconds):
+        a = np.linalg.solve(self.matrix, self.force)
+        self.q, self.w = self.q + seconds * self.w + seconds**2 / 2 * a, self.w + seconds * a
+        self.force = np.zeros(2)
+
+    def observe(self):
+        return {"q1": self.q[0], "q2": self.q[1], "w1": self.w[0], "w2": self.w[1]}
+
+    def apply_force(self, force):
+        self.force = force
+
+    def inertia(self):
+        return self.given
+
+
+def test_dry_friction_of_coupled_joints_takes_the_inertia_matrix():
+    (seen,) = Coupled(fixed={"friction.coulomb": 3.0}).simulate(np.array([[1.0]]), Scenario(TIMES))
+    start = np.array([1.0, -2.0])
+    # The force has a constant size and acts against the momentum, whose direction it keeps.
+    momentum = Coupled.given @ start
+    rest = np.linalg.norm(momentum) / 3.0
+    np.testing.assert_allclose(seen[-1], start * rest / 2, rtol=2e-3)
+    assert TIMES[-1] > rest
+    np.testing.assert_array_equal(seen[-1], seen[-5])
+
+
+def test_an_inertia_of_another_shape_is_refused_with_the_one_that_is_expected():
+    wrong = type("Wrong", (Coupled,), {"name": "wrong", "given": np.eye(1)})
+    says = r"simulator wrong: inertia: expected shape \(2, 2\) \(joints × joints; here: q1, q2\)"
+    with pytest.raises(InputError, match=says + r" or a number, found \(1, 1\)"):
+        wrong(fixed={"friction.coulomb": 3.0}).simulate(np.array([[1.0]]), Scenario(TIMES))
+    as_matrix = type("Matrix", (Block,), {"inertia": lambda self: np.array([[self.mass]])})
+    kinds = (Block, as_matrix)
+    seen = [kind(fixed={"friction.coulomb": 1.0}).simulate(THETA, PUSHED) for kind in kinds]
+    np.testing.assert_array_equal(*seen)
+
+
+THETA = np.array([[2.0]])
+
+
 def test_effects_at_zero_change_nothing_and_tuned_ones_are_parameters():
     plain = Block().simulate(np.array([[2.0]]), PUSHED)
     block = Block(effects=["friction.coulomb", "drag.linear", "input.gain", "sensor.bias"])
@@ -185,6 +240,10 @@ def test_faulty_declarations_are_one_line():
             Block(**settings)
     with pytest.raises(InputError, match=r"observe\(\) gave no 'charge'; it gave: x, v"):
         declared(observe=lambda self: {"x": 0.0, "v": 0.0})().simulate(np.array([[1.0]]), PUSHED)
+    for value, message in [(np.zeros(3), r"found shape \(3,\)"), ("fast", "found 'fast'")]:
+        seen = {"x": value, "v": 0.0, "charge": 0.0}
+        with pytest.raises(InputError, match=r"observe\(\), x: expected a number, " + message):
+            declared(observe=lambda self, seen=seen: seen)().simulate(np.array([[1.0]]), PUSHED)
     with pytest.raises(InputError, match="the attribute 'engine' is the base class's"):
         declared(reset=lambda self, *_: setattr(self, "engine", 1))().simulate(
             np.array([[1.0]]), PUSHED
