@@ -17,7 +17,7 @@ from bench.problem.experiment import Entry, Experiment
 from bench.registry import REGISTRIES, diagnosers, load_plugins, tuners
 from bench.runs.housing import housed, nursery, tuned_of, undisturbed
 from bench.runs.sources import digest, named_effects, source
-from bench.sealing.ended import EndedError
+from bench.sealing.ended import EndedError, with_isolation
 from bench.sealing.seals import Reach
 from bench.sealing.wire import Channel, printable
 from methods.base import Tuner
@@ -296,7 +296,7 @@ def _asked(question: dict[str, str], what: str) -> list[dict[str, Any]]:
         said = "takes too long to load" if ended.status == "timeout" else ended.reason
         raise InputError(f"plugin {what}: {said.strip().splitlines()[-1]}") from None
     if isinstance(answer, dict):
-        raise InputError(str(answer.get("fault")))
+        raise InputError(with_isolation(str(answer.get("fault"))))
     return [_plain(part, file) for part in answer]
 
 

@@ -175,8 +175,10 @@ def test_tuner_check_rejects_its_broken_subject_and_no_sound_one(check):
         load_plugins([PLUGINS / "awkward.py"])
         check(registered.get("over_asking"))
         broken = registered.get(broken)
-    with pytest.raises(CheckError, match=r"(?s)expected .*; found .*; see "):
+    with pytest.raises(CheckError, match=r"(?s)expected .*; found .*; see ") as error:
         check(broken)
+    isolated = check.__name__ == "check_same_run_when_sealed"
+    assert isolated == ("use --trust while developing" in str(error.value))
 
 
 def test_a_learned_tuner_without_storage_and_a_tune_that_does_not_yield_are_rejected():
