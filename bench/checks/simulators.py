@@ -166,9 +166,11 @@ def check_every_parameter_shows(kind: type[Simulator]) -> None:
     """Each parameter changes some channel, in a run of ten seconds."""
     simulator = kind()
     cube = UnitCube(simulator.parameters)
-    points = np.full((1 + cube.dim, cube.dim), 0.4)
+    # Inside the training range: far from it, a large friction may hold everything still.
+    low, high = cube.training
+    points = np.tile(low + 0.4 * (high - low), (1 + cube.dim, 1))
     # One point for each parameter, moved in that direction alone.
-    points[1:] += 0.2 * np.eye(cube.dim)
+    points[1:] += 0.2 * np.diag(high - low)
     inputs = {c.name: np.ones(600) for c in simulator.inputs}
     seen = simulator.simulate(cube.physical(points), Scenario(np.arange(600) / 60.0, inputs=inputs))
     for parameter, lane in zip(simulator.parameters, seen[1:], strict=True):
