@@ -164,7 +164,7 @@ def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simul
 
 def check_every_parameter_shows(kind: type[Simulator]) -> None:
     """Each parameter changes some channel, in a run of ten seconds."""
-    simulator = kind()
+    simulator = kind(observe=[c.name for c in kind.channels])
     cube = UnitCube(simulator.parameters)
     # Inside the training range: far from it, a large friction may hold everything still.
     low, high = cube.training
@@ -187,7 +187,7 @@ def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
     """Each initial state changes some channel, in a run of ten seconds."""
     if not kind.states:
         return NotApplicable("it has no initial state")
-    simulator = kind()
+    simulator = kind(observe=[c.name for c in kind.channels])
     scales = {c.name: c.scale for c in kind.channels}
     theta = np.array([[p.nominal for p in simulator.parameters]])
     run = _scenario(kind, 600, size=1.0)

@@ -320,3 +320,46 @@ def test_puck_is_compared_as_a_plugin(tmp_path, capsys):
         line for line in capsys.readouterr().out.splitlines() if line.startswith("least_squares")
     )
     assert float(line.split()[-2]) < 1e-3, "friction is found from a second of positions"
+
+
+def extended_block(folder):
+    """The file of a block with a friction that explain may have found, and its plugin."""
+    plugin = folder / "blocks.py"
+    text = Path(__file__).read_text()
+    body = text[text.index("class Block(") : text.index("\n\n\nTIMES = ")]
+    plugin.write_text(
+        "from sims.base import Channel, Constant, Parameter\n"
+        f"from sims.own import OwnSimulator\n\n\n{body}\n".replace('"block"', '"stored_block"')
+    )
+    file = folder / "extended.toml"
+    file.write_text(
+        'format = 1\nname = "block_extended"\nsystem = "stored_block"\nobserve = ["x", "v"]\n'
+        '[parameters.mass]\nvalue = 2.5\nunit = "kg"\n'
+        '[effects."friction.coulomb".coefficient]\nvalue = 0.25\nunit = "N"\n'
+    )
+    return plugin, file
+
+
+@pytest.mark.usefixtures("fresh_registries", "undrawn")
+def test_an_extended_own_simulator_is_simulated_checked_and_compared(tmp_path, capsys):
+    plugin, file = extended_block(tmp_path)
+    plugins = ["--plugin", str(file), "--plugin", str(plugin)]
+    log = tmp_path / "log.csv"
+    pushed = ["--input", "push=sine:2:1", "--seconds", "1", "--runs", "2"]
+    assert main(["simulate", "block_extended", *plugins, *pushed, "--out", str(log)]) == 0
+    from bench.registry import simulators
+
+    kind = simulators.get("block_extended")
+    assert [p.nominal for p in kind().parameters] == [2.5, 0.25]
+    for check in SIMULATOR_CHECKS:
+        check(kind)
+    experiment = tmp_path / "e.toml"
+    experiment.write_text(
+        'simulator = "block_extended"\nobserve = ["v"]\ntargets = 1\nbudget = 3\n'
+        "ranges = ['in']\n[sampling]\nrate = 20.0\nsamples = 20\n[initial]\nv = [0.5, 1.5]\n"
+        "[tuners.random]\n"
+    )
+    out = ["--jobs", "1", "--out", str(tmp_path / "out")]
+    capsys.readouterr()
+    assert main(["compare", str(experiment), *plugins, *out]) == 0
+    assert main(["score", str(file), str(log), "--plugin", str(plugin)]) == 0
