@@ -139,16 +139,12 @@ def observed(world: Stepping, seen: Mapping[str, float], name: str) -> float:
     Raises:
         InputError: there is no such value, or it is not a number.
     """
-    if not isinstance(seen, Mapping):
-        found = type(seen).__name__
-        raise InputError(f"simulator {world.name}: observe(): expected a dictionary, found {found}")
-    if name not in seen:
-        raise InputError(
-            f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(seen)}"
-        )
-    value = seen[name]
-    if type(value) is float:  # almost always; the general test takes longer than this function
-        return value
+    try:
+        value = seen[name]
+    except (KeyError, TypeError, IndexError):
+        raise _unobserved(world, seen, name) from None
+    if isinstance(value, float):  # also NumPy's; the general test takes longer than all the rest
+        return float(value)
     if shape := np.shape(value):
         raise InputError(
             f"simulator {world.name}: observe(), {name}: expected a number, found shape {shape}"
@@ -161,26 +157,43 @@ def observed(world: Stepping, seen: Mapping[str, float], name: str) -> float:
         ) from None
 
 
-def inertia_matrix(world: Stepping) -> Array:
-    """Return the generalised inertia of a simulator now, as a matrix (D, D).
+def _unobserved(world: Stepping, seen: object, name: str) -> InputError:
+    """The error where `observe` gave no value of this name."""
+    if not isinstance(seen, Mapping):
+        found = type(seen).__name__
+        return InputError(
+            f"simulator {world.name}: observe(): expected a dictionary, found {found}"
+        )
+    return InputError(
+        f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(seen)}"
+    )
+
+
+def inertia_of(world: Stepping) -> float | Array:
+    """Return the generalised inertia of a simulator now.
+
+    Returns:
+        A number, which is that along every coordinate, or a matrix (D, D).
 
     Raises:
-        InputError: `inertia` gave neither a number nor an array of this shape.
+        InputError: `inertia` gave neither.
     """
+    given = world.inertia()
+    if isinstance(given, float):
+        return float(given)
     d = len(world.coordinates)
     try:
-        given = np.asarray(world.inertia(), dtype=np.float64)
+        matrix = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"simulator {world.name}: inertia: expected numbers; {error}") from None
-    if given.shape == (d, d):
-        return given
-    # A number is the inertia along every coordinate.
-    if not given.shape:
-        return given * np.eye(d)
+    if not matrix.shape:
+        return float(matrix)
+    if matrix.shape == (d, d):
+        return matrix
     joints = ", ".join(world.coordinates)
     raise InputError(
         f"simulator {world.name}: inertia: expected shape {(d, d)} (joints × joints; here: "
-        f"{joints}) or a number, found {given.shape}"
+        f"{joints}) or a number, found {matrix.shape}"
     )
 
 
@@ -242,14 +255,14 @@ class _Forces:
 
         What the simulator itself pulls with is taken from the last step.
         """
-        inertia = inertia_matrix(self.world)
+        inertia = inertia_of(self.world)
         v = moment.v[0]
         own = np.zeros_like(force)
         if self._last is not None:
             before, applied, took = self._last
-            own = inertia @ (v - before) / took - applied  # (1)
+            own = np.dot(inertia, v - before) / took - applied  # (1)
         limit = sum(float(effect.limit(c, moment)[0, 0]) for effect, c in self.frictions)
-        stop = -(inertia @ v / seconds + own + force)  # (2)
+        stop = -(np.dot(inertia, v) / seconds + own + force)  # (2)
         size = float(np.linalg.norm(stop))
         friction: Array = stop if size <= limit else stop * (limit / size)  # (3)
         self._last = v, force + friction, seconds

@@ -7,7 +7,7 @@ import numpy as np
 from bench.checks.base import CheckError, NotApplicable, require, same_bits
 from sims.base import Array, InputError, Simulator
 from sims.own import OwnSimulator
-from sims.own_engine import inertia_matrix, observed
+from sims.own_engine import inertia_of, observed
 
 _STEPS = 20
 """Steps of a run in which a force is applied."""
@@ -59,7 +59,7 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
             for name in dict.fromkeys([*names, *own.coordinates, *own.rates, *own.levels]):
                 observed(simulator, seen, name)
             if heavy:
-                _check_inertia(own, inertia_matrix(simulator))
+                _check_inertia(own, inertia_of(simulator))
             if forced:
                 simulator.apply_force(np.zeros(len(own.coordinates)))
             _step(simulator)
@@ -72,7 +72,8 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
     return None
 
 
-def _check_inertia(kind: type[OwnSimulator], inertia: Array) -> None:
+def _check_inertia(kind: type[OwnSimulator], given: float | Array) -> None:
+    inertia = np.atleast_2d(given)
     sound = bool(np.isfinite(inertia).all()) and np.allclose(inertia, inertia.T)
     sound = sound and bool(np.linalg.eigvalsh(inertia).min() > 0)
     wanted = "inertia: expected a positive number, or a symmetric positive definite matrix"
