@@ -11,7 +11,10 @@ effects and the simulator's own force P, which is unknown and estimated from the
 
 from __future__ import annotations
 
+import sys
+import traceback
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -69,15 +72,24 @@ class OwnEngine:
         """Nothing to give back."""
 
     def integrate(self, lanes: Lanes) -> Motion:
-        """Readings (L, R, C) in place of positions, a row after every `lanes.every` steps and one
-        before the first.
+        """Return readings (L, R, C) in place of positions, a row after every `lanes.every` steps
+        and one before the first.
+
+        Raises:
+            InputError: a method of the simulator raised an exception, or gave something else than
+                it must.
         """
         count = lanes.steps.shape[1] // lanes.every + 1
         width = len(lanes.system.channels)
         shape = len(lanes.theta), count, width
         result = np.full(shape, np.nan)
         for lane in range(len(lanes.theta)):
-            rows = self._run(lanes, lane)
+            try:
+                rows = self._run(lanes, lane)
+            except InputError:
+                raise
+            except Exception as error:
+                raise _fault(self.world, error) from error
             if rows is not None and np.isfinite(rows).all():
                 result[lane] = rows
         return Motion(result, result, result)
@@ -126,6 +138,17 @@ class OwnEngine:
     def _row(self, system: System) -> list[float]:
         seen = self.world.observe()
         return [observed(self.world, seen, c.name) for c in system.channels]
+
+
+def _fault(world: Stepping, error: Exception) -> InputError:
+    """The error where the code of a simulator raised an exception: which, and at which line."""
+    frames = traceback.extract_tb(error.__traceback__)
+    module = sys.modules.get(type(world).__module__)
+    own = [frame for frame in frames if frame.filename == getattr(module, "__file__", None)]
+    frame = (own or list(frames))[-1]
+    what = f"{type(error).__name__}: {error}"
+    at = f"{Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
+    return InputError(f"simulator {world.name}: {what} ({at})")
 
 
 def observed(world: Stepping, seen: Mapping[str, float], name: str) -> float:

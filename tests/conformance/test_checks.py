@@ -231,6 +231,11 @@ class NoSentence(Wave):
     says = ""
 
 
+class Raises(Wave):
+    def simulate(self, theta, scenario):
+        return theta[:, 7]
+
+
 class UnknownUnit(Wave):
     channels = (Channel("x", "m"), Channel("v", "furlongs/fortnite"))
 
@@ -471,6 +476,11 @@ def test_simulator_check_rejects_its_broken_subject_and_no_sound_one(check):
         (WarmStarted, "check_same_proposal_gives_the_same_bits", "in place of"),
         (Clobbers, "check_arguments_are_not_changed", "arguments as they were"),
         (WrongShape, "check_observations_have_the_declared_shape", "observations of shape"),
+        (
+            Raises,
+            "check_observations_have_the_declared_shape",
+            r"no exception; found IndexError: .*; see test_checks.py, line \d+, in simulate",
+        ),
     ],
 )
 def test_one_cause_gives_one_failure(kind, failing, says, fresh_registries):

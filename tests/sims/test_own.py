@@ -322,6 +322,20 @@ def test_puck_is_compared_as_a_plugin(tmp_path, capsys):
     assert float(line.split()[-2]) < 1e-3, "friction is found from a second of positions"
 
 
+@pytest.mark.usefixtures("fresh_registries")
+def test_an_exception_of_its_code_is_one_line_with_its_place(tmp_path, capsys):
+    plugin, _ = extended_block(tmp_path)
+    text = plugin.read_text().replace('constants["wind"]', 'constants["wid"]')
+    plugin.write_text(text)
+    line = 1 + text[: text.index('constants["wid"]')].count("\n")
+    out = tmp_path / "log.csv"
+    assert main(["simulate", "stored_block", "--plugin", str(plugin), "--out", str(out)]) == 2
+    assert capsys.readouterr().err == (
+        f"simgap: simulator stored_block: KeyError: 'wid' (blocks.py, line {line}, in reset)\n"
+    )
+    assert not out.exists()
+
+
 def extended_block(folder):
     """The file of a block with a friction that explain may have found, and its plugin."""
     plugin = folder / "blocks.py"

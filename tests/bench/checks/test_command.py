@@ -145,7 +145,7 @@ def test_an_exception_of_the_subject_names_its_line(tmp_path, capsys):
     plugin.write_text(LEAKY.replace('theta["friction"]', 'theta["fiction"]'))
     code, said = checked(capsys, "leaky", "--plugin", str(plugin))
     assert (code, said.count("FAILED")) == (1, 1)
-    assert "found KeyError: 'fiction'; see leaky.py, line 14, in reset" in said
+    assert "simulator leaky: KeyError: 'fiction' (leaky.py, line 14, in reset)" in said
 
 
 def test_unknown_name_is_one_line(capsys):
