@@ -14,6 +14,7 @@ from bench.checks import (
     SIMULATOR_CHECKS,
     TUNER_CHECKS,
     CheckError,
+    parametrize,
     simulators,
     tuners,
 )
@@ -495,6 +496,23 @@ def test_one_cause_gives_one_failure(kind, failing, says, fresh_registries):
                 failed[check] = line
     assert [check.__name__ for check in failed] == [failing], failed
     assert re.search(says, *failed.values())
+
+
+def test_parametrized_tests_skip_what_means_nothing_without_a_check_that_failed():
+    made = {case.id: case.values[0] for case in parametrize(KeepsHeat).args[1]}
+    ends = {}
+    for name, check in made.items():
+        try:
+            check()
+        except CheckError:
+            ends[name] = "failed"
+        except pytest.skip.Exception as skipped:
+            ends[name] = str(skipped)
+    needs = "not tested: needs 'same proposal gives the same bits'"
+    assert ends.pop("KeepsHeat-same_proposal_gives_the_same_bits") == "failed"
+    assert ends.pop("KeepsHeat-initial_states_show") == needs
+    assert set(ends.values()) == {needs}
+    assert not {"KeepsHeat-units_are_known", "KeepsHeat-unknown_names_are_refused"} & set(ends)
 
 
 def test_the_test_simulator_conforms(spring):
