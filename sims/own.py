@@ -23,6 +23,7 @@ from sims.own_engine import OwnEngine
 from sims.own_levels import at_levels, named
 from sims.simulated import Simulated
 from sims.system import (
+    KINDS,
     Contact,
     Effect,
     Engine,
@@ -252,6 +253,9 @@ def _check(cls: type[OwnSimulator]) -> None:
         raise InputError(f'class {cls.__name__}: expected name = "..."')
     if not cls.channels or not cls.parameters:
         raise InputError(f"simulator {cls.name}: expected at least one parameter and one channel")
+    if cls.kind not in KINDS:
+        kinds = ", ".join(KINDS)
+        raise InputError(f"simulator {cls.name}: kind: expected {kinds}, found {cls.kind!r:.40}")
     if len(cls.coordinates) != len(cls.rates):
         raise InputError(
             f"simulator {cls.name}: expected a rate for each of {cls.coordinates}, found"

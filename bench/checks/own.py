@@ -81,6 +81,49 @@ def _check_inertia(kind: type[OwnSimulator], given: float | Array) -> None:
         raise CheckError(f"{wanted}; found {inertia.tolist()}; see {kind.__name__}.inertia")
 
 
+def check_step_goes_on_by_its_seconds(kind: type[Simulator]) -> NotApplicable | None:
+    """Steps of half the length, twice as many, lead to about the same state."""
+    own = _own(kind)
+    if own is None:
+        return _NOT_OWN
+    simulator = own()
+    whole, half = (_way(simulator, own.time_step / n, _FEW * n) for n in (1, 2))
+    simulator.close()
+    moved = np.abs(whole) > _ROUNDING
+    if not moved.any():
+        return NotApplicable("nothing moves")
+    ratio = float(np.min(np.abs(half[moved] / whole[moved])))
+    what = f"{2 * _FEW} steps of time_step / 2 to lead as far as {_FEW} of time_step"
+    look = f"{own.__name__}.step: the engine must step by `seconds`"
+    require(ratio < _FARTHER, what, f"{ratio:.2g} times as far", look)
+    return None
+
+
+_FEW = 8
+"""Steps that are compared with twice as many of half their length."""
+_FARTHER = 1.6
+"""Ratio of ways above which the length of steps is ignored: it is 2 or more then, and near 1 for
+any integrator that resolves the motion.
+"""
+_ROUNDING = 1e-9
+"""Way of a channel, in units of its scale, below which it has not moved."""
+
+
+def _way(simulator: OwnSimulator, seconds: float, steps: int) -> Array:
+    """(C,) the change of every channel over a run, in units of its scale."""
+    inputs = {c.name: c.scale for c in simulator.inputs}
+
+    def seen() -> Array:
+        now = simulator.observe()
+        return np.array([observed(simulator, now, c.name) / c.scale for c in simulator.channels])
+
+    _started(simulator)
+    before = seen()
+    for _ in range(steps):
+        simulator.step(inputs, seconds)
+    return seen() - before
+
+
 def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
     """A force along each coordinate changes the motion, acts for one step alone, and does not act
     in the next run.

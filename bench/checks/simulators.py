@@ -12,6 +12,7 @@ from bench.checks.own import (
     check_forces_act,
     check_hooks_have_the_declared_shapes,
     check_levels_can_be_set,
+    check_step_goes_on_by_its_seconds,
 )
 from sims.base import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator, UnitCube
 from sims.recording.units import is_unit
@@ -268,6 +269,7 @@ SIMULATOR_CHECKS: tuple[Check, ...] = (
     check_unknown_names_are_refused,
     check_chosen_channels_are_the_same_columns,
     check_hooks_have_the_declared_shapes,
+    check_step_goes_on_by_its_seconds,
     check_forces_act,
     check_levels_can_be_set,
 )
@@ -285,6 +287,7 @@ SIMULATOR_NEEDS: Mapping[Check, tuple[Check, ...]] = {
     check_unknown_names_are_refused: (_SIMULATES,),
     check_chosen_channels_are_the_same_columns: (_REPEATS,),
     check_hooks_have_the_declared_shapes: (_SIMULATES,),
+    check_step_goes_on_by_its_seconds: (_REPEATS, check_hooks_have_the_declared_shapes),
     check_forces_act: (_REPEATS, check_hooks_have_the_declared_shapes),
     check_levels_can_be_set: (_REPEATS, check_hooks_have_the_declared_shapes),
 }

@@ -365,6 +365,13 @@ class IgnoresStart(Cart):
         super().reset(theta, constants, {**initial, "v2": 0.0})
 
 
+class OwnClock(Cart):
+    name = "own_clock"
+
+    def step(self, inputs, seconds):
+        super().step(inputs, self.time_step)
+
+
 class IgnoresForces(Cart):
     name = "ignores_forces"
 
@@ -424,6 +431,7 @@ BROKEN_SIMULATORS = {
     "check_unknown_names_are_refused": TakesAnything,
     "check_chosen_channels_are_the_same_columns": WrongColumns,
     "check_hooks_have_the_declared_shapes": SmallInertia,
+    "check_step_goes_on_by_its_seconds": OwnClock,
     "check_forces_act": IgnoresForces,
     "check_levels_can_be_set": IgnoresPut,
 }
@@ -470,6 +478,11 @@ def test_simulator_check_rejects_its_broken_subject_and_no_sound_one(check):
             "KeepsHeat.reset",
         ),
         (IgnoresStart, "check_initial_states_show", "initial state v2 = 0.01 in place of 0"),
+        (
+            OwnClock,
+            "check_step_goes_on_by_its_seconds",
+            "found 2.* times as far; see OwnClock.step",
+        ),
         (IgnoresForces, "check_forces_act", "a force along x2 to change the motion"),
         (SumsForces, "check_forces_act", "along x1 to act in the next step alone"),
         (KeepsForces, "check_forces_act", "the same run after one with forces"),

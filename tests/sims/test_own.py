@@ -225,6 +225,7 @@ def test_faulty_declarations_are_one_line():
     for changes, message in [
         ({"name": 3}, "class Faulty: expected name"),
         ({"channels": ()}, "at least one parameter and one channel"),
+        ({"kind": "slide"}, "kind: expected point, linear, rotary, found 'slide'"),
         ({"rates": ()}, r"expected a rate for each of \('x',\), found \(\)"),
         ({"coordinates": ("y",)}, "y is not among its states charge, x, v"),
         ({"levels": ("y",)}, "level y must be a state and a channel"),
