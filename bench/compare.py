@@ -273,7 +273,10 @@ class Comparison:
 
         results = self.results
         problem = results.problem if results else Problem(self.configuration.experiment)
-        return finish(self.folder, problem, say)
+        failed = finish(self.folder, problem, say)
+        for line in results.notes.lines() if results else ():
+            say(line)
+        return failed
 
 
 def _at_file(file: RunsFile, _row: int, says: str) -> InputError:

@@ -21,6 +21,7 @@ from bench.pages.comparison.page import comparison_page
 from bench.pages.comparison.results import Results
 from bench.problem.experiment import Experiment
 from bench.problem.problem import Problem
+from bench.sealing.ended import ISOLATED, without_isolation
 from bench.store.folder import CONFIGURATION, Stored, environment, read
 from bench.store.segments import FOLDER, read_plan
 from bench.store.status import FAILURES
@@ -263,7 +264,10 @@ def failure_lines(failed: pd.DataFrame) -> list[str]:
         f"{tuner:{a}}  {runs:>{b}}  {status:{c}}  {reason}".rstrip()
         for tuner, runs, status, reason in lines
     ]
-    return ["", "failures", *laid_out]
+    refused = [reason.endswith(ISOLATED) for reason in failed["reason"].astype(str)]
+    isolated = list(dict.fromkeys(failed["tuner"][refused].astype(str)))
+    note = [f"{', '.join(isolated)}: {ISOLATED}"] if isolated else []
+    return ["", "failures", *laid_out, *note]
 
 
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+), in (?P<function>\S+)')
@@ -271,7 +275,7 @@ _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+), in (?P<functio
 
 def first_line(reason: str) -> str:
     """What went wrong and where, of a reason that may be a traceback."""
-    lines = reason.strip().splitlines() or [""]
+    lines = without_isolation(reason.strip()).splitlines() or [""]
     frames = [i for i, line in enumerate(lines) if _FRAME.search(line)]
     if not frames:
         return lines[-1].strip()

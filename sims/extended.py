@@ -296,7 +296,8 @@ def _class_of(
         stated = {**extended.constants, **(constants or {})}
         chosen = {**_engine(extended), **settings}
         kind.__init__(self, stated, observe or observed, effects=effects, **chosen)
-        self.parameters = parameters
+        # An own simulator refuses to have it set twice, as its author might by accident.
+        object.__setattr__(self, "parameters", parameters)
 
     body = {
         "__init__": __init__,

@@ -23,6 +23,7 @@ from sims.own_engine import OwnEngine
 from sims.own_levels import at_levels, named
 from sims.simulated import Simulated
 from sims.system import (
+    KINDS,
     Contact,
     Effect,
     Engine,
@@ -206,12 +207,19 @@ class OwnSimulator(Simulated):
         """
 
     def apply_force(self, force: Array) -> None:
-        """Optional: add a generalised force (D,) along the coordinates, for the next step alone."""
+        """Optional: add a generalised force to the next step, and to that step alone.
+
+        Args:
+            force: (D,) one value for each coordinate: N, N m, or m/s^2 for ``point``.
+        """
         raise NotImplementedError
 
-    def inertia(self) -> float:
-        """Optional: generalised inertia now (kg or kg m^2; 1 for ``point``), with which friction
-        can hold still.
+    def inertia(self) -> float | Array:
+        """Optional: return the generalised inertia now, which dry friction needs to hold still.
+
+        Returns:
+            The inertia matrix (D, D) of the coordinates, or a number where every coordinate has
+            the same inertia and none acts on another; kg, kg m^2, or 1 for ``point``.
         """
         raise NotImplementedError
 
@@ -245,6 +253,9 @@ def _check(cls: type[OwnSimulator]) -> None:
         raise InputError(f'class {cls.__name__}: expected name = "..."')
     if not cls.channels or not cls.parameters:
         raise InputError(f"simulator {cls.name}: expected at least one parameter and one channel")
+    if cls.kind not in KINDS:
+        kinds = ", ".join(KINDS)
+        raise InputError(f"simulator {cls.name}: kind: expected {kinds}, found {cls.kind!r:.40}")
     if len(cls.coordinates) != len(cls.rates):
         raise InputError(
             f"simulator {cls.name}: expected a rate for each of {cls.coordinates}, found"

@@ -1,8 +1,8 @@
 """Steps a user's own simulator, and puts effects that are forces into it.
 
 Dry friction is the force that would stop the motion within the coming step of length h, as far as
-its limit L allows. With inertia M, velocity v, the forces F of effects and the simulator's own pull
-P, which it does not say and which is taken from the step before,
+its limit L allows. With the inertia matrix M (D, D), the velocity v (D,), the forces F (D,) of
+effects and the simulator's own force P, which is unknown and estimated from the step before,
 
     P = M (v - v_before) / h_before - F_before                             (1)
     S = -(M v / h + P + F)                                                 (2)
@@ -11,7 +11,10 @@ P, which it does not say and which is taken from the step before,
 
 from __future__ import annotations
 
+import sys
+import traceback
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -46,7 +49,7 @@ class Stepping(Protocol):
 
     def apply_force(self, force: Array) -> None: ...
 
-    def inertia(self) -> float: ...
+    def inertia(self) -> float | Array: ...
 
     def put(self, levels: Mapping[str, float]) -> None: ...
 
@@ -69,15 +72,24 @@ class OwnEngine:
         """Nothing to give back."""
 
     def integrate(self, lanes: Lanes) -> Motion:
-        """Readings (L, R, C) in place of positions, a row after every `lanes.every` steps and one
-        before the first.
+        """Return readings (L, R, C) in place of positions, a row after every `lanes.every` steps
+        and one before the first.
+
+        Raises:
+            InputError: a method of the simulator raised an exception, or gave something else than
+                it must.
         """
         count = lanes.steps.shape[1] // lanes.every + 1
         width = len(lanes.system.channels)
         shape = len(lanes.theta), count, width
         result = np.full(shape, np.nan)
         for lane in range(len(lanes.theta)):
-            rows = self._run(lanes, lane)
+            try:
+                rows = self._run(lanes, lane)
+            except InputError:
+                raise
+            except Exception as error:
+                raise _fault(self.world, error) from error
             if rows is not None and np.isfinite(rows).all():
                 result[lane] = rows
         return Motion(result, result, result)
@@ -125,15 +137,87 @@ class OwnEngine:
 
     def _row(self, system: System) -> list[float]:
         seen = self.world.observe()
-        return [_seen(self.world, seen, c.name) for c in system.channels]
+        return [observed(self.world, seen, c.name) for c in system.channels]
 
 
-def _seen(world: Stepping, seen: Mapping[str, float], name: str) -> float:
-    if name not in seen:
+def _fault(world: Stepping, error: Exception) -> InputError:
+    """The error where the code of a simulator raised an exception: which, and at which line."""
+    frames = traceback.extract_tb(error.__traceback__)
+    module = sys.modules.get(type(world).__module__)
+    own = [frame for frame in frames if frame.filename == getattr(module, "__file__", None)]
+    frame = (own or list(frames))[-1]
+    what = f"{type(error).__name__}: {error}"
+    at = f"{Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
+    return InputError(f"simulator {world.name}: {what} ({at})")
+
+
+def observed(world: Stepping, seen: Mapping[str, float], name: str) -> float:
+    """Return one value of what `observe` gave.
+
+    Args:
+        world: the simulator.
+        seen: what its `observe` gave.
+        name: of a channel, a coordinate, a rate or a level.
+
+    Raises:
+        InputError: there is no such value, or it is not a number.
+    """
+    try:
+        value = seen[name]
+    except (KeyError, TypeError, IndexError):
+        raise _unobserved(world, seen, name) from None
+    if isinstance(value, float):  # also NumPy's; the general test takes longer than all the rest
+        return float(value)
+    if shape := np.shape(value):
         raise InputError(
-            f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(seen)}"
+            f"simulator {world.name}: observe(), {name}: expected a number, found shape {shape}"
         )
-    return float(seen[name])
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"simulator {world.name}: observe(), {name}: expected a number, found {value!r:.40}"
+        ) from None
+
+
+def _unobserved(world: Stepping, seen: object, name: str) -> InputError:
+    """The error where `observe` gave no value of this name."""
+    if not isinstance(seen, Mapping):
+        found = type(seen).__name__
+        return InputError(
+            f"simulator {world.name}: observe(): expected a dictionary, found {found}"
+        )
+    return InputError(
+        f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(seen)}"
+    )
+
+
+def inertia_of(world: Stepping) -> float | Array:
+    """Return the generalised inertia of a simulator now.
+
+    Returns:
+        A number, which is that along every coordinate, or a matrix (D, D).
+
+    Raises:
+        InputError: `inertia` gave neither.
+    """
+    given = world.inertia()
+    if isinstance(given, float):
+        return float(given)
+    d = len(world.coordinates)
+    try:
+        matrix = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"simulator {world.name}: inertia: expected numbers; {error}") from None
+    if not matrix.shape:
+        return float(matrix)
+    if matrix.shape == (d, d):
+        return matrix
+    joints = ", ".join(world.coordinates)
+    raise InputError(
+        f"simulator {world.name}: inertia: expected shape {(d, d)} (joints × joints; here: "
+        f"{joints}) or a number, found {matrix.shape}"
+    )
 
 
 class _Rims:
@@ -153,7 +237,7 @@ class _Rims:
             return
         seen = self.world.observe()
         for effect, c, name in self.acting:
-            level = np.array([[_seen(self.world, seen, name)]])
+            level = np.array([[observed(self.world, seen, name)]])
             kept = float(effect.keep(c, level)[0, 0])
             if kept != level[0, 0]:
                 self.world.put({name: kept})
@@ -194,20 +278,20 @@ class _Forces:
 
         What the simulator itself pulls with is taken from the last step.
         """
-        inertia = self.world.inertia()
+        inertia = inertia_of(self.world)
         v = moment.v[0]
         own = np.zeros_like(force)
         if self._last is not None:
             before, applied, took = self._last
-            own = inertia * (v - before) / took - applied  # (1)
+            own = np.dot(inertia, v - before) / took - applied  # (1)
         limit = sum(float(effect.limit(c, moment)[0, 0]) for effect, c in self.frictions)
-        stop = -(inertia * v / seconds + own + force)  # (2)
+        stop = -(np.dot(inertia, v) / seconds + own + force)  # (2)
         size = float(np.linalg.norm(stop))
         friction: Array = stop if size <= limit else stop * (limit / size)  # (3)
         self._last = v, force + friction, seconds
         return friction
 
     def _state(self, seen: Mapping[str, float], names: Sequence[str]) -> Array:
-        values = [_seen(self.world, seen, name) for name in names]
+        values = [observed(self.world, seen, name) for name in names]
         state: Array = np.array([values])
         return state

@@ -90,7 +90,8 @@ class Registry(Generic[T]):
         elif name in self._entries:
             part = self._installed(name)
         else:
-            raise unknown(self.kind, name, self.names())
+            error = unknown(self.kind, name, self.names())
+            raise InputError(f"{error}; one of your own needs its file: --plugin FILE.py")
         # Looked for each time: a package may be installed while a notebook is open.
         requires = getattr(part, "requires", ())
         missing = [package for package in requires if importlib.util.find_spec(package) is None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -27,6 +27,10 @@ class NotApplicable(NamedTuple):
     """
 
     reason: str
+
+
+Check = Callable[[Any], NotApplicable | None]
+"""Raises `CheckError` where its subject does not conform."""
 
 
 def require(condition: bool, expected: str, found: object, look: str) -> None:

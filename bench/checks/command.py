@@ -1,16 +1,20 @@
 """What `simgap check NAME` does: the conformance suite on a tuner, a simulator, an effect or a
-diagnoser, each
-check isolated.
+diagnoser, each check in a worker process.
+
+A check is not made where another one has failed without which it means nothing: one cause gives one
+failure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench.checks.base import CheckError
+from bench.checks.base import Check, CheckError
 from bench.checks.processes import LIMIT
-from bench.checks.suites import SUITES
+from bench.checks.suites import SUITES, failed_need, title_of
 from bench.checks.tuners import check_same_run_in_other_processes
 from bench.registry import REGISTRIES
 from bench.runs.pools import LocalPool
@@ -23,9 +27,11 @@ _KNOWN = "known: "
 """Begins the line of a check that fails on purpose."""
 _IDLE = "not applicable: "
 """Begins the line of a check that found nothing to check."""
-_MARKS = {_KNOWN: "known ", _IDLE: "-     "}
-_OUTCOMES = {"ok    ": "passed", "known ": "known", "-     ": "not applicable", "FAILED": "failed"}
-"""What a mark is called where there is no room to be saved."""
+_LEFT_OUT = "not tested: "
+"""Begins the line of a check that was not made."""
+_MARKS = {_KNOWN: "known ", _IDLE: "-     ", _LEFT_OUT: "-     "}
+_OUTCOMES = {_KNOWN: "known", _IDLE: "not applicable", _LEFT_OUT: "not tested"}
+"""What a line's beginning means, for programs."""
 
 
 class Checked(NamedTuple):
@@ -46,12 +52,12 @@ class Checked(NamedTuple):
     @property
     def passed(self) -> bool:
         """Whether no check failed."""
-        return all(_mark(line) != "FAILED" for line in self.lines.values())
+        return all(_outcome(line) != "failed" for line in self.lines.values())
 
     def document(self) -> dict[str, Any]:
         """For programs."""
         checks = [
-            {"check": title, "outcome": _OUTCOMES[_mark(line)], "says": line.strip()}
+            {"check": title, "outcome": _outcome(line), "says": line.strip()}
             for title, line in self.lines.items()
         ]
         return {
@@ -88,9 +94,23 @@ def attempt(kind: str, name: str, place: int) -> str:
         outcome = check(subject)
     except CheckError as error:
         return f"{_KNOWN}{known}" if known else str(error)
+    except InputError as error:
+        return str(error)
+    except Exception as error:
+        return f"expected no exception; found {type(error).__name__}: {error}; {_raised_at(error)}"
     if known:
         return f"expected to fail ({known}); found that it passes; see {name}.known_failures"
     return f"{_IDLE}{outcome.reason}" if outcome else ""
+
+
+def _raised_at(error: Exception) -> str:
+    """Where the subject's own code raised an exception, or else where it was raised at all."""
+    frames = traceback.extract_tb(error.__traceback__)
+    packages = Path(__file__).parents[2]
+    folders = [str(packages / name) for name in ("bench", "methods", "sims")]
+    own = [frame for frame in frames if not frame.filename.startswith(tuple(folders))]
+    frame = (own or list(frames))[-1]
+    return f"see {Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
 
 
 def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> Checked:
@@ -106,35 +126,33 @@ def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> Checke
     """
     kind = kind_of(name)
     subject = _subject(kind, name)
-    checks = SUITES[kind]
-    ends = _isolated(kind, name, plugins)
-    for place, check in enumerate(checks):
-        if check in _HERE and not any(isinstance(end, Exception) for end in ends.values()):
-            # It runs the subject here too, which is known to be safe now.
-            ends[place] = attempt(kind, name, place)
-    lines = {
-        check.__name__.removeprefix("check_").replace("_", " "): _line(
-            ends.get(place, "not made: the subject does not survive the others")
-        )
-        for place, check in enumerate(checks)
-    }
-    for title, line in lines.items():
+    lines = {}
+    for check, line in _lines(kind, name, plugins):
+        lines[title_of(check)] = line
         below = f"\n        {line.removeprefix(_KNOWN)}" if line else ""
-        say(f"{_mark(line)}  {title}{below}")
+        say(f"{_mark(line)}  {title_of(check)}{below}")
     checked = Checked(name, kind, f"{subject.__module__}.{subject.__qualname__}", lines)
     say(f"{kind} {name} ({checked.qualified}): {_summary(checked)}")
     return checked
 
 
 def _summary(checked: Checked) -> str:
-    """How many checks failed."""
-    failed = sum(_mark(line) == "FAILED" for line in checked.lines.values())
-    idle = sum(line.startswith(_IDLE) for line in checked.lines.values())
-    made = len(checked.lines) - idle
-    rest = f", {idle} not applicable" if idle else ""
+    """How many checks failed, and how many were not made."""
+    outcomes = [_outcome(line) for line in checked.lines.values()]
+    idle = {what: outcomes.count(what) for what in ("not tested", "not applicable")}
+    made, failed = len(outcomes) - sum(idle.values()), outcomes.count("failed")
+    rest = "".join(f", {count} {what}" for what, count in idle.items() if count)
     if failed:
         return f"{failed} of {made} checks failed{rest}"
     return f"all {made} checks passed{rest}"
+
+
+def _outcome(line: str) -> str:
+    """What the line of a check means."""
+    for begin, outcome in _OUTCOMES.items():
+        if line.startswith(begin):
+            return outcome
+    return "failed" if line else "passed"
 
 
 def _mark(line: str) -> str:
@@ -145,27 +163,39 @@ def _mark(line: str) -> str:
     return "FAILED" if line else "ok    "
 
 
-def _isolated(kind: str, name: str, plugins: Sequence[str]) -> dict[int, Any]:
-    """How each check ends in a worker process; after two that had to be killed, or died, no more
-    are made.
+def _lines(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tuple[Check, str]]:
+    """Make the checks one after another; what each found is empty where all is well.
+
+    After two checks that had to be killed, or whose process died, no more are made.
     """
-    places = [place for place, check in enumerate(SUITES[kind]) if check not in _HERE]
-    ends: dict[int, Any] = {}
+    failed: list[Check] = []
+    lost = 0
     with LocalPool(1) as pool:
         pool.load([Plugin(path) for path in plugins])
-        for i, end in pool.results([(attempt, (kind, name, place)) for place in places], LIMIT):
-            ends[places[i]] = end
-            if sum(isinstance(e, Exception) for e in ends.values()) == 2:
-                break
-    return ends
+        for place, check in enumerate(SUITES[kind]):
+            needed = failed_need(check, failed)
+            if needed is not None:
+                line = f"{_LEFT_OUT}needs '{title_of(needed)}'"
+            elif lost == 2 or (lost and check in _HERE):
+                line = f"{_LEFT_OUT}the process of other checks died, or had to be killed"
+            elif check in _HERE:
+                # It runs the subject in this process too, which is known to be safe by now.
+                line = attempt(kind, name, place)
+            else:
+                ((_, end),) = pool.results([(attempt, (kind, name, place))], LIMIT)
+                lost += isinstance(end, Exception) and not isinstance(end, InputError)
+                line = _line(end)
+            if _outcome(line) == "failed":
+                failed.append(check)
+            yield check, line.strip().replace("\n", "\n        ")
 
 
 def _line(end: Any) -> str:
-    """What a check found, in lines that stand below its title."""
+    """What a check in a worker process found."""
     if isinstance(end, TimeoutError):
         return f"expected an end within {LIMIT:g} s; found none; see what it waits for"
     if isinstance(end, InputError):
         return str(end)
     if isinstance(end, Exception):
         return f"expected to survive; found {type(end).__name__}: {end}; see where it says"
-    return str(end).strip().replace("\n", "\n        ")
+    return str(end)

@@ -8,7 +8,7 @@ diagnosis-small`).
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.checks.base import (
+    Check,
     CheckError,
     NotApplicable,
     global_random_state_untouched,
@@ -254,7 +255,7 @@ def check_learns_within_its_budget(kind: type[Diagnoser]) -> NotApplicable | Non
     return None
 
 
-DIAGNOSER_CHECKS = (
+DIAGNOSER_CHECKS: tuple[Check, ...] = (
     check_answers,
     check_names_what_there_is,
     check_same_answer_again,
@@ -265,3 +266,8 @@ DIAGNOSER_CHECKS = (
     check_learns_within_its_budget,
 )
 """Every check, in the order in which they are made."""
+
+DIAGNOSER_NEEDS: Mapping[Check, tuple[Check, ...]] = dict.fromkeys(
+    DIAGNOSER_CHECKS[1:], (check_answers,)
+)
+"""Checks that mean nothing where another one fails."""

@@ -5,14 +5,21 @@ can have it.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 
 import numpy as np
 
 from bench.checks.arm import placed
-from bench.checks.base import CheckError, NotApplicable, require, same_bits
-from bench.checks.places import PLACE_CHECKS
+from bench.checks.base import Check, CheckError, NotApplicable, require, same_bits
+from bench.checks.places import (
+    PLACE_CHECKS,
+    check_family_is_the_sum_of_its_members,
+    check_it_acts_at_its_place_alone,
+    check_lanes_of_a_robot_are_independent,
+    check_nothing_at_zero_at_a_place,
+    check_places_are_declared,
+)
 from bench.checks.tub import Tub
 from bench.registry import SkippedError, simulators
 from sims import effects
@@ -242,7 +249,7 @@ def check_impossible_hosts_are_refused(effect: type[Effect]) -> NotApplicable | 
 
 NO_HOST = NotApplicable("no registered system can have it")
 
-EFFECT_CHECKS: tuple[Callable[[type[Effect]], NotApplicable | None], ...] = (
+EFFECT_CHECKS: tuple[Check, ...] = (
     check_declaration_is_complete,
     check_contribution_is_nothing_at_zero,
     check_it_shows_and_stays_finite,
@@ -250,3 +257,25 @@ EFFECT_CHECKS: tuple[Callable[[type[Effect]], NotApplicable | None], ...] = (
     check_impossible_hosts_are_refused,
     *PLACE_CHECKS,
 )
+
+EFFECT_NEEDS: Mapping[Check, tuple[Check, ...]] = {
+    check_contribution_is_nothing_at_zero: (check_declaration_is_complete,),
+    check_it_shows_and_stays_finite: (check_declaration_is_complete,),
+    check_lanes_are_independent: (check_declaration_is_complete,),
+    check_impossible_hosts_are_refused: (check_declaration_is_complete,),
+    check_places_are_declared: (check_declaration_is_complete,),
+    check_nothing_at_zero_at_a_place: (
+        check_places_are_declared,
+        check_contribution_is_nothing_at_zero,
+    ),
+    check_it_acts_at_its_place_alone: (check_places_are_declared, check_it_shows_and_stays_finite),
+    check_family_is_the_sum_of_its_members: (
+        check_places_are_declared,
+        check_lanes_are_independent,
+    ),
+    check_lanes_of_a_robot_are_independent: (
+        check_places_are_declared,
+        check_lanes_are_independent,
+    ),
+}
+"""Checks that mean nothing where another one fails."""

@@ -4,12 +4,12 @@ it on the arm of `bench.checks.arm` wherever it can act there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from bench.checks.arm import OBSERVED, arm, placed, scenario
-from bench.checks.base import CheckError, NotApplicable, require, same_bits
+from bench.checks.base import Check, CheckError, NotApplicable, require, same_bits
 from sims.base import Array, InputError
 from sims.system import Effect, Force, Friction, Hidden, Sensor, State, Value
 
@@ -222,7 +222,7 @@ def _pushed(effect: Force | Friction | Hidden, c: Array, kind: type) -> tuple[ob
     return tuple(int(joint) for joint in np.unique(np.nonzero(force)[1]))
 
 
-PLACE_CHECKS: tuple[Callable[[type[Effect]], NotApplicable | None], ...] = (
+PLACE_CHECKS: tuple[Check, ...] = (
     check_places_are_declared,
     check_nothing_at_zero_at_a_place,
     check_it_acts_at_its_place_alone,

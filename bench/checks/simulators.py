@@ -3,18 +3,37 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from bench.checks.base import CheckError, NotApplicable, require, same_bits
+from bench.checks.base import Check, CheckError, NotApplicable, require, same_bits
+from bench.checks.own import (
+    check_forces_act,
+    check_hooks_have_the_declared_shapes,
+    check_levels_can_be_set,
+    check_step_goes_on_by_its_seconds,
+)
 from sims.base import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator, UnitCube
+from sims.recording.units import is_unit
 
 _NAME = re.compile(r"[a-z][a-z0-9_.]*$")
 
 
-def _scenario(samples: int = 40, rate: float = 60.0) -> Scenario:
-    return Scenario(np.arange(samples) / rate)
+def _scenario(
+    kind: type[Simulator], samples: int = 40, rate: float = 60.0, size: float = 0.0
+) -> Scenario:
+    """A run from the default initial state.
+
+    Args:
+        kind: the simulator's class.
+        samples: their number.
+        rate: samples per second.
+        size: amplitude of the inputs, in units of their `scale`.
+    """
+    times = np.arange(samples) / rate
+    waves = {c.name: c.scale * size * np.cos((3.0 + i) * times) for i, c in enumerate(kind.inputs)}
+    return Scenario(times, inputs=waves)
 
 
 def _points(simulator: Simulator, n: int, seed: int = 0) -> Array:
@@ -22,15 +41,13 @@ def _points(simulator: Simulator, n: int, seed: int = 0) -> Array:
     return cube.physical(np.random.default_rng(seed).uniform(size=(n, cube.dim)))
 
 
+def _named(kind: type[Simulator]) -> list[Parameter | Channel | Constant]:
+    return [*kind.parameters, *kind.channels, *kind.constants, *kind.inputs]
+
+
 def check_declaration_is_complete(kind: type[Simulator]) -> None:
-    """Names are plain, units and sentences are there, nothing is declared twice."""
+    """Names are plain, a sentence is there, nothing is declared twice."""
     look = kind.__name__
-    named: list[Parameter | Channel | Constant] = [
-        *kind.parameters,
-        *kind.channels,
-        *kind.constants,
-        *kind.inputs,
-    ]
     require(
         bool(kind.parameters and kind.channels and kind.says),
         "parameters, channels and a sentence",
@@ -42,68 +59,85 @@ def check_declaration_is_complete(kind: type[Simulator]) -> None:
     for group in groups:
         names = [thing.name for thing in group]
         require(len(set(names)) == len(names), "different names", names, look)
-    for thing in named:
-        # A robot's are those of its file, whatever that calls them.
+    for thing in _named(kind):
+        # The names of a robot are those of its model file, which may hold anything.
         plain = kind.has_model or bool(_NAME.match(thing.name))
         require(plain, "a name in lower case", thing.name, look)
-        require(bool(thing.unit), f"a unit for {thing.name} ('1' for a number)", "none", look)
+
+
+def check_units_are_known(kind: type[Simulator]) -> None:
+    """Every parameter, channel, constant and input has a unit that can be converted."""
+    for thing in _named(kind):
+        require(
+            is_unit(thing.unit),
+            f"a unit for {thing.name} (such as m/s, rad, N*m; '1' for a number)",
+            repr(thing.unit),
+            kind.__name__,
+        )
 
 
 def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
     """(n, T, C), finite, for any number of parameter vectors and samples."""
-    simulator = kind()
+    simulator, look = kind(), f"{kind.__name__}.simulate"
     for n, samples in ((1, 2), (3, 40), (1, 1)):
-        seen = simulator.simulate(_points(simulator, n), _scenario(samples))
+        seen = simulator.simulate(_points(simulator, n), _scenario(kind, samples))
         shape = (n, samples, len(simulator.channels))
-        require(
-            seen.shape == shape,
-            f"observations of shape {shape}",
-            seen.shape,
-            f"{kind.__name__}.simulate",
-        )
-        require(
-            bool(np.isfinite(seen).all()),
-            "finite observations inside the bounds",
-            "others",
-            f"{kind.__name__}.simulate",
-        )
+        require(seen.shape == shape, f"observations of shape {shape}", seen.shape, look)
+        for place, channel in enumerate(simulator.channels):
+            bad = seen[:, :, place][~np.isfinite(seen[:, :, place])]
+            what = f"finite values of {channel.name} for parameters inside the bounds"
+            require(not bad.size, what, bad[:1], look)
     simulator.close()
 
 
 def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
-    """Whatever was simulated before, here or in a fresh simulator, alone or among others."""
+    """A run depends on nothing that was simulated before, in this simulator or another, and on no
+    other parameter vector of the same call.
+    """
     simulator, other = kind(), kind()
-    points, look = (
-        _points(simulator, 6),
-        f"what {kind.__name__} keeps from one simulation to the next",
-    )
-    together = simulator.simulate(points, _scenario())
-    # In between something else, of another length and rate, which may leave its traces.
-    simulator.simulate(_points(simulator, 5, seed=9), _scenario(samples=77, rate=50.0))
-    alone = np.concatenate(
-        [simulator.simulate(point[None], _scenario()) for point in points[::-1]]
-    )[::-1]
-    require(same_bits(together, alone), "the same bits after other simulations", "others", look)
-    require(
-        same_bits(together, other.simulate(points, _scenario())),
-        "the same bits in a new simulator",
-        "others",
-        look,
-    )
+    points = _points(simulator, 6)
+    # Inputs that are not zero: what they leave behind, such as heat, would not show otherwise.
+    run, longer = _scenario(kind, size=1.0), _scenario(kind, 300, 50.0, size=3.0)
+    together = simulator.simulate(points.copy(), run)
+
+    def compare(seen: Array, after: str) -> None:
+        if not same_bits(together, seen):
+            what = f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__
+            raise CheckError(
+                f"expected the same numbers {after}; found "
+                f"{_first_difference(kind, together, seen)}; see {what}: it must set everything "
+                "that a run has changed"
+            )
+
+    simulator.simulate(_points(simulator, 2, seed=9), longer)
+    compare(simulator.simulate(points.copy(), run), "after a run with other inputs")
+    alone = [simulator.simulate(point[None].copy(), run) for point in points[::-1]]
+    compare(np.concatenate(alone[::-1]), "one by one as all together")
+    compare(other.simulate(points.copy(), run), "in a new simulator")
     simulator.close()
-    require(
-        same_bits(together, simulator.simulate(points, _scenario())),
-        "the same bits after close()",
-        "others",
-        look,
-    )
+    compare(simulator.simulate(points.copy(), run), "after close()")
     simulator.close()
     other.close()
 
 
+def _first_difference(kind: type[Simulator], expected: Array, seen: Array) -> str:
+    """Where two observations (n, T, C) first differ in time, in words."""
+    if expected.shape != seen.shape:
+        return f"shape {seen.shape} in place of {expected.shape}"
+    differs = (expected != seen) & ~(np.isnan(expected) & np.isnan(seen))
+    if not differs.any():
+        return "zeros of another sign"
+    lane, sample, channel = min(np.argwhere(differs).tolist(), key=lambda at: at[1])
+    before, after = expected[lane, sample, channel], seen[lane, sample, channel]
+    # Where rounding alone differs, every digit.
+    digits = 6 if f"{before:.6g}" != f"{after:.6g}" else 17
+    name = kind.channels[channel].name
+    return f"{name} = {after:.{digits}g} in place of {before:.{digits}g} at sample {sample}"
+
+
 def check_arguments_are_not_changed(kind: type[Simulator]) -> None:
     """`theta` and the scenario are the caller's."""
-    simulator, scenario = kind(), _scenario()
+    simulator, scenario = kind(), _scenario(kind)
     points = _points(simulator, 3)
     before, times = points.copy(), scenario.times.copy()
     simulator.simulate(points, scenario)
@@ -120,10 +154,10 @@ def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simul
     """A lane with a NaN parameter is all NaN, its neighbours are as without it."""
     simulator, look = kind(), f"{kind.__name__}.simulate"
     points = _points(simulator, 3)
-    clean = simulator.simulate(points, _scenario())
+    clean = simulator.simulate(points, _scenario(kind))
     # The middle one, so that it has neighbours on both sides.
     points[1] = np.nan
-    seen = simulator.simulate(points, _scenario())
+    seen = simulator.simulate(points, _scenario(kind))
     require(bool(np.isnan(seen[1]).all()), "a lane of NaN", seen[1][:2], look)
     require(same_bits(clean[[0, 2]], seen[[0, 2]]), "neighbours as they were", "others", look)
     simulator.close()
@@ -131,11 +165,13 @@ def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simul
 
 def check_every_parameter_shows(kind: type[Simulator]) -> None:
     """Each parameter changes some channel, in a run of ten seconds."""
-    simulator = kind()
+    simulator = kind(observe=[c.name for c in kind.channels])
     cube = UnitCube(simulator.parameters)
-    points = np.full((1 + cube.dim, cube.dim), 0.4)
+    # Inside the training range: far from it, a large friction may hold everything still.
+    low, high = cube.training
+    points = np.tile(low + 0.4 * (high - low), (1 + cube.dim, 1))
     # One point for each parameter, moved in that direction alone.
-    points[1:] += 0.2 * np.eye(cube.dim)
+    points[1:] += 0.2 * np.diag(high - low)
     inputs = {c.name: np.ones(600) for c in simulator.inputs}
     seen = simulator.simulate(cube.physical(points), Scenario(np.arange(600) / 60.0, inputs=inputs))
     for parameter, lane in zip(simulator.parameters, seen[1:], strict=True):
@@ -146,6 +182,32 @@ def check_every_parameter_shows(kind: type[Simulator]) -> None:
             kind.__name__,
         )
     simulator.close()
+
+
+def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
+    """Each initial state changes some channel, in a run of ten seconds."""
+    if not kind.states:
+        return NotApplicable("it has no initial state")
+    simulator = kind(observe=[c.name for c in kind.channels])
+    scales = {c.name: c.scale for c in kind.channels}
+    theta = np.array([[p.nominal for p in simulator.parameters]])
+    run = _scenario(kind, 600, size=1.0)
+    seen = simulator.simulate(theta, run)
+    for name, value in kind.states.items():
+        other = value + _MOVED * max(abs(value), scales.get(name, 1.0))
+        moved = Scenario(run.times, {name: other}, run.inputs)
+        require(
+            not np.array_equal(seen, simulator.simulate(theta, moved)),
+            f"initial state {name} = {other:g} in place of {value:g} to change something",
+            "the same observation",
+            f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__,
+        )
+    simulator.close()
+    return None
+
+
+_MOVED = 0.01
+"""By this share of its value, or of its channel's scale, an initial state is changed."""
 
 
 def check_unknown_names_are_refused(kind: type[Simulator]) -> None:
@@ -184,8 +246,8 @@ def check_chosen_channels_are_the_same_columns(kind: type[Simulator]) -> NotAppl
     chosen = kind(observe=names)
     points = _points(everything, 2)
     same = same_bits(
-        np.ascontiguousarray(everything.simulate(points, _scenario())[:, :, ::-1]),
-        np.ascontiguousarray(chosen.simulate(points, _scenario())),
+        np.ascontiguousarray(everything.simulate(points, _scenario(kind))[:, :, ::-1]),
+        np.ascontiguousarray(chosen.simulate(points, _scenario(kind))),
     )
     require(
         same, "the same columns in the order asked for", "others", f"{kind.__name__}: self.columns"
@@ -195,13 +257,38 @@ def check_chosen_channels_are_the_same_columns(kind: type[Simulator]) -> NotAppl
     return None
 
 
-SIMULATOR_CHECKS: tuple[Callable[[type[Simulator]], NotApplicable | None], ...] = (
+SIMULATOR_CHECKS: tuple[Check, ...] = (
     check_declaration_is_complete,
+    check_units_are_known,
     check_observations_have_the_declared_shape,
-    check_same_proposal_gives_the_same_bits,
     check_arguments_are_not_changed,
+    check_same_proposal_gives_the_same_bits,
     check_parameters_that_are_not_numbers_spoil_only_their_lane,
     check_every_parameter_shows,
+    check_initial_states_show,
     check_unknown_names_are_refused,
     check_chosen_channels_are_the_same_columns,
+    check_hooks_have_the_declared_shapes,
+    check_step_goes_on_by_its_seconds,
+    check_forces_act,
+    check_levels_can_be_set,
 )
+
+_SIMULATES = check_observations_have_the_declared_shape
+_REPEATS = check_same_proposal_gives_the_same_bits
+
+SIMULATOR_NEEDS: Mapping[Check, tuple[Check, ...]] = {
+    _SIMULATES: (check_declaration_is_complete,),
+    check_arguments_are_not_changed: (_SIMULATES,),
+    _REPEATS: (check_arguments_are_not_changed,),
+    check_parameters_that_are_not_numbers_spoil_only_their_lane: (_REPEATS,),
+    check_every_parameter_shows: (_REPEATS,),
+    check_initial_states_show: (_REPEATS,),
+    check_unknown_names_are_refused: (_SIMULATES,),
+    check_chosen_channels_are_the_same_columns: (_REPEATS,),
+    check_hooks_have_the_declared_shapes: (_SIMULATES,),
+    check_step_goes_on_by_its_seconds: (_REPEATS, check_hooks_have_the_declared_shapes),
+    check_forces_act: (_REPEATS, check_hooks_have_the_declared_shapes),
+    check_levels_can_be_set: (_REPEATS, check_hooks_have_the_declared_shapes),
+}
+"""Checks that mean nothing where another one fails."""

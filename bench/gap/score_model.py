@@ -18,8 +18,9 @@ from bench.recordings.inspection import refuse_huge
 from bench.recordings.size import check_recording
 from bench.recordings.stamps import refuse_odd
 from bench.registry import robot, simulators
+from bench.store.made import environment
 from sims.base import Array, InputError, unknown
-from sims.extended import Extended, opened
+from sims.extended import Extended, opened, read
 from sims.recording.description import model_of
 from sims.recording.recording import read_recording, system_of
 from sims.simulated import Simulated
@@ -78,19 +79,41 @@ def _opened(model: Path, recording: Path) -> tuple[Extended, type[Simulated]]:
     """What is scored, and the simulator of its system."""
     if model.suffix in _MODEL_FILES:
         return _robot(model, recording)
+    _check_plugin(model)
     extended, kind, _ = opened(model, simulators.get)
     _check_system(recording, extended, model)
     return extended, kind
 
 
+def _check_plugin(model: Path) -> None:
+    """Refuse a file that extends a simulator of the user's own, where its plugin is not given.
+
+    Raises:
+        InputError: it does; the message names the option, with the plugin that explain was given
+            where the folder still says so.
+    """
+    extended = read(model)
+    if extended.robot is not None or extended.system in simulators.names():
+        return
+    # It is named and not loaded: a file of numbers must not decide which code is run.
+    settings = environment(model.parent).get("settings")
+    plugins = settings.get("plugin") if isinstance(settings, dict) else None
+    files = [str(plugin) for plugin in plugins] if isinstance(plugins, list) else ["FILE.py"]
+    options = " ".join(f"--plugin {file}" for file in files)
+    raise InputError(
+        f"{model}: extends simulator '{extended.system}', which is not one of "
+        f"{', '.join(simulators.names())}; add the file that defines it: {options}"
+    )
+
+
 def _robot(model: Path, recording: Path) -> tuple[Extended, type[Simulated]]:
     """A robot as its file states it: no number of it is fitted, no effect is added."""
-    from sims.robot.reading import read
+    from sims.robot.reading import read as read_robot
 
     stated = model_of(recording)
     tables = stated.actuators if stated else {}
     # A file that explain has written has the recording's actuators already.
-    there = {actuator.name for actuator in read(model).actuators}
+    there = {actuator.name for actuator in read_robot(model).actuators}
     lacking = {name: table for name, table in tables.items() if name not in there}
     # An MJCF states how it is stepped; it may be what was found.
     engine = stated.engine if stated and model.suffix == ".urdf" else {}

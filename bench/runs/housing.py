@@ -175,6 +175,8 @@ def housed(
     # Weights are hashed only where a tuner may wait that has others.
     key = (repr(tuned), seed, hidden, memory, _digest(state or {})) if kept else None
     tuner = _waiting.pop(key, None)
+    if tuner is not None:
+        tuner.import_seconds = 0.0
     if tuner is None or not tuner.child.alive:
         house = nursery()
         house.load(

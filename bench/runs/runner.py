@@ -18,6 +18,7 @@ from bench.problem.targets import Target
 from bench.registry import Registry, SkippedError, effects, simulators, tuners
 from bench.runs.housing import tuned_of
 from bench.runs.identity import Identities
+from bench.runs.notes import Notes
 from bench.runs.pools import Call, DeathError, LostError, Pool, pool_of
 from bench.runs.rows import rows, status_of, unfinished
 from bench.runs.sources import effect_names
@@ -68,7 +69,8 @@ class Results:
     training cost.
 
     `spectra` says what each target's data identify, by its name, where that can be asked; `tuned`
-    which tuner lives in a process of its own, by label; `hidden` what it must not reach.
+    which tuner lives in a process of its own, by label; `hidden` what it must not reach; `notes`
+    what the runs made now tell the authors of their tuners.
     """
 
     problem: Problem
@@ -81,6 +83,10 @@ class Results:
     hidden: tuple[str, ...] = ()
     interrupted: bool = False
     stopped: str = ""
+    notes: Notes = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.notes = Notes(self.problem.experiment.isolation)
 
     def training_rows(self) -> list[tuple[str, int, int, float]]:
         """Rows of training.csv: tuner, seed, simulations, seconds."""
@@ -345,6 +351,7 @@ def _file(results: Results, place: int, outcome: Outcome | Exception) -> None:
     elif isinstance(outcome, Exception):
         reason = "".join(traceback.format_exception(outcome))
         outcome = unfinished(problem, job.target, "crashed", reason)
+    results.notes.add(job.order.entry.label, outcome)
     columns = rows(
         problem, job.order, job.target, outcome, results.spectra.get(job.target.sealed.name)
     )

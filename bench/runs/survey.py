@@ -17,11 +17,12 @@ from bench.problem.experiment import Entry, Experiment
 from bench.registry import REGISTRIES, diagnosers, load_plugins, tuners
 from bench.runs.housing import housed, nursery, tuned_of, undisturbed
 from bench.runs.sources import digest, named_effects, source
-from bench.sealing.ended import EndedError
+from bench.sealing.ended import EndedError, with_isolation
 from bench.sealing.seals import Reach
 from bench.sealing.wire import Channel, printable
 from methods.base import Tuner
 from sims.base import InputError
+from sims.extended import read
 from sims.registry import Registry, SkippedError
 
 _PATIENCE = 120.0
@@ -134,12 +135,29 @@ def admit(paths: Sequence[str], experiment: Experiment) -> None:
     known = [Plugin(path) for path in paths]
     if not experiment.trusted:
         needed = {experiment.simulator} | named_effects(experiment.settings, experiment.world)
-        known = survey(paths, needed)
+        known = survey(paths, needed | _extended(paths))
         _refuse_both(known, experiment)
     enter(known)
     _admitted.update({plugin.path: plugin for plugin in known})
     if not experiment.trusted:
         _announce_installed(entry.tuner for entry in experiment.tuners)
+
+
+def _extended(paths: Iterable[str]) -> set[str]:
+    """Names of the simulators and effects that extended simulators are made of.
+
+    Args:
+        paths: of plugin files; those of extended simulators end in .toml.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    names = set()
+    for path in paths:
+        if path.endswith(".toml"):
+            extended = read(Path(path))
+            names |= {extended.system, *(name.partition("@")[0] for name in extended.effects)}
+    return names
 
 
 def _refuse_both(plugins: Iterable[Plugin], experiment: Experiment) -> None:
@@ -296,7 +314,7 @@ def _asked(question: dict[str, str], what: str) -> list[dict[str, Any]]:
         said = "takes too long to load" if ended.status == "timeout" else ended.reason
         raise InputError(f"plugin {what}: {said.strip().splitlines()[-1]}") from None
     if isinstance(answer, dict):
-        raise InputError(str(answer.get("fault")))
+        raise InputError(with_isolation(str(answer.get("fault"))))
     return [_plain(part, file) for part in answer]
 
 

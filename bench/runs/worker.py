@@ -24,6 +24,7 @@ from bench.runs.drive import Evaluate, Steps, Trace, drive
 from bench.runs.evaluate import Evaluator
 from bench.runs.housing import housed, undisturbed
 from bench.runs.training import MADE_AGAIN, build, trained, weights_of
+from bench.sealing.children import NOTHING_WRITTEN, Written
 from bench.sealing.ended import EndedError
 from bench.sealing.memory import memory_limit
 from bench.sealing.outside import Sealed, Tuned, moved
@@ -77,12 +78,16 @@ class Outcome:
         obs_rmse: (k + 1, C) error on the target's own runs, channel units.
         heldout_rmse: (k + 1, C) error on its held-out runs; None where there are none.
         seconds: wall-clock time of the run, without the scoring.
+        written: files that the tuner wrote and that were thrown away with its process.
+        import_seconds: that the imports of the tuner's file took before the run.
     """
 
     trace: Trace
     obs_rmse: Array
     heldout_rmse: Array | None
     seconds: float
+    written: Written = NOTHING_WRITTEN
+    import_seconds: float = 0.0
 
 
 class CheatError(RuntimeError):
@@ -154,10 +159,12 @@ def _perform(experiment: Experiment, order: Order, before: list[Array]) -> Outco
     # Scoring and what came before do not count.
     simulated = problem.simulated
     started = perf_counter()
+    written, import_seconds = NOTHING_WRITTEN, 0.0
     if order.tuned is None:
         trace = _trusted(experiment, order, task, evaluator)
     else:
-        trace = _sealed(experiment, order, task, _Repeated(evaluator, before))
+        repeated = _Repeated(evaluator, before)
+        trace, written, import_seconds = _sealed(experiment, order, task, repeated)
     seconds = perf_counter() - started
     beside = problem.simulated - simulated - len(trace.losses)
     # A simulator that raises has simulated, and nothing came of it.
@@ -172,7 +179,8 @@ def _perform(experiment: Experiment, order: Order, before: list[Array]) -> Outco
         heldout = Evaluator(problem, target.held_out).rmse(
             trace.proposals[:0], trace.recommendations
         )
-    return Outcome(trace, evaluator.rmse(trace.proposals, trace.recommendations), heldout, seconds)
+    rmse = evaluator.rmse(trace.proposals, trace.recommendations)
+    return Outcome(trace, rmse, heldout, seconds, written, import_seconds)
 
 
 def _names(experiment: Experiment, order: Order) -> tuple[str | int, ...]:
@@ -189,8 +197,14 @@ def _trusted(experiment: Experiment, order: Order, task: Task, evaluate: Evaluat
         return drive(tuner, task, evaluate, rng, experiment.timeout)
 
 
-def _sealed(experiment: Experiment, order: Order, task: Task, evaluate: Evaluate) -> Trace:
-    """A run whose tuner has a process of its own."""
+def _sealed(
+    experiment: Experiment, order: Order, task: Task, evaluate: Evaluate
+) -> tuple[Trace, Written, float]:
+    """Make a run whose tuner has a process of its own.
+
+    Returns:
+        The run, what the tuner wrote, and the seconds of its imports.
+    """
     assert order.tuned is not None
     state = None if order.weights is None else weights_of(order.weights)
     names = _names(experiment, order)
@@ -201,13 +215,15 @@ def _sealed(experiment: Experiment, order: Order, task: Task, evaluate: Evaluate
         with house as tuner:
             run = Sealed(tuner, stream_of(*names), experiment.timeout)
             trace = drive(run, task, evaluate, rng_for(*names), experiment.timeout)
+            written = tuner.child.written()
             # What failed may have left anything behind.
             if trace.status in FAILED:
                 tuner.child.end()
-            return trace
+            return trace, written, tuner.import_seconds
     except EndedError as ended:
         # It never began: it could not be built.
-        return drive(Ended(ended), task, evaluate, rng_for(*names))
+        trace = drive(Ended(ended), task, evaluate, rng_for(*names))
+        return trace, NOTHING_WRITTEN, 0.0
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 from bench.sealing import folders, nursery
-from bench.sealing.ended import EndedError, KilledError, how_it_ended
+from bench.sealing.ended import EndedError, KilledError, how_it_ended, with_isolation
 from bench.sealing.seals import ROOT, readable
-from bench.sealing.wire import TEXT_LIMIT, Channel, FoulError, GoneError, Message
+from bench.sealing.wire import TEXT_LIMIT, Channel, FoulError, GoneError, Message, printable
 from methods.base import Array
 from sims.engines.compiled import kept as compiled
 
@@ -33,6 +33,32 @@ PATIENCE = 60.0
 """Seconds in which a process must have been started, and a tuner built."""
 _OUTSIDE = (-9, -15)
 """How who was killed from outside ends: SIGKILL (also the kernel's, short of memory), SIGTERM."""
+
+
+_COURTESY = 1.0
+"""Seconds in which a process must have said what it has written."""
+_FILES = 1_000_000
+"""Largest number of files that is believed."""
+
+
+class Written(NamedTuple):
+    """What a tuner has written to the folder that is thrown away with its process.
+
+    Attributes:
+        files: their number.
+        names: of the first of them.
+    """
+
+    files: int
+    names: tuple[str, ...]
+
+
+NOTHING_WRITTEN = Written(0, ())
+
+
+def _name(said: object) -> str:
+    """The name of a file that can stand in a line."""
+    return " ".join(printable(str(said)[:100]).split())
 
 
 class Nursery:
@@ -213,8 +239,27 @@ class Child:
         except GoneError:
             raise self._gone() from None
         if message.kind == b"D":
-            raise EndedError("crashed", message.text())
+            raise EndedError("crashed", with_isolation(message.text()))
         return message
+
+    def written(self) -> Written:
+        """Return what the tuner has written to its folder since this was last asked.
+
+        Nothing where the process does not answer: what it says of itself is a courtesy.
+        """
+        if not self._open:
+            return NOTHING_WRITTEN
+        deadline = perf_counter() + _COURTESY
+        try:
+            self.send(b"N", deadline=deadline)
+            said = self.receive(deadline=deadline).document()
+            count = max(0, min(int(said["count"]), _FILES))
+            return Written(count, tuple(map(_name, said["names"][:3])) if count else ())
+        except (EndedError, KilledError, FoulError):
+            return NOTHING_WRITTEN
+        except (TypeError, ValueError, LookupError, OverflowError):
+            # JSON, but not what was asked for.
+            return NOTHING_WRITTEN
 
     def send(self, kind: bytes, *parts: bytes | Array, deadline: float, **head: int) -> None:
         """Send it a message; raises as `receive`."""

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
+import re
 import signal
+
+ISOLATED = "tuners run isolated: no files, no processes, no network; use --trust while developing"
+"""What is added to the error of a tuner that the isolation has refused something."""
+_REFUSED = re.compile(
+    r"^[\w.]*(PermissionError|BlockingIOError|FileNotFoundError|Connection\w*Error|gaierror"
+    r"|BrokenProcessPool|TerminatedWorkerError)\b"
+    r"|Permission denied|Operation not permitted|Read-only file system|No such file or directory"
+    r"|Resource temporarily unavailable|Function not implemented|No space left on device"
+    r"|File too large|Too many open files|can't start new thread|Network is unreachable"
+)
+"""What the line of an exception says where the kernel refused a file, a process or a socket."""
 
 
 class EndedError(Exception):
@@ -20,6 +32,23 @@ class EndedError(Exception):
     def __reduce__(self) -> tuple[type[EndedError], tuple[str, str]]:
         # Workers hand errors over pickled, which calls the class with the message alone.
         return EndedError, (self.status, self.reason)
+
+
+def with_isolation(reason: str) -> str:
+    """Return a reason with `ISOLATED` at its end, where the isolation may be the cause.
+
+    Args:
+        reason: a traceback of an isolated tuner.
+    """
+    # The lines at the margin are those of exceptions; the others are frames and source code.
+    if any(_REFUSED.search(line) for line in reason.splitlines() if line[:1].strip()):
+        return f"{reason.rstrip()}; {ISOLATED}"
+    return reason
+
+
+def without_isolation(reason: str) -> str:
+    """Return a reason without what `with_isolation` has added."""
+    return reason.removesuffix(f"; {ISOLATED}")
 
 
 class KilledError(Exception):

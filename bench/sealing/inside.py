@@ -12,7 +12,9 @@ import inspect
 import os
 import sys
 import traceback
+from collections.abc import Iterator
 from contextlib import suppress
+from itertools import islice
 from typing import Any, NoReturn
 
 import numpy as np
@@ -38,15 +40,19 @@ _LIMIT = 1 << 40
 """What the harness sends is not bounded: it is trusted."""
 
 
-def serve(channel: Channel, _reach: Reach, held: list[str]) -> None:
+def serve(channel: Channel, reach: Reach, held: list[str]) -> None:
     """Do what is asked until nobody asks any more."""
     channel.send_document(b"R", held)
     # Loaded ahead, it would give each run the same numbers to those who use it in place of theirs.
     np.random.seed()  # noqa: NPY002
     with suppress(GoneError):
         tuner = None
+        told: set[str] = set()
         while True:
             message = channel.receive(_LIMIT)
+            if message.kind == b"N":
+                _tell_written(channel, reach.folder, told)
+                continue
             try:
                 tuner = _served(channel, message, tuner)
             except GoneError:
@@ -54,6 +60,27 @@ def serve(channel: Channel, _reach: Reach, held: list[str]) -> None:
             except BaseException:
                 # Also what asks to exit: it is the tuner's doing, and its run's end.
                 _say(channel, traceback.format_exc())
+
+
+def _tell_written(channel: Channel, folder: str, told: set[str]) -> None:
+    """Tell which files the tuner has written to its folder and are not in `told`; add them there.
+
+    Hidden files and compiled Python are left out: libraries write them, and nobody misses them.
+    """
+    new = [path for path in islice(_written(folder), _MOST_FILES) if path not in told]
+    told.update(new)
+    names = [os.path.relpath(path, folder) for path in sorted(new)[:3]]
+    channel.send_document(b"N", {"count": len(new), "names": names})
+
+
+_MOST_FILES = 10_000
+"""Files that are counted."""
+
+
+def _written(folder: str) -> Iterator[str]:
+    for place, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if name[0] != "." and name != "__pycache__"]
+        yield from (os.path.join(place, name) for name in files if name[0] != ".")
 
 
 def _say(channel: Channel, text: str) -> None:

@@ -72,6 +72,18 @@ def scale(unit: str, target: str) -> Scale:
     return SAME if zero == 0.0 and abs(gain - 1.0) < 1e-12 else Scale(gain, zero)
 
 
+def is_unit(unit: str) -> bool:
+    """Return whether `unit` can be converted: pint knows every name in it."""
+    if len(unit) > _LONGEST or not _plain(unit):
+        return False
+    try:
+        _registry().parse_units(unit)
+    except Exception:
+        # the parser raises whatever it trips over
+        return False
+    return True
+
+
 def _plain(unit: str) -> bool:
     """Whether the text is names and 1, joined by * / or spaces, each perhaps to one small power."""
     place, before = 0, "operator"

@@ -4,6 +4,7 @@ all.
 
 import os
 import random
+import re
 
 import numpy as np
 import pytest
@@ -13,11 +14,15 @@ from bench.checks import (
     SIMULATOR_CHECKS,
     TUNER_CHECKS,
     CheckError,
+    parametrize,
     simulators,
     tuners,
 )
+from bench.checks.command import attempt
+from bench.checks.suites import SUITES, failed_need
 from methods.base import Ask, Tuner
 from sims.base import Channel, Constant, Parameter, Simulator
+from sims.own import OwnSimulator
 from sims.system import Coefficient, Force
 from tests.conftest import PLUGINS
 
@@ -171,8 +176,10 @@ def test_tuner_check_rejects_its_broken_subject_and_no_sound_one(check):
         load_plugins([PLUGINS / "awkward.py"])
         check(registered.get("over_asking"))
         broken = registered.get(broken)
-    with pytest.raises(CheckError, match=r"(?s)expected .*; found .*; see "):
+    with pytest.raises(CheckError, match=r"(?s)expected .*; found .*; see ") as error:
         check(broken)
+    isolated = check.__name__ == "check_same_run_when_sealed"
+    assert isolated == ("use --trust while developing" in str(error.value))
 
 
 def test_a_learned_tuner_without_storage_and_a_tune_that_does_not_yield_are_rejected():
@@ -221,8 +228,17 @@ class Wave(Simulator):
         return (shift + theta[:, 1:, None] * wave)[:, :, self.columns]
 
 
-class NoUnit(Wave):
-    channels = (Channel("x", ""), Channel("v", "m/s"))
+class NoSentence(Wave):
+    says = ""
+
+
+class Raises(Wave):
+    def simulate(self, theta, scenario):
+        return theta[:, 7]
+
+
+class UnknownUnit(Wave):
+    channels = (Channel("x", "m"), Channel("v", "furlongs/fortnite"))
 
 
 class WrongShape(Wave):
@@ -267,23 +283,249 @@ class WrongColumns(Wave):
         return np.sort(super().simulate(theta, scenario), axis=2)
 
 
+class Cart(OwnSimulator):
+    """A sound simulator of one's own: two carts with a spring between them, one on a heater."""
+
+    name, says = "cart", "two carts that are coupled by a spring"
+    parameters = (Parameter("stiffness", "N/m", 20.0, (5.0, 50.0)),)
+    inputs = (Channel("push", "N"),)
+    channels = (Channel("x1", "m"), Channel("x2", "m"), Channel("heat", "K"))
+    states, time_step = {"x1": 0.0, "x2": 0.1, "v1": 0.0, "v2": 0.0, "heat": 0.0}, 0.01
+    coordinates, rates, levels = ("x1", "x2"), ("v1", "v2"), ("heat",)
+
+    def reset(self, theta, constants, initial):
+        self.stiffness, self.now, self.force = theta["stiffness"], dict(initial), np.zeros(2)
+
+    def step(self, inputs, seconds):
+        now, pull = self.now, self.stiffness * (self.now["x2"] - self.now["x1"])
+        now["heat"] += abs(inputs["push"]) * seconds
+        now["v1"] += (pull + inputs["push"] + self.force[0]) * seconds
+        now["v2"] += (self.force[1] - pull - 0.1 * now["heat"] * now["v2"]) * seconds
+        now["x1"] += now["v1"] * seconds
+        now["x2"] += now["v2"] * seconds
+        self.force = np.zeros(2)
+
+    def observe(self):
+        return self.now
+
+    def apply_force(self, force):
+        self.force = force
+
+    def inertia(self):
+        return np.eye(2)
+
+    def put(self, levels):
+        self.now |= levels
+
+
+class SmallInertia(Cart):
+    name = "small_inertia"
+
+    def inertia(self):
+        return np.eye(1)
+
+
+class NegativeInertia(Cart):
+    name = "negative_inertia"
+
+    def inertia(self):
+        return np.diag([1.0, -1.0])
+
+
+class ObservesArrays(Cart):
+    name = "observes_arrays"
+
+    def observe(self):
+        return {**self.now, "v2": np.array([self.now["v2"]])}
+
+
+class ForcesWithoutCoordinates(Cart):
+    name = "forces_without_coordinates"
+    coordinates = rates = ()
+
+
+class KeepsHeat(Cart):
+    """Heat that only its inputs make, and that the next run begins with."""
+
+    name = "keeps_heat"
+    warmth = 0.0
+
+    def reset(self, theta, constants, initial):
+        super().reset(theta, constants, {**initial, "heat": initial["heat"] + self.warmth})
+
+    def step(self, inputs, seconds):
+        super().step(inputs, seconds)
+        self.warmth = self.now["heat"]
+
+
+class IgnoresStart(Cart):
+    name = "ignores_start"
+
+    def reset(self, theta, constants, initial):
+        super().reset(theta, constants, {**initial, "v2": 0.0})
+
+
+class OwnClock(Cart):
+    name = "own_clock"
+
+    def step(self, inputs, seconds):
+        super().step(inputs, self.time_step)
+
+
+class IgnoresForces(Cart):
+    name = "ignores_forces"
+
+    def apply_force(self, force):
+        self.force[0] = force[0]
+
+
+class SumsForces(Cart):
+    """Adds each force to those before, and never takes one away."""
+
+    name = "sums_forces"
+
+    def reset(self, theta, constants, initial):
+        super().reset(theta, constants, initial)
+        self.sum = np.zeros(2)
+
+    def step(self, inputs, seconds):
+        self.force = self.sum
+        super().step(inputs, seconds)
+
+    def apply_force(self, force):
+        self.sum = self.sum + force
+
+
+class KeepsForces(Cart):
+    """A force that is applied is there until another is, also in the next run."""
+
+    name = "keeps_forces"
+    last = np.zeros(2)
+
+    def step(self, inputs, seconds):
+        self.force = self.last
+        super().step(inputs, seconds)
+
+    def apply_force(self, force):
+        # The zero forces of later steps change nothing, as in a cache of forces that act.
+        if force.any():
+            self.last = force
+
+
+class IgnoresPut(Cart):
+    name = "ignores_put"
+
+    def put(self, levels):
+        pass
+
+
 BROKEN_SIMULATORS = {
-    "check_declaration_is_complete": NoUnit,
+    "check_declaration_is_complete": NoSentence,
+    "check_units_are_known": UnknownUnit,
     "check_observations_have_the_declared_shape": WrongShape,
     "check_same_proposal_gives_the_same_bits": WarmStarted,
     "check_arguments_are_not_changed": Clobbers,
     "check_parameters_that_are_not_numbers_spoil_only_their_lane": SpoilsNeighbours,
     "check_every_parameter_shows": IgnoresHeight,
+    "check_initial_states_show": IgnoresStart,
     "check_unknown_names_are_refused": TakesAnything,
     "check_chosen_channels_are_the_same_columns": WrongColumns,
+    "check_hooks_have_the_declared_shapes": SmallInertia,
+    "check_step_goes_on_by_its_seconds": OwnClock,
+    "check_forces_act": IgnoresForces,
+    "check_levels_can_be_set": IgnoresPut,
 }
 
 
 @pytest.mark.parametrize("check", SIMULATOR_CHECKS, ids=lambda check: check.__name__)
 def test_simulator_check_rejects_its_broken_subject_and_no_sound_one(check):
     check(Wave)
+    assert check(Cart) is None
     with pytest.raises(CheckError, match=r"(?s)expected .*; found .*; see "):
         check(BROKEN_SIMULATORS[check.__name__])
+
+
+@pytest.mark.parametrize(
+    ("kind", "failing", "says"),
+    [
+        (NoSentence, "check_declaration_is_complete", "a sentence; found none"),
+        (
+            UnknownUnit,
+            "check_units_are_known",
+            "a unit for v .* found 'furlongs/fortnite'; see UnknownUnit",
+        ),
+        (
+            SmallInertia,
+            "check_hooks_have_the_declared_shapes",
+            r"inertia: expected shape \(2, 2\) \(joints × joints; here: x1, x2\) or a number; "
+            r"found \(1, 1\)",
+        ),
+        (NegativeInertia, "check_hooks_have_the_declared_shapes", "positive definite matrix"),
+        (
+            ObservesArrays,
+            "check_hooks_have_the_declared_shapes",
+            r"observe\(\), v2: expected a number; found shape \(1,\)",
+        ),
+        (
+            ForcesWithoutCoordinates,
+            "check_hooks_have_the_declared_shapes",
+            "coordinates and rates beside apply_force; found none",
+        ),
+        (
+            KeepsHeat,
+            "check_same_proposal_gives_the_same_bits",
+            "after a run with other inputs; found heat = .* in place of .* at sample 0; see "
+            "KeepsHeat.reset",
+        ),
+        (IgnoresStart, "check_initial_states_show", "initial state v2 = 0.01 in place of 0"),
+        (
+            OwnClock,
+            "check_step_goes_on_by_its_seconds",
+            "found 2.* times as far; see OwnClock.step",
+        ),
+        (IgnoresForces, "check_forces_act", "a force along x2 to change the motion"),
+        (SumsForces, "check_forces_act", "along x1 to act in the next step alone"),
+        (KeepsForces, "check_forces_act", "the same run after one with forces"),
+        (IgnoresPut, "check_levels_can_be_set", r"after put\(heat\)"),
+        (WarmStarted, "check_same_proposal_gives_the_same_bits", "in place of"),
+        (Clobbers, "check_arguments_are_not_changed", "arguments as they were"),
+        (WrongShape, "check_observations_have_the_declared_shape", "observations of shape"),
+        (
+            Raises,
+            "check_observations_have_the_declared_shape",
+            r"no exception; found IndexError: .*; see test_checks.py, line \d+, in simulate",
+        ),
+    ],
+)
+def test_one_cause_gives_one_failure(kind, failing, says, fresh_registries):
+    from bench.registry import simulators as registered
+
+    registered.register(kind)
+    failed = {}
+    for place, check in enumerate(SUITES["simulator"]):
+        if failed_need(check, failed) is None:
+            line = attempt("simulator", kind.name, place)
+            if line and not line.startswith("not applicable"):
+                failed[check] = line
+    assert [check.__name__ for check in failed] == [failing], failed
+    assert re.search(says, *failed.values())
+
+
+def test_parametrized_tests_skip_what_means_nothing_without_a_check_that_failed():
+    made = {case.id: case.values[0] for case in parametrize(KeepsHeat).args[1]}
+    ends = {}
+    for name, check in made.items():
+        try:
+            check()
+        except CheckError:
+            ends[name] = "failed"
+        except pytest.skip.Exception as skipped:
+            ends[name] = str(skipped)
+    needs = "not tested: needs 'same proposal gives the same bits'"
+    assert ends.pop("KeepsHeat-same_proposal_gives_the_same_bits") == "failed"
+    assert ends.pop("KeepsHeat-initial_states_show") == needs
+    assert set(ends.values()) == {needs}
+    assert not {"KeepsHeat-units_are_known", "KeepsHeat-unknown_names_are_refused"} & set(ends)
 
 
 def test_the_test_simulator_conforms(spring):

@@ -61,3 +61,28 @@ class Drawing(Tuner):
         while True:
             time.sleep(0.05)
             yield other.uniform(size=(1, task.dim))
+
+
+class Logging(Tuner):
+    """Writes a log in its first run, and another file beside it in every further one."""
+
+    def tune(self, task, rng):
+        yield task.start
+        name = "second.txt" if SEEN else "log.txt"
+        SEEN.append(task)
+        with open(name, "a") as file:
+            file.write("a line\n")
+
+
+class Boasting(Tuner):
+    """Answers for itself when it is asked for its files."""
+
+    def __init__(self, says="{}"):
+        self.says = says
+
+    def tune(self, task, rng):
+        from bench.sealing import inside
+
+        says = self.says
+        inside._tell_written = lambda channel, *_: channel.send(b"N", says.encode())
+        yield task.start

@@ -119,6 +119,61 @@ def test_friction_holds_against_a_constant_pull_and_lets_go_of_a_greater_one():
     assert friction.simulate(np.array([[2.0]]), pulled)[0, -1, 1] == pytest.approx(2.0, rel=0.02)
 
 
+class Coupled(OwnSimulator):
+    """Two joints whose motion is coupled by their inertia, stepped exactly between forces."""
+
+    name = "coupled"
+    parameters = (Parameter("scale", "1", 1.0, (0.5, 2.0)),)
+    channels = (Channel("q1", "rad"), Channel("q2", "rad"))
+    states = {"q1": 0.0, "q2": 0.0, "w1": 1.0, "w2": -2.0}  # noqa: RUF012
+    kind, coordinates, rates, time_step = "rotary", ("q1", "q2"), ("w1", "w2"), 1e-3
+    given = np.array([[2.0, 0.8], [0.8, 1.0]])
+
+    def reset(self, theta, constants, initial):
+        self.q = np.array([initial["q1"], initial["q2"]])
+        self.w = np.array([initial["w1"], initial["w2"]])
+        self.matrix, self.force = theta["scale"] * Coupled.given, np.zeros(2)
+
+    def step(self, inputs, seconds):
+        a = np.linalg.solve(self.matrix, self.force)
+        self.q, self.w = self.q + seconds * self.w + seconds**2 / 2 * a, self.w + seconds * a
+        self.force = np.zeros(2)
+
+    def observe(self):
+        return {"q1": self.q[0], "q2": self.q[1], "w1": self.w[0], "w2": self.w[1]}
+
+    def apply_force(self, force):
+        self.force = force
+
+    def inertia(self):
+        return self.given
+
+
+def test_dry_friction_of_coupled_joints_takes_the_inertia_matrix():
+    (seen,) = Coupled(fixed={"friction.coulomb": 3.0}).simulate(np.array([[1.0]]), Scenario(TIMES))
+    start = np.array([1.0, -2.0])
+    # The force has a constant size and acts against the momentum, whose direction it keeps.
+    momentum = Coupled.given @ start
+    rest = np.linalg.norm(momentum) / 3.0
+    np.testing.assert_allclose(seen[-1], start * rest / 2, rtol=2e-3)
+    assert TIMES[-1] > rest
+    np.testing.assert_array_equal(seen[-1], seen[-5])
+
+
+def test_an_inertia_of_another_shape_is_refused_with_the_one_that_is_expected():
+    wrong = type("Wrong", (Coupled,), {"name": "wrong", "given": np.eye(1)})
+    says = r"simulator wrong: inertia: expected shape \(2, 2\) \(joints × joints; here: q1, q2\)"
+    with pytest.raises(InputError, match=says + r" or a number, found \(1, 1\)"):
+        wrong(fixed={"friction.coulomb": 3.0}).simulate(np.array([[1.0]]), Scenario(TIMES))
+    as_matrix = type("Matrix", (Block,), {"inertia": lambda self: np.array([[self.mass]])})
+    kinds = (Block, as_matrix)
+    seen = [kind(fixed={"friction.coulomb": 1.0}).simulate(THETA, PUSHED) for kind in kinds]
+    np.testing.assert_array_equal(*seen)
+
+
+THETA = np.array([[2.0]])
+
+
 def test_effects_at_zero_change_nothing_and_tuned_ones_are_parameters():
     plain = Block().simulate(np.array([[2.0]]), PUSHED)
     block = Block(effects=["friction.coulomb", "drag.linear", "input.gain", "sensor.bias"])
@@ -170,6 +225,7 @@ def test_faulty_declarations_are_one_line():
     for changes, message in [
         ({"name": 3}, "class Faulty: expected name"),
         ({"channels": ()}, "at least one parameter and one channel"),
+        ({"kind": "slide"}, "kind: expected point, linear, rotary, found 'slide'"),
         ({"rates": ()}, r"expected a rate for each of \('x',\), found \(\)"),
         ({"coordinates": ("y",)}, "y is not among its states charge, x, v"),
         ({"levels": ("y",)}, "level y must be a state and a channel"),
@@ -185,6 +241,10 @@ def test_faulty_declarations_are_one_line():
             Block(**settings)
     with pytest.raises(InputError, match=r"observe\(\) gave no 'charge'; it gave: x, v"):
         declared(observe=lambda self: {"x": 0.0, "v": 0.0})().simulate(np.array([[1.0]]), PUSHED)
+    for value, message in [(np.zeros(3), r"found shape \(3,\)"), ("fast", "found 'fast'")]:
+        seen = {"x": value, "v": 0.0, "charge": 0.0}
+        with pytest.raises(InputError, match=r"observe\(\), x: expected a number, " + message):
+            declared(observe=lambda self, seen=seen: seen)().simulate(np.array([[1.0]]), PUSHED)
     with pytest.raises(InputError, match="the attribute 'engine' is the base class's"):
         declared(reset=lambda self, *_: setattr(self, "engine", 1))().simulate(
             np.array([[1.0]]), PUSHED
@@ -261,3 +321,60 @@ def test_puck_is_compared_as_a_plugin(tmp_path, capsys):
         line for line in capsys.readouterr().out.splitlines() if line.startswith("least_squares")
     )
     assert float(line.split()[-2]) < 1e-3, "friction is found from a second of positions"
+
+
+@pytest.mark.usefixtures("fresh_registries")
+def test_an_exception_of_its_code_is_one_line_with_its_place(tmp_path, capsys):
+    plugin, _ = extended_block(tmp_path)
+    text = plugin.read_text().replace('constants["wind"]', 'constants["wid"]')
+    plugin.write_text(text)
+    line = 1 + text[: text.index('constants["wid"]')].count("\n")
+    out = tmp_path / "log.csv"
+    assert main(["simulate", "stored_block", "--plugin", str(plugin), "--out", str(out)]) == 2
+    assert capsys.readouterr().err == (
+        f"simgap: simulator stored_block: KeyError: 'wid' (blocks.py, line {line}, in reset)\n"
+    )
+    assert not out.exists()
+
+
+def extended_block(folder):
+    """The file of a block with a friction that explain may have found, and its plugin."""
+    plugin = folder / "blocks.py"
+    text = Path(__file__).read_text()
+    body = text[text.index("class Block(") : text.index("\n\n\nTIMES = ")]
+    plugin.write_text(
+        "from sims.base import Channel, Constant, Parameter\n"
+        f"from sims.own import OwnSimulator\n\n\n{body}\n".replace('"block"', '"stored_block"')
+    )
+    file = folder / "extended.toml"
+    file.write_text(
+        'format = 1\nname = "block_extended"\nsystem = "stored_block"\nobserve = ["x", "v"]\n'
+        '[parameters.mass]\nvalue = 2.5\nunit = "kg"\n'
+        '[effects."friction.coulomb".coefficient]\nvalue = 0.25\nunit = "N"\n'
+    )
+    return plugin, file
+
+
+@pytest.mark.usefixtures("fresh_registries", "undrawn")
+def test_an_extended_own_simulator_is_simulated_checked_and_compared(tmp_path, capsys):
+    plugin, file = extended_block(tmp_path)
+    plugins = ["--plugin", str(file), "--plugin", str(plugin)]
+    log = tmp_path / "log.csv"
+    pushed = ["--input", "push=sine:2:1", "--seconds", "1", "--runs", "2"]
+    assert main(["simulate", "block_extended", *plugins, *pushed, "--out", str(log)]) == 0
+    from bench.registry import simulators
+
+    kind = simulators.get("block_extended")
+    assert [p.nominal for p in kind().parameters] == [2.5, 0.25]
+    for check in SIMULATOR_CHECKS:
+        check(kind)
+    experiment = tmp_path / "e.toml"
+    experiment.write_text(
+        'simulator = "block_extended"\nobserve = ["v"]\ntargets = 1\nbudget = 3\n'
+        "ranges = ['in']\n[sampling]\nrate = 20.0\nsamples = 20\n[initial]\nv = [0.5, 1.5]\n"
+        "[tuners.random]\n"
+    )
+    out = ["--jobs", "1", "--out", str(tmp_path / "out")]
+    capsys.readouterr()
+    assert main(["compare", str(experiment), *plugins, *out]) == 0
+    assert main(["score", str(file), str(log), "--plugin", str(plugin)]) == 0

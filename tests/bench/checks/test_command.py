@@ -1,8 +1,12 @@
 """`simgap check NAME` on sound and on broken subjects."""
 
+import json
+
 import pytest
+from jsonschema import validate
 
 from bench.cli import main
+from bench.schemas import schema
 from tests.conftest import PLUGINS
 
 CHAOS = ["--plugin", str(PLUGINS / "chaos.py")]
@@ -84,10 +88,64 @@ def test_simulators_and_effects_are_checked_by_name(capsys):
     )
     code, said = checked(capsys, "slider")
     assert (code, said.splitlines()[-1]) == (
-        0, "simulator slider (sims.slider.simulator.Slider): all 8 checks passed"
+        0,
+        "simulator slider (sims.slider.simulator.Slider): all 10 checks passed, 4 not applicable",
     )  # fmt: skip
     code, said = checked(capsys, "spring", *SPRING)
     assert code == 0, said
+
+
+LEAKY = """from simgap import Channel, OwnSimulator, Parameter
+
+
+class Leaky(OwnSimulator):
+    \"\"\"A motor whose winding is still warm when the next run begins.\"\"\"
+
+    name = "leaky"
+    parameters = (Parameter("friction", "1/s", 0.5, (0.1, 1.0)),)
+    inputs, channels = (Channel("volts", "V"),), (Channel("speed", "rad/s"),)
+    states = {"speed": 1.0}
+    warmth = 0.0
+
+    def reset(self, theta, constants, initial):
+        self.friction, self.speed = theta["friction"], initial["speed"]
+
+    def step(self, inputs, seconds):
+        self.warmth += inputs["volts"] ** 2 * seconds
+        self.speed += (inputs["volts"] / (1 + self.warmth) - self.friction * self.speed) * seconds
+
+    def observe(self):
+        return {"speed": self.speed}
+"""
+
+
+@pytest.mark.usefixtures("fresh_registries")
+def test_state_left_over_between_runs_is_one_failure_for_people_and_programs(tmp_path, capsys):
+    plugin = tmp_path / "leaky.py"
+    plugin.write_text(LEAKY)
+    code, said = checked(capsys, "leaky", "--plugin", str(plugin))
+    assert code == 1
+    assert said.count("FAILED") == 1
+    assert "FAILED  same proposal gives the same bits\n        expected the same numbers" in said
+    assert "see Leaky.reset: it must set everything that a run has changed" in said
+    needs = "not tested: needs 'same proposal gives the same bits'"
+    assert f"-       initial states show\n        {needs}" in said
+    assert said.splitlines()[-1].endswith(": 1 of 7 checks failed, 7 not tested")
+    code, said = checked(capsys, "leaky", "--plugin", str(plugin), "--json")
+    document = json.loads(said)
+    assert (code, document["passed"]) == (1, False)
+    outcomes = [check["outcome"] for check in document["checks"]]
+    assert [outcomes.count(what) for what in ("passed", "failed", "not tested")] == [6, 1, 7]
+    validate(document, schema("check"))
+
+
+@pytest.mark.usefixtures("fresh_registries")
+def test_an_exception_of_the_subject_names_its_line(tmp_path, capsys):
+    plugin = tmp_path / "leaky.py"
+    plugin.write_text(LEAKY.replace('theta["friction"]', 'theta["fiction"]'))
+    code, said = checked(capsys, "leaky", "--plugin", str(plugin))
+    assert (code, said.count("FAILED")) == (1, 1)
+    assert "simulator leaky: KeyError: 'fiction' (leaky.py, line 14, in reset)" in said
 
 
 def test_unknown_name_is_one_line(capsys):

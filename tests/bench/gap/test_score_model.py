@@ -129,3 +129,27 @@ def test_another_system_is_refused(files, tmp_path):
         InputError, match=r"arm.csv: expected a recording of pendulum, as .* is; found one of servo"
     ):
         scored(model, tmp_path / "arm.csv")
+
+
+@pytest.mark.parametrize(
+    ("settings", "option"),
+    [
+        ('{"plugin": ["mine/cart.py"]}', "--plugin mine/cart.py"),
+        ("{}", "--plugin FILE.py"),
+        ("[]", "--plugin FILE.py"),
+    ],
+)
+def test_a_file_of_an_own_simulator_names_the_option_that_it_needs(
+    tmp_path, capsys, settings, option
+):
+    from bench.cli import main
+
+    file = tmp_path / "extended.toml"
+    file.write_text('format = 1\nname = "cart_extended"\nsystem = "cart"\nobserve = ["x"]\n')
+    (tmp_path / "environment.json").write_text(f'{{"settings": {settings}}}')
+    log = tmp_path / "log.csv"
+    log.write_text("run,t,x\n1,0,0\n")
+    assert main(["score", str(file), str(log)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"simgap: {file}: extends simulator 'cart', which is not one of arm, ")
+    assert error.endswith(f"; add the file that defines it: {option}\n")
