@@ -104,7 +104,7 @@ def _hidden_package() -> str:
 
 if _hidden := _hidden_package():
     if __name__ == "__main__":
-        print(f"simgap: error: {_hidden}", file=sys.stderr)
+        sys.stderr.write(f"simgap: error: {_hidden}\n")
         sys.exit(2)
     raise ImportError(_hidden)
 

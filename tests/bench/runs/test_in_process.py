@@ -191,7 +191,7 @@ def test_simulator_of_a_notebook_is_refused_too_and_a_redefined_one_is_not_remem
         results = here(small(simulator="mine", tuners={"same": {}}))
         reasons += [status.reason for status in results.kept.statuses.values()]
     assert reasons[0] == reasons[1], "targets and tuner meet the same simulator, the new one"
-    with pytest.raises(InputError, match="simulator mine: class Mine of __main__"):
+    with pytest.raises(InputError, match="simulator mine: class Mine is defined in"):
         run(results, PLUGIN_FILES, jobs=1)
 
 
