@@ -97,3 +97,29 @@ except simgap.InputError as error:
     assert rest in line
     assert line.endswith("or pass jobs=0, which runs everything in this process")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("trust", [False, True])
+def test_a_diagnoser_of_a_script_is_refused_at_once(trust, tmp_path):
+    """It is asked in worker processes, whether it is trusted or not."""
+    (tmp_path / "first.py").write_text(
+        f"""
+import simgap
+
+@simgap.diagnosers.register
+class Guess(simgap.Diagnoser):
+    name = "guess"
+
+    def diagnose(self, case):
+        return simgap.Answer("adequate")
+
+try:
+    simgap.compare("diagnosis-small", tuners="guess", targets=1, trust={trust}, out="out")
+except simgap.InputError as error:
+    print(error)
+"""
+    )
+    (line,) = ran(tmp_path, ["first.py"])
+    assert line.startswith("diagnoser guess: class Guess is defined in the script ")
+    assert "pass tuners=['guess'], plugins=['guess.py'], or pass jobs=0" in line
+    assert not (tmp_path / "out").exists()

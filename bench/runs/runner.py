@@ -157,11 +157,17 @@ def refuse_unreachable(experiment: Experiment, workers: bool = True) -> None:
     for registry, name in used:
         added = registry.snapshot().get(name)
         if added is not None and added.path is None:
-            raise _unreachable(registry.kind, name, added.part)
+            raise unreachable(registry.kind, name, added.part)
 
 
-def _unreachable(kind: str, name: str, part: type) -> InputError:
-    """The error for a class that worker processes cannot load."""
+def unreachable(kind: str, name: str, part: type) -> InputError:
+    """The error for a class that worker processes cannot load.
+
+    Args:
+        kind: what it is, as ``tuner``.
+        name: under which it is registered.
+        part: the class.
+    """
     file = getattr(sys.modules.get(part.__module__), "__file__", None)
     main = part.__module__ == "__main__"
     where = "this session"
@@ -169,7 +175,7 @@ def _unreachable(kind: str, name: str, part: type) -> InputError:
         where = f"the script {Path(file).resolve()}" if main else str(Path(file).resolve())
     plugin = f"{name}.py" if main or not file else str(Path(file).resolve())
     move = f"put it into a file of its own, say {plugin}, and " if main or not file else ""
-    named = f"tuners=[{name!r}], " if kind == "tuner" else ""
+    named = f"tuners=[{name!r}], " if kind in ("tuner", "diagnoser") else ""
     return InputError(
         f"{kind} {name}: class {part.__qualname__} is defined in {where}, which "
         f"worker processes do not import; {move}pass {named}plugins=[{plugin!r}], or pass "
