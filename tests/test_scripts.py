@@ -1,5 +1,5 @@
-"""simgap in the files that users write: scripts without ``if __name__ == "__main__"``, text on
-stdin, files with names of packages.
+"""simgap in the files that users write: scripts without ``if __name__ == "__main__"``, classes that
+stand in them, and files with the names of simgap's packages.
 """
 
 import subprocess
@@ -30,12 +30,11 @@ print(sorted(run.statuses["tuner"].unique()), sorted(run.statuses["status"].uniq
 """
 
 
-def ran(folder, words, stdin=None):
+def ran(folder, words):
     """Run Python in a folder and return what it printed; its errors are shown where it fails."""
     done = subprocess.run(
         [sys.executable, *words],
         cwd=folder,
-        input=stdin,
         capture_output=True,
         text=True,
         check=False,
@@ -48,14 +47,13 @@ def ran(folder, words, stdin=None):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["script", "stdin"])
-def test_a_script_without_a_guard_compares_in_worker_processes(how, tmp_path):
+@pytest.mark.parametrize("words", [["first.py"], ["-m", "first"]], ids=["script", "module"])
+def test_a_script_without_a_guard_compares_in_worker_processes(words, tmp_path):
     folder = tmp_path / "my scripts"
     folder.mkdir()
     text = COMPARE.format(tuner='"cma_es", "least_squares"', more="")
     (folder / "first.py").write_text(text)
-    words, stdin = (["first.py"], None) if how == "script" else (["-"], text)
-    lines = ran(folder, words, stdin)
+    lines = ran(folder, words)
     # Once: a worker that imported the script would say it again.
     assert lines == ["the script runs", "['cma_es', 'least_squares'] ['done']"]
     assert (folder / "out" / "table.csv").is_file()

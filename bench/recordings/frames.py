@@ -12,6 +12,7 @@ from sims.base import InputError, Simulator
 from sims.recording.description import model_in
 from sims.recording.frame import Frame
 from sims.recording.recording import Recording, recording_of_frame
+from sims.user_toml import table
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,8 @@ def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame")
         meta.pop("system", None)
         meta["model"] = str(about.model)
     if about.constants:
-        meta["constants"] = {**meta.get("constants", {}), **about.constants}
+        stated = table(name, "constants", meta.get("constants", {}))
+        meta["constants"] = {**stated, **about.constants}
     kind = _kind(name, meta)
     return recording_of_frame(frame, kind, meta, about.units, name)
 

@@ -5,13 +5,13 @@ by the same rules.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from sims.base import Array, InputError, similar, unknown
+from sims.limits import is_number
 from sims.recording.description import Declared, Description, afloat, dotted
 from sims.recording.table import Table, TableRun
 from sims.user_toml import shown, table
@@ -77,55 +77,63 @@ def described(
         InputError: a column belongs to nothing, or a unit is missing.
     """
     result: dict[str, Any] = _plain(meta)
-    signals = {kind: _signals(path, result, kind, declared) for kind in ("channels", "inputs")}
     poses = afloat(declared)
-    extra = dotted(table(path, "extra", result.get("extra", {})), poses)
-    time = table(path, "time", result.get("time", {}))
-    noted = frame.attrs.get("units", {})
-    noted = noted if isinstance(noted, Mapping) else {}
-    columns = [name for name in frame.columns if name != "run"]
     usual = {**poses, **{s.name: s.unit for s in (*declared.channels, *declared.inputs)}}
+    columns = [name for name in frame.columns if name != "run"]
     for name in units:
         # One dict of units may serve frames with different columns.
         if name not in columns and name not in usual:
             raise unknown(f"column in units of {path}", name, columns)
-    stated = {**noted, **units}
+    channels = dotted(table(path, "channels", result.get("channels", {})), usual)
+    inputs = dotted(table(path, "inputs", result.get("inputs", {})), usual)
+    extra = dotted(table(path, "extra", result.get("extra", {})), poses)
+    time = table(path, "time", result.get("time", {}))
+    tables = {"channels": channels, "inputs": inputs, "extra": extra, "time": time}
 
-    stamps = time.get("column", "t")
-    if stamps in stated and ("unit" not in time or stamps in units):
-        time["unit"] = stated[stamps]
-    taken = {stamps}
-    for own in signals.values():
-        for name, entry in own.items():
-            if isinstance(entry, dict):
-                taken.add(entry.get("column", name))
-    for name in columns:
-        if name in taken or name in extra:
-            continue
+    stamps = _column("t", time)
+    taken = {stamps, *extra}
+    taken.update(_column(name, own) for name, own in (*channels.items(), *inputs.items()))
+    for name in (name for name in columns if name not in taken):
         if name in _names(declared.channels):
-            signals["channels"][name] = {}
+            channels[name] = {}
         elif name in _names(declared.inputs):
-            signals["inputs"][name] = {}
+            inputs[name] = {}
         elif name in poses:
             extra[name] = {}
         else:
             raise _belongs_to_nothing(path, name, declared)
+
+    noted = frame.attrs.get("units", {})
+    noted = noted if isinstance(noted, Mapping) else {}
+    _state_unit(time, stamps, units, noted)
     missing = {}
-    for entries in (*signals.values(), extra):
-        for name, entry in entries.items():
-            if isinstance(entry, dict):
-                column = entry.get("column", name)
-                if column in units or (column in noted and "unit" not in entry):
-                    entry["unit"] = stated[column]
-                if "unit" not in entry:
-                    missing[column] = usual.get(name, "1")
+    for name, own in (*channels.items(), *inputs.items(), *extra.items()):
+        # Whatever is no table is refused where the description is checked.
+        if isinstance(own, dict) and not _state_unit(own, _column(name, own), units, noted):
+            missing[_column(name, own)] = usual.get(name, "1")
     if missing:
         raise InputError(
-            f"{path}: expected the unit of each column, found none of {', '.join(missing)}; pass "
-            f"units={missing}, if these are the units"
+            f"{path}: expected the unit of each column, found none of "
+            f"{', '.join(map(str, missing))}; pass units={missing}, if these are the units"
         )
-    tables = {**signals, "extra": extra, "time": time}
     return {**result, **{key: entries for key, entries in tables.items() if entries}}
+
+
+def _column(name: str, own: Any) -> str:
+    """The column that a signal stands in; what is no table or text is refused elsewhere."""
+    column = own.get("column") if isinstance(own, dict) else None
+    return column if isinstance(column, str) else name
+
+
+def _state_unit(
+    own: dict[str, Any], column: str, units: Mapping[str, str], noted: Mapping[str, Any]
+) -> bool:
+    """State the unit of a column in its table; returns whether there is one."""
+    if column in units:
+        own["unit"] = units[column]
+    elif "unit" not in own and column in noted:
+        own["unit"] = noted[column]
+    return "unit" in own
 
 
 def _plain(value: Any) -> Any:
@@ -135,11 +143,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(entry) for entry in value]
     return value.item() if isinstance(value, np.generic) else value
-
-
-def _signals(path: Path, meta: Mapping[str, Any], kind: str, declared: Declared) -> dict[str, Any]:
-    """The tables of the channels or inputs that a description states."""
-    return dotted(table(path, kind, meta.get(kind, {})), _names(getattr(declared, kind)))
 
 
 def _names(signals: Iterable[Any]) -> list[str]:
@@ -223,8 +226,7 @@ class _FrameTable(Table):
         missing = cells.isna().to_numpy()
         if cells.dtype.kind not in "iuf":
             for record, cell in enumerate(cells):
-                number = isinstance(cell, Real) and not isinstance(cell, bool)
-                if not number and not missing[record]:
+                if not missing[record] and not is_number(cell):
                     self.fault(record, column, f"expected a number, found {shown(cell)}")
         values: Array = cells.to_numpy(dtype=float, na_value=np.nan)
         bad = np.isinf(values) if name in self.gaps else ~np.isfinite(values)
