@@ -10,7 +10,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from typing import Any, ClassVar
 
 import numpy as np
@@ -43,6 +42,8 @@ def unknown(kind: str, name: str, known: Sequence[str]) -> InputError:
 
 def similar(name: str, known: Iterable[str]) -> str:
     """The end of a message about an unknown name: the names that are most like it, if any are."""
+    from difflib import get_close_matches
+
     # Without case, as users write Pendulum for pendulum, and a family for one of its members.
     names = {one.lower(): one for one in known}
     wanted = name.lower()[:QUOTED]

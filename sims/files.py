@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from datetime import datetime, timezone
-from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 
@@ -51,6 +50,8 @@ def require_file(path: Path, wanted: str = "") -> None:
 
 def _similar(path: Path) -> str:
     """The end of a message about a missing file: files of similar names beside it."""
+    from difflib import get_close_matches
+
     try:
         entries = list(islice(path.parent.iterdir(), _MOST_LISTED))
     except OSError:

@@ -11,16 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from bench import study
-from bench.api.arguments import (
-    Count,
-    Expected,
-    Files,
-    Name,
-    Names,
-    Natural,
-    Seconds,
-    check_arguments,
-)
 from bench.diagnosis import columns as diagnosis
 from bench.figures import comparison
 from bench.misspecified.calibration import MODELS
@@ -46,6 +36,16 @@ from bench.store.schema import (
     SHOTS,
 )
 from methods.base import Tuner
+from sims.arguments import (
+    Count,
+    Expected,
+    Files,
+    Name,
+    Names,
+    Natural,
+    Seconds,
+    check_arguments,
+)
 from sims.base import InputError, unknown
 
 if TYPE_CHECKING:

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-from bench.api.arguments import Count, Expected, Name, Names, Seconds, check_arguments
 from bench.api.explain import Source, Sources, Units, explain, sources_of
 from bench.gap.causes.rules import MEANING
 from bench.gap.explanation import Explanation
@@ -18,6 +17,7 @@ from bench.gap.verdict import Verdict
 from bench.recordings.frames import FrameDescription
 from bench.recordings.joined import load_all
 from bench.registry import simulators
+from sims.arguments import Count, Expected, Name, Names, Seconds, check_arguments
 from sims.base import InputError
 from sims.extended import Extended, opened
 from sims.simulated import Simulated

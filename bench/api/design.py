@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from bench.api.arguments import Count, Name, Names, check_arguments
 from bench.api.explain import Sources, Units, sources_of
 from bench.gap import explain as explaining
 from bench.gap.design import Design
@@ -19,6 +18,7 @@ from bench.gap.model.crew import cores
 from bench.gap.model.watch import Watch
 from bench.gap.rig.worth import SPLITS
 from bench.recordings.frames import FrameDescription
+from sims.arguments import Count, Name, Names, check_arguments
 from sims.base import InputError
 from sims.recording.write import publish, refuse_existing
 
@@ -58,6 +58,7 @@ class NextRecording:
         what = f"it narrows what is known of all numbers together {factor:.3g} times"
         return [*lines, f"nothing is open: {what}"]
 
+    @check_arguments
     def write(self, path: str | Path) -> None:
         """Write the commands: ``t`` in s and a column for each input, in the SI units of
         `simgap list systems`, held from row to row.

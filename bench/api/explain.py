@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, cast
 
-from bench.api.arguments import Count, Expected, Name, Names, Seconds, check_arguments
 from bench.gap import explain as explaining
 from bench.gap.explanation import Explanation
 from bench.gap.model.crew import cores
@@ -16,6 +15,7 @@ from bench.gap.score_model import MODEL_FILES, scored
 from bench.recordings.frames import FrameDescription, recording_of
 from bench.recordings.simulate import SimulatedRecording
 from sims import extended as extended_file
+from sims.arguments import Count, Expected, Name, Names, Seconds, check_arguments
 from sims.base import InputError
 from sims.recording.frame import Frame
 from sims.recording.recording import Recording

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-from bench.api.arguments import Expected, Name, Names, check_arguments
 from bench.api.explain import Source, Units, sources_of
 from bench.recordings.frames import FrameDescription
 from bench.recordings.importing import Imported, checked, describe
 from bench.recordings.inspection import load
 from bench.recordings.simulate import Coefficients, SimulatedRecording, Wish, make
+from sims.arguments import Expected, Name, Names, check_arguments
 from sims.base import InputError
 from sims.recording.recording import Recording
 from sims.recording.write import refuse_existing

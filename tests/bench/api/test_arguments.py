@@ -111,6 +111,10 @@ def test_an_object_that_an_argument_cannot_be_is_refused_by_name(function, name)
         ),
         (lambda: simgap.simulate("Pendulum"), "did you mean pendulum?"),
         (lambda: simgap.simulate("pendulum", seed=1.5), "seed: expected a whole number, found 1.5"),
+        (
+            lambda: simgap.simulate("pendulum", runs=1, seconds=0.1).write(None),
+            "path: expected a path, found None",
+        ),
         (lambda: simgap.load_plugins(3), "plugins: expected a path or a list of paths, found 3"),
         (lambda: simgap.load_plugins("nope.py"), "nope.py: no such file"),
         (lambda: simgap.tuners.get(3), "unknown tuner '3'"),
