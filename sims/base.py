@@ -33,6 +33,10 @@ class InputError(ValueError):
         super().__init__(cut("".join(escaped), MESSAGE))
 
 
+_ALIKE = 0.7
+"""Least similarity (0 to 1, `difflib`) of a name that a message proposes in place of another."""
+
+
 def unknown(kind: str, name: str, known: Sequence[str]) -> InputError:
     """The error for a name that does not exist, with the names that do and those most like it."""
     listed = ", ".join(sorted(known))
@@ -48,7 +52,7 @@ def similar(name: str, known: Iterable[str]) -> str:
     names = {one.lower(): one for one in known}
     wanted = name.lower()[:QUOTED]
     begun = [one for one in names if len(wanted) >= 3 and one.startswith(wanted)]
-    near = [names[one] for one in (begun or get_close_matches(wanted, names))[:3]]
+    near = [names[one] for one in (begun or get_close_matches(wanted, names, cutoff=_ALIKE))[:3]]
     return f"; did you mean {' or '.join(near)}?" if near else ""
 
 

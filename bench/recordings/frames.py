@@ -69,6 +69,7 @@ def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame")
         stated = table(name, "constants", meta.get("constants", {}))
         meta["constants"] = {**stated, **about.constants}
     kind = _kind(name, meta)
+    meta.setdefault("title", f"{kind.name}, {name}")
     return recording_of_frame(frame, kind, meta, about.units, name)
 
 

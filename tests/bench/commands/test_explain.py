@@ -180,7 +180,7 @@ def test_bad_files_are_one_line(folder, capsys, tmp_path):
     assert "none.csv" in faulty(capsys, "explain", tmp_path / "none.csv").replace(
         "none.toml", "none.csv"
     )
-    assert "none.csv: no such file" in faulty(
+    assert "none.toml: no such file" in faulty(
         capsys, "score", tmp_path / "none.toml", folder / "swing.csv"
     )
     assert "format" in faulty(capsys, "score", folder / "swing.toml", folder / "swing.csv")
