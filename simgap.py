@@ -77,30 +77,36 @@ _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names
 __all__ = sorted([*_MODULE_OF, "main"])
 
 
-def _refuse_namesakes() -> None:
-    """Say in one line whose folder hides one of simgap's own packages, before something odd
-    happens.
+def _hidden_package() -> str:
+    """Say which file or folder would be imported in place of one of simgap's own packages.
 
-    Raises:
-        ImportError: a package that is called as one of simgap's would be imported in its place.
+    Returns:
+        One line with its path and what to do; empty if simgap's packages are found.
     """
-    home = dirname(realpath(abspath(__file__)))
+    # Two, since an installer may link each file to a cache (uv's link mode "symlink").
+    homes = {realpath(dirname(abspath(__file__))), dirname(realpath(__file__))}
     for name in ("bench", "methods", "sims"):
-        if name in sys.modules:
-            places = getattr(sys.modules[name], "__path__", [])
-        else:
-            spec = PathFinder.find_spec(name)
-            places = (spec.submodule_search_locations if spec else None) or []
-        for place in places:
-            if dirname(realpath(place)) != home:
-                raise ImportError(
-                    f"simgap cannot be imported here: the package '{name}' in {realpath(place)} "
-                    "hides "
-                    f"simgap's own; rename that folder, or run from another one"
+        module = sys.modules.get(name)
+        spec = PathFinder.find_spec(name) if module is None else getattr(module, "__spec__", None)
+        if module is None and spec is None:
+            continue  # another finder has it, as in an editable install
+        folders = list(spec.submodule_search_locations or ()) if spec is not None else []
+        file = getattr(module, "__file__", None) or (spec.origin if spec is not None else None)
+        for place in map(realpath, folders or [file or "<a module without a file>"]):
+            if dirname(place) not in homes or not folders:
+                what = "folder" if folders else "file"
+                return (
+                    f"simgap cannot be imported here: the {what} {place} hides simgap's own "
+                    f"package '{name}'; rename that {what}, or move your script out of its folder"
                 )
+    return ""
 
 
-_refuse_namesakes()
+if _hidden := _hidden_package():
+    if __name__ == "__main__":
+        sys.stderr.write(f"simgap: error: {_hidden}\n")
+        sys.exit(2)
+    raise ImportError(_hidden)
 
 
 def main(arguments: list[str] | None = None) -> int:

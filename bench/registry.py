@@ -74,7 +74,7 @@ def robot(
     return robot_simulator(read(Path(path), actuators=actuators, engine=engine), free)
 
 
-def load_plugins(paths: Iterable[str | Path]) -> None:
+def load_plugins(paths: str | Path | Iterable[str | Path]) -> None:
     """Register every tuner, simulator, effect and diagnoser that is defined in the files, once.
 
     A file ending in .toml is an extended simulator as `simgap explain` writes it, loaded after what
@@ -84,7 +84,12 @@ def load_plugins(paths: Iterable[str | Path]) -> None:
         InputError: a file is missing, does not run, or defines none of them; of this file nothing
             is registered then.
     """
-    files = [Path(path).resolve() for path in paths]
+    given = [paths] if isinstance(paths, str | Path) or not isinstance(paths, Iterable) else paths
+    files = []
+    for path in given:
+        if not isinstance(path, str | Path):
+            raise InputError(f"plugins: expected a path or a list of paths, found {path!r:.80}")
+        files.append(Path(path).resolve())
     for path in sorted(files, key=lambda file: file.suffix == ".toml"):
         if any(path in registry.paths() for registry in REGISTRIES):
             continue

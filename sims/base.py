@@ -8,14 +8,14 @@ or knows is in the `Scenario`, everything the sensors give is a `Channel`. All n
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sims.limits import LARGEST, MESSAGE, cut
+from sims.limits import LARGEST, MESSAGE, QUOTED, cut
 
 Array = NDArray[np.float64]
 
@@ -33,9 +33,27 @@ class InputError(ValueError):
         super().__init__(cut("".join(escaped), MESSAGE))
 
 
+_ALIKE = 0.7
+"""Least similarity (0 to 1, `difflib`) of a name that a message proposes in place of another."""
+
+
 def unknown(kind: str, name: str, known: Sequence[str]) -> InputError:
-    """The error for a name that does not exist, listing the names that do."""
-    return InputError(f"unknown {kind} '{cut(name)}'; there are: {', '.join(sorted(known))}")
+    """The error for a name that does not exist, with the names that do and those most like it."""
+    listed = ", ".join(sorted(known))
+    near = similar(str(name), known)
+    return InputError(f"unknown {kind} '{cut(str(name))}'; there are: {listed}{near}")
+
+
+def similar(name: str, known: Iterable[str]) -> str:
+    """The end of a message about an unknown name: the names that are most like it, if any are."""
+    from difflib import get_close_matches
+
+    # Without case, as users write Pendulum for pendulum, and a family for one of its members.
+    names = {one.lower(): one for one in known}
+    wanted = name.lower()[:QUOTED]
+    begun = [one for one in names if len(wanted) >= 3 and one.startswith(wanted)]
+    near = [names[one] for one in (begun or get_close_matches(wanted, names, cutoff=_ALIKE))[:3]]
+    return f"; did you mean {' or '.join(near)}?" if near else ""
 
 
 def frozen(values: ArrayLike) -> Array:

@@ -11,12 +11,54 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from datetime import datetime, timezone
+from itertools import islice
 from pathlib import Path
 
 from sims.base import InputError
+from sims.limits import cut
 
 Content = str | bytes
 """Of a file; text is written as UTF-8."""
+
+
+_MOST_LISTED = 10_000
+"""Maximum number of a folder's entries among which similar names are looked for."""
+
+
+def require_file(path: Path, wanted: str = "") -> None:
+    """Refuse a path where there is no file.
+
+    Args:
+        path: of the file.
+        wanted: what was expected, for the message; may be empty.
+
+    Raises:
+        InputError: there is none; the message names files of similar names in that folder.
+    """
+    expected = f"; expected {wanted}" if wanted else ""
+    try:
+        if path.is_file():
+            return
+        exists = path.exists()
+    except (OSError, ValueError) as error:  # too long, or with a null character
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"{cut(str(path))}: not a path ({why})") from None
+    if exists:
+        raise InputError(f"{path}: not a file{expected}")
+    raise InputError(f"{path}: no such file{expected}{_similar(path)}")
+
+
+def _similar(path: Path) -> str:
+    """The end of a message about a missing file: files of similar names beside it."""
+    from difflib import get_close_matches
+
+    try:
+        entries = list(islice(path.parent.iterdir(), _MOST_LISTED))
+    except OSError:
+        return "" if path.parent.is_dir() else f"; there is no folder '{path.parent}'"
+    stems = {entry.stem: entry.name for entry in entries if entry.suffix == path.suffix}
+    near = [stems[stem] for stem in get_close_matches(path.stem, stems, n=3)]
+    return f"; did you mean {' or '.join(near)}?" if near else ""
 
 
 def write(path: Path, content: Content) -> None:

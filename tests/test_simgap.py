@@ -52,17 +52,34 @@ def test_the_import_takes_less_than_five_milliseconds_and_brings_nothing_heavy(t
 
 
 @pytest.mark.parametrize("name", ["bench", "methods", "sims"])
-def test_a_folder_that_hides_a_package_is_named_in_one_line(name, tmp_path):
-    (tmp_path / name).mkdir()
-    (tmp_path / name / "__init__.py").write_text("")
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_what_hides_a_package_is_named_in_one_line(name, kind, tmp_path):
+    place = tmp_path / (f"{name}.py" if kind == "file" else name)
+    if kind == "folder":
+        place.mkdir()
+    (place if kind == "file" else place / "__init__.py").write_text("")
+    wanted = (
+        f"simgap cannot be imported here: the {kind} {place.resolve()} hides simgap's own package "
+        f"'{name}'; rename that {kind}, or move your script out of its folder"
+    )
     said = python("import simgap", tmp_path)
     assert said.returncode == 1
-    last = said.stderr.strip().splitlines()[-1]
-    assert last.startswith(f"ImportError: simgap cannot be imported here: the package '{name}' in")
-    assert str(tmp_path.resolve() / name) in last
+    assert said.stderr.strip().splitlines()[-1] == f"ImportError: {wanted}"
     # Imported before simgap, it hides the other way round.
     path = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import {name}; import simgap"
-    assert str(tmp_path.resolve() / name) in python(path, "/").stderr
+    assert python(path, "/").stderr.strip().splitlines()[-1] == f"ImportError: {wanted}"
+    # `python -m simgap` in that folder: one line and the exit code of a wrong input.
+    said = python("import runpy; runpy.run_module('simgap', run_name='__main__')", tmp_path)
+    assert (said.returncode, said.stderr) == (2, f"simgap: error: {wanted}\n")
+
+
+def test_a_script_beside_a_file_that_hides_a_package_is_refused(tmp_path):
+    """The folder of the script counts, not the working folder."""
+    (tmp_path / "sims.py").write_text("")
+    (tmp_path / "mine.py").write_text("import simgap")
+    script = f"import runpy, sys; sys.path[0] = {str(tmp_path)!r}; runpy.run_path('mine.py')"
+    said = python(script, tmp_path)
+    assert str(tmp_path.resolve() / "sims.py") in said.stderr.strip().splitlines()[-1]
 
 
 def test_a_folder_of_that_name_without_a_package_in_it_does_no_harm(tmp_path):

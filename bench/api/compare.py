@@ -8,14 +8,14 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from bench import study
 from bench.diagnosis import columns as diagnosis
 from bench.figures import comparison
 from bench.misspecified.calibration import MODELS
 from bench.problem.asked import asked
-from bench.problem.experiment import Experiment, load
+from bench.problem.experiment import Experiment, load, names
 from bench.problem.problem import Problem
 from bench.problem.robots import completed
 from bench.registry import diagnosers
@@ -36,6 +36,16 @@ from bench.store.schema import (
     SHOTS,
 )
 from methods.base import Tuner
+from sims.arguments import (
+    Count,
+    Expected,
+    Files,
+    Name,
+    Names,
+    Natural,
+    Seconds,
+    check_arguments,
+)
 from sims.base import InputError, unknown
 
 if TYPE_CHECKING:
@@ -56,25 +66,42 @@ _ROWS = 200
 """Rows of a table that a notebook shows."""
 
 
+AnExperiment: TypeAlias = Annotated[
+    str | Path | Experiment,
+    Expected("the name of an experiment, the path of its TOML file or an Experiment"),
+]
+"""What is compared."""
+Tuners: TypeAlias = Annotated[
+    Sequence[Name | type[Tuner]],
+    Expected("names of tuners or subclasses of Tuner, as ['cma_es', 'random']"),
+]
+"""Who is compared."""
+RecordingFile: TypeAlias = Annotated[
+    str | Path, Expected("the path of NAME.csv, which results are traced to")
+]
+"""A recording that must be in a file."""
+
+
+@check_arguments
 def compare(
-    experiment: str | Path | Experiment | None = None,
+    experiment: AnExperiment | None = None,
     *,
     model: str | Path | None = None,
-    recording: str | Path | None = None,
-    free: Sequence[str] = (),
-    tuners: Sequence[str | type[Tuner]] | None = None,
-    targets: int | None = None,
-    seeds: int | None = None,
-    budget: int | None = None,
-    training_budget: int | None = None,
-    timeout: float | None = None,
-    memory: int | None = None,
-    jobs: int = 2,
+    recording: RecordingFile | None = None,
+    free: Names = (),
+    tuners: Tuners | None = None,
+    targets: Count | None = None,
+    seeds: Count | None = None,
+    budget: Count | None = None,
+    training_budget: Count | None = None,
+    timeout: Seconds | None = None,
+    memory: Natural | None = None,
+    jobs: Natural = 2,
     trust: bool = False,
-    isolation: str | None = None,
+    isolation: Name | None = None,
     salt: str | None = None,
     out: str | Path | None = None,
-    plugins: Sequence[str | Path] = (),
+    plugins: Files = (),
     cluster: str | None = None,
     progress: Progress | None = None,
     force: bool = False,
@@ -111,6 +138,12 @@ def compare(
     Raises:
         InputError: a fault in what was asked for, in one line; nothing has been run then.
     """
+    if experiment is None and not (model or recording or free):
+        raise InputError(
+            "compare: expected an experiment, as simgap.compare('ball-drop'), or a robot, as "
+            "simgap.compare(model='robot.xml', free=['damping@*']); experiments are "
+            f"{', '.join(names())}"
+        )
     files = [str(Path(plugin).resolve()) for plugin in plugins]
     chosen = choose(
         given(wanted(experiment, model, recording, free), files, trust or not jobs, isolation),
@@ -133,14 +166,15 @@ def compare(
     return _made(begun, jobs, progress, pool)
 
 
+@check_arguments
 def sweep(
-    experiment: str | Path | Experiment,
+    experiment: AnExperiment,
     *,
-    jobs: int = 2,
+    jobs: Natural = 2,
     trust: bool = False,
     salt: str | None = None,
     out: str | Path | None = None,
-    plugins: Sequence[str | Path] = (),
+    plugins: Files = (),
     progress: Progress | None = None,
     force: bool = False,
 ) -> list[Compared]:
@@ -317,6 +351,7 @@ class Compared:
         InputError: the folder is not that of a comparison.
     """
 
+    @check_arguments
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self.experiment: Experiment = study.opened(self.folder).configuration.experiment

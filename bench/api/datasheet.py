@@ -3,35 +3,48 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated, Any, TypeAlias
 
-from bench.api.explain import Source, explain, sources_of
+from bench.api.explain import Source, Sources, Units, explain, sources_of
 from bench.gap.causes.rules import MEANING
 from bench.gap.explanation import Explanation
 from bench.gap.sheet.sheet import DataSheet, sheet
 from bench.gap.sheet.subject import subject_of
 from bench.gap.verdict import Verdict
+from bench.recordings.frames import FrameDescription
 from bench.recordings.joined import load_all
 from bench.registry import simulators
+from sims.arguments import Count, Expected, Name, Names, Seconds, check_arguments
 from sims.base import InputError
 from sims.extended import Extended, opened
 from sims.simulated import Simulated
 
+Explained: TypeAlias = Annotated[
+    str | Path | Explanation,
+    Expected("an Explanation (of explain), or the folder that it was written to"),
+]
+"""What `explain` has found."""
 
+
+@check_arguments
 def datasheet(
-    recording: Source | Sequence[Source],
+    recording: Sources,
     *,
-    joint: str | None = None,
-    name: str | None = None,
-    explained: str | Path | Explanation | None = None,
-    system: str | None = None,
+    joint: Name | None = None,
+    name: Name | None = None,
+    explained: Explained | None = None,
+    system: Name | None = None,
     model: str | Path | None = None,
-    free: Sequence[str] = (),
+    units: Units | None = None,
+    constants: Mapping[str, float] | None = None,
+    description: Mapping[str, Any] | None = None,
+    free: Names = (),
     force: bool = False,
-    budget: float | None = None,
-    jobs: int | None = None,
+    budget: Seconds | None = None,
+    jobs: Count | None = None,
     say: Callable[[str], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float, str], None] | None = None,
@@ -46,6 +59,9 @@ def datasheet(
             None to explain them now.
         system: as for `explain`, and so what follows.
         model: see there.
+        units: see there.
+        constants: see there.
+        description: see there.
         free: see there.
         force: see there.
         budget: see there.
@@ -58,7 +74,8 @@ def datasheet(
         InputError: as `explain`; or there is no such joint, or the folder is not one that explain
             has written, or of other logs.
     """
-    sources = sources_of(recording)
+    about = FrameDescription(system, model, units or {}, constants or {}, description or {})
+    sources = sources_of(recording, about)
     if explained is None:
         refuse_joint(sources, joint, system, model, free)
         explained = explain(

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from bench.api.explain import Source, sources_of
+from bench.api.explain import Sources, Units, sources_of
 from bench.gap import explain as explaining
 from bench.gap.design import Design
 from bench.gap.explanation import Explanation
 from bench.gap.model.crew import cores
 from bench.gap.model.watch import Watch
 from bench.gap.rig.worth import SPLITS
+from bench.recordings.frames import FrameDescription
+from sims.arguments import Count, Name, Names, check_arguments
 from sims.base import InputError
 from sims.recording.write import publish, refuse_existing
 
@@ -55,6 +58,7 @@ class NextRecording:
         what = f"it narrows what is known of all numbers together {factor:.3g} times"
         return [*lines, f"nothing is open: {what}"]
 
+    @check_arguments
     def write(self, path: str | Path) -> None:
         """Write the commands: ``t`` in s and a column for each input, in the SI units of
         `simgap list systems`, held from row to row.
@@ -94,15 +98,19 @@ def _told(found: Design) -> list[str]:
     return lines
 
 
+@check_arguments
 def design(
-    recording: Source | Sequence[Source],
+    recording: Sources,
     *,
     seconds: float = 4.0,
     longest: float | None = None,
-    system: str | None = None,
+    system: Name | None = None,
     model: str | Path | None = None,
-    free: Sequence[str] = (),
-    jobs: int | None = None,
+    units: Units | None = None,
+    constants: Mapping[str, float] | None = None,
+    description: Mapping[str, Any] | None = None,
+    free: Names = (),
+    jobs: Count | None = None,
     say: Callable[[str], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float, str], None] | None = None,
@@ -117,6 +125,9 @@ def design(
             as long where it is not given.
         system: as for `explain`.
         model: as for `explain`.
+        units: as for `explain`.
+        constants: as for `explain`.
+        description: as for `explain`.
         free: as for `explain`.
         jobs: as for `explain`.
         say: as for `explain`.
@@ -132,5 +143,7 @@ def design(
     if not seconds <= most <= LONGEST:
         raise InputError(f"longest: expected {seconds:g} to {LONGEST:g}, found {most!r}")
     watch = Watch(None, stop, progress)
-    given = sources_of(recording), seconds, most, system, model, free, say, watch, jobs or cores()
+    about = FrameDescription(system, model, units or {}, constants or {}, description or {})
+    sources = sources_of(recording, about)
+    given = sources, seconds, most, system, model, free, say, watch, jobs or cores()
     return NextRecording(*explaining.explain_and_design(*given))

@@ -2,37 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, cast
 
 from bench.gap import explain as explaining
 from bench.gap.explanation import Explanation
 from bench.gap.model.crew import cores
 from bench.gap.model.watch import Watch
-from bench.gap.score_model import scored
+from bench.gap.score_model import MODEL_FILES, scored
+from bench.recordings.frames import FrameDescription, recording_of
 from bench.recordings.simulate import SimulatedRecording
+from sims import extended as extended_file
+from sims.arguments import Count, Expected, Name, Names, Seconds, check_arguments
 from sims.base import InputError
+from sims.recording.frame import Frame
 from sims.recording.recording import Recording
 
-Source: TypeAlias = str | Path | Recording | SimulatedRecording
+_RECORDING = (
+    "the path of NAME.csv, a Recording (of read_recording), a SimulatedRecording (of simulate) or "
+    "a pandas DataFrame"
+)
+Source: TypeAlias = Annotated[
+    str | Path | Recording | SimulatedRecording | Frame, Expected(_RECORDING)
+]
 """What holds a recording."""
+Sources: TypeAlias = Annotated[
+    Source | Sequence[Source], Expected(f"{_RECORDING}, or a list of these")
+]
+"""What holds one recording, or several."""
+Units: TypeAlias = Annotated[
+    Mapping[str, str], Expected("units of columns by their names, as {'q': 'rad'}")
+]
+"""Of the columns of a data frame, by name."""
 
 
+@check_arguments
 def explain(
-    recording: Source | Sequence[Source],
+    recording: Sources,
     *,
-    system: str | None = None,
+    system: Name | None = None,
     model: str | Path | None = None,
-    engine: str = "batch",
-    free: Sequence[str] = (),
-    tuner: str | None = None,
+    units: Units | None = None,
+    constants: Mapping[str, float] | None = None,
+    description: Mapping[str, Any] | None = None,
+    engine: Name = "batch",
+    free: Names = (),
+    tuner: Name | None = None,
     seed: int = 0,
     force: bool = False,
-    budget: float | None = None,
-    jobs: int | None = None,
+    budget: Seconds | None = None,
+    jobs: Count | None = None,
     whole: bool = False,
-    pieces: float | None = None,
+    pieces: Seconds | None = None,
     thorough: bool = False,
     say: Callable[[str], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
@@ -41,10 +64,14 @@ def explain(
     """Show what the simulation of a recording gets wrong, name the cause, extend the simulator.
 
     Args:
-        recording: the path of ``NAME.csv``, or a recording that was read or simulated; several of
-            one system are explained together, and each beside that by itself.
-        system: take it for this system, whatever the description says.
+        recording: the path of ``NAME.csv``, a recording that was read or simulated, or a pandas
+            DataFrame (`read_recording` says what its columns are); several of one system are
+            explained together, and each also by itself.
+        system: take it for this system, whatever the description says; a DataFrame needs it, or:
         model: take it for this robot, whatever the description says: an MJCF or URDF.
+        units: of the columns of a DataFrame.
+        constants: known numbers of the system, with a DataFrame.
+        description: anything else about a DataFrame, with the keys of ``NAME.toml``.
         engine: pybullet, mujoco or batch; a simulator that steps itself has its own.
         free: constants to estimate with the parameters; of a robot numbers of its file, as
             ``damping@*`` or ``mass@forearm``.
@@ -68,40 +95,65 @@ def explain(
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
             or the budget is no number above 0, or ended before anything could be simulated.
     """
-    sources = sources_of(recording)
-    if budget is not None and not budget > 0:
-        raise InputError(f"budget: expected a number of seconds above 0, found {budget!r}")
-    if jobs is not None and jobs < 1:
-        raise InputError(f"jobs: expected a whole number of at least 1, found {jobs!r}")
-    if pieces is not None and not pieces > 0:
-        raise InputError(f"pieces: expected a number of seconds above 0, found {pieces!r}")
+    about = FrameDescription(system, model, units or {}, constants or {}, description or {})
+    sources = sources_of(recording, about)
     watch = Watch(budget, stop, progress)
     given = system, engine, seed, free, tuner, say, force
     more = jobs or cores(), model, whole, pieces, thorough
     return explaining.explain(sources, *given, watch, *more)
 
 
-def sources_of(recording: Source | Sequence[Source]) -> list[str | Path | Recording]:
-    """One or several, each as a path or as what was read.
+def sources_of(
+    recording: Source | Sequence[Source], about: FrameDescription | None = None
+) -> list[str | Path | Recording]:
+    """One or several recordings, each as a path or as a recording in memory.
+
+    Args:
+        recording: one, or several.
+        about: what the user states of data frames among them.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, a data frame is malformed, or `about` states something of what is
+            no data frame.
     """
-    each = [recording] if isinstance(recording, Source) else list(recording)
+    about = about or FrameDescription()
+    single = isinstance(recording, str | Path | Recording | SimulatedRecording | Frame)
+    each: list[Any] = [recording] if single else [*cast(Sequence[Source], recording)]
     if not each:
-        raise InputError("expected a recording, found none")
-    return [one.recording if isinstance(one, SimulatedRecording) else one for one in each]
+        raise InputError(f"recording: expected {_RECORDING}, found an empty list")
+    frames = [one for one in each if isinstance(one, Frame)]
+    sources: list[str | Path | Recording] = []
+    for one in each:
+        if isinstance(one, Frame):
+            number = f" {len(sources) + 1}" if len(each) > 1 else ""
+            sources.append(recording_of(one, about, f"DataFrame{number}"))
+        else:
+            if not frames:
+                about.refuse_for_files(one)
+            sources.append(one.recording if isinstance(one, SimulatedRecording) else one)
+    return sources
 
 
+@check_arguments
 def score(
-    model: str | Path, recording: str | Path, *, held_out: bool = False, force: bool = False
+    model: str | Path,
+    recording: Source,
+    *,
+    units: Units | None = None,
+    constants: Mapping[str, float] | None = None,
+    description: Mapping[str, Any] | None = None,
+    held_out: bool = False,
+    force: bool = False,
 ) -> dict[str, Any]:
     """The error of an extended simulator on another recording; initial states are estimated there,
     nothing else.
 
     Args:
         model: extended.toml, or a robot's model file, as extended.xml.
-        recording: the path of ``NAME.csv``.
+        recording: as in `explain`; a DataFrame is of the model's system.
+        units: as in `explain`.
+        constants: as in `explain`.
+        description: as in `explain`.
         held_out: count only runs that are marked so.
         force: as in `explain`.
 
@@ -111,4 +163,20 @@ def score(
     Raises:
         InputError: a file cannot be read, or the recording is of another system.
     """
-    return scored(Path(model), Path(recording), held_out, force)
+    about = FrameDescription(None, None, units or {}, constants or {}, description or {})
+    if isinstance(recording, Frame):
+        about = _of_model(Path(model), about)
+    (source,) = sources_of(recording, about)
+    return scored(Path(model), source, held_out, force)
+
+
+def _of_model(model: Path, about: FrameDescription) -> FrameDescription:
+    """What is stated of a data frame, of the system or robot that a model is of."""
+    if model.suffix in MODEL_FILES:
+        return replace(about, model=model)
+    extended = extended_file.read(model)
+    robot = extended.robot
+    if robot is None:
+        return replace(about, system=extended.system)
+    stated = {"actuators": robot.actuators, "engine": robot.engine}
+    return replace(about, model=robot.path, description={**stated, **about.description})

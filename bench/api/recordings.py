@@ -4,33 +4,55 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
+from bench.api.explain import Source, Units, sources_of
+from bench.recordings.frames import FrameDescription
 from bench.recordings.importing import Imported, checked, describe
 from bench.recordings.inspection import load
 from bench.recordings.simulate import Coefficients, SimulatedRecording, Wish, make
+from sims.arguments import Expected, Name, Names, check_arguments
 from sims.base import InputError
 from sims.recording.recording import Recording
 from sims.recording.write import refuse_existing
 from sims.robot.reading import read
 
+Effects: TypeAlias = Annotated[
+    Mapping[str, Coefficients],
+    Expected("coefficients by the names of effects, as {'drag.linear': 2e-4}"),
+]
+"""Effects that act."""
+InputSignal: TypeAlias = Annotated[
+    float | str, Expected("a number or the text of a signal, as 'sine:2:0.5'")
+]
+"""What is put in."""
+InitialState: TypeAlias = Annotated[
+    float | tuple[float, float], Expected("a number or (low, high)")
+]
+"""Where each run begins, or the range from which it is drawn."""
+Logs: TypeAlias = Annotated[
+    str | Path | Sequence[str | Path], Expected("the path of a log, or a list of paths")
+]
+"""Files of one run, or folders that each hold those of one."""
 
+
+@check_arguments
 def simulate(
-    system: str = "",
+    system: Name = "",
     *,
     model: str | Path | None = None,
     actuators: Mapping[str, Any] | None = None,
     parameters: Mapping[str, float] | Sequence[float] | None = None,
-    effects: Mapping[str, Coefficients] | None = None,
+    effects: Effects | None = None,
     constants: Mapping[str, float] | None = None,
     noise: float | Mapping[str, float] = 0.0,
-    inputs: Mapping[str, float | str] | None = None,
-    initial: Mapping[str, float | tuple[float, float]] | None = None,
-    observe: Sequence[str] = (),
+    inputs: Mapping[str, InputSignal] | None = None,
+    initial: Mapping[str, InitialState] | None = None,
+    observe: Names = (),
     runs: int = 4,
     seconds: float = 4.0,
     rate: float = 100.0,
-    engine: str | None = None,
+    engine: Name | None = None,
     seed: int = 0,
     held_out: int | None = None,
     force: bool = False,
@@ -82,25 +104,45 @@ def simulate(
     )
 
 
-def read_recording(path: str | Path, system: str | None = None) -> Recording:
-    """Read and check ``NAME.csv`` with ``NAME.toml`` beside it.
+@check_arguments
+def read_recording(
+    path: Source,
+    system: Name | None = None,
+    *,
+    model: str | Path | None = None,
+    units: Units | None = None,
+    constants: Mapping[str, float] | None = None,
+    description: Mapping[str, Any] | None = None,
+) -> Recording:
+    """Read and check ``NAME.csv`` with ``NAME.toml`` beside it, or a pandas DataFrame.
+
+    The columns of a DataFrame are those of ``NAME.csv``: ``run`` (not needed for a single run),
+    ``t`` in seconds, and channels and inputs under their names in the system; a missing sample is
+    NaN. ``run`` and ``t`` may be levels of its index.
 
     Args:
-        path: the table.
-        system: take it for this system, whatever the description says.
+        path: the table, or a DataFrame.
+        system: take it for this system, whatever the description says; a DataFrame needs it, or:
+        model: take it for this robot, whatever the description says: an MJCF or URDF.
+        units: of a DataFrame's columns by name; those in ``df.attrs["units"]`` without.
+        constants: known numbers of the system in SI units, with a DataFrame.
+        description: anything else about a DataFrame, with the keys of ``NAME.toml``.
 
     Raises:
         InputError: anything malformed, in one line.
     """
-    return load(Path(path), system)[0]
+    about = FrameDescription(system, model, units or {}, constants or {}, description or {})
+    (source,) = sources_of(path, about)
+    return load(source, system, model)[0]
 
 
+@check_arguments
 def import_logs(
-    logs: str | Path | Sequence[str | Path],
+    logs: Logs,
     model: str | Path,
     out: str | Path,
     *,
-    held_out: Sequence[str] = (),
+    held_out: Names = (),
 ) -> Imported:
     """Describe a robot's logs as they lie: write the toml by which every command reads them.
 

@@ -26,7 +26,7 @@ from bench.runs.begun import begun
 from bench.runs.housing import ahead_of
 from bench.runs.identity import refuse_changes
 from bench.runs.pools import Call, LostError, Pool, pool_of
-from bench.runs.runner import Progress, silent
+from bench.runs.runner import Progress, silent, unreachable
 from bench.runs.sources import digest, plugin_files, rooms, source, versions
 from bench.runs.survey import admit, enter, foreign, installed
 from bench.runs.training import folder as trained
@@ -83,6 +83,8 @@ class DiagnosisStudy:
         settings = settings_of(experiment)
         new = begun(experiment, folder, jobs, salt)
         sheet(settings)
+        if jobs:
+            _refuse_unreachable(settings.diagnosers)
         for name in settings.diagnosers:
             _announced(name, new.experiment.trusted)
         return cls(new.write(plugins, _fingerprint(new.experiment, plugins)))
@@ -329,6 +331,18 @@ def code_of(name: str) -> Tuned:
     # Packages that are imported where they are needed would be imported anew for each answer.
     ahead = ahead_of(file or (own.origin or "" if own else "")) if file or own else ()
     return Tuned(name, module, file, {}, ahead)
+
+
+def _refuse_unreachable(names: Sequence[str]) -> None:
+    """Refuse diagnosers that exist in this process alone, if worker processes are to ask them.
+
+    Raises:
+        InputError: one is a class of a script or a notebook.
+    """
+    for name in names:
+        added = diagnosers.snapshot().get(name)
+        if added is not None and added.path is None:
+            raise unreachable("diagnoser", name, added.part)
 
 
 def _announced(name: str, trusted: bool) -> None:

@@ -23,6 +23,7 @@ from bench.gap.robot_files import RobotFiles, robot_files
 from bench.gap.verdict import Cause, Verdict
 from bench.pages.elements import framed
 from sims import extended as extending
+from sims.arguments import check_arguments
 from sims.base import InputError
 from sims.extended import Extended
 from sims.files import Content, write_all
@@ -73,6 +74,7 @@ class Explanation:
         """
         return pictures.figure(self.story, name)
 
+    @check_arguments
     def write(self, folder: str | Path) -> list[Path]:
         """Write verdict.json, extended.toml, the figures and report.html: all of them or none. Of
         several runs also apart.csv, and for a robot extended.xml, and extended.urdf for one from a

@@ -21,40 +21,49 @@ from bench.registry import robot, simulators
 from bench.store.made import environment
 from sims.base import Array, InputError, unknown
 from sims.extended import Extended, opened, read
-from sims.recording.description import model_of
-from sims.recording.recording import read_recording, system_of
+from sims.recording.description import ModelFile, model_of
+from sims.recording.recording import Recording, read_recording, system_of
 from sims.simulated import Simulated
 
-_MODEL_FILES = (".xml", ".mjcf", ".urdf")
+MODEL_FILES = (".xml", ".mjcf", ".urdf")
 """Endings of a robot's files."""
 
 
 def scored(
-    model: Path, recording: Path, held_out: bool = False, force: bool = False
+    model: Path, recording: str | Path | Recording, held_out: bool = False, force: bool = False
 ) -> dict[str, Any]:
     """RMSE by channel in its unit, in units of the noise over all channels, runs and samples
     counted.
 
     Args:
         model: extended.toml, or a robot's model file, as extended.xml.
-        recording: the table.
+        recording: the table, or a recording that is in memory.
         held_out: count only runs that are marked so.
         force: whether the user insists on a recording that is refused otherwise.
 
     Raises:
         InputError: a file cannot be read, or the recording is of another system.
     """
-    extended, kind = _opened(model, recording)
+    memory = recording if isinstance(recording, Recording) else None
+    path = recording.path if isinstance(recording, Recording) else Path(recording)
+    # The description of a file says what it is a recording of, before the table is read.
+    of_robot = memory.model if memory is not None else model_of(path)
+    if model.suffix in MODEL_FILES:
+        extended, kind = _robot(model, of_robot)
+    else:
+        _check_plugin(model)
+        extended, kind, _ = opened(model, simulators.get)
+        # Another robot's recording shows by its channels.
+        if of_robot is None or extended.robot is None:
+            _check_system(path, _system(memory or path, of_robot), extended, model)
     # Every run counts, unless asked otherwise: nothing is fitted here but initial states.
-    data = read_recording(recording, kind, whole=True)
+    data = memory or read_recording(path, kind, whole=True)
     # What the recording states of itself stands above what the model was fitted with.
     data = replace(data, constants={**extended.constants, **data.constants})
     runs = data.held_out() if held_out else data.runs
     if not runs:
-        raise InputError(
-            f"{recording}: no run is marked held_out, and only such runs were to count"
-        )
-    _check_channels(recording, extended, list(runs[0].channels))
+        raise InputError(f"{path}: no run is marked held_out, and only such runs were to count")
+    _check_channels(path, extended, list(runs[0].channels))
     engine = None if kind.own_engine else extended.engine
     refuse_huge(data)
     refuse_odd(data, kind, force)
@@ -71,18 +80,8 @@ def scored(
     squares = _squares(world, _simulated(world, extended, sigma))
     world.close()
     if not np.isfinite(squares).all():
-        raise InputError(f"{recording}: the simulation failed with the parameters of {model}")
+        raise InputError(f"{path}: the simulation failed with the parameters of {model}")
     return _errors(world, squares, sigma)
-
-
-def _opened(model: Path, recording: Path) -> tuple[Extended, type[Simulated]]:
-    """What is scored, and the simulator of its system."""
-    if model.suffix in _MODEL_FILES:
-        return _robot(model, recording)
-    _check_plugin(model)
-    extended, kind, _ = opened(model, simulators.get)
-    _check_system(recording, extended, model)
-    return extended, kind
 
 
 def _check_plugin(model: Path) -> None:
@@ -106,11 +105,10 @@ def _check_plugin(model: Path) -> None:
     )
 
 
-def _robot(model: Path, recording: Path) -> tuple[Extended, type[Simulated]]:
+def _robot(model: Path, stated: ModelFile | None) -> tuple[Extended, type[Simulated]]:
     """A robot as its file states it: no number of it is fitted, no effect is added."""
     from sims.robot.reading import read as read_robot
 
-    stated = model_of(recording)
     tables = stated.actuators if stated else {}
     # A file that explain has written has the recording's actuators already.
     there = {actuator.name for actuator in read_robot(model).actuators}
@@ -121,16 +119,19 @@ def _robot(model: Path, recording: Path) -> tuple[Extended, type[Simulated]]:
     return Extended(kind.name, kind.name, None, "", {}, {}, {}, (), kind), kind
 
 
-def _check_system(recording: Path, extended: Extended, model: Path) -> None:
-    """Refuse a recording of something else; another robot's shows by its channels."""
-    of_robot = model_of(recording)
-    if of_robot is not None and extended.robot is not None:
-        return
-    other = of_robot.path.name if of_robot else system_of(recording)
-    if other not in (extended.system, extended.name):
+def _system(recording: Path | Recording, of_robot: ModelFile | None) -> str:
+    """What a recording says that it is of: the name of a robot's model file, or of a system."""
+    if of_robot is not None:
+        return of_robot.path.name
+    return recording.system if isinstance(recording, Recording) else system_of(recording)
+
+
+def _check_system(recording: Path, system: str, extended: Extended, model: Path) -> None:
+    """Refuse a recording of another system."""
+    if system not in (extended.system, extended.name):
         raise InputError(
             f"{recording}: expected a recording of {extended.system}, as {model} is; "
-            f"found one of {other}"
+            f"found one of {system}"
         )
 
 

@@ -11,6 +11,7 @@ from bench.problem.entries import Entry
 from bench.problem.experiment import Experiment, HeldOut, Source, plain_name
 from bench.problem.robots import completed
 from sims.base import InputError
+from sims.files import require_file
 from sims.recording.description import model_of
 
 TUNERS = (
@@ -54,8 +55,7 @@ def asked(
     if file is None:
         said = f"{recording}: its description" if recording is not None else "compare"
         raise InputError(f'{said}: expected model = "robot.xml" or --model FILE, found none')
-    if not file.is_file():
-        raise InputError(f"{file}: {'not a file' if file.exists() else 'no such file'}")
+    require_file(file)
     parts = [file.stem] if recording is None else [file.stem, Path(recording).stem]
     to = f"tuned to {Path(recording).name}" if recording is not None else "tuned to simulations"
     whole = Experiment(

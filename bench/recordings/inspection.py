@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from bench.recordings.facts import declared, run_facts, signal_facts
 from bench.registry import robot, simulators
 from sims.base import InputError, Simulator
 from sims.limits import LARGEST
-from sims.recording.description import model_of
+from sims.recording.description import ModelFile, model_of
 from sims.recording.recording import Recording, Run, divided, read_recording, system_of
 
 _MOST_RUNS = 40
@@ -72,9 +73,9 @@ def kind_of(
     if system is not None and model is not None:
         raise InputError("expected a system or a model file, found both; leave one out")
     if isinstance(source, Recording):
-        if model is not None:
-            return robot(model, free=free)
         of_file = source.model
+        if model is not None:
+            of_file = replace(of_file or ModelFile(Path(), {}, {}), path=Path(model))
     else:
         of_file = None if system is not None else model_of(path, model)
     if of_file is not None and system is None:

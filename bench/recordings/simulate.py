@@ -18,6 +18,7 @@ from bench.problem.signals import signal
 from bench.recordings.size import check_simulated
 from bench.registry import robot, simulators
 from sims import effects as library
+from sims.arguments import check_arguments
 from sims.base import Array, InputError, Scenario, Simulator
 from sims.limits import BRIEFEST, FASTEST, LARGEST, cut, is_number
 from sims.recording.description import ModelFile, afloat
@@ -96,6 +97,7 @@ class SimulatedRecording:
     truth: Mapping[str, Any] = field(repr=False)
     simulator: Simulator = field(repr=False)
 
+    @check_arguments
     def write(self, path: str | Path) -> list[Path]:
         """Write the table, its description and its truth: all three or none; returns their paths.
 

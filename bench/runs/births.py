@@ -1,33 +1,73 @@
-"""Fresh interpreters that no Ctrl-C reaches before they can say that it is not theirs to answer."""
+"""Worker processes in fresh interpreters: they do not import the user's script, and no Ctrl-C
+reaches them before they have said that it is the parent's to answer.
+"""
 
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
+from multiprocessing import resource_tracker, spawn
 from multiprocessing.context import SpawnContext, SpawnProcess
+from typing import Any
 
 
-class _HeldBack(SpawnProcess):
-    """A process that begins with interrupts held back, until `ignore_interrupts` is called in it.
+class WorkerProcess(SpawnProcess):
+    """A spawned process that does not import the parent's main module, and that starts with
+    interrupts held back until it calls `ignore_interrupts`.
 
-    A terminal's Ctrl-C reaches every process of the group. One that is at its imports, before any
-    line of ours has run, would end with a traceback in the midst of the table.
+    A worker needs nothing of the main module: plugins are loaded by their files. Without this,
+    multiprocessing would run a script that has no ``if __name__ == "__main__"`` again in each
+    worker.
+
+    A terminal's Ctrl-C reaches every process of the group. A process that is still importing would
+    end with a traceback in the midst of the table.
     """
 
     def start(self) -> None:
         """Start it."""
-        # It lets interrupts through again once it has started its own process: so first of all.
+        # The resource tracker lets interrupts through again once it has started its own process,
+        # so it must be running before they are held back.
         resource_tracker.ensure_running()
-        with _interrupts_held_back():
+        with _interrupts_held_back(), _main_module_left_out():
             super().start()
 
 
-class HeldBackContext(SpawnContext):
-    """multiprocessing's spawn context, with processes that interrupts wait for."""
+class WorkerContext(SpawnContext):
+    """multiprocessing's spawn context with `WorkerProcess` as its process."""
 
-    Process = _HeldBack
+    Process = WorkerProcess
+
+
+_MAIN_MODULE_KEYS = ("init_main_from_name", "init_main_from_path")
+"""Keys of multiprocessing's preparation data that make a child import the main module."""
+_preparing = threading.RLock()
+"""Held while `spawn.get_preparation_data` is replaced."""
+
+
+@contextmanager
+def _main_module_left_out() -> Iterator[None]:
+    """Within the block, processes that this thread spawns do not import the main module.
+
+    multiprocessing has no option for this. The preparation data is made inside ``Popen._launch``,
+    so the function that makes it is replaced for the calls of this thread.
+    """
+    with _preparing:
+        original, thread = spawn.get_preparation_data, threading.get_ident()
+
+        def without_main(name: str) -> dict[str, Any]:
+            data: dict[str, Any] = original(name)
+            if threading.get_ident() == thread:
+                for key in _MAIN_MODULE_KEYS:
+                    data.pop(key, None)
+            return data
+
+        spawn.get_preparation_data = without_main
+        try:
+            yield
+        finally:
+            spawn.get_preparation_data = original
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol
 
-from bench.runs.births import HeldBackContext
+from bench.runs.births import WorkerContext
 from bench.runs.guard import initialise
 from bench.runs.threads import THREADS, one_thread
 from bench.sealing.ended import how_it_ended
@@ -243,7 +243,7 @@ class _Slot:
         from pebble import ProcessPool
 
         # Not forked: a fork inherits the parent's memory, and in it the truth.
-        context = HeldBackContext()
+        context = WorkerContext()
         # Each process that the pool starts tells of its birth here: a second one means that the
         # first is dead, which pebble does not notice where it exited with code 0.
         self._births, telling = context.Pipe(duplex=False)

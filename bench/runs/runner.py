@@ -5,10 +5,12 @@ run is kept the moment it ends.
 from __future__ import annotations
 
 import math
+import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 from bench.problem.experiment import Entry, Experiment
@@ -139,18 +141,18 @@ def check(experiment: Experiment) -> dict[str, str]:
 
 
 def refuse_unreachable(experiment: Experiment, workers: bool = True) -> None:
-    """Refuse classes that this process alone has, for work in other processes.
+    """Refuse classes that exist in this process alone, if other processes are to work with them.
 
-    A worker starts afresh, so that no tuner finds a truth in its memory; it gets plugin files and
-    installed packages, and not what a notebook's cell or a script defined. So does the process of
-    a tuner.
+    A worker starts afresh, so that no tuner finds the true parameters in its memory. It loads
+    plugin files and installed packages, and does not import the script or notebook that calls
+    simgap. The same holds for the process of a tuner.
 
     Args:
         experiment: what is to be run.
-        workers: whether worker processes simulate; else the processes of tuners are all there are.
+        workers: whether worker processes simulate; else only tuners have processes.
 
     Raises:
-        InputError: the simulator, a tuner or an effect is one.
+        InputError: the simulator, a tuner or an effect is such a class.
     """
     tuned: list[tuple[Registry[Any], str]] = [(tuners, e.tuner) for e in experiment.tuners]
     used = tuned
@@ -161,12 +163,30 @@ def refuse_unreachable(experiment: Experiment, workers: bool = True) -> None:
     for registry, name in used:
         added = registry.snapshot().get(name)
         if added is not None and added.path is None:
-            raise InputError(
-                f"{registry.kind} {name}: class {added.part.__qualname__} of "
-                f"{added.part.__module__} exists in this process alone, and worker processes load "
-                "files; use jobs=0, which runs everything here and trusts the tuners, or put the "
-                "class into a file and give that as a plugin"
-            )
+            raise unreachable(registry.kind, name, added.part)
+
+
+def unreachable(kind: str, name: str, part: type) -> InputError:
+    """The error for a class that worker processes cannot load.
+
+    Args:
+        kind: what it is, as ``tuner``.
+        name: under which it is registered.
+        part: the class.
+    """
+    file = getattr(sys.modules.get(part.__module__), "__file__", None)
+    main = part.__module__ == "__main__"
+    where = "this session"
+    if file:
+        where = f"the script {Path(file).resolve()}" if main else str(Path(file).resolve())
+    plugin = f"{name}.py" if main or not file else str(Path(file).resolve())
+    move = f"put it into a file of its own, say {plugin}, and " if main or not file else ""
+    named = f"tuners=[{name!r}], " if kind in ("tuner", "diagnoser") else ""
+    return InputError(
+        f"{kind} {name}: class {part.__qualname__} is defined in {where}, which "
+        f"worker processes do not import; {move}pass {named}plugins=[{plugin!r}], or pass "
+        "jobs=0, which runs everything in this process"
+    )
 
 
 def prepare(experiment: Experiment, salt: str | None = None) -> Results:

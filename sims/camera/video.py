@@ -16,7 +16,7 @@ import numpy as np
 from sims.base import Array, InputError
 from sims.camera.packages import imported
 from sims.camera.render import Image
-from sims.files import replacing
+from sims.files import replacing, require_file
 from sims.recording.write import publish, refuse_existing
 
 _FRAMES = (1e-3, 1e7)
@@ -122,8 +122,7 @@ class Video:
     """
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
-        if not path.is_file():
-            raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+        require_file(path)
         if fps is not None and not _FRAMES[0] <= fps <= _FRAMES[1]:
             wanted = f"more than 0, from {_FRAMES[0]:g} to {_FRAMES[1]:g}"
             raise InputError(f"frames a second, {fps:g}: expected {wanted}")

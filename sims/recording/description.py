@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from sims.base import Channel, InputError, Simulator
+from sims.files import require_file
 from sims.recording.mapping import Sources, read_sources
 from sims.recording.units import Scale, scale
 from sims.system import System
@@ -117,8 +118,22 @@ def model_of(path: str | Path, model: str | Path | None = None) -> ModelFile | N
     Raises:
         InputError: the description is missing or malformed, or states both.
     """
-    description = description_of(Path(path))
-    meta = read_toml(description)
+    return model_in(*read_meta(Path(path)), model)
+
+
+def model_in(
+    description: Path, meta: Mapping[str, Any], model: str | Path | None = None
+) -> ModelFile | None:
+    """The model file that a description states; None where it states a system.
+
+    Args:
+        description: its path, which messages begin with; the model file is found from its folder.
+        meta: its content.
+        model: a model file in place of the one that it states.
+
+    Raises:
+        InputError: it is malformed, or states both.
+    """
     if model is None and "model" not in meta:
         return None
     if model is None:
@@ -147,8 +162,7 @@ def system_of(path: str | Path) -> str:
     Raises:
         InputError: the description is missing or malformed, or states none.
     """
-    description = description_of(Path(path))
-    return _system(description, read_toml(description))
+    return _system(*read_meta(Path(path)))
 
 
 def description_of(table: Path) -> Path:
@@ -162,13 +176,41 @@ def description_of(table: Path) -> Path:
     return table.with_suffix(".toml")
 
 
-def read_description(path: Path, declared: Declared) -> Description:
-    """Read `NAME.toml` and check it against the system's channels, inputs, constants and states.
+def read_meta(table: Path) -> tuple[Path, dict[str, Any]]:
+    """The path and the content of the description of a recording.
+
+    Args:
+        table: `NAME.csv`, or `NAME.toml` itself.
+
+    Raises:
+        InputError: the recording or its description is missing, or it is not TOML.
+    """
+    description = description_of(table)
+    try:
+        missing = not description.exists()
+    except (OSError, ValueError):  # not a path: `require_file` says why
+        missing = True
+    if missing:
+        # The message is about the file that the user named.
+        require_file(table, "a recording, NAME.csv with NAME.toml beside it")
+        raise InputError(
+            f"{description}: no such file; expected the description of {table.name}: its system or "
+            "model, its channels and their units"
+        )
+    return description, read_toml(description)
+
+
+def check_description(path: Path, meta: Mapping[str, Any], declared: Declared) -> Description:
+    """Check a description against the system's channels, inputs, constants and states.
+
+    Args:
+        path: what messages begin with.
+        meta: its content, as in `NAME.toml`.
+        declared: the system, or a simulator of it.
 
     Raises:
         InputError: anything malformed, in one line.
     """
-    meta = read_toml(path)
     _known(path, "", meta, _KEYS)
     if "free" in meta and "model" not in meta:
         raise fault(path, "free", "it with model = FILE alone (else --free A,B)", meta["free"])
@@ -235,7 +277,7 @@ def afloat(declared: Declared) -> Mapping[str, str]:
 def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: Declared) -> None:
     """Refuse what floats among the channels, and say where it belongs."""
     units = afloat(declared)
-    given = _dotted(table(path, "channels", meta.get("channels", {})), units)
+    given = dotted(table(path, "channels", meta.get("channels", {})), units)
     for name in (name for name in units if name in given):
         raise InputError(
             f"{path}: channel {name}: expected a joint or a sensor, found where a body floats; as "
@@ -248,12 +290,12 @@ def _columns(
 ) -> dict[str, _Column]:
     """The columns of one kind, channel or input, each with its scale."""
     units = {signal.name: signal.unit for signal in declared}
-    given = _dotted(table(path, f"{kind}s", meta.get(f"{kind}s", {})), units)
+    given = dotted(table(path, f"{kind}s", meta.get(f"{kind}s", {})), units)
     known(f"{kind} in {path}", given, units)
     return {name: _column(path, kind, name, own, units[name]) for name, own in given.items()}
 
 
-def _dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+def dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
     """Entries whose names have dots, which TOML takes for tables in tables unless they are quoted:
     ``[channels.q.elbow]`` is ``q.elbow``.
     """
@@ -262,7 +304,7 @@ def _dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
         inside = isinstance(value, dict) and name not in names
         if inside and any(known.startswith(f"{name}.") for known in names):
             within = {f"{name}.{key}": entry for key, entry in value.items()}
-            result.update(_dotted(within, names))
+            result.update(dotted(within, names))
         else:
             result[name] = value
     return result
@@ -318,7 +360,7 @@ def _extra(path: Path, meta: Mapping[str, Any], declared: Declared) -> dict[str,
     # A channel left out by mistake must not pass for a column that nobody uses.
     taken = ["run", "t", *(signal.name for signal in (*declared.channels, *declared.inputs))]
     units = {}
-    given = _dotted(table(path, "extra", meta.get("extra", {})), afloat(declared))
+    given = dotted(table(path, "extra", meta.get("extra", {})), afloat(declared))
     for name, entry in given.items():
         if name in taken:
             remedy = "declare it as channel or input"
@@ -367,7 +409,7 @@ def _constants(path: Path, where: str, value: Any, declared: Declared) -> dict[s
 
 
 def _numbers(path: Path, where: str, value: Any, allowed: Collection[str]) -> dict[str, float]:
-    given = _dotted(table(path, where, value), allowed)
+    given = dotted(table(path, where, value), allowed)
     _known(path, where, given, allowed)
     return {name: finite(path, f"{where}.{name}", number) for name, number in given.items()}
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.base import Array, InputError, frozen
+from sims.files import require_file
 from sims.recording import bags, lerobot
 from sims.recording.columnar import WIDEST, columns_of, unreadable
 from sims.user_toml import shown
@@ -136,8 +137,7 @@ def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> Log:
     if bags.is_bag(path):
         there = ", ".join(bags.topics(path))
         raise InputError(f"{path}: a bag; name a topic of it, as {path.name}/TOPIC: {there}")
-    if not path.is_file():
-        raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+    require_file(path)
     kind = path.suffix.lower()
     if kind not in _READERS:
         kinds = ", ".join(FORMATS)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,12 +21,13 @@ from sims.recording.description import (
     Description,
     ModelFile,
     RunMarks,
+    check_description,
     check_names,
-    description_of,
-    model_of,
-    read_description,
+    model_in,
+    read_meta,
     system_of,
 )
+from sims.recording.frame import Frame, described, read_frame, with_index
 from sims.recording.mapping import read_logs
 from sims.recording.table import TableRun, read_table
 from sims.recording.units import SAME, Scale
@@ -151,8 +153,8 @@ def read_recording(path: str | Path, declared: Declared, whole: bool = False) ->
         InputError: anything malformed, in one line.
     """
     table = Path(path)
-    description = description_of(table)
-    about = read_description(description, declared)
+    description, meta = read_meta(table)
+    about = check_description(description, meta, declared)
     columns = list(about.channels), list(about.inputs)
     if about.sources.stated:
         parts = read_logs(table.with_suffix(".csv"), about.sources, *columns, about.linear)
@@ -170,7 +172,45 @@ def read_recording(path: str | Path, declared: Declared, whole: bool = False) ->
         about.noise,
         kept,
         about.extra,
-        model_of(table),
+        model_in(description, meta),
+    )
+
+
+def recording_of_frame(
+    frame: Frame,
+    declared: Declared,
+    meta: Mapping[str, Any],
+    units: Mapping[str, str],
+    name: str = "DataFrame",
+) -> Recording:
+    """A recording in a data frame, checked as `read_recording` checks files; nothing is held out
+    but the runs that are marked.
+
+    Args:
+        frame: columns ``run`` (where there are several), ``t`` and one for each channel and input.
+        declared: the system, or a simulator of it.
+        meta: its description, with the keys of `NAME.toml`.
+        units: of columns, by name; else those of `meta` and of ``frame.attrs["units"]``.
+        name: what messages call it.
+
+    Raises:
+        InputError: anything malformed, in one line.
+    """
+    path = Path(name)
+    whole = with_index(path, frame)
+    stated = described(path, whole, declared, meta, units)
+    about = check_description(path, stated, declared)
+    parts = read_frame(path, whole, about)
+    check_names(path, about.runs, [part.name for part in parts])
+    return Recording(
+        path,
+        about.system,
+        about.title,
+        about.constants,
+        about.noise,
+        tuple(_run(path, part, about) for part in parts),
+        about.extra,
+        model_in(path, stated),
     )
 
 

@@ -17,6 +17,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from sims.base import Array, InputError, frozen
+from sims.files import require_file
 from sims.limits import BRIEFEST, LATEST, NAME
 from sims.recording.fast import WORTHWHILE, read_fast
 from sims.user_toml import shown
@@ -48,10 +49,9 @@ def read_table(
     Raises:
         InputError: anything malformed, in one line.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+    require_file(path)
     try:
-        return _Table(path, channels, inputs, extra).read()
+        return Table(path, channels, inputs, extra).read()
     except UnicodeDecodeError:
         raise _not_text(path) from None
     except OSError as error:
@@ -73,7 +73,16 @@ def _not_text(path: Path) -> InputError:
     return InputError(f"{path}: expected UTF-8 text")
 
 
-class _Table:
+class Table:
+    """The table of a CSV file; what its rows must be holds of every table (`runs`).
+
+    Args:
+        path: what messages begin with.
+        channels: names of what was measured; a cell may be empty.
+        inputs: names of what was put in; no cell may be empty.
+        extra: names of other columns; a cell may be empty.
+    """
+
     def __init__(
         self, path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str]
     ) -> None:
@@ -83,6 +92,7 @@ class _Table:
         self.channels, self.inputs = channels, inputs
 
     def read(self) -> list[TableRun]:
+        """The runs of the file."""
         records = self._records()
         header = self._header(next(records, []))
         quick = None
@@ -90,12 +100,7 @@ class _Table:
             quick = read_fast(self.path, header, self.wanted[1:], self.gaps)
         # whatever the fast reader did not like is looked at cell by cell, and gets its message
         names, columns = quick or self._cells(header, records)
-        if not names:
-            raise InputError(f"{self.path}: expected rows of data, found none")
-        for name in self.channels:
-            if np.isnan(columns[name]).all():
-                raise InputError(f"{self.path}: column {name} has no sample; leave the channel out")
-        return self._runs(names, columns)
+        return self.runs(names, columns)
 
     def _cells(
         self, header: list[str], records: Iterator[list[str]]
@@ -186,31 +191,45 @@ class _Table:
         if not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
             missing = name in self.inputs and not cell.strip()
             more = "; an input has no missing samples" if missing else ""
-            self._fault(record, name, f"expected a finite number, found {shown(cell)}{more}")
+            self.fault(record, name, f"expected a finite number, found {shown(cell)}{more}")
 
-    def _runs(self, names: list[str], columns: dict[str, Array]) -> list[TableRun]:
-        """The runs, each a stretch of rows of one name."""
+    def runs(self, names: list[str], columns: dict[str, Array]) -> list[TableRun]:
+        """The runs, each a stretch of rows of one name.
+
+        Args:
+            names: of the run of each row.
+            columns: times ``t`` and all other columns by name; NaN where a cell is empty.
+
+        Raises:
+            InputError: there are no rows; a run has no name, too few rows or no sample; or time
+                does not increase.
+        """
+        if not names:
+            raise InputError(f"{self.path}: expected rows of data, found none")
+        for name in self.channels:
+            if np.isnan(columns[name]).all():
+                raise InputError(f"{self.path}: column {name} has no sample; leave the channel out")
         edges = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(names)) if a != b), len(names)]
         self._increasing(columns["t"], edges)
         runs: dict[str, TableRun] = {}
         for begin, end in pairwise(edges):
             name = names[begin]
             if not name:
-                self._fault(begin, "run", "expected the name of a run, found none")
+                self.fault(begin, "run", "expected the name of a run, found none")
             if len(name) > NAME:
                 wanted = f"a name of at most {NAME} characters"
-                self._fault(begin, "run", f"expected {wanted}, found {shown(name)}")
+                self.fault(begin, "run", f"expected {wanted}, found {shown(name)}")
             if name in runs:
-                self._fault(
+                self.fault(
                     begin,
                     "run",
                     f"run {shown(name)} goes on after another began; expected its rows together",
                 )
             part = {c: frozen(columns[c][begin:end]) for c in self.wanted[2:]}
             if end - begin < 2:
-                self._fault(begin, "run", f"run {shown(name)} has one row; expected at least two")
+                self.fault(begin, "run", f"run {shown(name)} has one row; expected at least two")
             if not any(np.isfinite(part[c]).any() for c in self.channels):
-                self._fault(
+                self.fault(
                     begin, self.channels[0], f"run {shown(name)} has no sample of any channel"
                 )
             self._seconds(columns["t"], begin, end - 1)
@@ -222,12 +241,12 @@ class _Table:
         latest = max(-t[first], t[last])
         if latest > LATEST:
             years = f"{latest:.4g}, which would be {latest / _YEAR:.2g} years"
-            self._fault(
+            self.fault(
                 last, "t", f"expected seconds, found {years}; are these milliseconds or less?"
             )
         lasts = t[last] - t[first]
         if lasts < BRIEFEST:
-            self._fault(last, "t", f"expected seconds, found a run of {lasts:.3g} s")
+            self.fault(last, "t", f"expected seconds, found a run of {lasts:.3g} s")
 
     def _increasing(self, t: Array, edges: list[int]) -> None:
         """Check the times between edges."""
@@ -237,10 +256,15 @@ class _Table:
         bad[begins - 1] = False
         if bad.any():
             i = int(np.argmax(bad))
-            self._fault(i + 1, "t", f"expected more than {t[i]:.12g} s, found {t[i + 1]:.12g} s")
+            self.fault(i + 1, "t", f"expected more than {t[i]:.12g} s, found {t[i + 1]:.12g} s")
 
-    def _fault(self, record: int, column: str, message: str) -> NoReturn:
-        raise InputError(f"{self.path}, row {self._line(record)}, column {column}: {message}")
+    def fault(self, record: int, column: str, message: str) -> NoReturn:
+        """Refuse a cell."""
+        raise InputError(f"{self.row(record)}, column {column}: {message}")
+
+    def row(self, record: int) -> str:
+        """Where row `record` (from 0) stands, as a message says it."""
+        return f"{self.path}, row {self._line(record)}"
 
     def _line(self, record: int) -> int:
         """The line on which row `record` (from 0) ends: read again, as only a fault asks for it."""

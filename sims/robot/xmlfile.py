@@ -13,6 +13,7 @@ from xml.etree.ElementTree import Element, tostring
 from xml.parsers import expat
 
 from sims.base import InputError
+from sims.files import require_file
 
 LARGEST = 50 * 2**20
 """Bytes of a model file with all that it includes."""
@@ -62,8 +63,7 @@ class Files:
         Raises:
             InputError: it cannot be read, or is too large.
         """
-        if not path.is_file():
-            raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+        require_file(path)
         try:
             size = path.stat().st_size
             if size > most:

@@ -17,6 +17,7 @@ from bench.gap.sheet.reach import shown
 from bench.gap.sheet.subject import Subject, subject_of
 from bench.gap.verdict import Verdict
 from bench.recordings.pieces import cut
+from sims.arguments import check_arguments
 from sims.base import InputError, unknown
 from sims.extended import Extended
 from sims.files import Content, write_all
@@ -27,6 +28,7 @@ from sims.system import FAMILY
 class DataSheet(Facts):
     """The data sheet of a joint or actuator."""
 
+    @check_arguments
     def write(self, folder: str | Path) -> list[Path]:
         """Write sheet.toml, .html and .pdf, class.xml and models that use it: all or none. The
         folder is made where it is missing.

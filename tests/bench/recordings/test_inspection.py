@@ -153,7 +153,7 @@ def test_thinning_keeps_the_extremes():
 
 def test_faults_are_one_line(odd, tmp_path, capsys):
     for arguments, message in [
-        ([str(tmp_path / "none.csv")], "none.toml: no such file"),
+        ([str(tmp_path / "none.csv")], "none.csv: no such file"),
         ([str(odd), "--system", "serv"], f"{odd}: unknown simulator 'serv'; there are: "),
         ([str(odd), "--system", "ball"], "unknown channel in"),
         ([str(odd), "--out", str(odd / "below")], "cannot be written (Not a directory)"),

@@ -149,12 +149,12 @@ def test_class_of_a_notebook_is_refused_for_workers_before_anything_is_written(
 ):
     in_a_cell(monkeypatch, "return ''")
     experiment = small(tuners={"mine": {}})
-    with pytest.raises(InputError, match="tuner mine: class Mine of __main__ exists in this") as e:
+    with pytest.raises(InputError, match="tuner mine: class Mine is defined in") as e:
         Comparison.begin(experiment, PLUGIN_FILES, tmp_path / "out", jobs=2)
     assert "jobs=0" in str(e.value)
     assert "\n" not in str(e.value)
     assert not (tmp_path / "out").exists()
-    with pytest.raises(InputError, match="exists in this process alone"):
+    with pytest.raises(InputError, match="which worker processes do not import"):
         run(prepare(experiment), PLUGIN_FILES, jobs=1)
 
 
@@ -191,7 +191,7 @@ def test_simulator_of_a_notebook_is_refused_too_and_a_redefined_one_is_not_remem
         results = here(small(simulator="mine", tuners={"same": {}}))
         reasons += [status.reason for status in results.kept.statuses.values()]
     assert reasons[0] == reasons[1], "targets and tuner meet the same simulator, the new one"
-    with pytest.raises(InputError, match="simulator mine: class Mine of __main__"):
+    with pytest.raises(InputError, match="simulator mine: class Mine is defined in"):
         run(results, PLUGIN_FILES, jobs=1)
 
 

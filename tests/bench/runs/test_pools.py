@@ -9,7 +9,7 @@ import numpy as np
 import psutil
 import pytest
 
-from bench.runs.births import HeldBackContext, ignore_interrupts
+from bench.runs.births import WorkerContext, ignore_interrupts
 from bench.runs.pools import RETRIES, DeathError, LocalPool
 from bench.runs.survey import Plugin
 from bench.sealing.memory import memory_limit
@@ -191,7 +191,7 @@ def leave_when_told():
 
 def test_an_interrupt_waits_for_a_worker_that_is_not_there_yet():
     """Ctrl-C goes to the whole group; a worker at its imports would end with a traceback."""
-    assert interrupted_at_birth(HeldBackContext()) == 7
+    assert interrupted_at_birth(WorkerContext()) == 7
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 

@@ -232,7 +232,7 @@ def test_faulty_description_is_one_line_that_says_where(tmp_path, toml, message)
 
 
 def test_missing_files(tmp_path):
-    with pytest.raises(InputError, match=r"none.toml: no such file"):
+    with pytest.raises(InputError, match=r"none.csv: no such file"):
         read_recording(tmp_path / "none.csv", Cart)
     path = written(tmp_path)
     path.unlink()

@@ -1,0 +1,90 @@
+"""Recordings in pandas data frames, of the systems and robots that are registered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bench.registry import robot, simulators
+from sims.base import InputError, Simulator
+from sims.recording.description import model_in
+from sims.recording.frame import Frame
+from sims.recording.recording import Recording, recording_of_frame
+from sims.user_toml import table
+
+
+@dataclass(frozen=True)
+class FrameDescription:
+    """What a user states of a data frame, which has no `NAME.toml` beside it.
+
+    Attributes:
+        system: registered name of the system.
+        model: a robot's model file, in place of a system.
+        units: of columns, by name.
+        constants: known numbers of the system, SI units.
+        description: anything else, with the keys of `NAME.toml`.
+    """
+
+    system: str | None = None
+    model: str | Path | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    description: Mapping[str, Any] = field(default_factory=dict)
+
+    def refuse_for_files(self, recording: object) -> None:
+        """Refuse words about a data frame where the recording is none.
+
+        Raises:
+            InputError: units, constants or a description are given.
+        """
+        for name in ("units", "constants", "description"):
+            if getattr(self, name):
+                raise InputError(
+                    f"{name}: expected only with a DataFrame; {recording} has a description, "
+                    "which states them"
+                )
+
+
+def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame") -> Recording:
+    """The recording in a data frame; nothing is held out but the runs that are marked.
+
+    Args:
+        frame: columns ``run`` (where there are several), ``t`` and one for each channel and input.
+        about: what the user states of it.
+        name: what messages call it.
+
+    Raises:
+        InputError: anything malformed, in one line.
+    """
+    meta = dict(about.description)
+    if about.system is not None:
+        meta.pop("model", None)
+        meta["system"] = about.system
+    if about.model is not None:
+        meta.pop("system", None)
+        meta["model"] = str(about.model)
+    if about.constants:
+        stated = table(name, "constants", meta.get("constants", {}))
+        meta["constants"] = {**stated, **about.constants}
+    kind = _kind(name, meta)
+    meta.setdefault("title", f"{kind.name}, {name}")
+    return recording_of_frame(frame, kind, meta, about.units, name)
+
+
+def _kind(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
+    """The simulator of the system or robot that a description states."""
+    file = model_in(Path(name), meta)
+    if file is not None:
+        return robot(file.path, file.actuators, file.engine, file.free)
+    system = meta.get("system")
+    if not isinstance(system, str):
+        raise InputError(
+            f"{name}: expected what it is a recording of: system='NAME' or model='robot.xml'; "
+            f"systems are {', '.join(simulators.names())}"
+        )
+    try:
+        return simulators.get(system)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
