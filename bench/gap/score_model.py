@@ -46,12 +46,13 @@ def scored(
     """
     memory = recording if isinstance(recording, Recording) else None
     path = recording.path if isinstance(recording, Recording) else Path(recording)
+    if model.suffix not in MODEL_FILES:
+        _check_plugin(model)
     # The description of a file says what it is a recording of, before the table is read.
     of_robot = memory.model if memory is not None else model_of(path)
     if model.suffix in MODEL_FILES:
         extended, kind = _robot(model, of_robot)
     else:
-        _check_plugin(model)
         extended, kind, _ = opened(model, simulators.get)
         # Another robot's recording shows by its channels.
         if of_robot is None or extended.robot is None:
