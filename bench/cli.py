@@ -31,6 +31,7 @@ from bench.commands.completion import add_completion
 from bench.commands.datasheet import add_datasheet
 from bench.commands.design import add_design
 from bench.commands.diff import add_diff
+from bench.commands.download import add_download
 from bench.commands.explain import add_explain, add_score
 from bench.commands.film import add_film, add_track
 from bench.commands.importing import add_import
@@ -70,6 +71,7 @@ COMMANDS = (
         add_list,
         "list tuners, simulators, systems, effects, diagnosers, experiments, references or schemas",
     ),
+    ("download", add_download, "get a public data set that an experiment needs, or list them"),
     ("schema", add_schema, "print the JSON schema of what a command prints with --json"),
     ("info", add_info, "versions, engines, platform and paths, for a report of a fault"),
     ("completion", add_completion, "print a script by which a shell completes simgap's commands"),
