@@ -35,13 +35,13 @@ def _experiment(each: Document) -> list[str]:
     """A line for an experiment: what it lacks on this machine, its sentence, its tags."""
     lacks = []
     if each["skipped"]:
-        lacks.append(f"skipped: {each['skipped']}.")
+        lacks.append(f"skipped: {each['skipped']}")
     if each["needs"]:
-        lacks.append(f"needs `{each['needs']}`.")
+        lacks.append(f"needs `{each['needs']}`")
     if each["tuners_skipped"] and not each["skipped"]:
         reasons = "; ".join(sorted(set(each["tuners_skipped"].values())))
-        lacks.append(f"without {', '.join(each['tuners_skipped'])}: {reasons}.")
-    words = " ".join((*lacks, each["says"]))
+        lacks.append(f"without {', '.join(each['tuners_skipped'])}: {reasons}")
+    words = f"{'; '.join(lacks)}. {each['says']}" if lacks else each["says"]
     return [f"{each['name']:22} {words} [{', '.join(each['tags'])}]"]
 
 

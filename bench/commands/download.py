@@ -22,6 +22,7 @@ def add_download(parser: argparse.ArgumentParser) -> None:
         "names",
         metavar="NAME",
         nargs="*",
+        default=[],
         help="data sets to download, or `all`; without a name the data sets are listed",
     )
     parser.add_argument(

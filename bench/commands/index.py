@@ -63,7 +63,7 @@ def _option(action: argparse.Action) -> Document:
         "choices": list(action.choices) if action.choices else None,
         "default": default,
         "required": action.required,
-        "several": action.nargs == "+",
+        "several": action.nargs in ("+", "*"),
         "repeatable": isinstance(action, argparse._AppendAction | argparse._ExtendAction),
         "says": action.help or "",
     }

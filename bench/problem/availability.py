@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from bench.datasets import catalogue as datasets
 from bench.datasets.catalogue import DataSet
-from bench.problem.experiment import Experiment
+from bench.problem.experiment import Experiment, expand
 from bench.problem.robots import missing
 from bench.registry import SkippedError, simulators, tuners
 from sims.engines import NAMES, missing_packages
@@ -30,14 +30,38 @@ class Availability:
 
 
 def availability(experiment: Experiment) -> Availability:
-    """Find what is missing for an experiment, without loading simulators or tuners that are
-    here.
-    """
+    """Find what is missing for an experiment; for one that names others, for all of them."""
+    if experiment.experiments:
+        return _together(experiment)
     data_set = _missing_data_set(experiment)
     skipped = "" if data_set else missing(experiment)
     return Availability(
-        data_set, skipped or _missing_engine(experiment), dict(_missing_tuners(experiment))
+        data_set,
+        skipped or _missing_simulator(experiment) or _missing_engine(experiment),
+        _missing_tuners(experiment),
     )
+
+
+def _together(experiment: Experiment) -> Availability:
+    """What is missing for the experiments that one names."""
+    parts = {each.name: availability(each) for each in expand(experiment)}
+    data_sets = [part.data_set for part in parts.values() if part.data_set]
+    skipped = [f"{name} {part.skipped}" for name, part in parts.items() if part.skipped]
+    absent = {label: why for part in parts.values() for label, why in part.tuners.items()}
+    return Availability(next(iter(data_sets), None), "; ".join(skipped), absent)
+
+
+def _missing_simulator(experiment: Experiment) -> str:
+    """Why the simulator of an experiment cannot be used here; empty where it can, or where it is
+    not a registered one.
+    """
+    if experiment.model or experiment.simulator not in simulators.names():
+        return ""
+    try:
+        simulators.get(experiment.simulator)
+    except SkippedError as error:
+        return error.reason
+    return ""
 
 
 def _missing_data_set(experiment: Experiment) -> DataSet | None:
@@ -69,15 +93,12 @@ def _missing_engine(experiment: Experiment) -> str:
 
 
 def _default_engine(experiment: Experiment) -> str:
-    """The engine of an experiment that names none."""
+    """The engine of an experiment that names none; empty where its simulator is not known."""
     if experiment.model:
         return "mujoco"
-    if not experiment.simulator or experiment.simulator not in simulators.names():
+    if experiment.simulator not in simulators.names():
         return ""
-    try:
-        return str(getattr(simulators.get(experiment.simulator), "default_engine", ""))
-    except SkippedError:
-        return ""
+    return str(getattr(simulators.get(experiment.simulator), "default_engine", ""))
 
 
 def _missing_tuners(experiment: Experiment) -> Mapping[str, str]:

@@ -192,15 +192,19 @@ def test_the_list_marks_experiments_whose_engine_or_tuners_are_absent(monkeypatc
         assert listed[name]["skipped"] == pybullet, name
     assert "pybullet_data" in listed["robot-iiwa"]["skipped"]
     assert listed["bounce-shot"]["skipped"] is None, "it asks for the engine batch"
-    assert listed["arm-swing"]["skipped"] is None
-    absent = listed["arm-swing"]["tuners_skipped"]
-    assert {"tunenet", "regressor"} <= set(absent)
+    assert listed["robot-arm2"]["skipped"] is None
+    absent = listed["robot-arm2"]["tuners_skipped"]
+    assert set(absent) == {"regressor", "tunenet", "hybrid"}
     assert set(absent.values()) == {"needs torch, not installed (pip install torch)"}
     assert "least_squares" not in absent
     words = {line.split()[0]: line for line in told("experiments", list(listed.values()))}
     assert f"skipped: {pybullet}." in words["ball-drop"]
-    assert "without " in words["arm-swing"]
-    assert "tunenet" in words["arm-swing"]
+    torch = "needs torch, not installed (pip install torch)"
+    said = f"without regressor, tunenet, hybrid: {torch}. {listed['robot-arm2']['says']}"
+    assert said in words["robot-arm2"]
+    together = listed["misspecified"]
+    assert together["skipped"] is None
+    assert set(together["tuners_skipped"]) == {"regressor", "tunenet", "hybrid"}
 
 
 @pytest.mark.parametrize("name", [name for name in names() if name.startswith("robot-")])
