@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import site
 import subprocess
 import sys
@@ -93,6 +94,60 @@ def test_no_page_or_message_advises_to_install_from_an_index_where_it_is_not():
     advised = re.compile(r"pip install [\"']?simgap\b")
     wrong = [str(path) for path in files if advised.search(path.read_text(encoding="utf-8"))]
     assert wrong == []
+
+
+def made(*words, code=0, **kept):
+    """What make prints; it needs no environment for what is only shown or refused."""
+    done = subprocess.run(
+        ["make", "--no-print-directory", *words],
+        cwd=ROOT, capture_output=True, text=True, check=False, **kept,
+    )  # fmt: skip
+    assert done.returncode == code, done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.mark.skipif(not shutil.which("make"), reason="no make")
+@pytest.mark.parametrize(
+    ("without", "installed", "absent"),
+    [
+        ("torch,pybullet", "requirements-explain.txt hatchling editables", "requirements.lock"),
+        ("torch", "requirements-explain.txt hatchling editables pybullet", "requirements.lock"),
+        ("", "install -r requirements.lock", "requirements-explain"),
+    ],
+)
+def test_make_installs_what_without_leaves(tmp_path, without, installed, absent):
+    stamp = tmp_path / "env" / ".installed"
+    shown = made("--dry-run", str(stamp), f"VENV={tmp_path / 'env'}", f"WITHOUT={without}")
+    assert installed in shown
+    assert f"install -r {absent}" not in shown
+
+
+@pytest.mark.skipif(not shutil.which("make"), reason="no make")
+def test_make_refuses_to_leave_out_what_explain_needs(tmp_path):
+    folder = tmp_path / "env"
+    said = made("install", f"VENV={folder}", "WITHOUT=numpy", f"PYTHON={sys.executable}", code=2)
+    assert "WITHOUT=numpy: expected torch, pybullet or torch,pybullet" in said
+    assert not folder.exists()
+
+
+@pytest.mark.skipif(not shutil.which("make"), reason="no make")
+@pytest.mark.parametrize(
+    ("last", "now", "again"),
+    [
+        ("torch pybullet", "", True),
+        ("torch pybullet", "torch,pybullet", False),
+        ("", "", False),
+        ("", "torch", True),
+    ],
+)
+def test_another_without_than_last_time_installs_again(tmp_path, last, now, again):
+    stamp = tmp_path / "env" / ".installed"
+    stamp.parent.mkdir()
+    stamp.write_text(f"{last}\n")
+    # A Python that is none ends the installation before it has begun.
+    words = ["install", f"VENV={stamp.parent}", f"WITHOUT={now}", "PYTHON=false"]
+    made(*words, code=2 if again else 0)
+    assert stamp.exists() != again
 
 
 @pytest.fixture(scope="module")
