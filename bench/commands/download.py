@@ -64,6 +64,8 @@ def _download(options: argparse.Namespace, say: Say) -> Answer:
         downloaded.append(data_set.name)
         if options.out:
             say(_how_found(data_set, options.out))
+        for name in _experiments(data_set):
+            say(f"needed by: simgap compare {name}")
     documents = [_document(each, options.out) for each in wanted]
     return Answer({"data_sets": documents, "downloaded": downloaded})
 

@@ -134,7 +134,8 @@ def test_a_download_is_a_recording_with_its_licence_and_source(served, tmp_path,
     address = served()
     assert main(["download", "pendulum_free_swing", "--from", address]) == 0
     folder = tmp_path / "xdg" / "simgap" / "pendulum_free_swing"
-    assert str(folder) in capsys.readouterr().out
+    said = capsys.readouterr().out.splitlines()
+    assert said == [f"pendulum_free_swing: {folder}", "needed by: simgap compare pendulum-real"]
     names = {"recording.csv", "recording.toml", "LICENSE", "SOURCE.txt"}
     assert {path.name for path in folder.iterdir()} == names
     assert (folder / "LICENSE").read_bytes() == LICENCE
@@ -165,7 +166,7 @@ def test_runs_from_the_seventh_on_are_held_out():
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_a_folder_holds_a_clone_or_the_files_alone(repository, tmp_path, flat):
+def test_a_folder_holds_a_clone_or_the_files_alone(repository, tmp_path, flat, capsys):
     folder = repository
     if flat:
         folder = tmp_path / "flat"
@@ -176,6 +177,7 @@ def test_a_folder_holds_a_clone_or_the_files_alone(repository, tmp_path, flat):
     words = ["download", "pendulum_free_swing", "--from", str(folder), "--out", str(out)]
     assert main(words) == 0
     assert (out / "pendulum_free_swing" / "recording.csv").is_file()
+    assert f"experiments find it with SIMGAP_DATA={out}" in capsys.readouterr().out
 
 
 def test_what_is_here_is_not_downloaded_again(repository, capsys):
