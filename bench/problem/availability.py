@@ -80,10 +80,8 @@ def _missing_engine(experiment: Experiment) -> str:
     """Why an engine of an experiment, that of the tuned simulator or of the world which makes the
     targets, cannot be used here; empty where all can.
     """
-    settings = [experiment.settings, experiment.world]
-    engines = [str(each["engine"]) for each in settings if "engine" in each]
-    if "engine" not in experiment.settings:
-        engines.append(_default_engine(experiment))
+    settings = [experiment.settings, *([experiment.world] if experiment.world else [])]
+    engines = [str(each.get("engine") or _default_engine(experiment)) for each in settings]
     packages = sorted(
         {package for name in engines if name in NAMES for package in missing_packages(name)}
     )
