@@ -13,20 +13,36 @@
 # make wheel     the wheel, in an empty environment of PYTHON (WITHOUT=torch,pybullet where pip would compile or fetch gigabytes)
 # make reference the comparison of results/reference/comparison again, below results/ (about 10 minutes)
 # make multi     the comparison of results/reference/multi again, below results/ (about 15 minutes; TUNERS=a,b,... for others)
+# make install  .venv alone; WITHOUT=torch,pybullet: a minute, for explain and what belongs to it
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .PHONY: compare explain robot test test-all check exam benchmark chaos malformed mutants reference multi wheel docs install
-install: $(STAMP)
+# Another WITHOUT than that of the last install changes the environment; other targets take it as it is.
+install:
+	@if [ -f $(STAMP) ] && [ "$$(cat $(STAMP))" != "$(strip $(LEFT_OUT))" ]; then rm $(STAMP); fi
+	@$(MAKE) --no-print-directory $(STAMP)
 
-$(STAMP): requirements.lock pyproject.toml
+COMMA := ,
+LARGE := torch pybullet
+LEFT_OUT := $(subst $(COMMA), ,$(WITHOUT))
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
+
+$(STAMP): requirements.lock requirements-explain.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if v >= (3, 10) else f"simgap needs Python 3.10 or newer, found {v.major}.{v.minor}; set PYTHON=")'
+	@test -z "$(filter-out $(LARGE),$(LEFT_OUT))" || { echo "WITHOUT=$(WITHOUT): expected torch, pybullet or torch,pybullet" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
-	@touch $@
+ifeq ($(strip $(LEFT_OUT)),)
+	$(PIP) install -r requirements.lock
+	$(PIP) install --no-deps --no-build-isolation --editable .
+else
+	$(PIP) uninstall --yes $(LEFT_OUT) 2>/dev/null
+	$(PIP) install --constraint requirements.lock -r requirements-explain.txt hatchling editables $(filter-out $(LEFT_OUT),$(LARGE))
+	$(PIP) install --no-deps --no-build-isolation --editable .
+endif
+	@echo "$(strip $(LEFT_OUT))" > $@
 
 TARGETS ?= 10
 SEEDS ?= 2

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from bench import __version__
 from bench.commands.answer import (
@@ -31,6 +31,7 @@ from bench.commands.completion import add_completion
 from bench.commands.datasheet import add_datasheet
 from bench.commands.design import add_design
 from bench.commands.diff import add_diff
+from bench.commands.download import add_download
 from bench.commands.explain import add_explain, add_score
 from bench.commands.film import add_film, add_track
 from bench.commands.importing import add_import
@@ -40,6 +41,7 @@ from bench.commands.plot import add_plot
 from bench.commands.recordings import add_inspect, add_simulate
 from bench.commands.status import add_status
 from bench.commands.train import add_train
+from bench.commands.variadic import positionals_first
 from bench.commands.verify import add_verify
 
 COMMANDS = (
@@ -69,6 +71,7 @@ COMMANDS = (
         add_list,
         "list tuners, simulators, systems, effects, diagnosers, experiments, references or schemas",
     ),
+    ("download", add_download, "get a public data set that an experiment needs, or list them"),
     ("schema", add_schema, "print the JSON schema of what a command prints with --json"),
     ("info", add_info, "versions, engines, platform and paths, for a report of a fault"),
     ("completion", add_completion, "print a script by which a shell completes simgap's commands"),
@@ -87,6 +90,14 @@ class _Parser(argparse.ArgumentParser):
         from sims.base import InputError  # its message can be printed, whatever was typed
 
         raise _UsageError(f"{InputError(message)}; see {self.prog} --help")
+
+    # argparse declares this method with overloads, of which none takes None for both arguments.
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse a command line in which a positional argument may follow an option of several
+        values.
+        """
+        words = sys.argv[1:] if args is None else list(args)
+        return super().parse_known_args(positionals_first(self, words), namespace)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

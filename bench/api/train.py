@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -41,8 +41,9 @@ def choose(
 
     Args:
         tuner: registered name, or the experiment's label.
-        simulator: registered name.
-        experiment: name or TOML file; the only one of the project with this simulator where None.
+        simulator: registered name; or the name of an experiment, whose simulator is then meant.
+        experiment: name or TOML file; where None, the project's default experiment of the
+            simulator (`default_experiment`).
         budget: simulations to learn from; the experiment's where None.
         plugins: plugin files that they need.
         trust: train it inside the harness, for comparisons that do likewise.
@@ -50,11 +51,14 @@ def choose(
     Raises:
         InputError: they do not go together, or the tuner does not learn.
     """
+    if experiment is None and simulator in set(names()) - set(simulators.names()):
+        experiment = simulator
+        simulator = load(experiment).simulator
     # A robot's simulator is registered nowhere: its experiment alone knows it.
     robotic = experiment is not None and load(experiment).model
     if not plugins and not robotic:
         simulators.get(simulator)
-    chosen = load(experiment or _only(simulator)).chosen(training_budget=budget)
+    chosen = load(experiment or default_experiment(simulator)).chosen(training_budget=budget)
     chosen = chosen.chosen(trusted=trust or chosen.trusted)
     admit([str(Path(plugin).resolve()) for plugin in plugins], chosen)
     chosen = completed(chosen)
@@ -94,18 +98,36 @@ def taught(
         raise
 
 
-def _only(simulator: str) -> str:
-    """The only experiment that comes with the project and has this simulator; those that compare
-    simulators besides are no usual ones.
+DEFAULT_EXPERIMENTS: Mapping[str, str] = {
+    "arm": "arm-swing",
+    "ball": "ball-drop",
+    "pendulum": "pendulum-swing",
+    "servo": "servo-step",
+}
+"""By simulator the experiment in whose settings `simgap train` trains, where several of the project
+tune it.
+"""
+
+
+def default_experiment(simulator: str) -> str:
+    """Return the name of the experiment in whose settings a simulator's tuners are trained.
+
+    It is the default of `DEFAULT_EXPERIMENTS`, else the only experiment of the project that tunes
+    the simulator. Studies of a missing effect, which compare simulators too, do not count.
+
+    Raises:
+        InputError: there are several and no default, or there is none.
     """
+    if simulator in DEFAULT_EXPERIMENTS:
+        return DEFAULT_EXPERIMENTS[simulator]
     shipped = [load(name) for name in names()]
     fitting = [e.name for e in shipped if e.simulator == simulator and e.calibration is None]
     if len(fitting) == 1:
         return fitting[0]
-    there = "none of the project's fits; give a TOML file"
-    if fitting:
-        there = f"there are: {', '.join(fitting)}"
-    raise InputError(f"simulator {simulator}: expected an experiment with it; {there}")
+    there = f"choose one with --experiment: {', '.join(fitting)}"
+    if not fitting:
+        there = "none of the project tunes it; give a TOML file with --experiment FILE"
+    raise InputError(f"simulator {simulator}: expected an experiment that tunes it; {there}")
 
 
 @dataclass

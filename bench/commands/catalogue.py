@@ -32,9 +32,17 @@ def _says(each: Document) -> str:
 
 
 def _experiment(each: Document) -> list[str]:
-    """Its sentence, then its tags; before it why it cannot be used here."""
-    says = f"{_says(each)}. {each['says']}" if each["skipped"] else each["says"]
-    return [f"{each['name']:22} {says} [{', '.join(each['tags'])}]"]
+    """A line for an experiment: what it lacks on this machine, its sentence, its tags."""
+    lacks = []
+    if each["skipped"]:
+        lacks.append(f"skipped: {each['skipped']}")
+    if each["needs"]:
+        lacks.append(f"needs `{each['needs']}`")
+    if each["tuners_skipped"] and not each["skipped"]:
+        reasons = "; ".join(sorted(set(each["tuners_skipped"].values())))
+        lacks.append(f"without {', '.join(each['tuners_skipped'])}: {reasons}")
+    words = f"{'; '.join(lacks)}. {each['says']}" if lacks else each["says"]
+    return [f"{each['name']:22} {words} [{', '.join(each['tags'])}]"]
 
 
 def _system(each: Document) -> list[str]:

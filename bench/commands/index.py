@@ -63,7 +63,7 @@ def _option(action: argparse.Action) -> Document:
         "choices": list(action.choices) if action.choices else None,
         "default": default,
         "required": action.required,
-        "several": action.nargs == "+",
+        "several": action.nargs in ("+", "*"),
         "repeatable": isinstance(action, argparse._AppendAction | argparse._ExtendAction),
         "says": action.help or "",
     }
@@ -176,18 +176,20 @@ def diagnosers() -> list[Document]:
 
 
 def experiments() -> list[Document]:
-    """Every experiment that comes with the project."""
+    """Every experiment that comes with the project, and what it lacks on this machine."""
     from bench.problem import experiment
-    from bench.problem.robots import missing
+    from bench.problem.availability import availability
 
     told = []
     for name in experiment.names():
         each = experiment.load(name)
+        lacks = availability(each)
         told.append(
             {
                 "name": each.name,
                 "says": each.says,
-                "skipped": missing(each) or None,
+                "skipped": lacks.skipped or None,
+                "needs": lacks.data_set.command if lacks.data_set else None,
                 "title": each.title,
                 "tags": list(each.tags),
                 "simulator": each.simulator,
@@ -196,6 +198,7 @@ def experiments() -> list[Document]:
                 "targets": each.targets,
                 "budget": each.budget,
                 "tuners": [asdict(entry)["label"] for entry in each.tuners],
+                "tuners_skipped": dict(lacks.tuners),
             }
         )
     return told

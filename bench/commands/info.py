@@ -41,6 +41,7 @@ def info() -> Document:
         "paths": {
             "simgap": str(_HOME),
             "cache": str(_cache()),
+            "data sets": str(_data_sets()),
             "SIMGAP_DATA": os.environ.get("SIMGAP_DATA"),
             "SIMGAP_ROBOTS": os.environ.get("SIMGAP_ROBOTS"),
         },
@@ -57,6 +58,12 @@ def _cache() -> Path:
     from bench.runs.training import folder
 
     return folder()
+
+
+def _data_sets() -> Path:
+    from bench.datasets.catalogue import user_folder
+
+    return user_folder()
 
 
 def _revision() -> str | None:
@@ -118,7 +125,8 @@ def _packages() -> Iterator[Document]:
         if extra == "dev" or not (each.marker is None or each.marker.evaluate({"extra": extra})):
             continue
         version = _version(each.name)
-        remedy = f'pip install "simgap[{extra}]"' if extra else f"pip install {each.name}"
+        # simgap is on no index, so that its extras cannot be installed by name.
+        remedy = f'pip install "{each.name}{each.specifier}"'
         missing = None if version else f"not installed ({remedy})"
         if version and not each.specifier.contains(version, prereleases=True):
             missing = f"expected {each.specifier}"

@@ -16,11 +16,16 @@ def add_train(parser: argparse.ArgumentParser) -> None:
         metavar="TUNER",
         help="a learned tuner, by registered name or the experiment's label",
     )
-    parser.add_argument("simulator", metavar="SIMULATOR", help="see `simgap list simulators`")
+    parser.add_argument(
+        "simulator",
+        metavar="SIMULATOR",
+        help="see `simgap list simulators`; or the name of an experiment, to train in its settings",
+    )
     parser.add_argument(
         "--experiment",
         metavar="NAME",
-        help="whose settings to train in: a name or TOML file (default: the only one)",
+        help="train in the settings of this experiment, a name or TOML file (default: the "
+        "simulator's own, which is printed)",
     )
     parser.add_argument(
         "--budget", type=positive, metavar="N", help="simulations to learn from (default: its own)"
@@ -61,6 +66,7 @@ def _train(options: argparse.Namespace, say: Say) -> Answer:
     )
     seeds = options.seeds or seeds_of(experiment, entry)
     check_training(experiment, entry, seeds, options.force)
+    say(f"experiment: {experiment.name}")
     trained, files = [], []
     with Bars("epoch") as bars:
         losses = Losses(experiment, bars.start)

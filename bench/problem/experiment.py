@@ -80,7 +80,8 @@ class HeldOut:
 @dataclass(frozen=True)
 class Source:
     """The recording that an experiment on real data tunes to; `path` is relative to the folder of
-    recordings ($SIMGAP_DATA), to the experiment's file, or to the working directory.
+    recordings ($SIMGAP_DATA), to that of `simgap download`, to the experiment's file, or to the
+    working directory.
     """
 
     path: str = ""
@@ -115,8 +116,8 @@ class Experiment:
         tags: words by which a list is searched, e.g. ``quick``; they change nothing.
         simulator: registered name; of a robot what tables call it, its file's name where empty.
         model: a robot's model file (MJCF or URDF) in place of a registered simulator: relative to
-            the experiment's file, to the folder in $SIMGAP_ROBOTS or to the working directory, or
-            in an installed package as ``package://NAME/FILE``.
+            the experiment's file, to the folder in $SIMGAP_ROBOTS, to that of `simgap download` or
+            to the working directory, or in an installed package as ``package://NAME/FILE``.
         free: numbers of the model file to tune, as ``damping@*`` or ``mass@forearm``.
         actuators: that the model file lacks, as in a recording's ``[actuators.NAME]``.
         observe: channels the tuner sees; all where empty.

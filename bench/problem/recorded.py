@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.datasets import catalogue as datasets
 from sims.base import Array, InputError, Scenario, Simulator
 from sims.recording.recording import Recording, Run, read_recording
 from sims.user_toml import known
@@ -81,32 +82,27 @@ def scenario_of(run: Run, simulator: Simulator, constants: Mapping[str, float]) 
 
 def beside(path: str, experiment: Path) -> str:
     """The path of an experiment's recording, made absolute where it lies beside the experiment's
-    file: elsewhere, as in a worker or a folder of results, nobody knows where that was.
+    file: a worker or a folder of results does not know where that was.
     """
     file = experiment.parent / path
-    # The folder of recordings comes first wherever the path is looked up.
-    return path if _in_folder(path) or not file.is_file() else str(file.resolve())
+    # The folders of recordings come first wherever the path is looked up.
+    return path if datasets.find("recording", path) or not file.is_file() else str(file.resolve())
 
 
 def find_recording(path: str) -> Path:
-    """The file `path` below $SIMGAP_DATA, or as it stands.
+    """The file `path` below $SIMGAP_DATA or the user's folder of data sets, or as it stands.
 
     Raises:
-        InputError: it is in neither place.
+        InputError: it is in none of these places; the message says how to get it.
     """
-    in_folder = _in_folder(path)
+    in_folder = datasets.find("recording", path)
     if in_folder is not None:
         return in_folder
     if Path(path).is_file():
         return Path(path)
+    if data_set := datasets.providing("recording", path):
+        raise InputError(f"recording {path}: this experiment {data_set.advice}")
     folder = os.environ.get("SIMGAP_DATA")
     places = f"in {folder} (SIMGAP_DATA)" if folder else "here (SIMGAP_DATA is not set)"
     remedy = "set SIMGAP_DATA to the folder of recordings"
     raise InputError(f"recording {path}: no such file {places} or beside the experiment; {remedy}")
-
-
-def _in_folder(path: str) -> Path | None:
-    """The file below the folder of recordings, if it is there."""
-    folder = os.environ.get("SIMGAP_DATA")
-    file = Path(folder, path) if folder else None
-    return file if file is not None and file.is_file() else None

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from bench.datasets import catalogue as datasets
 from bench.problem.experiment import Experiment, is_there
 from bench.problem.recorded import find_recording
 from bench.registry import robot, simulators
@@ -19,8 +20,6 @@ from sims.simulated import Simulated
 
 PACKAGE = "package://"
 """Begins the place of a model file in an installed Python package, as URDF files write it."""
-_SHARED = Path(__file__).resolve().parents[3] / "shared" / "robots"
-"""Where robots lie beside a checkout."""
 
 
 def kind_of(experiment: Experiment) -> type[Simulator]:
@@ -79,27 +78,22 @@ def missing(experiment: Experiment) -> str:
 
 def find_model(path: str, name: str) -> Path:
     """The model file of experiment `name`: in an installed package (``package://NAME/FILE``), below
-    $SIMGAP_ROBOTS, or as it stands.
+    $SIMGAP_ROBOTS or the user's folder of data sets, or as it stands.
 
     Raises:
         SkippedError: it is in none of these places.
     """
     if path.startswith(PACKAGE):
         return _packaged(path, name)
-    for folder in (robots_folder(), Path()):
-        if folder is not None and is_there(folder / path):
-            return folder / path
+    if found := datasets.find("robot", path):
+        return found
+    if is_there(Path(path)):
+        return Path(path)
+    if data_set := datasets.providing("robot", path):
+        raise SkippedError("experiment", name, f"it {data_set.advice}")
     given = os.environ.get("SIMGAP_ROBOTS")
     places = f"in {given} (SIMGAP_ROBOTS)" if given else "here (SIMGAP_ROBOTS is not set)"
     raise SkippedError("experiment", name, f"model {cut(path)}: no such file {places}")
-
-
-def robots_folder() -> Path | None:
-    """The folder of robots' files: $SIMGAP_ROBOTS, else ``shared/robots`` beside a checkout."""
-    given = os.environ.get("SIMGAP_ROBOTS")
-    if given:
-        return Path(given)
-    return _SHARED if _SHARED.is_dir() else None
 
 
 def _packaged(path: str, name: str) -> Path:

@@ -36,6 +36,12 @@ def stepping() -> str:
     return "numpy" if machine.machine() is None else "machine code"
 
 
+def missing_packages(name: str) -> list[str]:
+    """Packages that an engine of `NAMES` requires and that are not installed."""
+    required = import_module(NAMES[name]).REQUIRES
+    return [package for package in required if importlib.util.find_spec(package) is None]
+
+
 def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -> Engine:
     """A new engine for one simulator; its module's `engine(system, **settings)` makes it.
 
@@ -46,8 +52,7 @@ def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -
     if name not in NAMES:
         raise unknown("engine", name, list(NAMES))
     module = import_module(NAMES[name])
-    missing = [package for package in module.REQUIRES if importlib.util.find_spec(package) is None]
-    if missing:
+    if missing := missing_packages(name):
         raise InputError(
             f"engine {name} needs {', '.join(missing)}, not installed"
             f" (pip install {' '.join(missing)})"

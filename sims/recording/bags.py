@@ -88,7 +88,7 @@ def _opened(bag: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise InputError(
-            f"{bag}: bags are read by rosbags, which is not installed; pip install 'simgap[bags]'"
+            f"{bag}: needs rosbags to read it, not installed (pip install rosbags)"
         ) from None
     try:
         # Bags of ROS 2 did not hold their types before Iron: those of Humble are assumed then.

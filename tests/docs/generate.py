@@ -106,7 +106,7 @@ def spelt(option):
     metavar = option["metavar"]
     several = f"{metavar} ..." if option["several"] else metavar
     if not option["flags"]:
-        return several if option["required"] else f"[{metavar}]"
+        return several if option["required"] else f"[{several}]"
     value = [] if option["type"] == "flag" else [several]
     return " ".join([*option["flags"], *value])
 

@@ -39,6 +39,53 @@ def test_commands_are_taken(page, capsys):
     assert [line for line in lines if refused(line)] == []
 
 
+def named_wrongly(words):
+    """What a command line names that does not exist; empty where all does, or is a user's file."""
+    from bench.api.train import choose
+    from bench.datasets import catalogue
+    from bench.problem.experiment import load
+    from bench.registry import tuners
+    from sims.base import InputError
+
+    options = parser().parse_args(words)
+    own = getattr(options, "plugin", None)
+    try:
+        if words[0] == "train" and not own:
+            choose(options.tuner, options.simulator, options.experiment)
+        elif words[0] == "download":
+            [catalogue.get(name) for name in options.names if name != "all"]
+        elif words[0] == "compare" and (name := options.experiment) and not name.endswith(".toml"):
+            labels = {entry.label for entry in load(name).tuners}
+            for label in [] if own or not options.tuners else options.tuners.split(","):
+                if label not in labels and not load(name).diagnosis:
+                    tuners.get(label)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def test_what_commands_name_exists(capsys):
+    """A tuner with a simulator that can train it, an experiment, a data set."""
+    lines = [line for page in pages() for line in commands(page.read_text(encoding="utf-8"))]
+    checked = [line for line in lines if line[:1] in (["train"], ["compare"], ["download"])]
+    assert len(checked) > 15
+    assert {" ".join(line): said for line in checked if (said := named_wrongly(line))} == {}
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("simgap train tunenet bal", "unknown simulator"),
+        ("simgap train cma_es ball", "does not learn"),
+        ("simgap compare ball-dropp", "unknown experiment"),
+        ("simgap compare ball-drop --tuners random,tunnet", "unknown tuner"),
+        ("simgap download so10", "unknown data set"),
+    ],
+)
+def test_a_command_that_names_what_does_not_exist_is_found(line, said, capsys):
+    assert said in named_wrongly(line.split()[1:])
+
+
 def test_there_are_commands():
     assert sum(len([*commands(page.read_text(encoding="utf-8"))]) for page in pages()) > 60
 

@@ -28,6 +28,7 @@ VECTORS = (
     "track none.mp4 --out new.csv --ball-diameter 0.1 --fps 30 --scale fall",
     "train learner pendulum --experiment swing.toml --budget 5 --seeds 1 --out out "
     "--plugin learner.py --trust",
+    "download", "download so101 --from run --out out", "download all --from none",
     "--version", "--help", "compare --help",
 )  # fmt: skip
 WORDS = st.sampled_from([

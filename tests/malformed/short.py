@@ -42,9 +42,14 @@ def _nobody(address: str) -> Any:
     raise InputError(f"{address}: no Dask scheduler answers there")
 
 
+def _no_network(url: str, *_: Any) -> Any:
+    raise InputError(f"{url}: cannot be downloaded")
+
+
 SHORT = {
     "bench.commands.compare._made": _closed,
     "bench.runs.cluster.ClusterPool": _nobody,
+    "bench.datasets.download._received": _no_network,
     "bench.report.tables": _cut,
     "bench.verify.tables": _cut,
     "bench.across.Together.frames": _cut,
@@ -68,7 +73,8 @@ def environment(place: Path) -> Iterator[None]:
     try:
         for registry, parts in zip(REGISTRIES, known, strict=True):
             registry.restore({name: part for name, part in parts.items() if part.path is None})
-        with patch.dict(os.environ, {"SIMGAP_CACHE": str(place / HERE / "run")}):
+        own = {"SIMGAP_CACHE": str(place / HERE / "run"), "XDG_DATA_HOME": str(place / HERE)}
+        with patch.dict(os.environ, own):
             yield
     finally:
         for registry, parts in zip(REGISTRIES, known, strict=True):

@@ -41,6 +41,8 @@ def steps():
         ["--version"],
         ["list", "tuners"],
         ["list", "references"],
+        ["list", "experiments"],
+        ["download"],
         ["info"],
         ["schema", "verdict"],
         ["completion", "bash"],

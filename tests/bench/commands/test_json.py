@@ -267,6 +267,18 @@ def list_(ask, place, **_):
 
 
 @case
+def download(ask, place, **_):
+    yield ask("download")
+    for name in ("so101.urdf", "LICENSE"):
+        (place / "so101").mkdir(exist_ok=True)
+        (place / "so101" / name).write_text("")
+    found = ask("download", "so101", "--out", place)
+    assert found["downloaded"] == []
+    assert found["data_sets"][0]["folder"] == str(place / "so101")
+    yield found
+
+
+@case
 def schema_(ask, **_):
     found = ask("schema", "status")
     assert found == schema("status")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import tomli_w
 
-from bench.api.train import Losses
+from bench.api.train import DEFAULT_EXPERIMENTS, Losses, choose, default_experiment
 from bench.cli import main
-from bench.problem.experiment import Entry, load
+from bench.problem.experiment import Entry, load, names
 from bench.runs.housing import tuned_of
 from bench.runs.training import Lesson, WeightsError, key, train, trained
 from tests.conftest import PLUGINS
@@ -224,8 +224,8 @@ def test_broken_weights_are_refused_with_one_line(experiment, cache, capsys, spo
             "experiment ball-drop: its simulator is ball, not servo",
         ),
         (
-            ["tunenet", "ball"],
-            "simulator ball: expected an experiment with it; there are: ball-crossengine",
+            ["tunenet", "bounce-shot"],
+            "simulator bounce-shot: expected an experiment that tunes it; none of the project",
         ),
     ],
 )
@@ -234,6 +234,32 @@ def test_faults_are_one_line(arguments, said, capsys):
     error = capsys.readouterr().err
     assert said in error
     assert len(error.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("simulator", "experiment"),
+    [("ball", "ball-drop"), ("ball-drop", "ball-drop"), ("ball-tilt", "ball-tilt")],
+)
+def test_a_simulator_with_several_experiments_has_a_default(simulator, experiment):
+    chosen, entry = choose("tunenet", simulator)
+    assert (chosen.name, entry.label) == (experiment, "tunenet")
+
+
+def test_every_tuned_simulator_of_the_project_has_exactly_one_default_experiment():
+    loaded = [load(name) for name in names()]
+    tuned = {e.simulator for e in loaded if e.simulator and not e.calibration}
+    for simulator in tuned:
+        assert load(default_experiment(simulator)).simulator == simulator
+    assert set(DEFAULT_EXPERIMENTS) <= tuned
+
+
+def test_the_default_experiment_is_printed_and_finds_the_weights(tmp_path, capsys):
+    words = ["tunenet", "ball", "--budget", "40", "--seeds", "1", "--out", str(tmp_path / "out")]
+    assert main(["train", *words]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "experiment: ball-drop"
+    assert said[-1] == "found by: simgap compare ball-drop --training-budget 40"
+    assert (tmp_path / "out" / "loss.csv").is_file()
 
 
 def test_a_value_that_cannot_be_is_one_line(capsys):

@@ -223,6 +223,7 @@ RECORDED = SPRING | {"ranges": ["real"], "recording": {"path": "logs/swing.csv"}
 
 def test_a_recording_is_looked_for_in_its_folder_and_beside_the_experiment(tmp_path, monkeypatch):
     monkeypatch.delenv("SIMGAP_DATA", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "xdg"))
     beside, data = tmp_path / "mine" / "logs", tmp_path / "data" / "logs"
     for folder in (beside, data):
         folder.mkdir(parents=True)
@@ -239,13 +240,20 @@ def test_a_recording_is_looked_for_in_its_folder_and_beside_the_experiment(tmp_p
     monkeypatch.chdir(tmp_path / "mine")
     monkeypatch.setenv("SIMGAP_DATA", str(tmp_path / "nowhere"))
     assert find_recording("logs/swing.csv").samefile(beside / "swing.csv"), "as it stands"
+    downloaded = tmp_path / "xdg" / "simgap" / "logs"
+    downloaded.mkdir(parents=True)
+    (downloaded / "swing.csv").touch()
+    assert find_recording("logs/swing.csv") == downloaded / "swing.csv"
+    monkeypatch.setenv("SIMGAP_DATA", str(tmp_path / "data"))
+    assert find_recording("logs/swing.csv") == data / "swing.csv", "the one that is named wins"
 
 
 def test_a_recording_that_is_missing_says_what_to_set(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("SIMGAP_DATA", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     with pytest.raises(InputError, match=r"SIMGAP_DATA is not set.*; set SIMGAP_DATA to the folde"):
-        find_recording("pendulum_free_swing/recording.csv")
+        find_recording("swing/recording.csv")
     monkeypatch.setenv("SIMGAP_DATA", "/elsewhere")
     with pytest.raises(InputError, match=r"no such file in /elsewhere \(SIMGAP_DATA\) or beside"):
-        find_recording("pendulum_free_swing/recording.csv")
+        find_recording("swing/recording.csv")

@@ -1,9 +1,14 @@
+import importlib.util
 import json
+import os
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bench.commands import index
+from bench.commands.catalogue import told
 from bench.problem.asked import asked
 from bench.problem.entries import Entry
 from bench.problem.experiment import load, names, parse
@@ -17,6 +22,8 @@ from sims.base import InputError
 from sims.registry import SkippedError
 from tests.bench.swinging import SWINGING, written
 
+ROBOTS = Path(__file__).parents[4] / "shared" / "robots"
+"""Where robots lie on machines that have them; elsewhere what needs them is skipped."""
 ARM = {
     "model": "swinging.xml",
     "free": ["damping@elbow", "mass@fore"],
@@ -159,14 +166,51 @@ def test_what_a_shipped_experiment_lacks_is_said_in_the_list(tmp_path, monkeypat
     from bench.commands.catalogue import lines
 
     monkeypatch.setenv("SIMGAP_ROBOTS", str(tmp_path))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     monkeypatch.setitem(sys.modules, "pybullet_data", None)
     listed = {line.split()[0]: line for line in lines("experiments")}
-    assert "skipped: model so101/so101.urdf: no such file" in listed["robot-so101"]
-    assert "skipped" not in listed["robot-arm2"]
+    assert listed["robot-so101"].split(maxsplit=1)[1].startswith("needs `simgap download so101`.")
+    assert "skipped: needs pybullet_data, not installed" in listed["robot-iiwa"]
+    assert not [line for line in listed.values() if "skipped" in line and "iiwa" not in line]
+
+
+def without(monkeypatch, *packages):
+    """Make packages look as if they were not installed."""
+    find = importlib.util.find_spec
+
+    def found(name, *more):
+        return None if name.split(".")[0] in packages else find(name, *more)
+
+    monkeypatch.setattr(importlib.util, "find_spec", found)
+
+
+def test_the_list_marks_experiments_whose_engine_or_tuners_are_absent(monkeypatch):
+    without(monkeypatch, "torch", "pybullet", "pybullet_data")
+    listed = {each["name"]: each for each in index.experiments()}
+    pybullet = "needs pybullet, not installed (pip install pybullet)"
+    for name in ("ball-drop", "ball-crossengine", "pendulum-real"):
+        assert listed[name]["skipped"] == pybullet, name
+    assert "pybullet_data" in listed["robot-iiwa"]["skipped"]
+    assert listed["bounce-shot"]["skipped"] is None, "it asks for the engine batch"
+    assert listed["robot-arm2"]["skipped"] is None
+    absent = listed["robot-arm2"]["tuners_skipped"]
+    assert set(absent) == {"regressor", "tunenet", "hybrid"}
+    assert set(absent.values()) == {"needs torch, not installed (pip install torch)"}
+    assert "least_squares" not in absent
+    words = {line.split()[0]: line for line in told("experiments", list(listed.values()))}
+    assert f"skipped: {pybullet}." in words["ball-drop"]
+    torch = "needs torch, not installed (pip install torch)"
+    said = f"without regressor, tunenet, hybrid: {torch}. {listed['robot-arm2']['says']}"
+    assert said in words["robot-arm2"]
+    together = listed["misspecified"]
+    assert together["skipped"] is None
+    assert set(together["tuners_skipped"]) == {"regressor", "tunenet", "hybrid"}
 
 
 @pytest.mark.parametrize("name", [name for name in names() if name.startswith("robot-")])
-def test_shipped_experiments_on_robots_are_sound_and_their_numbers_show(name):
+def test_shipped_experiments_on_robots_are_sound_and_their_numbers_show(name, monkeypatch):
+    if ROBOTS.is_dir():
+        monkeypatch.setenv("SIMGAP_ROBOTS", os.environ.get("SIMGAP_ROBOTS", str(ROBOTS)))
     experiment = load(name)
     if reason := missing(experiment):
         pytest.skip(reason)

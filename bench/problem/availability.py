@@ -1,0 +1,110 @@
+"""What an experiment needs and this machine lacks: a data set, packages, tuners."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from bench.datasets import catalogue as datasets
+from bench.datasets.catalogue import DataSet
+from bench.problem.experiment import Experiment, expand
+from bench.problem.robots import missing
+from bench.registry import SkippedError, simulators, tuners
+from sims.engines import NAMES, missing_packages
+
+
+@dataclass(frozen=True)
+class Availability:
+    """What is missing for an experiment.
+
+    Attributes:
+        data_set: that a command of the project downloads.
+        skipped: why the experiment cannot run here; empty where it can, or where it only lacks the
+            data set.
+        tuners: reason by label of each tuner that is left out, as it cannot run here.
+    """
+
+    data_set: DataSet | None
+    skipped: str
+    tuners: Mapping[str, str]
+
+
+def availability(experiment: Experiment) -> Availability:
+    """Find what is missing for an experiment; for one that names others, for all of them."""
+    if experiment.experiments:
+        return _together(experiment)
+    data_set = _missing_data_set(experiment)
+    skipped = "" if data_set else missing(experiment)
+    return Availability(
+        data_set,
+        skipped or _missing_simulator(experiment) or _missing_engine(experiment),
+        _missing_tuners(experiment),
+    )
+
+
+def _together(experiment: Experiment) -> Availability:
+    """What is missing for the experiments that one names."""
+    parts = {each.name: availability(each) for each in expand(experiment)}
+    data_sets = [part.data_set for part in parts.values() if part.data_set]
+    skipped = [f"{name} {part.skipped}" for name, part in parts.items() if part.skipped]
+    absent = {label: why for part in parts.values() for label, why in part.tuners.items()}
+    return Availability(next(iter(data_sets), None), "; ".join(skipped), absent)
+
+
+def _missing_simulator(experiment: Experiment) -> str:
+    """Why the simulator of an experiment cannot be used here; empty where it can, or where it is
+    not a registered one.
+    """
+    if experiment.model or experiment.simulator not in simulators.names():
+        return ""
+    try:
+        simulators.get(experiment.simulator)
+    except SkippedError as error:
+        return error.reason
+    return ""
+
+
+def _missing_data_set(experiment: Experiment) -> DataSet | None:
+    """The data set that an experiment needs and that is not here."""
+    wanted = [("robot", experiment.model)] if experiment.model else []
+    if experiment.recording:
+        wanted.append(("recording", experiment.recording.path))
+    for kind, path in wanted:
+        found = datasets.providing(kind, path)
+        if found and datasets.find(kind, path) is None:
+            return found
+    return None
+
+
+def _missing_engine(experiment: Experiment) -> str:
+    """Why an engine of an experiment, that of the tuned simulator or of the world which makes the
+    targets, cannot be used here; empty where all can.
+    """
+    settings = [experiment.settings, *([experiment.world] if experiment.world else [])]
+    engines = [str(each.get("engine") or _default_engine(experiment)) for each in settings]
+    packages = sorted(
+        {package for name in engines if name in NAMES for package in missing_packages(name)}
+    )
+    if not packages:
+        return ""
+    return f"needs {', '.join(packages)}, not installed (pip install {' '.join(packages)})"
+
+
+def _default_engine(experiment: Experiment) -> str:
+    """The engine of an experiment that names none; empty where its simulator is not known."""
+    if experiment.model:
+        return "mujoco"
+    if experiment.simulator not in simulators.names():
+        return ""
+    return str(getattr(simulators.get(experiment.simulator), "default_engine", ""))
+
+
+def _missing_tuners(experiment: Experiment) -> Mapping[str, str]:
+    """Reason by label of each tuner of an experiment that cannot run here."""
+    reasons = {}
+    for entry in experiment.tuners:
+        try:
+            tuners.get(entry.tuner)
+        except SkippedError as error:
+            reasons[entry.label] = error.reason
+    return reasons

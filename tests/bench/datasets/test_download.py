@@ -1,0 +1,351 @@
+"""`simgap download` gets a data set whole and unchanged, or says in one line why not."""
+
+import hashlib
+import io
+import json
+import os
+import threading
+from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from bench.cli import main
+from bench.datasets import catalogue
+from bench.datasets.catalogue import SourceFile
+from bench.problem.availability import availability
+from bench.problem.experiment import load, names
+from sims.pendulum.simulator import Pendulum
+from sims.recording.recording import read_recording
+
+MAT = "ParameterEstimation/SinglePendulum/SinglePendulumDataForParameterEstimation.mat"
+LICENCE = b"Anybody may use this.\n"
+PIECES = (2600, 2600, 2600, 2601)
+"""Samples of 1 ms of each piece of the made swing: two runs of 5 s and a rest."""
+
+
+def made_swing():
+    """(2, T) angles and rates at 1 ms; the angle hangs at pi."""
+    t = np.arange(sum(PIECES)) * 1e-3
+    return np.stack([np.pi + 0.8 * np.cos(8.0 * t), -6.4 * np.sin(8.0 * t)])
+
+
+def cells(pieces):
+    """A MATLAB cell array of column shape."""
+    array = np.empty((len(pieces), 1), object)
+    array[:, 0] = pieces
+    return array
+
+
+@pytest.fixture
+def repository(tmp_path, monkeypatch):
+    """A folder like a clone of the pendulum's repository with a short made swing, which the
+    catalogue takes for the published one; nothing of this machine's data sets is found.
+    """
+    parts = np.split(made_swing(), np.cumsum(PIECES)[:-1], axis=1)
+    content = io.BytesIO()
+    savemat(content, {"Y_id": cells(parts[:2]), "Y_vad": cells(parts[2:]), "dt": 1e-3})
+    folder = tmp_path / "clone"
+    files = {MAT: content.getvalue(), "LICENSE": LICENCE}
+    for path, data in files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_bytes(data)
+    declared = tuple(
+        SourceFile(path, len(data), hashlib.sha256(data).hexdigest())
+        for path, data in files.items()
+    )
+    made = replace(catalogue.get("pendulum_free_swing"), files=declared)
+    every = {**catalogue._catalogue(), made.name: made}
+    monkeypatch.setattr(catalogue, "_catalogue", lambda: every)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "xdg"))
+    monkeypatch.delenv("SIMGAP_DATA", raising=False)
+    monkeypatch.delenv("SIMGAP_ROBOTS", raising=False)
+    monkeypatch.chdir(tmp_path)
+    return folder
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+
+class CutOff(Quiet):
+    """Announces a whole file, sends 100 bytes and closes the connection."""
+
+    def do_GET(self):
+        path = Path(self.translate_path(self.path))
+        self.send_response(200)
+        self.send_header("Content-Length", str(path.stat().st_size))
+        self.end_headers()
+        self.wfile.write(path.read_bytes()[:100])
+
+
+class Endless(Quiet):
+    """Sends a file of unknown length that does not end."""
+
+    sent = 0
+
+    def do_GET(self):
+        self.send_response(200)
+        self.end_headers()
+        try:
+            while type(self).sent < 2**28:
+                self.wfile.write(bytes(2**16))
+                type(self).sent += 2**16
+        except OSError:
+            return
+
+
+@pytest.fixture
+def served(repository):
+    """Serves the repository on this machine; gives its address, and takes another handler."""
+    servers = []
+
+    def serve(handler=Quiet):
+        made = partial(handler, directory=str(repository))
+        server = ThreadingHTTPServer(("127.0.0.1", 0), made)
+        servers.append(server)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        return f"http://127.0.0.1:{server.server_port}"
+
+    yield serve
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+def refused(capsys, *words):
+    """The one line with which `simgap download` refuses; nothing has been written."""
+    capsys.readouterr()
+    assert main(["download", "pendulum_free_swing", *map(str, words)]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert len(said.err.splitlines()) == 1, said.err
+    folder = catalogue.user_folder()
+    assert not folder.exists() or not list(folder.iterdir())
+    return said.err
+
+
+def test_a_download_is_a_recording_with_its_licence_and_source(served, tmp_path, capsys):
+    address = served()
+    assert main(["download", "pendulum_free_swing", "--from", address]) == 0
+    folder = tmp_path / "xdg" / "simgap" / "pendulum_free_swing"
+    said = capsys.readouterr().out.splitlines()
+    assert said == [f"pendulum_free_swing: {folder}", "needed by: simgap compare pendulum-real"]
+    names = {"recording.csv", "recording.toml", "LICENSE", "SOURCE.txt"}
+    assert {path.name for path in folder.iterdir()} == names
+    assert (folder / "LICENSE").read_bytes() == LICENCE
+    source = (folder / "SOURCE.txt").read_text()
+    made = catalogue.get("pendulum_free_swing")
+    assert all(word in source for word in (made.commit, made.repository, made.files[0].sha256))
+    recording = read_recording(folder / "recording.csv", Pendulum)
+    assert len(recording.runs) == 2
+    for number, run in enumerate(recording.runs):
+        swing = made_swing()[:, number * 5000 : (number + 1) * 5000 : 5]
+        np.testing.assert_allclose(run.times, np.arange(1000) * 0.005, atol=1e-12)
+        np.testing.assert_allclose(run.channels["q"], swing[0] - np.pi, atol=1.1e-6)
+        np.testing.assert_allclose(run.channels["qd"], swing[1], atol=1.1e-6)
+
+
+def test_runs_from_the_seventh_on_are_held_out():
+    from bench.datasets.conversions import free_swing
+
+    swing = np.stack([np.linspace(3.0, 3.2, 40_000), np.linspace(-1.0, 1.0, 40_000)])
+    content = io.BytesIO()
+    savemat(content, {"Y_id": cells([swing[:, :17_000]]), "Y_vad": cells([swing[:, 17_000:]])})
+    files = free_swing({"swing.mat": content.getvalue()})
+    rows = files["recording.csv"].splitlines()
+    assert len(rows) == 1 + 8000
+    assert rows[1001].startswith("2,0,")  # every run starts at 0 s
+    held_out = [line for line in files["recording.toml"].splitlines() if line.startswith("[runs")]
+    assert held_out == ["[runs.7]", "[runs.8]"]
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_a_folder_holds_a_clone_or_the_files_alone(repository, tmp_path, flat, capsys):
+    folder = repository
+    if flat:
+        folder = tmp_path / "flat"
+        folder.mkdir()
+        for path in (MAT, "LICENSE"):
+            (folder / Path(path).name).write_bytes((repository / path).read_bytes())
+    out = tmp_path / "mine"
+    words = ["download", "pendulum_free_swing", "--from", str(folder), "--out", str(out)]
+    assert main(words) == 0
+    assert (out / "pendulum_free_swing" / "recording.csv").is_file()
+    assert f"experiments find it with SIMGAP_DATA={out}" in capsys.readouterr().out
+
+
+def test_what_is_here_is_not_downloaded_again(repository, capsys):
+    words = ["download", "pendulum_free_swing"]
+    assert main([*words, "--from", str(repository)]) == 0
+    capsys.readouterr()
+    assert main([*words, "--from", "/nowhere"]) == 0
+    assert "already in" in capsys.readouterr().out
+
+
+def test_an_experiment_finds_what_was_downloaded(repository, capsys):
+    assert main(["compare", "pendulum-real", "--targets", "1"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "run `simgap download pendulum_free_swing`" in said
+    assert availability(load("pendulum-real")).data_set.name == "pendulum_free_swing"
+    assert main(["download", "pendulum_free_swing", "--from", str(repository)]) == 0
+    assert availability(load("pendulum-real")).data_set is None
+
+
+def test_an_address_that_lacks_the_file(served, repository, capsys):
+    (repository / MAT).unlink()
+    said = refused(capsys, "--from", served())
+    assert "404" in said
+    assert MAT in said
+    assert "--from FOLDER" in said
+
+
+def test_a_connection_that_is_cut_off(served, capsys):
+    said = refused(capsys, "--from", served(CutOff))
+    assert "expected" in said or "cannot be downloaded" in said
+    assert "100" in said
+
+
+def test_a_server_that_does_not_stop_sending(served, capsys):
+    said = refused(capsys, "--from", served(Endless))
+    assert "found more" in said
+    assert Endless.sent < 2**24, "no more is read than was published"
+
+
+def test_no_network(capsys, repository, monkeypatch):
+    import urllib.request
+
+    def unreachable(*_, **__):
+        raise urllib.error.URLError(OSError(-2, "Name or service not known"))
+
+    monkeypatch.setattr(urllib.request, "urlopen", unreachable)
+    said = refused(capsys)
+    assert "cannot be downloaded" in said
+    assert "Name or service not known" in said
+    assert f"{catalogue.get('pendulum_free_swing').base_url}/{MAT}" in said
+
+
+def test_nobody_answers(repository, capsys):
+    assert "cannot be downloaded" in refused(capsys, "--from", "http://127.0.0.1:9")
+
+
+def test_a_file_that_was_changed(repository, capsys):
+    content = bytearray((repository / MAT).read_bytes())
+    content[-1] ^= 1
+    (repository / MAT).write_bytes(content)
+    said = refused(capsys, "--from", repository)
+    assert "expected SHA-256" in said
+    assert "nothing is written" in said
+
+
+@pytest.mark.parametrize(("kept", "said"), [(0, "found 0"), (50, "found 50")])
+def test_a_file_that_is_not_whole(repository, capsys, kept, said):
+    content = (repository / MAT).read_bytes()[:kept]
+    (repository / MAT).write_bytes(content)
+    assert said in refused(capsys, "--from", repository)
+
+
+def test_a_licence_that_was_changed(repository, capsys):
+    (repository / "LICENSE").write_bytes(b"Nobody may use this..\n")
+    assert "LICENSE: expected SHA-256" in refused(capsys, "--from", repository)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--from", "nowhere"], "--from nowhere: no such folder"),
+        (["--from", "ftp://x"], "expected a folder, or an http or https address"),
+        (["--from", "."], f"expected {MAT} of commit e99a7e1"),
+    ],
+)
+def test_a_source_that_cannot_be(repository, capsys, words, said):
+    assert said in refused(capsys, *words)
+
+
+def test_an_unknown_name_names_those_that_there_are(capsys):
+    assert main(["download", "pendulum"]) == 2
+    assert "there are: pendulum_free_swing, so101" in capsys.readouterr().err
+
+
+def test_a_folder_with_other_things_is_left_alone(repository, tmp_path, capsys):
+    mine = tmp_path / "out" / "pendulum_free_swing"
+    mine.mkdir(parents=True)
+    (mine / "notes.txt").write_text("mine")
+    said = refused(capsys, "--from", repository, "--out", tmp_path / "out")
+    assert "delete it, or choose another folder with --out" in said
+    assert [path.name for path in mine.iterdir()] == ["notes.txt"]
+
+
+def test_a_folder_that_cannot_be_written(repository, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    said = refused(capsys, "--from", repository, "--out", tmp_path / "file")
+    assert "choose another folder with --out" in said
+
+
+@pytest.mark.parametrize("content", [b"", b"MATLAB 5.0 MAT-file" * 20, None])
+def test_a_file_of_other_content_is_no_recording(content):
+    from bench.datasets.conversions import free_swing
+    from sims.base import InputError
+
+    if content is None:
+        stream = io.BytesIO()
+        savemat(stream, {"Y_id": np.zeros((2, 3)), "Y_vad": np.zeros((2, 3))})
+        content = stream.getvalue()
+    with pytest.raises(InputError, match=r"x\.mat: expected ") as raised:
+        free_swing({"x.mat": content})
+    assert "\n" not in str(raised.value)
+
+
+def test_the_list_says_what_there_is_where_and_for_what(repository, capsys):
+    assert main(["download", "--json"]) == 0
+    listed = {one["name"]: one for one in json.loads(capsys.readouterr().out)["data_sets"]}
+    assert listed["so101"]["experiments"] == ["robot-so101"]
+    assert listed["so101"]["folder"] is None
+    assert main(["download", "pendulum_free_swing", "--from", str(repository), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["downloaded"] == ["pendulum_free_swing"]
+    (one,) = document["data_sets"]
+    assert Path(one["folder"]).is_dir()
+    assert main(["download"]) == 0
+    said = capsys.readouterr().out
+    assert f"in {one['folder']}" in said
+    assert "not here: run `simgap download so101`" in said
+
+
+def test_every_experiment_that_lacks_a_file_of_the_project_names_a_data_set(repository):
+    """In a clone without any data, experiments lack nothing that a command does not bring."""
+    for name in names():
+        lacks = availability(load(name))
+        if lacks.data_set is None:
+            assert not lacks.skipped, (name, lacks.skipped)
+    lacking = {n: d.name for n in names() if (d := availability(load(n)).data_set)}
+    assert lacking == {"pendulum-real": "pendulum_free_swing", "robot-so101": "so101"}
+
+
+def test_the_published_swing_is_the_recording_that_results_were_made_with(recordings, tmp_path):
+    """Where the published file and the recording are both on this machine."""
+    published = os.environ.get("SIMGAP_FREE_SWING")
+    if not published:
+        pytest.skip("SIMGAP_FREE_SWING does not name the published file")
+    from bench.datasets.conversions import free_swing
+
+    for name, content in free_swing({"x.mat": Path(published).read_bytes()}).items():
+        assert content == (recordings / "pendulum_free_swing" / name).read_text(), name
+
+
+def test_data_sets_are_those_that_results_were_made_with(recordings):
+    robots = recordings.parent / "robots"
+    for data_set, folder in (("so101", robots), ("pendulum_free_swing", recordings)):
+        for file in catalogue.get(data_set).files:
+            path = folder / data_set / file.name
+            if not path.is_file():
+                continue  # what is converted is compared above
+            content = path.read_bytes()
+            assert len(content) == file.bytes
+            assert hashlib.sha256(content).hexdigest() == file.sha256
