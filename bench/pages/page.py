@@ -178,18 +178,21 @@ def _policy(script: str) -> str:
 
 
 def _still(static: Static, spots: Sequence[tuple[str, float, float]] = ()) -> str:
-    """The printed figure, and what can be taken away without a script."""
+    """Build the HTML of the printed figure, and of its PDF where there is one."""
     svg = b64encode(static.svg).decode("ascii")
-    pdf = b64encode(static.pdf).decode("ascii")
     file = safe(static.file)
     image = (
         f'<img class="still" src="data:image/svg+xml;base64,{svg}" data-file="{file}" '
         f'alt="{safe(static.alternative, 1000)}">'
     )
-    link = f'<a href="data:application/pdf;base64,{pdf}" download="{file}.pdf">PDF</a>'
+    link = ""
+    if static.pdf is not None:
+        pdf = b64encode(static.pdf).decode("ascii")
+        link = f'<a href="data:application/pdf;base64,{pdf}" download="{file}.pdf">PDF</a>'
     for name, across, down in spots:
         style = f"left:{100 * across:.2f}%;top:{100 * down:.2f}%"
         image += f'<span class="spot" data-lights="{safe(name, 60)}" style="{style}"></span>'
+    # The script adds its buttons to this paragraph, so it stands there without a PDF too.
     return f'<div class="pictured">{image}</div>\n<p class="files">{link}</p>'
 
 

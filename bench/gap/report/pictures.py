@@ -1,8 +1,8 @@
 """The figures of an explanation: the run with the largest gap, where the gap is, the candidates.
 
 Made for print and for grey: before is dashed with open squares, after solid with filled circles,
-beside their colours. Each figure is written as PNG and PDF, and as SVG for the page. Texts from
-files are never read as mathematics.
+beside their colours. Each figure is written as PNG, as SVG for the page, and as PDF where one is
+asked for (`bench.figures.formats`). Texts from files are never read as mathematics.
 """
 
 from __future__ import annotations
@@ -89,21 +89,24 @@ def figure(story: Story, name: str) -> Figure:
 
 class Printed(NamedTuple):
     """One figure as the bytes of its files; of a robot's where its joints are: names with shares of
-    its width and height from above left.
+    its width and height from above left. `pdf` is None where no PDF is asked for.
     """
 
     png: bytes
-    pdf: bytes
+    pdf: bytes | None
     svg: bytes
     spots: tuple[tuple[str, float, float], ...] = ()
 
 
 def printed(story: Story) -> dict[str, Printed]:
-    """Every figure that there is, by name."""
+    """Draw every figure that a story has, and render its files; by name."""
     with _styled():
         # Within the settings: text is laid out once more when a figure is written.
-        figures = {name: figure(story, name) for name in names(story)}
-        made = {n: Printed(*style.printed(f, DPI), style.svg(f)) for n, f in figures.items()}
+        figures = {name: _MAKERS[name](story) for name in names(story)}
+        made = {}
+        for name, drawn in figures.items():
+            files = style.taken(drawn, DPI)
+            made[name] = Printed(files.png, files.pdf, files.svg)
         if story.robot is not None and "robot" in made:
             where = tuple(joints_in(figures["robot"], story.robot, pose(story, worst(story))))
             made["robot"] = made["robot"]._replace(spots=where)

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 
 from bench.figures import robot as drawing
+from bench.figures.formats import pdf_figures
 from bench.gap.report.page import page
 from bench.gap.report.pictures import printed
 from bench.pages.elements import framed
@@ -35,7 +36,8 @@ def written(tmp_path_factory):
             ("simple", story("ambiguous")),
             ("robot", robot_story("ambiguous", [WRISTS], changes=(CHANGE,))),
         ):
-            figures = printed(told)
+            with pdf_figures(name == "robot"):
+                figures = printed(told)
             path = folder / f"{name}.html"
             path.write_text(page(told, figures, folder), encoding="utf-8")
             made[name] = SimpleNamespace(path=path, story=told, figures=figures)

@@ -136,6 +136,8 @@ def test_figures_are_embedded_with_alternatives_that_say_what_they_show(figures)
     assert data == [(name, still(name).svg) for name in names]
     papers = re.findall(r'href="data:application/pdf;base64,([^"]+)"', html)
     assert [b64decode(paper) for paper in papers] == [still(name).pdf for name in names]
+    without = {name: figure._replace(pdf=None) for name, figure in figures.items()}
+    assert "application/pdf" not in page(story(), without)
     overview, where, candidates = (alt for _, _, alt in found)
     assert "q and qd" in overview
     assert "linear drag" in overview
