@@ -18,6 +18,7 @@ from bench.pages import elements
 from bench.pages.chart import Chart, Static
 from bench.pages.elements import safe
 from bench.pages.grid import Grid
+from bench.pages.table import Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,7 +45,7 @@ class Page:
         self._parts: list[str] = []
         self._sections: list[tuple[str, str]] = []
         self._tables: dict[str, str] = {}
-        self._frames: dict[str, pd.DataFrame] = {}
+        self._frames: dict[str, pd.DataFrame | Table] = {}
         self._charts: list[dict[str, Any]] = []
         self._grids: list[dict[str, Any]] = []
 
@@ -66,7 +67,7 @@ class Page:
             body = "\n".join([f'<h2 id="{name}-head">{head}</h2>', *held])
             self.add(f'<section id="{name}" aria-labelledby="{name}-head">\n{body}\n</section>')
 
-    def table(self, name: str, frame: pd.DataFrame, digits: int | None = None) -> None:
+    def table(self, name: str, frame: pd.DataFrame | Table, digits: int | None = None) -> None:
         """Keep a table in the page, for charts and grids, to be saved as NAME.csv.
 
         Args:
