@@ -377,9 +377,10 @@ def mark(figure: Figure, trusted: bool) -> Figure:
 
 
 def png(figure: Figure, dpi: int = DPI) -> bytes:
-    """A figure as the bytes of a PNG file."""
+    """Render a figure as the bytes of a PNG file."""
     file = BytesIO()
-    figure.savefig(file, format="png", dpi=dpi)
+    # Pillow's level 3 takes half as long as its usual 6, and files of lines and text are as small.
+    figure.savefig(file, format="png", dpi=dpi, pil_kwargs={"compress_level": 3})
     return file.getvalue()
 
 

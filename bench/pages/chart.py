@@ -159,13 +159,13 @@ class Static:
     """The same figure as it is printed.
 
     Attributes:
-        svg: the bytes of an SVG file.
+        image: the bytes of an SVG or PNG file, which the page shows.
         pdf: the bytes of a PDF file; None where none was asked for.
         alternative: what it shows, for those who do not see it.
         file: name of its files without an ending.
     """
 
-    svg: bytes
+    image: bytes
     pdf: bytes | None
     alternative: str
     file: str

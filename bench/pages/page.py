@@ -180,10 +180,11 @@ def _policy(script: str) -> str:
 
 def _still(static: Static, spots: Sequence[tuple[str, float, float]] = ()) -> str:
     """Build the HTML of the printed figure, and of its PDF where there is one."""
-    svg = b64encode(static.svg).decode("ascii")
+    kind = "png" if static.image.startswith(b"\x89PNG") else "svg+xml"
+    data = b64encode(static.image).decode("ascii")
     file = safe(static.file)
     image = (
-        f'<img class="still" src="data:image/svg+xml;base64,{svg}" data-file="{file}" '
+        f'<img class="still" src="data:image/{kind};base64,{data}" data-file="{file}" '
         f'alt="{safe(static.alternative, 1000)}">'
     )
     link = ""

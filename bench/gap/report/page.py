@@ -184,7 +184,7 @@ def _gain(story: Story) -> Iterator[str]:
 
 
 def _still(story: Story, name: str, figure: Printed) -> Static:
-    return Static(figure.svg, figure.pdf, _alternative(story, name), name)
+    return Static(figure.svg or figure.png, figure.pdf, _alternative(story, name), name)
 
 
 def _runs(

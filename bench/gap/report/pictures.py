@@ -1,7 +1,7 @@
 """The figures of an explanation: the run with the largest gap, where the gap is, the candidates.
 
 Made for print and for grey: before is dashed with open squares, after solid with filled circles,
-beside their colours. Each figure is written as PNG, as SVG for the page, and as PDF where one is
+beside their colours. Each figure is rendered as PNG, and as PDF and SVG where vector graphics are
 asked for (`bench.figures.formats`). Texts from files are never read as mathematics.
 """
 
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.figures import style
+from bench.figures.formats import is_pdf_wanted
 from bench.figures.robot import joints_in, robot_figure
 from bench.figures.style import BAND, ZERO, blank
 from bench.gap.report.joints import by_joint, joints_figure
@@ -42,8 +43,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-DPI = 130
-"""Dots an inch: the page shows figures at about this width."""
+DPI = 150
+"""Dots an inch of the PNG files, which the page shows at about two thirds of their size."""
 _WIDTHS = {1: 8.6, 2: 10.0, 3: 12.5}
 """Inches by the number of channels."""
 _HEADING = 0.22
@@ -89,12 +90,12 @@ def figure(story: Story, name: str) -> Figure:
 
 class Printed(NamedTuple):
     """One figure as the bytes of its files; of a robot's where its joints are: names with shares of
-    its width and height from above left. `pdf` is None where no PDF is asked for.
+    its width and height from above left. `pdf` and `svg` are None where no PDF is asked for.
     """
 
     png: bytes
     pdf: bytes | None
-    svg: bytes
+    svg: bytes | None
     spots: tuple[tuple[str, float, float], ...] = ()
 
 
@@ -105,8 +106,8 @@ def printed(story: Story) -> dict[str, Printed]:
         figures = {name: _MAKERS[name](story) for name in names(story)}
         made = {}
         for name, drawn in figures.items():
-            files = style.taken(drawn, DPI)
-            made[name] = Printed(files.png, files.pdf, files.svg)
+            png, pdf = style.printed(drawn, DPI)
+            made[name] = Printed(png, pdf, style.svg(drawn) if is_pdf_wanted() else None)
         if story.robot is not None and "robot" in made:
             where = tuple(joints_in(figures["robot"], story.robot, pose(story, worst(story))))
             made["robot"] = made["robot"]._replace(spots=where)

@@ -273,6 +273,14 @@ def test_every_figure_is_saved_with_its_numbers(robot, written):
     assert list(frame["before"]) == [place.before for place in told]
 
 
+def test_a_page_without_vector_graphics_saves_the_png_that_it_shows(simple, written):
+    files = simple.page.locator("#candidates-picture .files")
+    texts = files.locator("a, button").all_inner_texts()
+    assert texts == ["PNG", "numbers as CSV (candidates)"]
+    png = written["simple"].figures["candidates"].png
+    assert simple.saved(files.get_by_role("button", name="PNG").click) == ("candidates.png", png)
+
+
 def test_on_paper_and_without_a_script_figures_are_printed_ones(browser, simple, written):
     simple.page.emulate_media(media="print")
     for place in ("#motion", "#where-picture", "#candidates-picture"):
