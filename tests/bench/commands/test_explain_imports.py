@@ -27,6 +27,8 @@ HEAVY = {
     "torch",
 }
 """Packages whose import takes longer than the whole search of a small diagnosis, or nearly so."""
+ROBOTS = {"sims.robot.model", "sims.robot.simulator", "sims.robot.native"}
+"""Modules that only a model file needs."""
 BACKENDS = {
     "matplotlib.pyplot",
     "matplotlib.backends.backend_pdf",
@@ -68,7 +70,7 @@ def loaded(*arguments):
 def test_explain_loads_no_package_that_it_does_not_need(swing, tmp_path):
     modules = loaded("explain", swing, "--jobs", 1, "--out", tmp_path / "out")
     assert "matplotlib.backends.backend_agg" in modules, "the figures are drawn"
-    assert modules & (HEAVY | BACKENDS) == set()
+    assert modules & (HEAVY | BACKENDS | ROBOTS) == set()
     assert {path.suffix for path in (tmp_path / "out").iterdir()} == {
         ".csv", ".html", ".json", ".png", ".toml",
     }  # fmt: skip
