@@ -109,10 +109,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except _UsageError as error:
         printer.fault("usage", str(error), FAULT)
         sys.exit(FAULT)
-    from sims.base import InputError  # after the parser, which has ended the quick `--help`
+    # After the parser, which has ended the quick `--help`.
+    from bench.figures.formats import pdf_figures
+    from sims.base import InputError
 
     try:
-        with printer.working():
+        with printer.working(), pdf_figures(getattr(options, "pdf", False)):
             answer: Answer = options.command(options, printer.say)
         printer.answer(answer)
     except InputError as error:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 from bench import study
 from bench.diagnosis import columns as diagnosis
 from bench.figures import comparison
+from bench.figures.formats import pdf_figures
 from bench.misspecified.calibration import MODELS
 from bench.problem.asked import asked
 from bench.problem.experiment import Experiment, load, names
@@ -105,6 +106,7 @@ def compare(
     cluster: str | None = None,
     progress: Progress | None = None,
     force: bool = False,
+    pdf: bool = False,
 ) -> Compared:
     """Run an experiment: tuners x targets x seeds; returns its tables and figures.
 
@@ -134,6 +136,7 @@ def compare(
         cluster: address of a Dask scheduler to run on instead.
         progress: told of every step.
         force: begin although it needs more than this machine has.
+        pdf: write every figure as PDF too, in addition to PNG.
 
     Raises:
         InputError: a fault in what was asked for, in one line; nothing has been run then.
@@ -163,7 +166,8 @@ def compare(
     check_comparison(chosen, folder, jobs, cluster is not None, force)
     pool = _cluster(cluster)
     begun = study.begin(chosen, files, folder, jobs, salt)
-    return _made(begun, jobs, progress, pool)
+    with pdf_figures(pdf):
+        return _made(begun, jobs, progress, pool)
 
 
 @check_arguments
@@ -177,6 +181,7 @@ def sweep(
     plugins: Files = (),
     progress: Progress | None = None,
     force: bool = False,
+    pdf: bool = False,
 ) -> list[Compared]:
     """Run every experiment that one with a ``[sweep]`` or ``experiments`` stands for, one by one.
 
@@ -190,6 +195,7 @@ def sweep(
         plugins: as in `compare`.
         progress: told of every step.
         force: as in `compare`.
+        pdf: as in `compare`.
 
     Returns:
         Their results, in the order of the file's values.
@@ -202,9 +208,10 @@ def sweep(
     folder = None if out is None else Path(out)
     check_comparison(chosen, folder, jobs, force=force)
     begun = study.begin_all(chosen, files, folder, jobs, salt)
-    made = [_made(one, jobs, progress, None) for one in begun]
-    if len(begun) > 1:
-        study.conclude(begun[0].folder.parent, _unsaid)
+    with pdf_figures(pdf):
+        made = [_made(one, jobs, progress, None) for one in begun]
+        if len(begun) > 1:
+            study.conclude(begun[0].folder.parent, _unsaid)
     return made
 
 

@@ -10,6 +10,7 @@ from bench.commands.answer import DONE, INTERRUPTED, WRONG, Answer, Document, Sa
 from bench.commands.options import (
     add_force,
     add_model,
+    add_pdf,
     add_plugin,
     add_trust,
     cluster_pool,
@@ -122,6 +123,7 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
     compare.add_argument(
         "--allow-failures", action="store_true", help="exit with 0 although runs failed"
     )
+    add_pdf(compare)
     add_force(compare)
     compare.set_defaults(command=_compare)
 

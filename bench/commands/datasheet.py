@@ -9,6 +9,7 @@ from bench.commands.interrupts import Interrupts
 from bench.commands.options import (
     add_force,
     add_model,
+    add_pdf,
     add_plugin,
     names,
     place,
@@ -52,6 +53,7 @@ def add_datasheet(parser: argparse.ArgumentParser) -> None:
         "--budget", type=seconds, metavar="S", help="seconds, as for `simgap explain`"
     )
     parser.add_argument("--jobs", type=positive, metavar="N", help="processes that work at once")
+    add_pdf(parser)
     add_plugin(parser, "systems")
     add_force(parser)
     parser.set_defaults(command=_datasheet)
@@ -85,7 +87,7 @@ def _datasheet(options: argparse.Namespace, say: Say) -> Answer:
                 progress=look.show,
             )
             # What took minutes is kept, whatever comes of the sheet.
-            source.write(options.out / "explained")
+            source.write(options.out / "explained", pdf=options.pdf)
         made = datasheet(
             logs,
             joint=options.joint,

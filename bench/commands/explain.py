@@ -11,6 +11,7 @@ from bench.commands.interrupts import Interrupts
 from bench.commands.options import (
     add_force,
     add_model,
+    add_pdf,
     add_plugin,
     cluster_pool,
     names,
@@ -113,6 +114,7 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="with --each: on the Dask cluster with this scheduler, which must see the same files",
     )
+    add_pdf(parser)
     add_plugin(parser, "systems")
     add_force(parser)
     parser.set_defaults(command=_explain)
@@ -179,7 +181,7 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
             progress=look.show,
         )
     folder = options.out or stamped(Path("results"), f"explain-{options.recordings[0].stem}")
-    paths = explanation.write(folder)
+    paths = explanation.write(folder, pdf=options.pdf)
     settings = {name: getattr(options, name) for name in _SETTINGS}
     made = write_explained(folder, started, settings, options.recordings)
     for line in account(explanation.story):

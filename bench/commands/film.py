@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from bench.commands.answer import Answer, Say
-from bench.commands.options import add_force, place
+from bench.commands.options import add_force, add_pdf, place
 
 
 def add_film(parser: argparse.ArgumentParser) -> None:
@@ -58,6 +58,7 @@ def add_track(parser: argparse.ArgumentParser) -> None:
         help="where metres come from (default: VIDEO.camera.toml if there, else the diameter if "
         "given, else the fall)",
     )
+    add_pdf(parser)
     parser.set_defaults(command=track)
 
 
@@ -93,10 +94,11 @@ def track(options: argparse.Namespace, say: Say) -> Answer:
     from bench.recordings.tracking import write
 
     diameter, fps, scale = options.ball_diameter, options.fps, options.scale
-    found = write(options.video, options.out, drawn, diameter, fps, scale)
+    found = write(options.video, options.out, drawn, diameter, fps, scale, options.pdf)
     for note in found.notes:
         print(f"simgap: {options.video}: {note}", file=sys.stderr)
     for line in found.lines:
         say(line)
-    files = [options.out.with_suffix(ending) for ending in (".csv", ".toml", ".png", ".pdf")]
+    endings = (".csv", ".toml", ".png", ".pdf") if options.pdf else (".csv", ".toml", ".png")
+    files = [options.out.with_suffix(ending) for ending in endings]
     return Answer({**found.document(), "recording": options.out, "files": files})

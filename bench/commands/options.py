@@ -46,6 +46,15 @@ def add_force(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_pdf(parser: argparse.ArgumentParser) -> None:
+    """The option ``--pdf``, which `bench.cli` obeys for every command that has it."""
+    parser.add_argument(
+        "--pdf",
+        action="store_true",
+        help="write every figure as PDF too (default: PNG only)",
+    )
+
+
 def add_trust(parser: argparse.ArgumentParser) -> None:
     """The option ``--trust``."""
     parser.add_argument(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.commands.answer import Answer, Document, Say
-from bench.commands.options import add_plugin, place
+from bench.commands.options import add_pdf, add_plugin, place
 
 if TYPE_CHECKING:
     from bench.store.reference import Reference
@@ -34,6 +34,7 @@ def add_plot(plot: argparse.ArgumentParser) -> None:
         help="draw errors against simulations again, with this reference result in grey behind "
         "them: see `simgap list references`, or the folder of a comparison",
     )
+    add_pdf(plot)
     add_plugin(plot, "simulators")
     plot.set_defaults(command=_plot)
 

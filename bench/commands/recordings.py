@@ -7,7 +7,15 @@ from dataclasses import asdict
 from pathlib import Path
 
 from bench.commands.answer import DONE, WRONG, Answer, Document, Say
-from bench.commands.options import add_force, add_model, add_plugin, names, place, positive
+from bench.commands.options import (
+    add_force,
+    add_model,
+    add_pdf,
+    add_plugin,
+    names,
+    place,
+    positive,
+)
 
 
 def add_simulate(simulate: argparse.ArgumentParser) -> None:
@@ -88,6 +96,7 @@ def add_inspect(inspect: argparse.ArgumentParser) -> None:
         metavar="A,B,...",
         help="with --check: constants, or numbers of a model file, that are to be estimated",
     )
+    add_pdf(inspect)
     add_plugin(inspect, "systems")
     inspect.set_defaults(command=_inspect)
 

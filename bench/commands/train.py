@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from bench.commands.answer import Answer, Say
-from bench.commands.options import add_force, add_plugin, add_trust, place, positive
+from bench.commands.options import add_force, add_pdf, add_plugin, add_trust, place, positive
 
 
 def add_train(parser: argparse.ArgumentParser) -> None:
@@ -42,6 +42,7 @@ def add_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="DIR", type=place, help="folder of losses (default: below results/train)"
     )
+    add_pdf(parser)
     add_plugin(parser, "of them")
     add_trust(parser)
     add_force(parser)

@@ -9,10 +9,11 @@ import numpy as np
 from bench.figures.style import CHANCE, INK, SOFT
 from bench.figures.view import View
 from sims.base import Array
-from sims.robot.model import Joint, Robot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from sims.robot.model import Joint, Robot
 
 TICK = 0.07
 """Length of an axis of a joint to either side, as a share of the picture."""

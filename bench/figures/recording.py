@@ -48,7 +48,10 @@ class _Placed(NamedTuple):
 
 
 def draw(recording: Recording, kind: type[Simulator], folder: Path) -> list[Path]:
-    """Draw the recording into `folder` as PNG and PDF, named for it; returns the two.
+    """Draw the recording into `folder` as PNG, and as PDF where one is asked for.
+
+    Returns:
+        The files, which have the recording's name.
 
     Raises:
         InputError: the folder cannot be made or written to.

@@ -18,11 +18,12 @@ from bench.figures.offscreen import rendered
 from bench.figures.style import BLUE, INK, SOFT, blank
 from bench.figures.view import View, place_of, posed, view
 from sims.base import Array
-from sims.robot.model import Robot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from sims.robot.model import Robot
 
 LONGEST = 4.4
 """Inches of the longer side of the drawing."""

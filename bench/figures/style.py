@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.analysis.rounding import FLOOR
+from bench.figures.formats import is_pdf_wanted
 from bench.problem.experiment import Experiment
 from sims.base import InputError
 from sims.files import write_all
@@ -375,9 +377,10 @@ def mark(figure: Figure, trusted: bool) -> Figure:
 
 
 def png(figure: Figure, dpi: int = DPI) -> bytes:
-    """A figure as the bytes of a PNG file."""
+    """Render a figure as the bytes of a PNG file."""
     file = BytesIO()
-    figure.savefig(file, format="png", dpi=dpi)
+    # Pillow's level 3 takes half as long as its usual 6, and files of lines and text are as small.
+    figure.savefig(file, format="png", dpi=dpi, pil_kwargs={"compress_level": 3})
     return file.getvalue()
 
 
@@ -401,46 +404,55 @@ def svg(figure: Figure) -> bytes:
     return _LONG.sub(lambda match: f"{float(match[0]):.2f}".encode(), file.getvalue())
 
 
-def printed(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes]:
-    """A figure as the bytes of a PNG and of a PDF file, laid out once for both: finding room takes
-    as long as drawing.
+def printed(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | None]:
+    """Render a figure as PNG, and as PDF where one is asked for (`bench.figures.formats`).
+
+    Returns:
+        The bytes of the PNG file, and those of the PDF file or None.
     """
-    as_png, as_pdf = _laid_out_once(figure, dpi, pdf)
-    return as_png, as_pdf
+    with _laid_out_once(figure, dpi):
+        return png(figure, dpi), _asked_pdf(figure)
 
 
 def taken(figure: Figure, dpi: int = DPI) -> Pictures:
-    """A figure as the bytes of a PNG, a PDF and an SVG file, laid out once for all."""
-    return Pictures(*_laid_out_once(figure, dpi, pdf, svg))
+    """Render a figure as PNG, as SVG for a page, and as PDF where one is asked for."""
+    with _laid_out_once(figure, dpi):
+        return Pictures(png(figure, dpi), svg(figure), _asked_pdf(figure))
 
 
 class Pictures(NamedTuple):
-    """One figure as the bytes of three kinds of files."""
+    """One figure as the bytes of its files; `pdf` is None where no PDF is asked for."""
 
     png: bytes
-    pdf: bytes
     svg: bytes
+    pdf: bytes | None = None
 
 
-def _laid_out_once(
-    figure: Figure, dpi: int, *makers: Callable[[Figure], bytes]
-) -> tuple[bytes, ...]:
+def _asked_pdf(figure: Figure) -> bytes | None:
+    return pdf(figure) if is_pdf_wanted() else None
+
+
+@contextmanager
+def _laid_out_once(figure: Figure, dpi: int) -> Iterator[None]:
+    """Run the layout engine once, for all files that are written inside the context."""
     engine, screen = figure.get_layout_engine(), figure.dpi
     try:
         if engine is not None:
-            # Left to savefig, layout would cost a drawing of its own.
+            # savefig would draw the figure once more for the layout of each file.
             figure.set_dpi(dpi)
             engine.execute(figure)
             figure.set_dpi(screen)
             figure.set_layout_engine(None)
-        return png(figure, dpi), *(make(figure) for make in makers)
+        yield
     finally:
         figure.set_dpi(screen)
         figure.set_layout_engine(engine)
 
 
 def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
-    """Write a figure as PNG and PDF, both whole or neither; missing folders are made.
+    """Write a figure as PNG, and as PDF where one is asked for: all files or none.
+
+    Missing folders are made.
 
     Args:
         figure: what to write.
@@ -448,7 +460,7 @@ def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
         dpi: dots an inch of the PNG.
 
     Returns:
-        The PNG and the PDF.
+        The files, the PNG first.
 
     Raises:
         InputError: the folder cannot be made or written to.
@@ -456,12 +468,11 @@ def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
     return keep(path, *printed(figure, dpi))
 
 
-def keep(path: Path, as_png: bytes, as_pdf: bytes) -> list[Path]:
-    """Write a figure's files, both or neither; returns and raises as `save`."""
-    contents = {
-        path.with_name(f"{path.name}.png"): as_png,
-        path.with_name(f"{path.name}.pdf"): as_pdf,
-    }
+def keep(path: Path, as_png: bytes, as_pdf: bytes | None) -> list[Path]:
+    """Write a figure's files, all or none; returns and raises as `save`."""
+    contents = {path.with_name(f"{path.name}.png"): as_png}
+    if as_pdf is not None:
+        contents[path.with_name(f"{path.name}.pdf")] = as_pdf
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_all(contents)

@@ -23,8 +23,10 @@ _SEEN = BLUE
 _MISSING = RUST
 
 
-def drawn(track: Track, heights: Heights, part: slice, title: str) -> tuple[bytes, bytes]:
-    """The figure of a track as PNG and PDF; arguments as of `track_figure`."""
+def drawn(track: Track, heights: Heights, part: slice, title: str) -> tuple[bytes, bytes | None]:
+    """Render the figure of a track as PNG, and as PDF where one is asked for; arguments as of
+    `track_figure`.
+    """
     figure = track_figure(track, heights, part, title)
     return printed(figure, _DPI)
 

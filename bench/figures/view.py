@@ -12,12 +12,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sims.base import Array, InputError
-from sims.robot.model import Robot
+
+if TYPE_CHECKING:
+    from sims.robot.model import Robot
 
 AZIMUTHS = tuple(range(0, 360, 30))
 """Degrees: the directions from which a robot in space is looked at in turn."""

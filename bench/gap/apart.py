@@ -31,9 +31,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from math import erfc, sqrt
 
 import numpy as np
 
+from bench.analysis.chi_squared import chi_squared_tail
 from bench.gap.along import Kind, along, constant
 from bench.gap.measure import Z95, curved
 from bench.gap.model.fit import prior_of
@@ -285,12 +287,9 @@ def _heterogeneity(parts: Sequence[Part]) -> tuple[float, float]:
     mean = float(weights @ values / weights.sum())
     q = float(weights @ (values - mean) ** 2)  # (3)
     freedom = len(parts) - 1
-    # Loaded here alone: it is much, and most of explain goes without.
-    from scipy.special import chdtrc
-
     left = float(weights.sum() - (weights @ weights) / weights.sum())
     tau = np.sqrt(max(q - freedom, 0.0) / left) if left > 0 else 0.0  # (4)
-    return float(tau), float(chdtrc(freedom, q))
+    return float(tau), chi_squared_tail(freedom, q)
 
 
 def _trend(parts: Sequence[Part], numbers: Array) -> Trend | None:
@@ -304,10 +303,16 @@ def _trend(parts: Sequence[Part], numbers: Array) -> Trend | None:
     slope = float(weights @ (apart * values)) / power
     rest = values - weights @ values / weights.sum() - slope * apart
     freedom = len(parts) - 2
-    from scipy.special import ndtr, stdtr
-
     ratio = float(weights @ rest**2) / freedom
     error = float(np.sqrt(max(ratio, 1.0) / power))
     # Errors that the scatter bears out are known; those that it enlarges are estimated.
-    tail = ndtr(-abs(slope) / error) if ratio <= 1.0 else stdtr(freedom, -abs(slope) / error)
-    return Trend(slope, error, float(2.0 * tail))
+    size = abs(slope) / error
+    return Trend(slope, error, erfc(size / sqrt(2.0)) if ratio <= 1.0 else _student(size, freedom))
+
+
+def _student(size: float, freedom: int) -> float:
+    """Return the two-sided p-value of Student's t."""
+    # Importing scipy.special takes 0.1 s, and this is the only place of most diagnoses to need it.
+    from scipy.special import stdtr
+
+    return float(2.0 * stdtr(freedom, -size))

@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bench.figures.formats import pdf_figures
 from bench.gap.causes.rules import VerdictName
 from bench.gap.report import pictures
 from bench.gap.report.account import closes, cut, interval
@@ -75,12 +76,16 @@ class Explanation:
         return pictures.figure(self.story, name)
 
     @check_arguments
-    def write(self, folder: str | Path) -> list[Path]:
+    def write(self, folder: str | Path, *, pdf: bool = False) -> list[Path]:
         """Write verdict.json, extended.toml, the figures and report.html: all of them or none. Of
         several runs also apart.csv, and for a robot extended.xml, and extended.urdf for one from a
         URDF, after extended.toml.
 
         The folder is made where it is missing; files of these names in it are replaced.
+
+        Args:
+            folder: to write to.
+            pdf: write each figure as PDF too, in addition to PNG.
 
         Returns:
             The files in the order above, each figure as PNG before PDF.
@@ -89,7 +94,8 @@ class Explanation:
             InputError: the folder cannot be made or written to.
         """
         folder = Path(folder)
-        figures = pictures.printed(self.story)
+        with pdf_figures(pdf):
+            figures = pictures.printed(self.story)
         contents: dict[Path, Content] = {
             folder / "verdict.json": self._json(),
             folder / "extended.toml": extending.written(self.extended, folder),
@@ -99,7 +105,8 @@ class Explanation:
         contents |= {folder / name: text for name, text in self._robot_files.contents.items()}
         for name, figure in figures.items():
             contents[folder / f"{name}.png"] = figure.png
-            contents[folder / f"{name}.pdf"] = figure.pdf
+            if figure.pdf is not None:
+                contents[folder / f"{name}.pdf"] = figure.pdf
         contents[folder / "report.html"] = page(self._told, figures, folder)
         # All is drawn before the first file is made: what fails until here leaves no trace.
         try:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from bench.gap.causes.rules import VerdictName
-from bench.gap.model.numerics import Finer
 from bench.gap.verdict import Cause, Verdict
 from sims.extended import Number
-from sims.robot.numerics import INTEGRATORS
+
+if TYPE_CHECKING:
+    from bench.gap.model.numerics import Finer
 
 STEP, INTEGRATOR = "numerics.step", "numerics.integrator"
 _WITH: dict[VerdictName, VerdictName] = {"adequate": "named", "unknown": "partial"}
@@ -37,6 +38,8 @@ def with_numerics(verdict: Verdict, coarse: Coarse) -> Verdict:
 
 
 def _causes(coarse: Coarse) -> list[Cause]:
+    from sims.robot.numerics import INTEGRATORS
+
     own, numerics = coarse.fine.own, coarse.fine.numerics
     # Two numbers are fitted at most, so the gain is one of chance with this probability (Wilks).
     chance = float(np.exp(-0.5 * min(coarse.gain, 1400.0)))

@@ -2,8 +2,8 @@
 
 A chart has panels, a panel has series, and a series names columns of a table (a CSV text in the
 page): what is drawn, what is shown at the cursor and what can be saved as CSV are the same numbers.
-Beside it stands the same figure as matplotlib draws it: for print, without JavaScript, and as SVG,
-PNG and PDF to take away.
+In addition the page holds the same figure as matplotlib draws it: for print, without JavaScript,
+and to be saved as SVG and PNG, and as PDF where one was asked for.
 """
 
 from __future__ import annotations
@@ -159,14 +159,14 @@ class Static:
     """The same figure as it is printed.
 
     Attributes:
-        svg: the bytes of an SVG file.
-        pdf: the bytes of a PDF file.
+        image: the bytes of an SVG or PNG file, which the page shows.
+        pdf: the bytes of a PDF file; None where none was asked for.
         alternative: what it shows, for those who do not see it.
         file: name of its files without an ending.
     """
 
-    svg: bytes
-    pdf: bytes
+    image: bytes
+    pdf: bytes | None
     alternative: str
     file: str
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from bench.pages import elements
 from bench.pages.elements import safe
+from bench.pages.table import Table, is_missing
 from bench.pages.text import number
 
 if TYPE_CHECKING:
@@ -71,22 +72,29 @@ class Grid:
         """What the page's script is told, as JSON holds it."""
         return {**asdict(self), "few": FEW}
 
-    def html(self, frame: pd.DataFrame) -> str:
-        """The table as it stands without a script: what is chosen at first, and a few rows of it.
+    def html(self, frame: pd.DataFrame | Table) -> str:
+        """Render the table as it stands without a script: the first rows of the first choice.
 
         Args:
             frame: the table that the page holds as CSV.
         """
-        part = frame
+        table = (
+            frame
+            if isinstance(frame, Table)
+            else Table({str(name): frame[name].tolist() for name in frame})
+        )
+        part = table.rows()
         for name, value in self.only.items():
-            part = part[part[name].astype(str) == value]
+            part = [row for row in part if str(row[name]) == value]
         if self.sort:
             name, _, way = self.sort.partition(",")
-            part = part.sort_values(name, kind="stable", ascending=way != "down")
+            missing = [row for row in part if is_missing(row[name])]
+            part = [row for row in part if not is_missing(row[name])]
+            part = sorted(part, key=lambda row: row[name], reverse=way == "down") + missing
         heads = [
             f"{elements.NUMBERS * bool(c.digits)}{safe(c.head or c.name)}" for c in self.columns
         ]
-        shown = part.head(FEW).to_dict("records")
+        shown = part[:FEW]
         rows = [self._cells(row) for row in shown]
         marks = ["found" if self._stands_out(row) else "" for row in shown]
         more = len(part) - FEW

@@ -18,6 +18,7 @@ from bench.pages import elements
 from bench.pages.chart import Chart, Static
 from bench.pages.elements import safe
 from bench.pages.grid import Grid
+from bench.pages.table import Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,7 +45,7 @@ class Page:
         self._parts: list[str] = []
         self._sections: list[tuple[str, str]] = []
         self._tables: dict[str, str] = {}
-        self._frames: dict[str, pd.DataFrame] = {}
+        self._frames: dict[str, pd.DataFrame | Table] = {}
         self._charts: list[dict[str, Any]] = []
         self._grids: list[dict[str, Any]] = []
 
@@ -66,7 +67,7 @@ class Page:
             body = "\n".join([f'<h2 id="{name}-head">{head}</h2>', *held])
             self.add(f'<section id="{name}" aria-labelledby="{name}-head">\n{body}\n</section>')
 
-    def table(self, name: str, frame: pd.DataFrame, digits: int | None = None) -> None:
+    def table(self, name: str, frame: pd.DataFrame | Table, digits: int | None = None) -> None:
         """Keep a table in the page, for charts and grids, to be saved as NAME.csv.
 
         Args:
@@ -178,18 +179,22 @@ def _policy(script: str) -> str:
 
 
 def _still(static: Static, spots: Sequence[tuple[str, float, float]] = ()) -> str:
-    """The printed figure, and what can be taken away without a script."""
-    svg = b64encode(static.svg).decode("ascii")
-    pdf = b64encode(static.pdf).decode("ascii")
+    """Build the HTML of the printed figure, and of its PDF where there is one."""
+    kind = "png" if static.image.startswith(b"\x89PNG") else "svg+xml"
+    data = b64encode(static.image).decode("ascii")
     file = safe(static.file)
     image = (
-        f'<img class="still" src="data:image/svg+xml;base64,{svg}" data-file="{file}" '
+        f'<img class="still" src="data:image/{kind};base64,{data}" data-file="{file}" '
         f'alt="{safe(static.alternative, 1000)}">'
     )
-    link = f'<a href="data:application/pdf;base64,{pdf}" download="{file}.pdf">PDF</a>'
+    link = ""
+    if static.pdf is not None:
+        pdf = b64encode(static.pdf).decode("ascii")
+        link = f'<a href="data:application/pdf;base64,{pdf}" download="{file}.pdf">PDF</a>'
     for name, across, down in spots:
         style = f"left:{100 * across:.2f}%;top:{100 * down:.2f}%"
         image += f'<span class="spot" data-lights="{safe(name, 60)}" style="{style}"></span>'
+    # The script adds its buttons to this paragraph, so it stands there without a PDF too.
     return f'<div class="pictured">{image}</div>\n<p class="files">{link}</p>'
 
 

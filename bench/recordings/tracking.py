@@ -55,8 +55,8 @@ class Found(NamedTuple):
         }
 
 
-Draw = Callable[[Track, metres.Heights, slice, str], tuple[bytes, bytes]]
-"""Draws a track, its heights, the frames that are recorded, and a title: PNG and PDF."""
+Draw = Callable[[Track, metres.Heights, slice, str], tuple[bytes, bytes | None]]
+"""Draws a track, its heights, the recorded frames and a title, as a PNG and a PDF or None."""
 
 
 def write(
@@ -66,6 +66,7 @@ def write(
     diameter: float | None = None,
     fps: float | None = None,
     scale: str | None = None,
+    pdf: bool = False,
 ) -> Found:
     """Track `video`; write `out`, its description, and the track's picture beside it.
 
@@ -76,15 +77,16 @@ def write(
         diameter: of the ball, m.
         fps: frames a second instead of the file's time stamps.
         scale: "camera", "diameter" or "fall"; None for the best there is.
+        pdf: whether `draw` makes a PDF too.
 
     Raises:
         InputError: anything that cannot be, in one line.
     """
     if out.suffix != ".csv":
         raise InputError(f"{out}: expected a name that ends in .csv")
-    pictures = [out.with_suffix(".png"), out.with_suffix(".pdf")]
+    pictures = [out.with_suffix(ending) for ending in (".png", ".pdf")]
     # Before the work: tracking a film takes a while.
-    refuse_existing([out, out.with_suffix(".toml"), *pictures])
+    refuse_existing([out, out.with_suffix(".toml"), *pictures[: 2 if pdf else 1]])
     if diameter is not None and not LENGTH[0] <= diameter <= LENGTH[1]:
         wanted = f"more than 0 m, from {LENGTH[0]:g} to {LENGTH[1]:g} m"
         raise InputError(f"ball diameter {diameter:g}: expected {wanted}")
@@ -107,8 +109,10 @@ def write(
     noise = _noise(seen, heights, part)
 
     # The recording and its pictures are published together: neither is left without the other.
-    contents = draw(seen, heights, part, f"{video.name}: {heights.how}")
-    shown = dict(zip(pictures, contents, strict=True))
+    drawn = draw(seen, heights, part, f"{video.name}: {heights.how}")
+    shown = {
+        path: content for path, content in zip(pictures, drawn, strict=True) if content is not None
+    }
     recording = _recording(seen, heights, noise, part, video)
     write_recording(out, recording, BallSystem, digits=_DIGITS, beside=shown)
 

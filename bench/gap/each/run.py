@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.figures.formats import is_pdf_wanted
 from bench.gap.each.rows import TABLE, Row, table
 from bench.gap.explain import explain
 from bench.gap.model.watch import Watch
@@ -87,7 +88,8 @@ def explain_each(
     for row in rows.values():
         done(row)
     left = [log for log in logs if log.name not in rows]
-    calls = [(explained, (log, dict(settings))) for log in left]
+    # A worker process does not know what this one was asked to draw.
+    calls = [(explained, (log, dict(settings), is_pdf_wanted())) for log in left]
     for place, result in pool.results(calls, np.inf):
         log = left[place]
         row = result if isinstance(result, Row) else Row(log.name, log.digest, error=_said(result))
@@ -102,12 +104,12 @@ def explain_each(
     return ordered
 
 
-def explained(log: Log, settings: Mapping[str, Any]) -> Row:
-    """Explain a log and write what was found; whoever makes the call."""
+def explained(log: Log, settings: Mapping[str, Any], pdf: bool = False) -> Row:
+    """Explain a log and write what was found, in whichever process makes the call."""
     try:
         given = {key: value for key, value in settings.items() if key != "budget"}
         explanation = explain(log.path, watch=Watch(settings.get("budget")), **given)
-        explanation.write(log.folder)
+        explanation.write(log.folder, pdf=pdf)
     except InputError as error:
         return Row(log.name, log.digest, error=first_line(error))
     found = explanation.answer.document()

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.analysis.chi_squared import chi_squared_tail
 from sims.base import Array
 
 Mask = NDArray[np.bool_]
@@ -210,8 +211,6 @@ def forgets(residual: Array, seen: Mask, found: Likelihood) -> float:
         seen: (R, T, C) which samples there are.
         found: its likelihood.
     """
-    from scipy.special import chdtrc
-
     least = 1.0
     for c, phi in enumerate(found.phi.tolist()):
         channel = slice(c, c + 1)
@@ -219,7 +218,7 @@ def forgets(residual: Array, seen: Mask, found: Likelihood) -> float:
         white = whitened(residual[:, :, channel], here, _unit(phi))
         count = max(int(here.sum()), 2)
         statistic = count * (count + 2.0) * _correlated(white[:, :, 0], count)  # (5)
-        least = min(least, float(chdtrc(LAGS - 1, statistic)))
+        least = min(least, chi_squared_tail(LAGS - 1, statistic))
     return min(1.0, least * len(found.phi))
 
 

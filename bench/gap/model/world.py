@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.gap.model.crew import Crew
+from bench.gap.model.lane_cache import LaneCache
 from bench.gap.model.noise import Mask
 from bench.gap.model.tracks import Track, first_of, tracked
 from bench.gap.model.watch import Watch
@@ -155,6 +156,7 @@ class World:
         self.neighbourhoods: dict[tuple[int, bytes, bytes], Any] = {}
         self.simulated: dict[tuple[str, bytes], Array] = {}
         self.simulations = 0
+        self._cache = LaneCache()
         self.watch = Watch()
         self.crew = Crew()
         self._parts: dict[float, list[Scenario]] = {}
@@ -312,9 +314,31 @@ class World:
             share: only this first share of each run is simulated; what is behind it, or behind the
                 end of a shorter run, is NaN.
         """
+        result = np.empty((len(theta), *self.observed.shape[1:]))
+        if self.linear:
+            lanes = zip(theta, runs.tolist(), states, strict=True)
+            keys = [
+                b"".join((repr((share, run)).encode(), own.tobytes(), begin.tobytes()))
+                for own, run, begin in lanes
+            ]
+            new = self._cache.missing(keys)
+            made = self._simulate(theta[new], runs[new], states[new], share)
+            self._cache.fill(keys, new, made, result)
+        else:
+            # The slowest lane of a call sets the steps of all: in another call a lane differs in
+            # its last digits.
+            result = self._simulate(theta, runs, states, share)
+        if self.correction is not None:
+            result += self.correction[runs]
+        return result
+
+    def _simulate(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
+        """Simulate lanes, uncorrected; arguments and result as those of `simulate`."""
         self.simulations += len(theta)
         _, length, channels = self.observed.shape
         result = np.empty((len(theta), length, channels))
+        if not len(theta):
+            return result
 
         # the slowest lane of a call sets its steps: those that need many do not go with the others
         kinds = self.kinds(theta)
@@ -331,8 +355,6 @@ class World:
             last = simulated.shape[1]
             result[parts[number], :last] = simulated
             result[parts[number], last:] = np.nan
-        if self.correction is not None:
-            result += self.correction[runs]
         return result
 
     def over(self, runs: Sequence[Run]) -> World:

@@ -4,8 +4,6 @@ a chart; their numbers are those of verdict.json and of the story.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from bench.gap.report.joints import by_joint, joint_of
 from bench.gap.report.motion import AFTER, BEFORE
 from bench.gap.report.panels import MOST_LETTERS, changed, telling
@@ -15,11 +13,9 @@ from bench.gap.report.story import Story
 from bench.gap.report.words import FAMILY, clean, kind_of, labelled, name_of, parted, sentence
 from bench.pages.chart import Axis, Chart, Panel, Series
 from bench.pages.grid import Column, Grid
+from bench.pages.table import Table
 from sims import effects
 from sims.base import InputError
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 CANDIDATES, PLACES, FOLLOWS = "candidates", "where", "follows"
 """Names of the tables."""
@@ -27,10 +23,8 @@ BEST, ELSEWHERE = "the best of each effect", "the same at other places"
 """Rows of a robot's candidates."""
 
 
-def candidates_table(story: Story) -> pd.DataFrame:
+def candidates_table(story: Story) -> Table:
     """A row for each candidate, the highest score first."""
-    import pandas as pd
-
     sets = _sets(story)
     heads = {entry.best.effect for entry in entries(story)}
     found = bool(story.verdict.causes)
@@ -55,8 +49,7 @@ def candidates_table(story: Story) -> pd.DataFrame:
                 "says": _says(story, c.effect),
             }
         )
-    frame = pd.DataFrame(rows)
-    return frame.drop(columns=_needless(story)) if rows else frame
+    return Table.from_rows(rows).without(_needless(story))
 
 
 def _needless(story: Story) -> list[str]:
@@ -87,7 +80,7 @@ def _says(story: Story, name: str) -> str:
         return ""
 
 
-def candidates_grid(frame: pd.DataFrame) -> Grid:
+def candidates_grid(frame: Table) -> Grid:
     """The candidates to sort and to filter; of a robot's effects at first the best place each."""
     digits = {"score": 3, "p_value": 2, "heldout_gain": 3}
     heads = {
@@ -122,10 +115,8 @@ def candidates_grid(frame: pd.DataFrame) -> Grid:
     )
 
 
-def places_table(story: Story) -> pd.DataFrame:
+def places_table(story: Story) -> Table:
     """A row for each part of the data: RMS of the residual in noises."""
-    import pandas as pd
-
     rows = []
     for p in story.places:
         row = {"kind": p.kind, "part": clean(p.label, 80), "samples": p.samples, "before": p.before}
@@ -135,10 +126,10 @@ def places_table(story: Story) -> pd.DataFrame:
             name = p.label if p.kind == "channel" else ""
             row["joint"] = joint_of(story, "channel", name)
         rows.append(row)
-    return pd.DataFrame(rows)
+    return Table.from_rows(rows)
 
 
-def places_grid(frame: pd.DataFrame) -> Grid:
+def places_grid(frame: Table) -> Grid:
     """The parts of the data to sort and to filter, the largest gap first."""
     after = "after" in frame
     heads = {"before": "RMS before" if after else "RMS", "after": "RMS after"}
@@ -159,10 +150,8 @@ def places_grid(frame: pd.DataFrame) -> Grid:
     )
 
 
-def follows_table(story: Story) -> pd.DataFrame:
+def follows_table(story: Story) -> Table:
     """The residual against what it may follow, bin by bin."""
-    import pandas as pd
-
     rows = []
     for p in story.profiles:
         about = {"channel": clean(p.channel, 80), "variable": clean(p.variable, 80)}
@@ -171,7 +160,7 @@ def follows_table(story: Story) -> pd.DataFrame:
             for centre, mean, error in zip(p.centres, means, p.error, strict=True):
                 bars = {"mean": mean, "low": mean - 2 * error, "high": mean + 2 * error}
                 rows.append({**about, "when": when, "at": centre, **bars})
-    return pd.DataFrame(rows)
+    return Table.from_rows(rows)
 
 
 def follows_chart(story: Story) -> Chart:

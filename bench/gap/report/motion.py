@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import ceil, floor, log10
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,8 @@ from bench.gap.report.shots import worst
 from bench.gap.report.story import Side, Story
 from bench.gap.report.words import clean, labelled, number, pretty
 from bench.pages.chart import Axis, Chart, Panel, Series, Span, Static, Tell
+from bench.pages.table import Table
 from sims.base import Array
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 TABLE = "motion"
 """Name of the table, and of the chart."""
@@ -71,7 +69,7 @@ class Motion(NamedTuple):
         absent: runs that are not shown.
     """
 
-    frame: pd.DataFrame
+    frame: Table
     runs: tuple[Drawn, ...]
     stretches: int
     longest: int
@@ -80,8 +78,6 @@ class Motion(NamedTuple):
 
 def motion(story: Story, most: int = MOST_ROWS) -> Motion:
     """The samples to show, at most about so many."""
-    import pandas as pd
-
     runs = _runs(story)
     count = len(story.channels)
     shown = runs[: max(1, most // (LEAST_ROWS * count))]
@@ -90,7 +86,7 @@ def motion(story: Story, most: int = MOST_ROWS) -> Motion:
     names = ["run", "channel", "t", "measured", "before"] + ["after"] * changed(story)
     names += ["residual_before"] + ["residual_after"] * changed(story)
     columns = [[cell for part in parts for cell in part[i]] for i in range(len(names))]
-    frame = pd.DataFrame(dict(zip(names, columns, strict=True)), dtype=str)
+    frame = Table(dict(zip(names, columns, strict=True)))
     longest = max(len(run.side.times[run.row]) for run in shown)
     cut = _stretches(story, each) if longest > each else 0
     return Motion(frame, tuple(shown), cut, longest, len(runs) - len(shown))

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from bench.gap.report.account import closes, effort, following, headline, heldout_unit, interval
 from bench.gap.report.advice import advice
@@ -47,9 +46,7 @@ from bench.gap.report.words import clean, joined, name_of, number, percent, pret
 from bench.pages.chart import Static
 from bench.pages.elements import bar, code, figure, paragraph, safe, strong
 from bench.pages.page import Page
-
-if TYPE_CHECKING:
-    import pandas as pd
+from bench.pages.table import Table
 
 _STYLE = Path(__file__).with_name("page.css")
 _BADGES = {
@@ -187,7 +184,7 @@ def _gain(story: Story) -> Iterator[str]:
 
 
 def _still(story: Story, name: str, figure: Printed) -> Static:
-    return Static(figure.svg, figure.pdf, _alternative(story, name), name)
+    return Static(figure.svg or figure.png, figure.pdf, _alternative(story, name), name)
 
 
 def _runs(
@@ -230,7 +227,7 @@ def _film(story: Story) -> Iterator[str]:
 
 
 def _where(
-    made: Page, story: Story, stills: Mapping[str, Static], frames: Mapping[str, pd.DataFrame]
+    made: Page, story: Story, stills: Mapping[str, Static], frames: Mapping[str, Table]
 ) -> Iterator[str]:
     """Where the gap is, in units of the noise and of each channel."""
     if "where" in stills:
@@ -245,7 +242,7 @@ def _where(
 
 
 def _candidates(
-    made: Page, story: Story, stills: Mapping[str, Static], frames: Mapping[str, pd.DataFrame]
+    made: Page, story: Story, stills: Mapping[str, Static], frames: Mapping[str, Table]
 ) -> Iterator[str]:
     """The candidates with their evidence, and what cannot be told apart."""
     yield from sets(story)

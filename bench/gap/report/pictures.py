@@ -1,8 +1,8 @@
 """The figures of an explanation: the run with the largest gap, where the gap is, the candidates.
 
 Made for print and for grey: before is dashed with open squares, after solid with filled circles,
-beside their colours. Each figure is written as PNG and PDF, and as SVG for the page. Texts from
-files are never read as mathematics.
+beside their colours. Each figure is rendered as PNG, and as PDF and SVG where vector graphics are
+asked for (`bench.figures.formats`). Texts from files are never read as mathematics.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.figures import style
+from bench.figures.formats import is_pdf_wanted
 from bench.figures.robot import joints_in, robot_figure
 from bench.figures.style import BAND, ZERO, blank
 from bench.gap.report.joints import by_joint, joints_figure
@@ -42,8 +43,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-DPI = 130
-"""Dots an inch: the page shows figures at about this width."""
+DPI = 150
+"""Dots an inch of the PNG files, which the page shows at about two thirds of their size."""
 _WIDTHS = {1: 8.6, 2: 10.0, 3: 12.5}
 """Inches by the number of channels."""
 _HEADING = 0.22
@@ -55,6 +56,8 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "legend.frameon": False,
     "text.usetex": False,
+    # Fitting letters to the grid of pixels takes a tenth of a figure's time, and spaces them worse.
+    "text.hinting": "none",
     # Names come from files: a dollar sign in one is a dollar sign.
     "text.parse_math": False,
 }
@@ -89,21 +92,24 @@ def figure(story: Story, name: str) -> Figure:
 
 class Printed(NamedTuple):
     """One figure as the bytes of its files; of a robot's where its joints are: names with shares of
-    its width and height from above left.
+    its width and height from above left. `pdf` and `svg` are None where no PDF is asked for.
     """
 
     png: bytes
-    pdf: bytes
-    svg: bytes
+    pdf: bytes | None
+    svg: bytes | None
     spots: tuple[tuple[str, float, float], ...] = ()
 
 
 def printed(story: Story) -> dict[str, Printed]:
-    """Every figure that there is, by name."""
+    """Draw every figure that a story has, and render its files; by name."""
     with _styled():
         # Within the settings: text is laid out once more when a figure is written.
-        figures = {name: figure(story, name) for name in names(story)}
-        made = {n: Printed(*style.printed(f, DPI), style.svg(f)) for n, f in figures.items()}
+        figures = {name: _MAKERS[name](story) for name in names(story)}
+        made = {}
+        for name, drawn in figures.items():
+            png, pdf = style.printed(drawn, DPI)
+            made[name] = Printed(png, pdf, style.svg(drawn) if is_pdf_wanted() else None)
         if story.robot is not None and "robot" in made:
             where = tuple(joints_in(figures["robot"], story.robot, pose(story, worst(story))))
             made["robot"] = made["robot"]._replace(spots=where)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,7 +11,9 @@ from bench.gap.model.noise import Mask
 from bench.gap.model.world import World
 from bench.gap.report.story import Place, Profile, Side
 from sims.base import Array
-from sims.robot.model import Robot
+
+if TYPE_CHECKING:
+    from sims.robot.model import Robot
 
 BINS = 12
 """Of a profile."""

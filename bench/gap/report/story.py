@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bench.gap.apart import Apart
 from bench.gap.identify import Number
 from bench.gap.verdict import Verdict
 from sims.base import Array
-from sims.robot.model import Robot
+
+if TYPE_CHECKING:
+    from sims.robot.model import Robot
 
 
 @dataclass(frozen=True)

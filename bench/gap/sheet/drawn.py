@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.figures import style
+from bench.figures.formats import is_pdf_wanted
 from bench.gap.report.words import clean, estimated, number, pretty, sentence, with_unit
 from bench.gap.sheet.diagram import Diagram
 from bench.gap.sheet.facts import Facts
@@ -40,12 +41,12 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-def picture(diagram: Diagram) -> tuple[bytes, bytes]:
-    """The diagram as SVG and PDF."""
+def picture(diagram: Diagram) -> tuple[bytes, bytes | None]:
+    """Render the diagram as SVG for the page, and as PDF where one is asked for."""
     with _styled():
         figure, axes = style.blank(1, 1, (5.4, 4.6))
         draw(axes[0, 0], diagram)
-        return style.svg(figure), style.pdf(figure)
+        return style.svg(figure), style.pdf(figure) if is_pdf_wanted() else None
 
 
 def draw(axes: Axes, diagram: Diagram) -> None:

@@ -39,8 +39,8 @@ _REACH = (
 )
 
 
-def page(sheet: Facts, diagram: Diagram, drawn: tuple[bytes, bytes], made: Made) -> str:
-    """The page as HTML, with the diagram as it is drawn (SVG and PDF)."""
+def page(sheet: Facts, diagram: Diagram, drawn: tuple[bytes, bytes | None], made: Made) -> str:
+    """Render the page as HTML, with the diagram as SVG and, where one is asked for, PDF."""
     built = Page(f"Data sheet: {clean(sheet.name, 80)}", _foot(sheet))
     built.table(DIAGRAM, _numbers(diagram))
     built.add(*_head(sheet))

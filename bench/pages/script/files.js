@@ -1,6 +1,7 @@
 // Files that are saved from the page.
 
-// SVG and PNG from the printed figure, the numbers from the tables.
+// SVG and PNG from the printed figure, or PNG alone where that is what the page holds; the numbers
+// from the tables.
 function filesOf(place, own, tables) {
   const still = place.querySelector("img.still");
   const files = place.querySelector(".files") ?? element("p", { class: "files" });
@@ -8,8 +9,10 @@ function filesOf(place, own, tables) {
   const made = [];
   if (still) {
     const name = still.dataset.file;
-    made.push(button("SVG", () => fileOf(still.src).then((blob) => save(`${name}.svg`, "", blob))));
-    made.push(button("PNG", () => pixels(still).then((blob) => save(`${name}.png`, "", blob))));
+    const vector = still.src.startsWith("data:image/svg");
+    if (vector) made.push(button("SVG", () => fileOf(still.src, "image/svg+xml").then((blob) => save(`${name}.svg`, "", blob))));
+    const png = () => (vector ? pixels(still) : fileOf(still.src, "image/png"));
+    made.push(button("PNG", () => png().then((blob) => save(`${name}.png`, "", blob))));
   }
   for (const name of tables) {
     made.push(button(`numbers as CSV${name === own ? "" : ` (${name})`}`, () => save(`${name}.csv`, "text/csv", DATA.tables[name])));
@@ -20,9 +23,9 @@ function filesOf(place, own, tables) {
 }
 
 // The bytes of an image that lies in the page; nothing is asked of anybody.
-async function fileOf(source) {
+async function fileOf(source, type) {
   const text = atob(source.slice(source.indexOf(",") + 1));
-  return new Blob([Uint8Array.from(text, (letter) => letter.charCodeAt(0))], { type: "image/svg+xml" });
+  return new Blob([Uint8Array.from(text, (letter) => letter.charCodeAt(0))], { type });
 }
 
 async function pixels(still) {

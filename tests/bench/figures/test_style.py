@@ -15,9 +15,10 @@ import bench
 from bench.analysis.paired import nemenyi
 from bench.figures import style, training
 from bench.figures.comparison import figure, names
+from bench.figures.formats import pdf_figures
 from bench.figures.recording import recording_figure
 from bench.figures.runtimes import rank_figure
-from bench.figures.style import blank, png, save
+from bench.figures.style import blank, png, save, taken
 from bench.figures.track import track_figure
 from bench.gap.report import pictures
 from bench.recordings.inspection import load
@@ -107,12 +108,27 @@ def test_a_notebook_can_show_a_figure_that_pyplot_does_not_know():
 
 
 def test_files_are_whole_and_the_same_whenever_they_are_made(tmp_path):
-    paths = save(loss(), tmp_path / "new" / "figures" / "loss")
+    with pdf_figures():
+        paths = save(loss(), tmp_path / "new" / "figures" / "loss")
+        again = save(loss(), tmp_path / "loss")
     assert [path.name for path in paths] == ["loss.png", "loss.pdf"]
     assert sorted((tmp_path / "new" / "figures").iterdir()) == sorted(paths)
-    again = save(loss(), tmp_path / "loss")
     assert [p.read_bytes() for p in again] == [p.read_bytes() for p in paths]
     assert paths[0].read_bytes() == png(loss())
+
+
+def test_a_pdf_is_made_only_where_one_is_asked_for(tmp_path, monkeypatch):
+    rendered = []
+    plain = style.pdf
+    monkeypatch.setattr(style, "pdf", lambda figure: rendered.append(figure) or plain(figure))
+    assert [path.name for path in save(loss(), tmp_path / "loss")] == ["loss.png"]
+    assert taken(loss()).pdf is None
+    with pdf_figures(False):
+        assert taken(loss()).pdf is None
+    assert rendered == [], "what nobody asks for costs nothing"
+    with pdf_figures(), pdf_figures(False):
+        assert taken(loss()).pdf.startswith(b"%PDF")
+    assert taken(loss()).pdf is None
 
 
 def test_of_png_and_pdf_neither_is_left_without_the_other(tmp_path, monkeypatch):
@@ -123,7 +139,10 @@ def test_of_png_and_pdf_neither_is_left_without_the_other(tmp_path, monkeypatch)
 
     original = Path.write_bytes
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(InputError, match=r"cannot be written \(No space left on device\)"):
+    with (
+        pdf_figures(),
+        pytest.raises(InputError, match=r"cannot be written \(No space left on device\)"),
+    ):
         save(loss(), tmp_path / "loss")
     assert not list(tmp_path.iterdir())
 

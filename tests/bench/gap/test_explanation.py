@@ -119,14 +119,23 @@ def test_a_figure_looks_alike_shown_and_written(named, tmp_path):
 
 def test_it_is_written_into_a_folder_that_is_made(named, tmp_path):
     folder = tmp_path / "new" / "one"
-    paths = named.write(str(folder))
+    paths = named.write(str(folder), pdf=True)
     names = [f"{n}{e}" for n in named.figures for e in (".png", ".pdf")]
     assert paths[-1].read_bytes().decode("utf-8").startswith("<!DOCTYPE html>")
     assert [p.name for p in paths] == ["verdict.json", "extended.toml", *names, "report.html"]
     assert sorted(folder.iterdir()) == sorted(paths), "nothing else is left there"
     assert json.loads(paths[0].read_text()) == named.answer.document()
-    again = named.write(folder)
+    again = named.write(folder, pdf=True)
     assert again == paths
+
+
+def test_without_being_asked_it_writes_no_pdf(named, tmp_path):
+    paths = named.write(tmp_path)
+    assert {path.name for path in paths if path.stem in named.figures} == {
+        f"{name}.png" for name in named.figures
+    }
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+    assert b"application/pdf" not in paths[-1].read_bytes()
 
 
 def test_all_is_written_or_nothing(named, tmp_path, monkeypatch):

@@ -138,7 +138,7 @@ def test_it_is_reported_in_words_tables_and_figures(folder, capsys):
     assert "the world has restitution.speed -0.1; explain says named: restitution.speed" in said
     assert "Kendall's tau" in said
     for name in ("bias", "prediction", "ranks"):
-        assert (folder / "figures" / f"{name}.pdf").stat().st_size > 5000
+        assert (folder / "figures" / f"{name}.png").stat().st_size > 5000
     compared = simgap.Compared(folder)
     assert list(compared.tables) == ["table", "ranks", "ranking"]
     assert set(compared.runs["model"]) == set(MODELS)

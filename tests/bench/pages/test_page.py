@@ -284,7 +284,7 @@ def test_a_figure_is_saved_as_svg_png_and_pdf(opened):
         assert name == f"error.{kind.lower()}"
         assert content.startswith(begins)
         if kind != "PNG":
-            assert content == getattr(still, kind.lower())
+            assert content == {"SVG": still.image, "PDF": still.pdf}[kind]
     assert opened.complaints == []
 
 

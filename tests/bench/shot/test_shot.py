@@ -188,7 +188,7 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
         assert by_rows.restitution == pytest.approx(by_metres.restitution, abs=0.06)
         assert by_rows.simulations <= experiment.budget
         found[kind] = by_rows.restitution
-        for left in ("drop.csv", "drop.toml", "drop.png", "drop.pdf"):
+        for left in ("drop.csv", "drop.toml", "drop.png"):
             (tmp_path / left).unlink()
     assert found["golf"] - found["squash"] > 0.2  # 0.86 and 0.54 by the tables
 
@@ -302,7 +302,7 @@ shot = {{ balls = ["golf"] }}
     assert set(pd.read_csv(out / "status.csv")["status"]) <= {"done", "converged"}
     for figure in ("success", "off", "shots"):
         assert (out / "figures" / f"{figure}.png").stat().st_size > 10_000
-        assert (out / "figures" / f"{figure}.pdf").exists()
+        assert not (out / "figures" / f"{figure}.pdf").exists()
     assert (out / "figures" / "shot.gif").stat().st_size > 10_000
     kept = (out / "shots" / "golf-000.json").read_text()
     assert {row["method"] for row in json.loads(kept)["rows"]} == set(lines.index.unique("method"))

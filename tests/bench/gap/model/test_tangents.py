@@ -63,3 +63,23 @@ def test_what_is_held_or_damped_forgets_and_what_swings_or_creeps_does_not(
     assert forgets(there, noise, by_states) is expected
     known = np.zeros_like(by_states)
     assert not forgets(there, noise, known), "what is known shows nothing of how long it acts"
+
+
+def test_a_lane_that_was_simulated_is_not_simulated_again(tmp_path):
+    there = world(tmp_path, ARM.format(damping=0.4, drive=SERVO))
+    theta = np.tile(there.nominal(), (3, 1))
+    runs = np.array([0, 1, 0])
+    states = there.guess[runs] + np.array([[0.0], [0.0], [0.1]])
+    first = there.simulate(theta, runs, states)
+    assert there.simulations == 3
+    again = there.simulate(theta[::-1], runs[::-1], states[::-1])
+    assert there.simulations == 3
+    np.testing.assert_array_equal(again[::-1], first)
+    # A part of a run, or another run, is another lane.
+    half = there.simulate(theta[:1], runs[:1], states[:1], 0.5)
+    assert there.simulations == 4
+    assert np.isnan(half).any()
+    # What is taken out of all simulations is no part of what is held.
+    there.correction = np.full(there.observed.shape, 1.0)
+    np.testing.assert_array_equal(there.simulate(theta, runs, states), first + 1.0)
+    assert there.simulations == 4

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 
 from bench.figures import robot as drawing
+from bench.figures.formats import pdf_figures
 from bench.gap.report.page import page
 from bench.gap.report.pictures import printed
 from bench.pages.elements import framed
@@ -35,7 +36,8 @@ def written(tmp_path_factory):
             ("simple", story("ambiguous")),
             ("robot", robot_story("ambiguous", [WRISTS], changes=(CHANGE,))),
         ):
-            figures = printed(told)
+            with pdf_figures(name == "robot"):
+                figures = printed(told)
             path = folder / f"{name}.html"
             path.write_text(page(told, figures, folder), encoding="utf-8")
             made[name] = SimpleNamespace(path=path, story=told, figures=figures)
@@ -269,6 +271,14 @@ def test_every_figure_is_saved_with_its_numbers(robot, written):
     assert file == "where.csv"
     told = written["robot"].story.places
     assert list(frame["before"]) == [place.before for place in told]
+
+
+def test_a_page_without_vector_graphics_saves_the_png_that_it_shows(simple, written):
+    files = simple.page.locator("#candidates-picture .files")
+    texts = files.locator("a, button").all_inner_texts()
+    assert texts == ["PNG", "numbers as CSV (candidates)"]
+    png = written["simple"].figures["candidates"].png
+    assert simple.saved(files.get_by_role("button", name="PNG").click) == ("candidates.png", png)
 
 
 def test_on_paper_and_without_a_script_figures_are_printed_ones(browser, simple, written):

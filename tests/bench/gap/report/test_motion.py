@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from bench.gap.report.motion import LEAST_ROWS, MOST_ROWS, extremes, motion, motion_chart
@@ -55,7 +56,8 @@ def test_long_recordings_are_thinned_said_so_and_stay_below_3_mb():
     assert "Of runs of up to 25000 samples not all are shown" in caption
     assert f"each of {found.stretches} stretches" in caption
     # Every row is a sample as it was: nothing is averaged.
-    rows = found.frame[(found.frame["run"] == "2") & (found.frame["channel"] == "channel_3")]
+    frame = pd.DataFrame(found.frame.rows())
+    rows = frame[(frame["run"] == "2") & (frame["channel"] == "channel_3")]
     places = np.round(rows["t"].astype(float) * 1000).astype(int)
     measured = told.fitting.observed[1, places, 3]
     assert np.allclose(rows["measured"].astype(float), measured, atol=1e-4)
@@ -91,9 +93,10 @@ def test_runs_of_one_sample_and_runs_without_any_are_no_trouble():
     observed[0] = np.nan
     short = replace(side, observed=observed, times=(side.times[0], side.times[1][:1]))
     found = motion(replace(told, held_out=short))
-    rows = found.frame[found.frame["run"] == side.names[1]]
+    frame = pd.DataFrame(found.frame.rows())
+    rows = frame[frame["run"] == side.names[1]]
     assert list(rows["t"]) == ["0", "0"]
-    assert set(found.frame[found.frame["run"] == side.names[0]]["measured"]) == {""}
+    assert set(frame[frame["run"] == side.names[0]]["measured"]) == {""}
 
 
 def test_dots_of_a_long_run_are_pixels_in_vector_files_too():

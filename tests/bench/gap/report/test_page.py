@@ -136,6 +136,13 @@ def test_figures_are_embedded_with_alternatives_that_say_what_they_show(figures)
     assert data == [(name, still(name).svg) for name in names]
     papers = re.findall(r'href="data:application/pdf;base64,([^"]+)"', html)
     assert [b64decode(paper) for paper in papers] == [still(name).pdf for name in names]
+    without = {name: figure._replace(pdf=None, svg=None) for name, figure in figures.items()}
+    html = page(story(), without)
+    assert not re.search("data:(application/pdf|image/svg.xml);", html)
+    shown = re.findall(r'src="data:image/png;base64,([^"]+)" data-file="(\w+)"', html)
+    assert [(b64decode(data), name) for data, name in shown] == [
+        (still(name).png, name) for name in names
+    ]
     overview, where, candidates = (alt for _, _, alt in found)
     assert "q and qd" in overview
     assert "linear drag" in overview

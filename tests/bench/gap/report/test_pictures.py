@@ -6,6 +6,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from bench.figures.formats import pdf_figures
 from bench.gap.report.page import page
 from bench.gap.report.panels import chosen_places, profile_panel, telling
 from bench.gap.report.pictures import printed
@@ -23,7 +24,8 @@ def pixels(png):
 
 @pytest.fixture(scope="module")
 def named():
-    return printed(story())
+    with pdf_figures():
+        return printed(story())
 
 
 def test_each_figure_is_there_in_every_format_and_shows_something(named):
@@ -51,8 +53,15 @@ def test_before_and_after_are_both_drawn_where_there_is_an_after(named):
     assert share(adequate, 0xD5, 0x5E, 0x00) > 1e-3
 
 
+def test_without_being_asked_there_are_no_vector_graphics():
+    for png, pdf, svg, _ in printed(story()).values():
+        assert png.startswith(b"\x89PNG")
+        assert pdf is svg is None
+
+
 def test_figures_are_the_same_again(named):
-    assert printed(story()) == named
+    with pdf_figures():
+        assert printed(story()) == named
 
 
 def test_a_page_with_its_figures_stays_small(named):
