@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 from bench.gap import explain as explaining
 from bench.gap.explanation import Explanation
 from bench.gap.model.crew import cores
+from bench.gap.model.progress import ProgressListener
 from bench.gap.model.watch import Watch
 from bench.gap.score_model import scored
 from bench.recordings.simulate import SimulatedRecording
@@ -37,6 +38,7 @@ def explain(
     say: Callable[[str], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float, str], None] | None = None,
+    listener: ProgressListener | None = None,
 ) -> Explanation:
     """Show what the simulation of a recording gets wrong, name the cause, extend the simulator.
 
@@ -60,9 +62,11 @@ def explain(
             own: for motion that drifts or is unstable.
         thorough: search on where causes are found and something is left over: further causes are
             taken that held-out runs bear out. Takes about twice as long there.
-        say: told what is being done.
+        say: told what the user should know of the recording and of the base model.
         stop: asked between two steps of the search; True ends it as a budget does.
         progress: told the share that is done, as far as can be known, and what is looked at.
+        listener: receives the events of the search: its stages with their steps, and the best
+            model so far.
 
     Raises:
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
@@ -75,7 +79,7 @@ def explain(
         raise InputError(f"jobs: expected a whole number of at least 1, found {jobs!r}")
     if pieces is not None and not pieces > 0:
         raise InputError(f"pieces: expected a number of seconds above 0, found {pieces!r}")
-    watch = Watch(budget, stop, progress)
+    watch = Watch(budget, stop, progress, listener)
     given = system, engine, seed, free, tuner, say, force
     more = jobs or cores(), model, whole, pieces, thorough
     return explaining.explain(sources, *given, watch, *more)
