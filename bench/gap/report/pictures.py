@@ -17,23 +17,21 @@ import numpy as np
 from bench.figures import style
 from bench.figures.robot import joints_in, robot_figure
 from bench.figures.style import BAND, ZERO, blank
+from bench.gap.report.candidates_figure import candidates_figure
 from bench.gap.report.joints import by_joint, joints_figure
 from bench.gap.report.panels import (
     AFTER,
     BEFORE,
     changed,
     chosen_places,
-    gains_panel,
     in_order,
     label,
     places_panel,
     profile_panel,
-    scores_panel,
-    standings,
     telling,
 )
-from bench.gap.report.places import has_places, marks
-from bench.gap.report.ranking import entries, ranked
+from bench.gap.report.places import marks
+from bench.gap.report.ranking import ranked
 from bench.gap.report.shots import MOST_OUTLINES, Shot, kept, worst
 from bench.gap.report.story import Story
 from sims.base import InputError, unknown
@@ -279,28 +277,9 @@ def _where(story: Story) -> Figure:
     return figure
 
 
-def _candidates(story: Story) -> Figure:
-    """Left the scores, right the gains on held-out runs."""
-    shown, total = ranked(story), len(entries(story))
-    # With its place a name is longer.
-    names = 3.2 if has_places(story) else 2.35
-    width, height = 7.05 + names, 1.75 + 0.28 * len(shown)
-    figure, axes = blank(1, 2, (width, height), layout=None, sharey=True, width_ratios=(3, 2))
-    scores_panel(axes[0, 0], story, shown)
-    gains_panel(axes[0, 1], story, shown)
-    # Whoever misses a candidate must see that not all are shown.
-    some = f", the best {len(shown)} of {total}" if len(shown) < total else ""
-    y = 1 - _HEADING / height
-    figure.text(0.015, y, f"Candidate causes{some}", fontsize=11, va="center")
-    figure.legend(*standings(story), loc="upper right", ncols=3, fontsize=8.5)
-    bottom, top = 0.68 / height, 1 - 0.45 / height
-    figure.subplots_adjust(left=names / width, right=0.985, bottom=bottom, top=top, wspace=0.06)
-    return figure
-
-
 _MAKERS: Mapping[str, Callable[[Story], Figure]] = {
     "robot": _robot,
     "overview": _overview,
     "where": _where,
-    "candidates": _candidates,
+    "candidates": candidates_figure,
 }
