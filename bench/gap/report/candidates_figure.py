@@ -4,7 +4,6 @@ for it.
 
 from __future__ import annotations
 
-import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.figures.style import BAND, BLUE, INK, SKY, SOFT, ZERO, blank
+from bench.figures.text_layout import break_name, most_lines, text_width
 from bench.gap.report.places import has_places
 from bench.gap.report.ranking import entries, ranked, short_name, standing
 from bench.gap.report.story import Side, Story
@@ -73,11 +73,12 @@ def candidates_figure(story: Story) -> Figure:
     names = [_name(story, candidate) for candidate in shown]
     has_shares = any(candidate.heldout_gain is not None for candidate in shown)
 
-    left = _EDGE + 0.12 + _widest(names)
+    # Bold, as names of causes are, and a little wider than the others.
+    left = _EDGE + 0.12 + text_width(names, _NAME_SIZE, "bold")
     between = _SHARES_WIDTH + _SHARE_TEXTS_WIDTH if has_shares else 0.0
     width = max(left + between + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
     # Rows are as high as the longest name needs, so that bars stand at even distances.
-    row = _ROW + _LINE * max(name.count("\n") + 1 for name in names)
+    row = _ROW + _LINE * most_lines(names)
     handles, labels = _legend(story)
     top = _TOP if handles else _TOP_WITHOUT_LEGEND
     height = top + _BOTTOM + row * len(shown)
@@ -124,29 +125,7 @@ def _name(story: Story, candidate: Candidate) -> str:
     # The place has lines of its own.
     effect, at, place = text.rpartition(" at ")
     lines = textwrap.wrap(effect if at else text, LINE_LENGTH)
-    return "\n".join([*lines, *_broken(f"at {place}")] if at else lines)
-
-
-def _broken(place: str) -> list[str]:
-    """Break the name of a place into lines, behind underscores and the like if possible."""
-    lines = [""]
-    for part in re.findall(r"[^_\-./ ]*[_\-./ ]?", place):
-        if lines[-1] and len(lines[-1]) + len(part) > LONGEST_LINE:
-            lines.append("")
-        lines[-1] += part
-    return [piece for line in lines for piece in textwrap.wrap(line, LONGEST_LINE)]
-
-
-def _widest(names: Sequence[str]) -> float:
-    """Width of the longest line of some names, in inches."""
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import text_to_path
-
-    # Bold, as names of causes are, and a little wider than the others.
-    font = FontProperties(family="DejaVu Sans", weight="bold", size=_NAME_SIZE)
-    lines = [line for name in names for line in name.split("\n")]
-    widths = [text_to_path.get_text_width_height_descent(line, font, False)[0] for line in lines]
-    return float(max(widths)) / 72.0
+    return "\n".join([*lines, break_name(f"at {place}", LONGEST_LINE)] if at else lines)
 
 
 def _label_rows(axis: Axes, story: Story, shown: Sequence[Candidate], names: Sequence[str]) -> None:

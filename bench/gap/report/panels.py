@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.figures.style import BLUE, CHANCE, INK, JOIN, VERMILION, ZERO
+from bench.figures.text_layout import break_name
 from bench.gap.report.story import Place, Profile, Story
 from bench.gap.report.words import clean, labelled
 
@@ -21,8 +22,12 @@ MOST_PLACES = 10
 MOST_PROFILES = 4
 MOST_LETTERS = 26
 """Of the name of a variable or of a channel."""
+LONGEST_NAME = 64
+"""Of the name of a run or channel among the places."""
+_NAME_LINE = 32
+"""Longest line of such a name, in characters."""
 SHORT = 9
-"""Letters of a channel's name that stand in one line with what is said of it."""
+"""Letters of a unit beside a panel."""
 BEFORE: Mapping[str, Any] = {"color": VERMILION, "linestyle": (0, (5, 2)), "linewidth": 1.3}
 """Curves of the tuned base model: dashed, to be told apart in grey."""
 AFTER: Mapping[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5}
@@ -91,10 +96,15 @@ def places_panel(axis: Axes, places: Sequence[Place], story: Story) -> None:
     drawn = [*squares, *dots] if changed(story) else squares
     # The noise floor belongs into view, whatever the sizes.
     _decades(axis, [*drawn, 1.0])
-    names = [f"{label(p.label, most=18)} ({p.samples})" for p in places]
-    axis.set_yticks(rows, names)
+    axis.set_yticks(rows, place_names(places), linespacing=1.05)
     axis.set_ylim(rows[-1] + 0.7, -0.1)
     axis.set_xlabel("RMS of the residual, in units of the noise")
+
+
+def place_names(places: Sequence[Place]) -> list[str]:
+    """Name each place with its number of samples, in as many lines as that needs."""
+    names = [f"{clean(place.label, LONGEST_NAME)} ({place.samples})" for place in places]
+    return [break_name(name, _NAME_LINE) for name in names]
 
 
 def _rows_of(axis: Axes, places: Sequence[Place]) -> list[float]:
@@ -183,8 +193,24 @@ def _standing(profile: Profile) -> float:
     return float(np.mean((profile.before[there] / profile.error[there]) ** 2))
 
 
-def profile_panel(axis: Axes, profile: Profile, unit: str, extended: bool) -> None:
-    """The mean residual of a channel, with its unit, against a variable."""
+def profile_label(profile: Profile) -> str:
+    """Name a variable with its unit, in as many lines as that needs."""
+    name = labelled(clean(profile.variable, LONGEST_NAME), clean(profile.unit, 12), LONGEST_NAME)
+    return break_name(name, _NAME_LINE)
+
+
+def profile_panel(
+    axis: Axes, profile: Profile, unit: str, extended: bool, *, one_channel: bool = False
+) -> None:
+    """Draw the mean residual of a channel, with its unit, against a variable.
+
+    Args:
+        axis: where.
+        profile: the residual in bins.
+        unit: of the channel.
+        extended: whether there is an extended model to draw.
+        one_channel: whether all panels are of the same channel, which their heading names.
+    """
     # Bins without a sample have no mean.
     there = np.isfinite(profile.before)
     centres = profile.centres[there]
@@ -195,9 +221,7 @@ def profile_panel(axis: Axes, profile: Profile, unit: str, extended: bool) -> No
         looks.append((profile.after, {**AFTER, **FILLED, "markersize": 3.5, "linewidth": 1.2}))
     for values, look in looks:
         axis.errorbar(centres, values[there], yerr=bars, elinewidth=1.0, **look)
-    axis.set_xlabel(label(profile.variable, profile.unit, MOST_LETTERS))
-    # The name of a robot's channel is long: it has a line of its own.
-    name = clean(profile.channel, MOST_LETTERS)
-    of = " of " if len(name) <= SHORT else " of\n"
-    axis.set_ylabel(f"residual{of}{label(name, clean(unit, SHORT))}")
+    axis.set_xlabel(profile_label(profile))
+    what = "residual" if one_channel else f"residual of {clean(profile.channel, MOST_LETTERS)}"
+    axis.set_ylabel(break_name(labelled(what, clean(unit, SHORT)), MOST_LETTERS))
     axis.locator_params(nbins=5)
