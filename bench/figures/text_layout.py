@@ -14,13 +14,24 @@ def break_name(name: str, longest: int) -> str:
     """Break a name into lines of at most `longest` characters, behind underscores and the like
     where possible, and never within the brackets of a unit.
     """
+    parts = []
+    for bracketed, free in re.findall(r"(\[[^\]]*\]\s*)|([^\[]+|\[)", name):
+        # Not behind the point of a number.
+        parts += [bracketed] if bracketed else re.split(r"(?<=[_\-/ ])|(?<=\.)(?!\d)", free)
     lines = [""]
-    for part in re.findall(r"\[[^\]]*\]|[^_\-./ ]+[_\-./ ]*|[_\-./ ]+", name):
+    for part in parts:
         if lines[-1] and len(lines[-1]) + len(part.rstrip()) > longest:
             lines.append("")
         lines[-1] += part
     # A part may be too long by itself.
     return "\n".join(piece for line in lines for piece in textwrap.wrap(line, longest))
+
+
+def brief(name: str, most: int) -> str:
+    """Shorten the name of a quantity of a joint to the quantity, if it has more than `most`
+    characters: ``velocity of elbow`` to ``velocity``, ``u.elbow`` to ``u``.
+    """
+    return name if len(name) <= most else re.split(r" of |\.", name, maxsplit=1)[0][:most]
 
 
 def text_width(texts: Sequence[str], size: float, weight: str = "normal") -> float:

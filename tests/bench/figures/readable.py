@@ -7,13 +7,16 @@ def unreadable(figure):
     Args:
         figure: a matplotlib figure, whose layout is final.
     """
+    from matplotlib.text import Text
+
     figure.draw_without_rendering()
     renderer = figure._get_renderer()
     page = figure.bbox
     shown = []
     for text in _texts(figure):
         if text.get_visible() and text.get_text().strip():
-            shown.append((text.get_text(), text.get_window_extent(renderer)))
+            # Of an annotation its words, without the line that leads to its place.
+            shown.append((text.get_text(), Text.get_window_extent(text, renderer)))
     faults = [f"shortened: {words}" for words, _ in shown if "…" in words]
     for words, box in shown:
         # A pixel of antialiasing is not a cut.
