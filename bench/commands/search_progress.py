@@ -104,7 +104,8 @@ class SearchProgress:
             empty: a character of the bar that is not done; without it no bar is drawn.
             full: a character of the bar that is done.
         """
-        done = round(BAR_WIDTH * self._share)
+        # Rounded down: a full bar means that all is done.
+        done = int(BAR_WIDTH * self._share)
         percent, bar = f"{100 * self._share:3.0f}% ", ""
         if not self._is_searching:
             # The share is one of the search, which may have ended early.

@@ -121,6 +121,8 @@ def test_a_bar_does_not_go_back(clock):
     progress.completed(0.3)
     assert " 50% " in next(progress.lines("-", "#"))
     assert progress.remaining() == pytest.approx(5.0), "half of the time since the last event"
+    progress.completed(0.99)
+    assert "|#########-|" in next(progress.lines("-", "#")), "full only where all is done"
 
 
 def test_the_live_line_is_written_at_most_five_times_a_second(clock):
@@ -250,7 +252,9 @@ def test_a_search_reports_its_stages_their_steps_and_the_best_model():
     assert names[0] == "fitting the base model"
     tested = next(i for i, name in enumerate(names) if re.fullmatch(r"testing \d+ effects", name))
     assert tested < names.index("fitting single effects")
-    assert names.index("fitting single effects") < names.index("simulating held-out runs")
+    held_out = next(i for i, name in enumerate(names) if "held-out runs with" in name)
+    assert names.index("fitting single effects") < held_out
+    assert heard.stages[held_out][1] == 4, "the held-out runs are fitted over four shares of them"
     assert names[-1] == "measuring the gain"
     for (name, total), finished in zip(heard.stages, heard.finished, strict=True):
         if total is not None:
