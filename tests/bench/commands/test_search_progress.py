@@ -272,8 +272,14 @@ def test_a_watch_without_a_listener_is_silent():
     watch.found(["drag.linear"], 1.0)
 
 
-def terminal_output(command, columns=120):
-    """What a command writes to a terminal of its own, piece by piece, and its exit code."""
+def terminal_output(command, columns=120, interrupt_at=None):
+    """What a command writes to a terminal of its own, and its exit code.
+
+    Args:
+        command: its words.
+        columns: of the terminal.
+        interrupt_at: Ctrl-C is pressed once as soon as this is written.
+    """
     child, terminal = pty.fork()
     if not child:
         os.execvp(command[0], command)
@@ -287,16 +293,24 @@ def terminal_output(command, columns=120):
         if not part:
             break
         written += part
+        if interrupt_at is not None and interrupt_at.encode() in written:
+            os.write(terminal, b"\x03")
+            interrupt_at = None
     os.close(terminal)
     return written.decode(), os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-@pytest.mark.slow
-def test_explain_shows_a_live_line_on_a_terminal_and_erases_it(tmp_path):
+@pytest.fixture
+def command(tmp_path):
+    """The words of an explanation of a small recording."""
     log = str(tmp_path / "swing.csv")
     make = ["simulate", "pendulum", "--effect", "drag.linear=1e-3", "--noise", "q=0.003"]
     assert main([*make, "--runs", "3", "--seconds", "1", "--rate", "60", "--out", log]) == 0
-    command = [sys.executable, "-m", "bench.cli", "explain", log, "--out", str(tmp_path / "out")]
+    return [sys.executable, "-m", "bench.cli", "explain", log, "--out", str(tmp_path / "out")]
+
+
+@pytest.mark.slow
+def test_explain_shows_a_live_line_on_a_terminal_and_erases_it(command):
     written, code = terminal_output(command)
     assert code == 0, written
     shown, _, account = written.partition("pendulum, simulated")
@@ -308,3 +322,15 @@ def test_explain_shows_a_live_line_on_a_terminal_and_erases_it(tmp_path):
     # The last line is overwritten with spaces before anything else is printed.
     assert re.search(r"\r +\r$", shown)
     assert "\r " not in account
+
+
+@pytest.mark.slow
+def test_ctrl_c_on_a_terminal_leaves_whole_lines(command):
+    written, code = terminal_output(command, interrupt_at="fitting the base model")
+    assert code == 130, written
+    terminal = Terminal()
+    terminal.write(written.replace("\r\n", "\n"))
+    screen = terminal.screen()
+    assert screen[0] == "simgap: ending with what there is; Ctrl-C again ends at once"
+    assert screen[1] == "pendulum, simulated"
+    assert "The search was ended by an interrupt" in " ".join(screen)
