@@ -141,8 +141,8 @@ class Scored(Models):
             )
         if calls:
             most = max(len(lacking) for _, lacking, *_ in calls)
-            beside = f" beside {len(calls)} models" if len(calls) > 1 else ""
-            self.world.watch.stage(f"testing {most} effects{beside}", len(calls))
+            several = f" beside {len(calls)} models" if len(calls) > 1 else ""
+            self.world.watch.stage(f"testing {most} effects{several}", len(calls))
         found = {}
         for number, scanned in self.world.crew.each(self.world, _scanned, calls):
             found[number] = scanned
