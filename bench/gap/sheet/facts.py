@@ -75,8 +75,11 @@ class Facts:
 
     def without_drive(self) -> str:
         """Say why there is no diagram, and what is known of the joint at rest instead."""
-        joint = f"joint {self.subject.joint} has no actuator in the model"
-        why = joint if self.subject.joint else "the log has no input"
+        why = "the log has no input"
+        if self.subject.joint:
+            why = (
+                f"joint {self.subject.joint} has no actuator in the model, and no force in the log"
+            )
         rest = self.rest
         if rest.laws and rest.breakaway > 0:
             force = with_unit(number(rest.breakaway), rest.unit)

@@ -72,9 +72,11 @@ class Subject:
 
     def is_driven(self, recording: Recording) -> bool:
         """Return whether a drive acts here: an actuator of the robot's file, or an input of the
-        recording.
+        recording that is not always zero.
         """
-        inputs = {name for run in recording.runs for name in run.inputs}
+        inputs = {
+            name for run in recording.runs for name, signal in run.inputs.items() if signal.any()
+        }
         if not self.joint:
             return bool(inputs)
         return bool(self.actuators) or f"force.{self.joint}" in inputs

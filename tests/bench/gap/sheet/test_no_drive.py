@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tomllib
 
@@ -11,7 +13,10 @@ from bench.api.datasheet import datasheet
 from bench.cli import main
 from bench.gap.sheet import drawn
 from bench.gap.sheet.sheet import DataSheet
+from bench.gap.sheet.subject import subject_of
+from bench.registry import simulators
 from tests.bench.figures.readable import unreadable
+from tests.bench.gap.made import recording
 
 FRICTION = 0.004
 """N m."""
@@ -64,3 +69,13 @@ def test_a_driven_joint_has_its_diagram_and_a_page_that_can_be_read(sheet: DataS
         page = drawn.paper(sheet)
         assert unreadable(page) == []
     assert len(page.axes) == 1
+
+
+@pytest.mark.parametrize(("torque", "is_driven"), [(None, False), (0.0, False), (0.1, True)])
+def test_an_input_that_is_always_zero_is_no_drive(torque: float | None, is_driven: bool) -> None:
+    made = recording(runs=2, seconds=0.5, rate=50.0)
+    if torque is not None:
+        signal = np.full(len(made.runs[0].times), torque)
+        runs = tuple(replace(run, inputs={"u": signal}) for run in made.runs)
+        made = replace(made, runs=runs)
+    assert subject_of(simulators.get("pendulum"), None).is_driven(made) is is_driven
