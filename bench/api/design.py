@@ -15,6 +15,7 @@ from bench.gap import explain as explaining
 from bench.gap.design import Design
 from bench.gap.explanation import Explanation
 from bench.gap.model.crew import cores
+from bench.gap.model.progress import ProgressListener
 from bench.gap.model.watch import Watch
 from bench.gap.rig.worth import SPLITS
 from bench.recordings.frames import FrameDescription
@@ -114,6 +115,7 @@ def design(
     say: Callable[[str], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float, str], None] | None = None,
+    listener: ProgressListener | None = None,
 ) -> NextRecording:
     """Design the next recording: commands that split causes which these runs cannot tell apart, or
     that narrow the numbers that stand; within the limits of joints and commands, by simulation.
@@ -133,6 +135,7 @@ def design(
         say: as for `explain`.
         stop: as for `explain`.
         progress: as for `explain`.
+        listener: as for `explain`.
 
     Raises:
         InputError: as `explain`, or the seconds are no number above 0.
@@ -142,7 +145,7 @@ def design(
     most = min(LONGER * seconds, LONGEST) if longest is None else longest
     if not seconds <= most <= LONGEST:
         raise InputError(f"longest: expected {seconds:g} to {LONGEST:g}, found {most!r}")
-    watch = Watch(None, stop, progress)
+    watch = Watch(None, stop, progress, listener)
     about = FrameDescription(system, model, units or {}, constants or {}, description or {})
     sources = sources_of(recording, about)
     given = sources, seconds, most, system, model, free, say, watch, jobs or cores()

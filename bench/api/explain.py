@@ -10,6 +10,7 @@ from typing import Annotated, Any, TypeAlias, cast
 from bench.gap import explain as explaining
 from bench.gap.explanation import Explanation
 from bench.gap.model.crew import cores
+from bench.gap.model.progress import ProgressListener
 from bench.gap.model.watch import Watch
 from bench.gap.score_model import MODEL_FILES, scored
 from bench.recordings.frames import FrameDescription, recording_of
@@ -60,6 +61,7 @@ def explain(
     say: Callable[[str], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float, str], None] | None = None,
+    listener: ProgressListener | None = None,
 ) -> Explanation:
     """Show what the simulation of a recording gets wrong, name the cause, extend the simulator.
 
@@ -87,9 +89,11 @@ def explain(
             own: for motion that drifts or is unstable.
         thorough: search on where causes are found and something is left over: further causes are
             taken that held-out runs bear out. Takes about twice as long there.
-        say: told what is being done.
+        say: told what the user should know of the recording and of the base model.
         stop: asked between two steps of the search; True ends it as a budget does.
         progress: told the share that is done, as far as can be known, and what is looked at.
+        listener: receives the events of the search: its stages with their steps, and the best
+            model so far.
 
     Raises:
         InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
@@ -97,7 +101,7 @@ def explain(
     """
     about = FrameDescription(system, model, units or {}, constants or {}, description or {})
     sources = sources_of(recording, about)
-    watch = Watch(budget, stop, progress)
+    watch = Watch(budget, stop, progress, listener)
     given = system, engine, seed, free, tuner, say, force
     more = jobs or cores(), model, whole, pieces, thorough
     return explaining.explain(sources, *given, watch, *more)

@@ -63,7 +63,7 @@ def _datasheet(options: argparse.Namespace, say: Say) -> Answer:
     """Make a sheet, and the explanation that it is from where there is none."""
     from bench.api.datasheet import datasheet, refuse_joint
     from bench.api.explain import explain
-    from bench.commands.progress import Look
+    from bench.commands.search_progress import ProgressDisplay
     from bench.registry import load_plugins
     from sims.files import refuse_full
 
@@ -71,7 +71,8 @@ def _datasheet(options: argparse.Namespace, say: Say) -> Answer:
     # Before the work, which may take minutes.
     refuse_full(options.out)
     logs, free, source = options.recordings, names(options.free), options.explained
-    with Look() as look, Interrupts() as interrupts:
+    display = ProgressDisplay(options.budget, silent=options.json)
+    with display, Interrupts(display.note) as interrupts:
         if source is None:
             refuse_joint(logs, options.joint, options.system, options.model, free)
             source = explain(
@@ -82,12 +83,13 @@ def _datasheet(options: argparse.Namespace, say: Say) -> Answer:
                 force=options.force,
                 budget=options.budget,
                 jobs=options.jobs,
-                say=look.say,
+                say=display.note,
                 stop=interrupts.asked,
-                progress=look.show,
+                listener=display,
             )
             # What took minutes is kept, whatever comes of the sheet.
             source.write(options.out / "explained", pdf=options.pdf)
+        display.finish("computing what these data would have shown")
         made = datasheet(
             logs,
             joint=options.joint,
@@ -95,7 +97,6 @@ def _datasheet(options: argparse.Namespace, say: Say) -> Answer:
             explained=source,
             system=options.system,
             model=options.model,
-            say=look.say,
         )
     paths = made.write(options.out)
     for line in made.lines():

@@ -50,13 +50,14 @@ def add_design(parser: argparse.ArgumentParser) -> None:
 def _design(options: argparse.Namespace, say: Say) -> Answer:
     from bench.api.design import design
     from bench.commands.interrupts import Interrupts
-    from bench.commands.progress import Look
+    from bench.commands.search_progress import ProgressDisplay
     from bench.registry import load_plugins
     from sims.recording.write import refuse_existing
 
     load_plugins(options.plugin)
     refuse_existing([options.out])
-    with Look() as look, Interrupts() as interrupts:
+    display = ProgressDisplay(silent=options.json, hint=False)
+    with display, Interrupts(display.note) as interrupts:
         proposed = design(
             options.recordings,
             seconds=options.seconds,
@@ -65,9 +66,9 @@ def _design(options: argparse.Namespace, say: Say) -> Answer:
             model=options.model,
             free=names(options.free),
             jobs=options.jobs,
-            say=look.say,
+            say=display.note,
             stop=interrupts.asked,
-            progress=look.show,
+            listener=display,
         )
     say(str(proposed.explanation))
     for line in proposed.lines():

@@ -145,7 +145,7 @@ def add_score(parser: argparse.ArgumentParser) -> None:
 def _explain(options: argparse.Namespace, say: Say) -> Answer:
     """Explain a recording, write what was found, print the account."""
     from bench.api.explain import explain
-    from bench.commands.progress import Look
+    from bench.commands.search_progress import ProgressDisplay
     from bench.gap.report.account import account
     from bench.registry import load_plugins
     from bench.store.made import now, write_explained
@@ -161,27 +161,29 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
     if options.out is not None:
         refuse_full(options.out)
     started = now()
-    with Look() as look, Interrupts() as interrupts:
-        explanation = explain(
-            options.recordings,
-            system=options.system,
-            model=options.model,
-            engine=options.engine,
-            free=names(options.free),
-            tuner=options.tuner,
-            seed=options.seed,
-            force=options.force,
-            budget=options.budget,
-            jobs=options.jobs,
-            whole=options.whole,
-            pieces=options.pieces,
-            thorough=options.thorough,
-            say=look.say,
-            stop=interrupts.asked,
-            progress=look.show,
-        )
-    folder = options.out or stamped(Path("results"), f"explain-{options.recordings[0].stem}")
-    paths = explanation.write(folder, pdf=options.pdf)
+    with ProgressDisplay(options.budget, silent=options.json) as display:
+        with Interrupts(display.note) as interrupts:
+            explanation = explain(
+                options.recordings,
+                system=options.system,
+                model=options.model,
+                engine=options.engine,
+                free=names(options.free),
+                tuner=options.tuner,
+                seed=options.seed,
+                force=options.force,
+                budget=options.budget,
+                jobs=options.jobs,
+                whole=options.whole,
+                pieces=options.pieces,
+                thorough=options.thorough,
+                say=display.note,
+                stop=interrupts.asked,
+                listener=display,
+            )
+        display.finish("drawing the figures and writing the report")
+        folder = options.out or stamped(Path("results"), f"explain-{options.recordings[0].stem}")
+        paths = explanation.write(folder, pdf=options.pdf)
     settings = {name: getattr(options, name) for name in _SETTINGS}
     made = write_explained(folder, started, settings, options.recordings)
     for line in account(explanation.story):
@@ -206,6 +208,7 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
 
 def _explain_each(options: argparse.Namespace, say: Say) -> Answer:
     """Explain every recording by itself, as the rows come in, and print what they say together."""
+    from bench.commands.search_progress import ProgressDisplay
     from bench.gap.each.page import Asked, write_page
     from bench.gap.each.rows import TABLE, Row, named, told
     from bench.gap.each.run import explain_each, logs_of
@@ -226,12 +229,21 @@ def _explain_each(options: argparse.Namespace, say: Say) -> Answer:
     logs = logs_of(options.recordings, out, settings)
     started = now()
 
+    finished = 0
+
     def done(row: Row) -> None:
+        nonlocal finished
+        finished += 1
         causes = [named(cause) for cause in row.causes]
         seconds = "" if row.seconds is None else f" ({row.seconds:.0f} s)"
-        say(f"{row.log}: {row.error or row.verdict} {'; '.join(causes)}".rstrip() + seconds)
+        with display.paused():
+            say(f"{row.log}: {row.error or row.verdict} {'; '.join(causes)}".rstrip() + seconds)
+        display.advance()
+        display.completed(finished / len(logs))
 
-    with Interrupts() as interrupts:
+    display = ProgressDisplay(silent=options.json, hint=False)
+    with display, Interrupts(display.note) as interrupts:
+        display.stage("explaining each recording", len(logs))
         pool = cluster_pool(options.cluster) or pool_of(min(options.jobs or cores(), len(logs)))
         with pool:
             pool.load([Plugin(str(path)) for path in options.plugin])

@@ -5,13 +5,19 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from collections.abc import Callable
 
 
 class Interrupts:
-    """While it is entered the first Ctrl-C is noted, and the second one is an interrupt as ever."""
+    """While it is entered the first Ctrl-C is noted, and the second one is an interrupt as ever.
 
-    def __init__(self) -> None:
+    Args:
+        say: prints what the first Ctrl-C does; a line on stderr if None.
+    """
+
+    def __init__(self, say: Callable[[str], None] | None = None) -> None:
         self._asked = False
+        self._say = say or _print_line
 
     def asked(self) -> bool:
         """Whether somebody wants an end."""
@@ -32,5 +38,8 @@ class Interrupts:
     def _first(self, *_: object) -> None:
         self._asked = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        message = "ending with what there is; Ctrl-C again ends at once"
-        print(f"\nsimgap: {message}", file=sys.stderr, flush=True)
+        self._say("ending with what there is; Ctrl-C again ends at once")
+
+
+def _print_line(text: str) -> None:
+    print(f"\nsimgap: {text}", file=sys.stderr, flush=True)

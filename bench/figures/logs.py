@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.figures.style import BLUE, SOFT, VERMILION, below, blank, plain, titled
+from bench.figures.style import BLUE, SOFT, VERMILION, below, blank, plain
+from bench.figures.text_layout import break_name, most_lines
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,6 +18,14 @@ NAMED = 40
 """Logs that stand with their names; more have their number."""
 PANELS = 4
 """Numbers that are drawn side by side."""
+_NAME_LINE = 34
+"""Longest line of a log's name, in characters."""
+_TITLE_LINE = 34
+"""Longest line above a panel, in characters."""
+_PANEL = 2.8
+"""Width of a panel, in inches: room for such a line."""
+_LINE = 0.15
+"""Height of a line, in inches."""
 
 
 def held_out(logs: pd.DataFrame) -> Figure:
@@ -25,6 +34,8 @@ def held_out(logs: pd.DataFrame) -> Figure:
     Args:
         logs: a row a log: number, log, before, after; NaN where there is none.
     """
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     figure, ((panel,),) = blank(1, 1, (7.5, _height(logs)))
     rows = logs["number"].to_numpy()
     before, after = logs["before"].to_numpy(), logs["after"].to_numpy()
@@ -37,6 +48,9 @@ def held_out(logs: pd.DataFrame) -> Figure:
     )
     panel.axvline(1.0, color=SOFT, linestyle=":", linewidth=1.0)
     panel.set_xscale("log")
+    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.xaxis.set_minor_formatter(NullFormatter())
     panel.set_xlabel("error on held-out runs [noise floors]")
     _rows(panel, logs)
     figure.legend(loc="outside upper center", ncols=2, fontsize=8, frameon=False)
@@ -53,23 +67,36 @@ def numbers(logs: pd.DataFrame, found: pd.DataFrame) -> Figure:
             which `PANELS` are drawn.
     """
     names = list(dict.fromkeys(found["what"]))[:PANELS]
-    width = max(7.5, 2.2 + 2.6 * len(names))
-    figure, (panels,) = blank(1, len(names), (width, _height(logs)), sharey=True)
-    for panel, name in zip(panels, names, strict=True):
+    titles = [
+        "\n".join(break_name(part, _TITLE_LINE) for part in name.rsplit(": ", 1)) for name in names
+    ]
+    height = _height(logs) + _LINE * most_lines(titles)
+    figure, (panels,) = blank(
+        1, len(names), (max(7.5, 2.6 + _PANEL * len(names)), height), sharey=True
+    )
+    for panel, name, title in zip(panels, names, titles, strict=True):
         mine = found[found["what"] == name]
         value, low, high = (mine[key].to_numpy(float) for key in ("value", "low", "high"))
         lengths = np.maximum(np.nan_to_num([value - low, high - value]), 0.0)
         options = {"color": BLUE, "linestyle": "", "marker": "o", "markersize": 4, "capsize": 2}
         panel.errorbar(value, mine["number"], xerr=lengths, **options)
-        titled(panel, name.replace(": ", ":\n"))
+        panel.set_title(title, fontsize=8.5, y=1.0, loc="left", parse_math=False)
         panel.tick_params(axis="x", labelsize=8)
+        panel.locator_params(axis="x", nbins=4)
         _rows(panel, logs)
     below(figure, "Point: what a log gives by itself. Bar: its 95 % interval.", letters=17)
     return figure
 
 
+def _names(logs: pd.DataFrame) -> list[str]:
+    """The names of the logs, in as many lines as they need."""
+    # Dollars would be mathematics to whoever draws the text.
+    return [break_name(str(name), _NAME_LINE).replace("$", r"\$") for name in logs["log"]]
+
+
 def _height(logs: pd.DataFrame) -> float:
-    return 1.6 + min(0.24 * len(logs), 9.0)
+    lines = most_lines(_names(logs)) if len(logs) <= NAMED else 1
+    return 1.6 + min((0.09 + _LINE * lines) * len(logs), 9.0 * lines)
 
 
 def _rows(panel: Axes, logs: pd.DataFrame) -> None:
@@ -77,12 +104,6 @@ def _rows(panel: Axes, logs: pd.DataFrame) -> None:
     plain(panel)
     panel.set_ylim(logs["number"].max() + 0.6, logs["number"].min() - 0.6)
     if len(logs) <= NAMED:
-        panel.set_yticks(logs["number"], [_short(name) for name in logs["log"]], fontsize=8)
+        panel.set_yticks(logs["number"], _names(logs), fontsize=8)
     else:
         panel.set_ylabel("log, by its number")
-
-
-def _short(name: str) -> str:
-    # Dollars would be mathematics to whoever draws the text.
-    plain_name = str(name).replace("$", r"\$")
-    return plain_name if len(plain_name) <= 28 else f"…{plain_name[-27:]}"

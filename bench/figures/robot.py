@@ -16,6 +16,7 @@ import numpy as np
 from bench.figures.links import draw_links, links
 from bench.figures.offscreen import rendered
 from bench.figures.style import BLUE, INK, SOFT, blank
+from bench.figures.text_layout import break_name
 from bench.figures.view import View, place_of, posed, view
 from sims.base import Array
 
@@ -37,6 +38,8 @@ MOST_NAMED = 12
 """Joints up to which all are named; of more, those that are marked."""
 LETTERS = 34
 """Of a line of a label."""
+MOST_LETTERS = 120
+"""Of a text in a label, which may have several lines."""
 _LINE = 0.155
 """Inches from a line of a label to the next."""
 _BETWEEN = 0.09
@@ -172,14 +175,11 @@ def _labels(robot: Robot, data: Any, seen_from: View, marks: Sequence[Mark]) -> 
             continue
         # A bare name is a joint's.
         title = name if kind == "joint" else f"{kind} {name}"
-        lines = [_short(line) for line in (title, *lines)]
+        texts = [line[:MOST_LETTERS] for line in (title, *lines)]
+        lines = [line for text in texts for line in break_name(text, LETTERS).split("\n")]
         point = seen_from.seen(place[None])[0]
         labels.append(_Label(tuple(lines), point, (kind, name) in marked))
     return labels
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= LETTERS else text[: LETTERS - 1] + "…"
 
 
 def _sides(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]]:

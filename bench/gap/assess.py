@@ -18,6 +18,7 @@ from bench.gap.model.models import Model, Names
 from bench.gap.model.world import World
 from bench.gap.propose import Experiment, next_experiment
 from bench.gap.verdict import Candidate, Cause, Heldout, Verdict, finite
+from bench.problem.seeds import rng_for
 from sims.base import Array
 from sims.extended import Number
 from sims.recording.recording import Recording
@@ -181,6 +182,27 @@ class Assessor:
         if before > floor * 1.001:
             share = (before - max(after, floor)) / (before - floor)
         return float(np.clip(share, WORST, 1.0)) if np.isfinite(share) else None
+
+    def share_intervals(self, finding: Finding) -> dict[str, tuple[float, float]]:
+        """Return the 95 % interval of the share of the held-out gap that each effect closes alone,
+        for the effects that were simulated there.
+        """
+        runs, measured = self.measuring, finding.measured
+        if runs is None or measured is None:
+            return {}
+        before = measured[()].simulated
+        found = {}
+        for names, simulated in measured.items():
+            share = self._share(finding, names)
+            if len(names) != 1 or share is None or share <= WORST:
+                continue
+            # A stream of its own: an interval must not depend on what else is resampled.
+            rng = rng_for("held-out share", *names)
+            given = self._counted(), self._floor_of(finding), rng
+            result = gain(runs, before, simulated.simulated, *given)
+            if np.isfinite(result.low) and np.isfinite(result.high):
+                found[names[0]] = result.low, result.high
+        return found
 
     def _next(self, search: Search, finding: Finding) -> Experiment | None:
         """What to record next; None where nothing is open, or nobody waits for it."""

@@ -78,7 +78,7 @@ def explain(
         seed: of the surrogates and the bootstrap.
         free: constants to estimate with the parameters.
         tuner: a registered tuner that finds where the fit of the base parameters begins.
-        say: told what is being done.
+        say: told what the user should know of the recording and of the base model.
         force: whether the user insists on a recording that is refused otherwise.
         watch: says when the search has to end, and is told how far it is.
         jobs: processes that work at once; the answer does not depend on it.
@@ -127,7 +127,7 @@ def explain_and_design(
         given = "batch", 0, tuple(free), None, say, False
         with closing(_Explainer(subject, *given, watch or Watch(), crew)) as explainer:
             explanation = explainer.run()
-            say("designing the next recording")
+            explainer.watch.stage("designing the next recording")
             return Proposed(explanation, explainer.design(seconds, longest))
 
 
@@ -240,17 +240,15 @@ class _Explainer:
     # Small products: with a thread for each core they take five times as long where others compute.
     @one_thread()
     def run(self) -> Explanation:
-        self.say("fitting the base model")
         base = self._base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._fails()
         # One stream for surrogates and bootstrap: the same seed tells the same story.
         rng = self._rng()
         search = self._search(base, rng)
-        self.say("looking for what is missing")
         held_out = HeldOutRuns(self.measuring, self.noise) if self.measuring else None
         finding = name(search, held_out)
-        self.say("measuring the gain")
+        self.watch.stage("measuring the gain")
         verdict = self.assessor.verdict(search, finding, rng, self.started)
         if self.coarse is not None:
             verdict = with_numerics(verdict, self.coarse)

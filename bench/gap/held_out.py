@@ -86,10 +86,14 @@ class HeldOutRuns:
         fits: list[Fit] = []
         if not starts:
             return fits
+        watch = self.world.watch
+        models = "one model" if len(starts) == 1 else f"{len(starts)} models"
+        watch.stage(f"simulating held-out runs with {models}", len(stages))
         for share, iterations in stages:
             fitter = Fitter(self.world, self.noise, share=share, parameters=False)
             fits = fitter.fit(starts, iterations)
             starts = [fit.start() for fit in fits]
+            watch.advance()
         return fits
 
     def _bends(self, fit: Fit) -> bool:

@@ -78,6 +78,7 @@ class Teller:
             track=self._track(),
             logs=max(1, len({run.log for run in recording.runs})),
             thorough=self.search.thorough,
+            share_intervals=self.assessor.share_intervals(self.finding),
         )
 
     def _track(self) -> bytes:

@@ -139,10 +139,18 @@ class Scored(Models):
             calls.append(
                 (model.fit, self._lacking(model), self.weights(model), residual, self.seen, stream)
             )
-        found = self.world.crew.map(self.world, _scanned, calls)
-        for key, scanned in zip(keys, found, strict=True):
+        if calls:
+            most = max(len(lacking) for _, lacking, *_ in calls)
+            several = f" beside {len(calls)} models" if len(calls) > 1 else ""
+            self.world.watch.stage(f"testing {most} effects{several}", len(calls))
+        found = {}
+        for number, scanned in self.world.crew.each(self.world, _scanned, calls):
+            found[number] = scanned
+            self.world.watch.advance()
+        for number, key in enumerate(keys):
+            scores = self.scored.get(key, found[number].scores)
             # What had made room is as it was.
-            self._take(key, scanned._replace(scores=self.scored.get(key, scanned.scores)))
+            self._take(key, found[number]._replace(scores=scores))
         self._make_room([*keys, *(frozenset(model.names) for model in beside)])
 
     def _look(self, model: Model) -> None:

@@ -17,6 +17,8 @@ from bench.gap.report.words import labelled
 
 REPORT = "report.html"
 """The page of a log in its folder, and that of all logs above."""
+LONGEST_NAME = 80
+"""Characters of the name of a number that are shown."""
 _TEXTS = ("log", "verdict", "causes", "error", "report")
 _MEASURED = ("gap_closed", "low", "high", "before", "after", "seconds")
 """Columns of the table of logs."""
@@ -65,13 +67,20 @@ def _floors(error: Mapping[str, float], key: str) -> float | None:
     return value / floor if value is not None and floor else None
 
 
+def place_of(name: str) -> str:
+    """Name a number of a cause: ``at elbow`` for ``coefficient@elbow``."""
+    coefficient, at, place = name.partition("@")
+    return f"at {place}" if at and coefficient == "coefficient" else name
+
+
 def numbers(rows: Sequence[Row]) -> pd.DataFrame:
     """A row for each number of each cause of a log, those of the commonest cause first."""
     lines = []
     for place, row in enumerate(rows, start=1):
         for cause in row.causes:
             for name, known in cause["coefficients"].items():
-                what = f"{named(cause)}: {labelled(name, known['unit'])}"
+                label = labelled(place_of(name), known["unit"], LONGEST_NAME)
+                what = f"{named(cause)}: {label}"
                 about = {"cause": named(cause), "name": name, "what": what, **known}
                 lines.append({"number": place, "log": row.log, **about})
     columns = ["number", "log", "cause", "name", "what", "value", "low", "high", "unit"]

@@ -24,8 +24,8 @@ from bench.pages.page import Page
 from sims.base import InputError
 from sims.files import write
 
-_FEW = 8
-"""Logs that stand with their names on an axis; more have their number there."""
+_NAMED_LETTERS = 120
+"""Characters of the names of all logs that stand on an axis; of more, their numbers do."""
 _SAID = 6
 """Causes, and logs without an answer, that are told before the tables."""
 _ORDER = ("named", "ambiguous", "partial", "adequate", "unknown", "unidentifiable")
@@ -126,7 +126,7 @@ def _spans(found: pd.DataFrame) -> str:
     parts = []
     for name, mine in found.groupby("name", sort=False):
         ends = dict.fromkeys(number(end) for end in (mine["value"].min(), mine["value"].max()))
-        label = "" if name == "coefficient" else f"{name} "
+        label = "" if name == "coefficient" else f"{frames.place_of(str(name))} "
         parts.append(label + with_unit(" to ".join(ends), str(mine["unit"].iloc[0])))
     return f": {joined(parts)}" if parts else ""
 
@@ -176,16 +176,21 @@ def _each_grid() -> Grid:
 
 def _across(logs: pd.DataFrame) -> Axis:
     """The logs along an axis."""
-    if len(logs) > _FEW:
+    if not _has_names(logs):
         ends = (0.5, len(logs) + 0.5)
         return Axis("log, by its number", scales=("linear",), ends=ends)
-    names = tuple(str(name)[-20:] for name in logs["log"])
-    return Axis("log", names=names)
+    return Axis("log", names=tuple(str(name) for name in logs["log"]))
+
+
+def _has_names(logs: pd.DataFrame) -> bool:
+    """Whether the names of the logs have room along an axis."""
+    names = [str(name) for name in logs["log"]]
+    return len(names) * max(map(len, names), default=0) <= _NAMED_LETTERS
 
 
 def _placed(frame: pd.DataFrame, logs: pd.DataFrame) -> pd.DataFrame:
     """With the place along the axis: named ones stand at 0, 1, 2, ..."""
-    return frame.assign(place=frame["number"] - (1 if len(logs) <= _FEW else 0))
+    return frame.assign(place=frame["number"] - (1 if _has_names(logs) else 0))
 
 
 def _found(page: Page, logs: pd.DataFrame, found: pd.DataFrame) -> Iterator[str]:

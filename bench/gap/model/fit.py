@@ -8,7 +8,7 @@ fit one of generalised least squares.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -69,6 +69,7 @@ class Fitter:
         iterations: int = 12,
         race: bool = False,
         reached: float = np.inf,
+        finished: Callable[[], None] = lambda: None,
     ) -> list[Fit]:
         """Fit each model from its start.
 
@@ -77,6 +78,7 @@ class Fitter:
             iterations: steps of each, at most.
             race: leave those unfinished that are far behind the best, or behind the cost reached.
             reached: what other models have come down to.
+            finished: called once for each model whose fit has ended.
         """
         problems = [self._problem(start) for start in starts]
         for leg in legs(iterations, race):
@@ -87,10 +89,11 @@ class Fitter:
             best = min(reached, *(problem.point.cost for problem in problems))
             groups = self._groups(problems, going)
             calls = [(self._terms(), [problems[i] for i in g], leg, race, best) for g in groups]
-            gone = self.world.crew.map(self.world, _gone, calls)
-            for group, members in zip(groups, gone, strict=True):
-                for i, problem in zip(group, members, strict=True):
+            for number, members in self.world.crew.each(self.world, _gone, calls):
+                for i, problem in zip(groups[number], members, strict=True):
                     problems[i] = problem
+                    if problem.done or leg.last >= iterations:
+                        finished()
         return [p.fit() for p in problems]
 
     def _terms(self) -> tuple[Any, ...]:

@@ -43,6 +43,13 @@ noise that remembers has it; one that leaves more was pulled away by what is no 
 """
 LARGEST_DRAWN = 2**62
 """Whole numbers below it tell streams of random numbers apart."""
+_SIZES = {
+    0: ("the base model", "the base model"),
+    1: ("one effect", "single effects"),
+    2: ("one pair of effects", "pairs of effects"),
+    3: ("one set of three effects", "sets of three effects"),
+}
+"""One and several models with this number of effects, as the display of progress names them."""
 FEWEST = 2
 """Samples that there are taken to be at least: the logarithm of one prices nothing."""
 
@@ -169,7 +176,8 @@ class Models:
                 with the best.
             race: give up what falls far behind.
         """
-        self.world.watch.look(f"refit of {_listed(starts)}")
+        watch = self.world.watch
+        watch.look(f"refit of {_listed(starts)}")
         noise = noise or self.noise
         if patient:
             starts = self._sifted(starts, noise)
@@ -177,10 +185,23 @@ class Models:
         racing = race and noise is self.noise
         reached = self._reached(starts) if racing else np.inf
         fitter = Fitter(self.world, noise, self.frozen)
-        for fit in fitter.fit(starts, STEPS, race=race, reached=reached):
+        watch.stage(_fitting(starts), len(starts))
+        for fit in fitter.fit(starts, STEPS, race=race, reached=reached, finished=watch.advance):
             self.enter(fit)
         # One that was left off is kept, and not judged.
-        self.world.watch.check()
+        watch.check()
+        self._report_best()
+
+    def _report_best(self) -> None:
+        """Report the model with the highest merit, and the share of the gap that it closes."""
+        base = self.models.get(frozenset())
+        best = max(self.models.values(), key=lambda model: model.merit, default=base)
+        if base is None or best is None or not best.names:
+            return
+        gap = self.excess(base)
+        if gap > 0 and np.isfinite(gap):
+            share = 1.0 - max(self.excess(best), 0.0) / gap
+            self.world.watch.found(best.names, max(share, 0.0))
 
     def exact(self, model: Model) -> Model:
         """The model with derivatives of its own, where its fit has ended with those of a point
@@ -206,6 +227,7 @@ class Models:
         change nothing. What it may not is leave clearly more: where structure is left it would
         rather have that smooth than small.
         """
+        self.world.watch.stage("refining the model")
         squares = Fitter(self.world, self.noise).cost
         for _ in range(ROUNDS):
             left = model.likelihood
@@ -277,6 +299,13 @@ def _listed(starts: Sequence[Start]) -> str:
     names = list(dict.fromkeys(" + ".join(start.effects) or "the base model" for start in starts))
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
     return f"{names[0]}{more}" if names else "nothing"
+
+
+def _fitting(starts: Sequence[Start]) -> str:
+    """Name the stage that fits these models, by their number of effects."""
+    size = max((len(start.effects) for start in starts), default=0)
+    one, several = _SIZES.get(size, (f"set of {size} effects", f"sets of {size} effects"))
+    return f"fitting {one if len(starts) == 1 else several}"
 
 
 def freedom(world: World, fit: Fit, noise: Noise) -> float:

@@ -8,9 +8,11 @@ have been left off is followed by a `Watch.check`, so that nothing half fitted i
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
+
+from bench.gap.model.progress import ProgressListener, SilentListener
 
 By = Literal["budget", "interrupt"]
 Stop = Callable[[], bool]
@@ -25,6 +27,16 @@ QUESTIONS: Mapping[str, str] = {
     "alternatives": "what would explain the same as well",
 }
 """What is asked, in this order, by its name in verdict.json."""
+
+STAGES: Mapping[str, str] = {
+    "base_fit": "fitting the base model",
+    "search": "testing effects",
+    "rivals": "comparing similar causes",
+    "held_out": "simulating held-out runs",
+    "structure": "testing the residual for structure",
+    "alternatives": "looking for alternative causes",
+}
+"""The stage that each question begins with, as the display of progress names it."""
 
 WEIGHTS: Mapping[str, float] = {
     "base_fit": 1.5,
@@ -80,6 +92,7 @@ class Watch:
         budget: seconds of the clock after which it ends; None without an end.
         stop: asked between two steps: whether somebody wants an end.
         progress: told the share that is done, as far as can be known, and what is looked at.
+        listener: receives the stages, steps and findings of the search.
     """
 
     def __init__(
@@ -87,10 +100,12 @@ class Watch:
         budget: float | None = None,
         stop: Stop = lambda: False,
         progress: Progress | None = None,
+        listener: ProgressListener | None = None,
     ) -> None:
         self.deadline = None if budget is None else time.monotonic() + budget
         self._stop = stop
         self._progress = progress
+        self._listener = listener or SilentListener()
         self._by: By | None = None
         self._left = False
         self._what = ""
@@ -99,6 +114,19 @@ class Watch:
         self._done, self._now = 0.0, WEIGHTS["base_fit"]
         self._ahead = _after("base_fit")
         self._looks = -1
+        self._listener.stage(STAGES["base_fit"])
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Report the stage that begins, and its number of steps where that is known."""
+        self._listener.stage(name, total)
+
+    def advance(self, count: int = 1) -> None:
+        """Report further finished steps of the stage."""
+        self._listener.advance(count)
+
+    def found(self, effects: Sequence[str], share: float) -> None:
+        """Report the best model so far and the share of the gap that it closes."""
+        self._listener.found(effects, share)
 
     def over(self) -> bool:
         """Whether the search has to end; once it has, it does."""
@@ -117,6 +145,7 @@ class Watch:
         self._enter(WEIGHTS[question])
         self._question = question
         self._ahead = _after(question)
+        self.stage(STAGES[question])
         self.look(QUESTIONS[question])
 
     def grow(self) -> None:
@@ -183,8 +212,10 @@ class Watch:
         # Looks before this one have taken their shares; a fit is a part of this one's.
         within = 1.0 - remaining * (1.0 - STEP * share)
         total = self._done + self._now + self._ahead
+        done = (self._done + self._now * within) / total
+        self._listener.completed(done)
         if self._progress is not None:
-            self._progress((self._done + self._now * within) / total, self._what)
+            self._progress(done, self._what)
 
 
 def _after(question: str) -> float:

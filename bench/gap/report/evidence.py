@@ -4,6 +4,7 @@ a chart; their numbers are those of verdict.json and of the story.
 
 from __future__ import annotations
 
+from bench.figures.text_layout import brief
 from bench.gap.report.joints import by_joint, joint_of
 from bench.gap.report.motion import AFTER, BEFORE
 from bench.gap.report.panels import MOST_LETTERS, changed, telling
@@ -178,7 +179,11 @@ def follows_chart(story: Story) -> Chart:
             where = {**about, "when": when}
             look = looks[when]._replace(marker={"before": "s", "after": "o"}[when])
             series.append(Series(f"simulated {when}", "mean", look, where, "low", "high"))
-        name = f"{clean(p.channel, 30)} against {clean(p.variable, 30)}"
+        # The title has the names in full. Axes have no room for long ones.
+        name = f"{clean(p.channel, 80)} against {clean(p.variable, 80)}"
+        variable = brief(clean(p.variable), MOST_LETTERS)
+        channel = clean(p.channel)
+        residual = f"residual of {channel}" if len(channel) <= MOST_LETTERS else "residual"
         names += [name] * (id(p) not in first)
         panels.append(
             Panel(
@@ -186,9 +191,9 @@ def follows_chart(story: Story) -> Chart:
                 FOLLOWS,
                 "at",
                 tuple(series),
-                Axis(labelled(clean(p.variable, MOST_LETTERS), p.unit), scales=("linear",)),
+                Axis(labelled(variable, p.unit), scales=("linear",)),
                 Axis(
-                    labelled(f"residual of {clean(p.channel, 20)}", units.get(p.channel, "1"), 40),
+                    labelled(residual, units.get(p.channel, "1"), 60),
                     scales=("linear",),
                     holds=(0.0,),
                 ),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.figures.style import BAND, BLUE, INK, SOFT, ZERO, blank
+from bench.figures.text_layout import break_name, text_width
 from bench.gap.report.panels import AFTER, BEFORE, changed, label
 from bench.gap.report.places import marks
 from bench.gap.report.shots import MOST_OUTLINES, Shot, kept
@@ -35,6 +36,14 @@ _HEIGHTS = {1: 2.6, 2: 1.9, 3: 1.5, 4: 1.25, 5: 1.1}
 _LEAST_HEIGHT = 1.0
 POINTER = "▸"
 """Before the name of a joint that the verdict names: in grey, too, it stands out."""
+LONGEST_NAME = 64
+"""Characters of the name of a joint or sensor that are shown."""
+_NAME_LINE = 18
+"""Longest line of such a name, in characters."""
+_NAME_SIZE = 9.5
+"""Size of its letters, in points."""
+_BESIDE_NAME = 0.85
+"""Inches from the end of the names to the panels: ticks and units stand there."""
 _HEAD, _FOOT = 0.75, 0.95
 """Inches above and below the rows."""
 
@@ -87,13 +96,15 @@ def joints_figure(story: Story, shot: Shot) -> Figure:
     rows = _worst(story, shot)
     quantities = _quantities(story) or ["q"]
     height = _HEIGHTS.get(len(rows), _LEAST_HEIGHT)
-    width = 3.6 + 3.5 + 2.6 * len(quantities)
+    found = {mark.name for mark in marks(story)} | _joints_of_marks(story)
+    names = [_row_name(row, row.name in found) for row in rows]
+    left = max(1.95, 0.12 + text_width(names, _NAME_SIZE, "bold") + _BESIDE_NAME)
+    width = left + 5.15 + 2.6 * len(quantities)
     size = (width, _HEAD + _FOOT + height * len(rows))
     ratios = (4.2, *[3.0] * len(quantities))
     figure, axes = blank(
         len(rows), len(ratios), size, layout=None, sharex=True, width_ratios=ratios
     )
-    found = {mark.name for mark in marks(story)} | _joints_of_marks(story)
     for row, panels in zip(rows, axes, strict=True):
         _motion(panels[0], story, shot, row, row.name in found)
         for panel, quantity in zip(panels[1:], quantities, strict=True):
@@ -110,7 +121,7 @@ def joints_figure(story: Story, shot: Shot) -> Figure:
         panel.set_xlabel("time [s]")
         # The narrower column has no room for more; a late run has long numbers.
         panel.locator_params(axis="x", nbins=4)
-    _finish(figure, axes, story, shot, rows)
+    _finish(figure, axes, story, shot, rows, left)
     return figure
 
 
@@ -171,14 +182,14 @@ def _motion(panel: Axes, story: Story, shot: Shot, row: Row, found: bool) -> Non
     symbol = quantity if quantity in QUANTITIES else ""
     panel.set_ylabel(label(symbol, channel.unit, 14), fontsize=8)
     panel.annotate(
-        f"{POINTER} {label(row.name, most=16)}" if found else label(row.name, most=16),
+        _row_name(row, found),
         (0, 0.5),
         (-0.72 * 72, 0),
         xycoords="axes fraction",
         textcoords="offset points",
         ha="right",
         va="center",
-        fontsize=9.5,
+        fontsize=_NAME_SIZE,
         weight="bold",
         color=BLUE if found else INK,
         annotation_clip=False,
@@ -186,6 +197,12 @@ def _motion(panel: Axes, story: Story, shot: Shot, row: Row, found: bool) -> Non
     panel.margins(x=0.01)
     panel.locator_params(axis="y", nbins=4)
     panel.tick_params(labelsize=8)
+
+
+def _row_name(row: Row, found: bool) -> str:
+    """The name of a joint or sensor in short lines."""
+    name = break_name(clean(row.name, LONGEST_NAME), _NAME_LINE)
+    return f"{POINTER} {name}" if found else name
 
 
 def _residual(panel: Axes, story: Story, shot: Shot, c: int) -> None:
@@ -261,14 +278,19 @@ def _joints_of_marks(story: Story) -> set[str]:
     return {joint_of(story, mark.kind, mark.name) for mark in marks(story)}
 
 
-def _finish(figure: Figure, axes: Any, story: Story, shot: Shot, rows: Sequence[Row]) -> None:
-    """Title, legend and margins, in inches."""
+def _finish(
+    figure: Figure, axes: Any, story: Story, shot: Shot, rows: Sequence[Row], left: float
+) -> None:
+    """Title, legend and margins, in inches; the panels begin at `left`."""
     width, height = figure.get_size_inches().tolist()
     total = len(rows_of(story))
-    some = f"; the worst {len(rows)} of {total}" if len(rows) < total else ""
+    some = f"; the worst {len(rows)} of {total} joints and sensors" if len(rows) < total else ""
+    # A sample counts once, however many channels it has.
+    samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
     kind = "held-out run" if shot.held_out else "run"
     how = "that fits worst" if story.verdict.verdict == "adequate" else "with the largest gap"
-    title = f"The {kind} {how}, joint by joint: {label(shot.side.names[shot.row])}{some}"
+    title = f"The {kind} {how}, joint by joint: {label(shot.side.names[shot.row])}"
+    title += f" ({samples} samples{some})"
     figure.suptitle(title, fontsize=11, x=0.012, ha="left", y=1 - 0.2 / height, va="center")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     with warnings.catch_warnings():
@@ -288,7 +310,7 @@ def _finish(figure: Figure, axes: Any, story: Story, shot: Shot, rows: Sequence[
     note = f"residual: measured − simulated; above each its RMS in σ, {before}"
     figure.text(0.5, 0.14 / height, note, fontsize=8, ha="center", va="center", color=SOFT)
     figure.subplots_adjust(
-        left=1.95 / width,
+        left=left / width,
         right=1 - 0.12 / width,
         top=1 - _HEAD / height,
         bottom=_FOOT / height,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.figures.style import BLACK, BLUE, VERMILION, Look, drawn
+from bench.figures.text_layout import brief
 from bench.gap.report.account import sides
 from bench.gap.report.joints import QUANTITIES, by_joint, rows_of
 from bench.gap.report.panels import changed
@@ -262,7 +263,7 @@ def _pair(
     # Of a robot's joints one scale shows at a glance where the gap is.
     of = facets.get("quantity", name)
     residual = Axis(f"residual of {of} [σ]", scales=("linear",), holds=(-_LEAST, _LEAST))
-    up = Axis(labelled(channel.name, channel.unit, 24), scales=("linear",))
+    up = Axis(labelled(brief(clean(channel.name), 24), channel.unit), scales=("linear",))
     band = (Span(-2.0, 2.0, "±2σ: 95 % of the noise", along="y"),)
     tells = _tells(pretty(channel.unit), channel.sigma, extended)
     heights = (_ROW, _ROW) if wide else (_TALL, _LOW)

@@ -83,11 +83,16 @@ _CAPTIONS = {
         "is explained are the heights that it gives."
     ),
     "candidates": (
-        "Left: evidence for each candidate, with the probability p of as much by chance. Right: "
-        "what each gains on held-out runs."
+        "The evidence for each candidate on the fitted runs; the line below gives p, the "
+        "probability of such a score by chance. Causes are bold."
     ),
 }
 """Under the figures."""
+_SHARES = (
+    " Left: the share of the gap on held-out runs that each closes by itself, with its 95 % "
+    "interval, where it was simulated there."
+)
+"""Under the candidates, where held-out runs were simulated with any of them."""
 _TRACK = "The scene of the film with the ball's track over it, its height and radius over time."
 """What the picture of a track shows."""
 _JOINTS = (
@@ -248,6 +253,8 @@ def _candidates(
     yield from sets(story)
     if "candidates" in stills:
         caption = _CAPTIONS["candidates"] + (_PLACED if has_places(story) else "")
+        if any(c.heldout_gain is not None for c in story.verdict.candidates):
+            caption += _SHARES
         yield made.picture("candidates-picture", stills["candidates"], caption, [CANDIDATES])
     if not story.verdict.candidates:
         yield paragraph("No candidate was tried.")

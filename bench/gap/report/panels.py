@@ -1,6 +1,4 @@
-"""Panels of the figures: places and profiles of the gap, candidates; and the look that all figures
-share.
-"""
+"""Panels of the figures: places and profiles of the gap; and the look that all figures share."""
 
 from __future__ import annotations
 
@@ -9,12 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.figures.style import BAND, BLUE, CHANCE, INK, JOIN, SKY, VERMILION, ZERO
-from bench.gap.report.places import has_places
-from bench.gap.report.ranking import entries, short_name, standing
+from bench.figures.style import BLUE, CHANCE, INK, JOIN, VERMILION, ZERO
+from bench.figures.text_layout import break_name
 from bench.gap.report.story import Place, Profile, Story
-from bench.gap.report.words import clean, labelled, name_of, number, probability
-from bench.gap.verdict import Candidate
+from bench.gap.report.words import clean, labelled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,8 +22,12 @@ MOST_PLACES = 10
 MOST_PROFILES = 4
 MOST_LETTERS = 26
 """Of the name of a variable or of a channel."""
+LONGEST_NAME = 64
+"""Of the name of a run or channel among the places."""
+_NAME_LINE = 32
+"""Longest line of such a name, in characters."""
 SHORT = 9
-"""Letters of a channel's name that stand in one line with what is said of it."""
+"""Letters of a unit beside a panel."""
 BEFORE: Mapping[str, Any] = {"color": VERMILION, "linestyle": (0, (5, 2)), "linewidth": 1.3}
 """Curves of the tuned base model: dashed, to be told apart in grey."""
 AFTER: Mapping[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5}
@@ -41,13 +41,6 @@ OPEN: Mapping[str, Any] = {
 """Marks of the tuned base model: open squares, to be told apart in grey."""
 FILLED: Mapping[str, Any] = {"marker": "o", "markersize": 5.5, "color": BLUE}
 """Marks of the extended model."""
-GAIN = "gain on held-out runs"
-_LOOKS: Mapping[str, Mapping[str, Any]] = {
-    "found": {"facecolor": BLUE},
-    "found, but cannot be told apart": {"facecolor": SKY, "hatch": "///"},
-    "not needed": {"facecolor": BAND},
-}
-"""Bars of the candidates by their standing."""
 _SPAN_FOR_LOG = 8.0
 """Factor between the largest and the least value from which on an axis is logarithmic."""
 _FLOOR = "1: noise floor"
@@ -103,10 +96,15 @@ def places_panel(axis: Axes, places: Sequence[Place], story: Story) -> None:
     drawn = [*squares, *dots] if changed(story) else squares
     # The noise floor belongs into view, whatever the sizes.
     _decades(axis, [*drawn, 1.0])
-    names = [f"{label(p.label, most=18)} ({p.samples})" for p in places]
-    axis.set_yticks(rows, names)
+    axis.set_yticks(rows, place_names(places), linespacing=1.05)
     axis.set_ylim(rows[-1] + 0.7, -0.1)
     axis.set_xlabel("RMS of the residual, in units of the noise")
+
+
+def place_names(places: Sequence[Place]) -> list[str]:
+    """Name each place with its number of samples, in as many lines as that needs."""
+    names = [f"{clean(place.label, LONGEST_NAME)} ({place.samples})" for place in places]
+    return [break_name(name, _NAME_LINE) for name in names]
 
 
 def _rows_of(axis: Axes, places: Sequence[Place]) -> list[float]:
@@ -195,8 +193,24 @@ def _standing(profile: Profile) -> float:
     return float(np.mean((profile.before[there] / profile.error[there]) ** 2))
 
 
-def profile_panel(axis: Axes, profile: Profile, unit: str, extended: bool) -> None:
-    """The mean residual of a channel, with its unit, against a variable."""
+def profile_label(profile: Profile) -> str:
+    """Name a variable with its unit, in as many lines as that needs."""
+    name = labelled(clean(profile.variable, LONGEST_NAME), clean(profile.unit, 12), LONGEST_NAME)
+    return break_name(name, _NAME_LINE)
+
+
+def profile_panel(
+    axis: Axes, profile: Profile, unit: str, extended: bool, *, one_channel: bool = False
+) -> None:
+    """Draw the mean residual of a channel, with its unit, against a variable.
+
+    Args:
+        axis: where.
+        profile: the residual in bins.
+        unit: of the channel.
+        extended: whether there is an extended model to draw.
+        one_channel: whether all panels are of the same channel, which their heading names.
+    """
     # Bins without a sample have no mean.
     there = np.isfinite(profile.before)
     centres = profile.centres[there]
@@ -207,72 +221,7 @@ def profile_panel(axis: Axes, profile: Profile, unit: str, extended: bool) -> No
         looks.append((profile.after, {**AFTER, **FILLED, "markersize": 3.5, "linewidth": 1.2}))
     for values, look in looks:
         axis.errorbar(centres, values[there], yerr=bars, elinewidth=1.0, **look)
-    axis.set_xlabel(label(profile.variable, profile.unit, MOST_LETTERS))
-    # The name of a robot's channel is long: it has a line of its own.
-    name = clean(profile.channel, MOST_LETTERS)
-    of = " of " if len(name) <= SHORT else " of\n"
-    axis.set_ylabel(f"residual{of}{label(name, clean(unit, SHORT))}")
+    axis.set_xlabel(profile_label(profile))
+    what = "residual" if one_channel else f"residual of {clean(profile.channel, MOST_LETTERS)}"
+    axis.set_ylabel(break_name(labelled(what, clean(unit, SHORT)), MOST_LETTERS))
     axis.locator_params(nbins=5)
-
-
-def scores_panel(axis: Axes, story: Story, shown: Sequence[Candidate]) -> None:
-    """Bars of the candidates' scores, with their probabilities."""
-    rows = np.arange(len(shown))
-    # A fit that has failed to gain has no evidence, not evidence against.
-    sizes = [max(c.score, 0.0) for c in shown]
-    elsewhere = {entry.best.effect: entry.elsewhere for entry in entries(story)}
-    for row, size, c in zip(rows, sizes, shown, strict=True):
-        look = _LOOKS[standing(story, c.effect)]
-        axis.barh(row, size, height=0.62, edgecolor="white", **look)
-        others = [max(other.score, 0.0) for other in elsewhere.get(c.effect, ())]
-        axis.plot(others, [row] * len(others), "|", color=INK, markersize=8, markeredgewidth=1.0)
-        axis.annotate(
-            f"{number(c.score)}  ({probability(c.p_value)})",
-            (max([size, *others]), row),
-            (4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-        )
-    placed = has_places(story)
-    names = [
-        clean(short_name(c.effect), 44) if placed else label(name_of(c.effect), most=34)
-        for c in shown
-    ]
-    axis.set_yticks(rows, names)
-    axis.set_ylim(len(shown) - 0.4, -0.6)
-    # The number behind the longest bar needs room; without any evidence there is an axis still.
-    every = [c.score for entry in entries(story) for c in entry.elsewhere if entry.best in shown]
-    longest = max(*sizes, *every, 1e-9)
-    axis.set_xlim(0, (1.5 if placed else 1.35) * longest)
-    axis.set_xlabel(
-        "score: evidence that the simulation lacks it\n"
-        "(twice the gain in log likelihood, further numbers paid)"
-    )
-
-
-def gains_panel(axis: Axes, story: Story, shown: Sequence[Candidate]) -> None:
-    """The candidates' gains on held-out runs; none is drawn where none was measured."""
-    rows = np.arange(len(shown))
-    gains = [np.nan if c.heldout_gain is None else c.heldout_gain for c in shown]
-    colours = [_LOOKS[standing(story, c.effect)]["facecolor"] for c in shown]
-    axis.axvline(0, color=ZERO, linewidth=0.6)
-    axis.hlines(rows, 0, gains, color=JOIN, linewidth=0.9)
-    axis.scatter(gains, rows, c=colours, edgecolors=INK, s=36, zorder=3)
-    axis.set_xlabel(GAIN)
-    axis.tick_params(left=False)
-
-
-def standings(story: Story) -> tuple[list[Any], list[str]]:
-    """Handles and labels of the candidates' legend."""
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    there = {standing(story, c.effect) for c in story.verdict.candidates}
-    # Bars of one look need no legend where nothing is found.
-    names = [name for name in _LOOKS if name in there] if there != {"not needed"} else []
-    handles: list[Any] = [Patch(edgecolor="white", **_LOOKS[name]) for name in names]
-    if any(entry.elsewhere for entry in entries(story)):
-        handles.append(Line2D([], [], color=INK, marker="|", linestyle="", markersize=8))
-        names = [*names, "the same at other places"]
-    return handles, names

@@ -18,25 +18,28 @@ from bench.figures import style
 from bench.figures.formats import is_pdf_wanted
 from bench.figures.robot import joints_in, robot_figure
 from bench.figures.style import BAND, ZERO, blank
+from bench.figures.text_layout import most_lines, text_width
+from bench.gap.report.candidates_figure import candidates_figure
 from bench.gap.report.joints import by_joint, joints_figure
 from bench.gap.report.panels import (
     AFTER,
     BEFORE,
+    LONGEST_NAME,
     changed,
     chosen_places,
-    gains_panel,
     in_order,
     label,
+    place_names,
     places_panel,
+    profile_label,
     profile_panel,
-    scores_panel,
-    standings,
     telling,
 )
-from bench.gap.report.places import has_places, marks
-from bench.gap.report.ranking import entries, ranked
+from bench.gap.report.places import marks
+from bench.gap.report.ranking import ranked
 from bench.gap.report.shots import MOST_OUTLINES, Shot, kept, worst
 from bench.gap.report.story import Story
+from bench.gap.report.words import clean
 from sims.base import InputError, unknown
 
 if TYPE_CHECKING:
@@ -49,6 +52,8 @@ _WIDTHS = {1: 8.6, 2: 10.0, 3: 12.5}
 """Inches by the number of channels."""
 _HEADING = 0.22
 """Inches from the upper edge to the middle of a heading."""
+_HEADING_SIZE = 11.0
+"""Size of its letters at most, in points."""
 _STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
@@ -239,13 +244,17 @@ class _Sheet(NamedTuple):
         return inches / self.height
 
     def heading(self, inches: float, text: str) -> None:
-        """Write a heading so far from the left."""
+        """Write a heading that begins so far from the left, in letters that are small enough."""
+        room = self.width - inches - 0.1
+        size = _HEADING_SIZE * min(1.0, room / text_width([text], _HEADING_SIZE))
         y = 1 - self.up(_HEADING)
-        self.figure.text(self.across(inches), y, text, fontsize=11, va="center")
+        self.figure.text(self.across(inches), y, text, fontsize=size, va="center")
 
 
-_PROFILES_FROM = 6.0
-"""Inches from the left at which the profiles begin."""
+_NAMES = 1.9
+"""Least room for the names of places, in inches."""
+_PROFILES_AFTER = 4.1
+"""Inches from the end of these names to the profiles."""
 
 
 def _where(story: Story) -> Figure:
@@ -253,54 +262,44 @@ def _where(story: Story) -> Figure:
     places, profiles = chosen_places(story.places), telling(story.profiles)
     rows = min(2, len(profiles))
     columns = -(-len(profiles) // 2)
+    names = place_names(places)
+    left = max(_NAMES, 0.25 + text_width(names, _STYLE["font.size"]))
+    profiles_from = left + _PROFILES_AFTER
     # A single column of profiles gets more width than one of several.
-    width = 5.2 + (3.1 * columns if columns != 1 else 4.4)
-    height = max(2.6 + 0.27 * len(places), 1.5 + 1.9 * rows)
+    width = left + 3.3 + (3.1 * columns if columns != 1 else 4.4)
+    row = 0.27 + 0.13 * (most_lines(names) - 1)
+    # Variables of robots have long names, in several lines below their panels.
+    more = 0.15 * (most_lines([profile_label(profile) for profile in profiles]) - 1)
+    height = max(2.6 + row * len(places), 1.5 + (1.9 + more) * rows)
     figure, axes = blank(1, 1, (width, height), layout=None)
     sheet, axis = _Sheet(figure, width, height), axes[0, 0]
-    axis.set_position((1.9 / width, 1.0 / height, 3.1 / width, 1 - 1.4 / height))
+    axis.set_position((left / width, 1.0 / height, 3.1 / width, 1 - 1.4 / height))
     places_panel(axis, places, story)
     sheet.heading(0.15, "Where the gap is")
     figure.legend(*in_order(axis), loc="lower left", ncols=2, fontsize=8.5, columnspacing=1.0)
     if not profiles:
         return figure
 
-    sheet.heading(_PROFILES_FROM, "What it follows: mean residual in bins")
+    channels = {profile.channel for profile in profiles}
+    of = f" of {clean(profiles[0].channel, LONGEST_NAME)}" if len(channels) == 1 else ""
+    sheet.heading(profiles_from, f"What the residual{of} follows: means in bins")
     note = "residual: measured − simulated; bars: ±2 standard errors"
-    figure.text(sheet.across(_PROFILES_FROM), sheet.up(0.2), note, fontsize=8.5, va="center")
+    figure.text(sheet.across(profiles_from), sheet.up(0.2), note, fontsize=8.5, va="center")
     grid = figure.add_gridspec(
         rows,
         columns,
-        left=sheet.across(_PROFILES_FROM),
+        left=sheet.across(profiles_from),
         right=1 - sheet.across(0.12),
-        bottom=sheet.up(0.85),
+        bottom=sheet.up(0.85 + more),
         top=1 - sheet.up(0.5),
-        hspace=0.45,
+        hspace=0.45 + 0.6 * more,
         wspace=0.42,
     )
     units = {c.name: c.unit for c in story.channels}
     for i, profile in enumerate(profiles):
         axis = figure.add_subplot(grid[i // columns, i % columns])
-        profile_panel(axis, profile, units.get(profile.channel, "1"), changed(story))
-    return figure
-
-
-def _candidates(story: Story) -> Figure:
-    """Left the scores, right the gains on held-out runs."""
-    shown, total = ranked(story), len(entries(story))
-    # With its place a name is longer.
-    names = 3.2 if has_places(story) else 2.35
-    width, height = 7.05 + names, 1.75 + 0.28 * len(shown)
-    figure, axes = blank(1, 2, (width, height), layout=None, sharey=True, width_ratios=(3, 2))
-    scores_panel(axes[0, 0], story, shown)
-    gains_panel(axes[0, 1], story, shown)
-    # Whoever misses a candidate must see that not all are shown.
-    some = f", the best {len(shown)} of {total}" if len(shown) < total else ""
-    y = 1 - _HEADING / height
-    figure.text(0.015, y, f"Candidate causes{some}", fontsize=11, va="center")
-    figure.legend(*standings(story), loc="upper right", ncols=3, fontsize=8.5)
-    bottom, top = 0.68 / height, 1 - 0.45 / height
-    figure.subplots_adjust(left=names / width, right=0.985, bottom=bottom, top=top, wspace=0.06)
+        unit = units.get(profile.channel, "1")
+        profile_panel(axis, profile, unit, changed(story), one_channel=len(channels) == 1)
     return figure
 
 
@@ -308,5 +307,5 @@ _MAKERS: Mapping[str, Callable[[Story], Figure]] = {
     "robot": _robot,
     "overview": _overview,
     "where": _where,
-    "candidates": _candidates,
+    "candidates": candidates_figure,
 }

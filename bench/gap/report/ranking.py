@@ -67,10 +67,16 @@ def ranked(story: Story) -> list[Candidate]:
     return [c for c in ordered if c not in beyond]
 
 
+LONGEST_PLACE = 64
+"""Characters of a place's name that a list shows."""
+
+
 def short_name(effect: str) -> str:
-    """An effect for a list: without its article, and without the kind of its place."""
+    """Name an effect for a list: without its article, and without the kind of its place."""
     base, place = parted(effect)
     if not place:
         return name_of(effect)
-    where = at(kind_of(effect), [place]) if place == FAMILY else f" at {clean(place, 24)}"
+    where = (
+        at(kind_of(effect), [place]) if place == FAMILY else f" at {clean(place, LONGEST_PLACE)}"
+    )
     return name_of(base) + where

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +12,11 @@ import numpy as np
 
 from bench.figures import style
 from bench.figures.formats import is_pdf_wanted
+from bench.figures.text_layout import POINTS, text_width
 from bench.gap.report.words import clean, estimated, number, pretty, sentence, with_unit
 from bench.gap.sheet.diagram import Diagram
 from bench.gap.sheet.facts import Facts
-from bench.gap.sheet.words import TITLES, another, beside, called, evidence, reached, short
+from bench.gap.sheet.words import another, beside, called, evidence, reached, short, title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,9 +29,19 @@ _MARGIN = 0.06
 _LINE = 0.0118
 """Height of a line of the table, as a share of the page."""
 _SMALL = 0.0083
-"""The same of what is not shown."""
+"""Height of a line of what is not shown, in letters of `_SMALL_SIZE`, as a share of the page."""
+_SMALL_SIZE = 5.6
+"""Size of its letters, in points."""
+_NAME_LETTERS = 40
+"""Letters of a name in it at most."""
+_LETTER = 0.63
+"""Mean width of a letter, as a share of its size."""
+_TABLE_SIZE, _LEAST_SIZE = 7.5, 5.0
+"""Largest and least size of the letters of the table, in points."""
 _ROOM = 0.36
 """Height of the diagram at most, as a share of the page."""
+_LETTERS = 110
+"""Letters of a line across the page."""
 _STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8,
@@ -86,20 +97,27 @@ def draw(axes: Axes, diagram: Diagram) -> None:
     axes.set_title("Drive and back-drive, at rest", fontsize=9, loc="left")
 
 
-def printed(facts: Facts, diagram: Diagram) -> bytes:
+def printed(facts: Facts) -> bytes:
     """The sheet as a PDF of one page."""
     with _styled():
-        return style.pdf(paper(facts, diagram))
+        return style.pdf(paper(facts))
 
 
-def paper(facts: Facts, diagram: Diagram) -> Figure:
+def paper(facts: Facts) -> Figure:
     """The page."""
     from bench.figures.picture import Picture
 
     figure = Picture(figsize=A4, layout=None)
     top = _heading(figure, facts)
     top = _shown(figure, facts, top)
-    below = _not_shown(figure, facts)
+    diagram = facts.diagram
+    if diagram is None:
+        said = "\n".join(textwrap.wrap(facts.without_drive(), _LETTERS))
+        figure.text(_MARGIN, top - 0.01, said, va="top", linespacing=1.4)
+        # The room of the diagram belongs to the table: its letters are larger.
+        _not_shown(figure, facts, size=_SMALL_SIZE + 1.4, begins=top - 0.09)
+        return figure
+    below = _not_shown(figure, facts, size=_SMALL_SIZE)
     height = min(_ROOM, top - below - 0.09)
     if height > 0.1:
         width = height * A4[1] / A4[0]
@@ -113,48 +131,87 @@ def _heading(figure: Figure, facts: Facts) -> float:
     figure.text(_MARGIN, 0.965, clean(facts.name, 60), fontsize=17, weight="bold", va="top")
     title = facts.recording.title or facts.recording.path.stem
     said = f"Data sheet from {clean(title, 90)}. {sentence(facts.verdict.says)}"
-    lines = textwrap.wrap(clean(said, 300), 110)[:3]
+    lines = textwrap.wrap(clean(said, 300), _LETTERS)[:3]
     figure.text(_MARGIN, 0.938, "\n".join(lines), color=style.SOFT, va="top", linespacing=1.3)
     return 0.938 - 0.014 * len(lines) - 0.012
 
 
 def _shown(figure: Figure, facts: Facts, top: float) -> float:
     """The table of what is shown; what is left below."""
-    columns = (_MARGIN, 0.135, 0.405, 0.685, 0.785)
     heads = ("", "quantity", "value (95 %)", "another run", "evidence")
-    for x, text in zip(columns, heads, strict=True):
-        figure.text(x, top, text, weight="bold", va="top")
-    for row in facts.rows:
-        if row.number is None:
-            continue
-        top -= _LINE * 1.25
-        cells = [
-            TITLES[row.part],
-            clean(called(row), 44),
-            clean(estimated(row.number), 54),
+    rows = [
+        (
+            title(row, facts.is_driven),
+            clean(called(row), 60),
+            clean(estimated(row.number), 70),
             another(row),
-            clean(evidence(row, short=True), 30),
-        ]
-        for x, text in zip(columns, cells, strict=True):
-            weight = "bold" if row.state == "found" and x == columns[1] else "normal"
-            figure.text(x, top, text, va="top", weight=weight, fontsize=7.5)
+            clean(evidence(row, short=True), 60),
+        )
+        for row in facts.rows
+        if row.number is not None
+    ]
+    found = [row.state == "found" for row in facts.rows if row.number is not None]
+    size, columns = _columns([heads, *rows])
+    for x, text in zip(columns, heads, strict=True):
+        figure.text(x, top, text, weight="bold", va="top", fontsize=size)
+    for cells, is_found in zip(rows, found, strict=True):
+        top -= _LINE * 1.25
+        for i, (x, text) in enumerate(zip(columns, cells, strict=True)):
+            weight = "bold" if is_found and i == 1 else "normal"
+            figure.text(x, top, text, va="top", weight=weight, fontsize=size)
     return top - _LINE * 1.5
 
 
-def _not_shown(figure: Figure, facts: Facts) -> float:
-    """Two columns of what is not shown, from the foot up; where they begin."""
-    rows = [row for row in facts.rows if row.number is None]
-    half = -(-len(rows) // 2)
-    begins = 0.045 + _SMALL * 1.2 * half
-    for i, row in enumerate(rows):
-        x = _MARGIN + 0.45 * (i // half)
-        y = begins - _SMALL * 1.2 * (i % half)
-        mixed = beside(row)
-        said = reached(row) + (f" (mixed up with {mixed})" if mixed and row.reach else "")
-        figure.text(x, y, clean(short(row), 34), va="top", fontsize=5.6, family="monospace")
-        figure.text(x + 0.18, y, clean(said, 52), va="top", fontsize=5.6)
-    title = "Not shown by these data, and how small a number they would have shown (95 %)"
-    figure.text(_MARGIN, begins + 0.018, title, weight="bold", va="top")
+def _columns(rows: Sequence[Sequence[str]]) -> tuple[float, list[float]]:
+    """The size of the letters of a table, and where its columns begin, as shares of the width."""
+    size = _TABLE_SIZE
+    while True:
+        widths = [text_width(column, size, "bold") for column in zip(*rows, strict=True)]
+        gap = 0.14 * size / _TABLE_SIZE
+        if sum(widths) + gap * (len(widths) - 1) <= A4[0] * (1 - 2 * _MARGIN) or size < _LEAST_SIZE:
+            break
+        size -= 0.25
+    begins = np.concatenate([[0.0], np.cumsum(widths[:-1]) + gap * np.arange(1, len(widths))])
+    return size, (_MARGIN + begins / A4[0]).tolist()
+
+
+def _not_shown(figure: Figure, facts: Facts, size: float, begins: float = 0.0) -> float:
+    """Two columns of what is not shown; where they begin.
+
+    Args:
+        figure: the page.
+        facts: what is on it.
+        size: of the letters, in points.
+        begins: height of the first line, as a share of the page; 0 for a table that ends at the
+            foot.
+    """
+    rows = []
+    names = [short(row) for row in facts.rows if row.number is None]
+    longest = min(max(map(len, names), default=0), _NAME_LETTERS)
+    # Letters of a monospaced font are 0.602 of their size wide.
+    beside_name = (0.602 * size / POINTS * longest + 0.12) / A4[0]
+    letters = int((0.45 - beside_name) * A4[0] * POINTS / (_LETTER * size))
+    for row in facts.rows:
+        if row.number is None:
+            mixed = beside(row)
+            said = reached(row) + (f" (mixed up with {mixed})" if mixed and row.reach else "")
+            lines = textwrap.wrap(said, letters)
+            rows.append((short(row), lines))
+    line = _SMALL * 1.2 * size / _SMALL_SIZE
+    heights = [len(lines) for _, lines in rows]
+    half = next((i for i in range(len(rows) + 1) if 2 * sum(heights[:i]) >= sum(heights)), 0)
+    tallest = line * max(sum(heights[:half]), sum(heights[half:]))
+    # A long table may not run over the foot.
+    begins = max(begins, 0.045 + tallest)
+    for column, part in enumerate((rows[:half], rows[half:])):
+        x, y = _MARGIN + 0.45 * column, begins
+        for name, lines in part:
+            figure.text(x, y, clean(name, longest), va="top", fontsize=size, family="monospace")
+            said = "\n".join(lines)
+            figure.text(x + beside_name, y, said, va="top", fontsize=size, linespacing=1.25)
+            y -= line * len(lines)
+    heading = "Not shown by these data, and how small a number they would have shown (95 %)"
+    figure.text(_MARGIN, begins + 0.018, heading, weight="bold", va="top")
     text = "Limits and gaps show from the size given on. Made by simgap datasheet."
     figure.text(_MARGIN, 0.028, text, fontsize=6, color=style.SOFT, va="top")
     return begins + 0.02

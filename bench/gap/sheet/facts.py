@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from bench.gap.report.words import clean, estimated, joined
+from bench.gap.report.words import clean, estimated, joined, number, with_unit
 from bench.gap.sheet.diagram import Diagram, diagram
 from bench.gap.sheet.quantity import Quantity
 from bench.gap.sheet.subject import Subject
@@ -53,12 +53,47 @@ class Facts:
             "verdict": self.verdict.verdict,
             "elsewhere": list(self.elsewhere()),
             "quantities": named,
-            "diagram": self.diagram.document(),
+            **self._at_rest(),
         }
 
+    def _at_rest(self) -> dict[str, Any]:
+        """The diagram of a drive; without one, the dry friction that holds the joint."""
+        if self.diagram is not None:
+            return {"diagram": self.diagram.document()}
+        rest = self.rest
+        return {"rest": {"unit": rest.unit, "laws": list(rest.laws), "breakaway": rest.breakaway}}
+
     @cached_property
-    def diagram(self) -> Diagram:
-        """Where the joint moves, holds and slips."""
+    def is_driven(self) -> bool:
+        """Whether a drive acts here: without one there is nothing to say of it."""
+        return self.subject.is_driven(self.recording)
+
+    @property
+    def diagram(self) -> Diagram | None:
+        """Where the joint moves, holds and slips, by the force of its drive; None without one."""
+        return self.rest if self.is_driven else None
+
+    def without_drive(self) -> str:
+        """Say why there is no diagram, and what is known of the joint at rest instead."""
+        why = "the log has no input"
+        if self.subject.joint:
+            why = (
+                f"joint {self.subject.joint} has no actuator in the model, and no force in the log"
+            )
+        rest = self.rest
+        if rest.laws and rest.breakaway > 0:
+            force = with_unit(number(rest.breakaway), rest.unit)
+            held = f"At rest, dry friction holds against up to {force} ({joined(rest.laws)})"
+        else:
+            held = "No law of friction was found that holds it at rest"
+        return (
+            f"There is no drive: {why}. So this sheet has no drive and back-drive diagram, and no "
+            f"numbers of a drive; the table shows what else acts on the joint. {held}."
+        )
+
+    @cached_property
+    def rest(self) -> Diagram:
+        """Where the joint moves, holds and slips, by the forces that act on it at rest."""
         strongest = [row.number.value for row in self.rows if row.strongest and row.number]
         return diagram(self.subject, self.extended, next(iter(strongest), None))
 

@@ -19,7 +19,7 @@ from bench.gap.sheet.diagram import Diagram
 from bench.gap.sheet.facts import Facts
 from bench.gap.sheet.mjcf import CLASS, Made
 from bench.gap.sheet.quantity import Quantity
-from bench.gap.sheet.words import TITLES, another, beside, called, evidence, reached
+from bench.gap.sheet.words import another, beside, called, evidence, reached, title
 from bench.pages.chart import Static
 from bench.pages.elements import code, listed, paragraph, safe, table
 from bench.pages.page import Page
@@ -39,15 +39,21 @@ _REACH = (
 )
 
 
-def page(sheet: Facts, diagram: Diagram, drawn: tuple[bytes, bytes | None], made: Made) -> str:
-    """Render the page as HTML, with the diagram as SVG and, where one is asked for, PDF."""
+def page(sheet: Facts, drawn: tuple[bytes, bytes | None] | None, made: Made) -> str:
+    """Render the page as HTML, with the diagram as SVG and, where one is asked for, PDF.
+
+    `drawn` is None where there is no drive.
+    """
     built = Page(f"Data sheet: {clean(sheet.name, 80)}", _foot(sheet))
-    built.table(DIAGRAM, _numbers(diagram))
+    if sheet.diagram is not None:
+        built.table(DIAGRAM, _numbers(sheet.diagram))
     built.add(*_head(sheet))
     built.section("shown", "What these data show", *_found(sheet))
-    built.section(
-        "drive", "Drive and back-drive", *_diagram(built, diagram, Static(*drawn, "", DIAGRAM))
-    )
+    if sheet.diagram is None or drawn is None:
+        built.section("drive", "No drive", paragraph(safe(sheet.without_drive(), 600)))
+    else:
+        picture = Static(*drawn, "", DIAGRAM)
+        built.section("drive", "Drive and back-drive", *_diagram(built, sheet.diagram, picture))
     built.section("absent", "Not shown by these data", *_absent(sheet))
     built.section("mujoco", "For MuJoCo", *_class(made))
     return built.html()
@@ -75,7 +81,7 @@ def _found(sheet: Facts) -> Iterator[str]:
             continue
         rows.append(
             [
-                TITLES[row.part],
+                title(row, sheet.is_driven),
                 f"{safe(called(row), 80)}<br>{code(safe(row.name, 80))}",
                 safe(estimated(row.number), 120),
                 safe(another(row), 40),
@@ -109,7 +115,7 @@ def _diagram(built: Page, diagram: Diagram, drawn: Static) -> Iterator[str]:
 def _absent(sheet: Facts) -> Iterator[str]:
     rows = [
         [
-            TITLES[row.part],
+            title(row, sheet.is_driven),
             f"{safe(called(row), 80)}<br>{code(safe(row.name, 80))}",
             safe(reached(row), 120),
             _stated(row),

@@ -17,12 +17,16 @@ from bench.gap.sheet.reach import shown
 from bench.gap.sheet.subject import Subject, subject_of
 from bench.gap.verdict import Verdict
 from bench.recordings.pieces import cut
+from sims import effects as library
 from sims.arguments import check_arguments
 from sims.base import InputError, unknown
 from sims.extended import Extended
 from sims.files import Content, write_all
 from sims.recording.recording import Recording
-from sims.system import FAMILY
+from sims.system import FAMILY, Effect
+
+TRANSMISSION = frozenset({"joint.backlash", "joint.coupling", "joint.flexibility"})
+"""Effects between a drive and its joint."""
 
 
 class DataSheet(Facts):
@@ -40,10 +44,11 @@ class DataSheet(Facts):
 
         folder = Path(folder)
         made = mjcf(self, folder)
+        drawn = picture(self.diagram) if self.diagram is not None else None
         contents: dict[Path, Content] = {
             folder / "sheet.toml": tomli_w.dumps(self.document()),
-            folder / "sheet.html": page(self, self.diagram, picture(self.diagram), made),
-            folder / "sheet.pdf": printed(self, self.diagram),
+            folder / "sheet.html": page(self, drawn, made),
+            folder / "sheet.pdf": printed(self),
             **{folder / name: text for name, text in made.contents.items()},
         }
         try:
@@ -82,7 +87,14 @@ def sheet(
             raise unknown(f"channel of {recording.path}", channel, there)
     recording = replace(recording, constants={**extended.constants, **recording.constants})
     recording, _ = cut(recording, kind)
-    asked = tuple(absent(subject, extended))
+    is_driven = subject.is_driven(recording)
+    asked = tuple(
+        name
+        for name, effect in (
+            (name, library.find(name, kind.system)) for name in absent(subject, extended)
+        )
+        if (is_driven or not _needs_drive(name, effect)) and not _is_stop(effect)
+    )
     candidates = [*extended.effects, *asked]
     engine = None if kind.own_engine else extended.engine
     world = World(kind, recording, recording.training(), engine, candidates=candidates)
@@ -111,6 +123,16 @@ def absent(subject: Subject, extended: Extended) -> Iterator[str]:
     for name in effects:
         if name not in has | simpler and name.partition("@")[2] != FAMILY:
             yield name
+
+
+def _needs_drive(name: str, effect: Effect | type[Effect]) -> bool:
+    """Whether an effect is one of a drive or of its transmission."""
+    return effect.at == "actuator" or name.partition("@")[0] in TRANSMISSION
+
+
+def _is_stop(effect: Effect | type[Effect]) -> bool:
+    """Whether an effect is a stop: it shows by where it is, and not from some stiffness on."""
+    return effect.coefficients[0].of == "stop"
 
 
 def _seen(world: World, effect: str) -> bool:

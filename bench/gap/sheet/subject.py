@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from sims import effects as library
 from sims.base import InputError, unknown
 from sims.extended import Number
+from sims.recording.recording import Recording
 from sims.simulated import Simulated
 from sims.system import FAMILY, Effect
 
@@ -68,6 +69,17 @@ class Subject:
             return self.kind.system.kind != "rotary"
         (joint,) = (s for s in self._spots()["joint"] if s.name == self.joint)
         return bool(joint.kind == "slide")
+
+    def is_driven(self, recording: Recording) -> bool:
+        """Return whether a drive acts here: an actuator of the robot's file, or an input of the
+        recording that is not always zero.
+        """
+        inputs = {
+            name for run in recording.runs for name, signal in run.inputs.items() if signal.any()
+        }
+        if not self.joint:
+            return bool(inputs)
+        return bool(self.actuators) or f"force.{self.joint}" in inputs
 
     def has(self, effect: Effect | type[Effect]) -> bool:
         """Whether an effect acts here, and at no more than one place."""

@@ -10,8 +10,13 @@ from bench.gap.sheet.subject import PARTS
 
 UNLIKELY = 0.05
 """Chance above which a cause stands only because nobody had the time to judge it."""
-TITLES = {"system": "Motor", **PARTS}
-"""Of the parts of the table."""
+
+
+def title(row: Quantity, is_driven: bool) -> str:
+    """Name the part of the table that a row belongs to."""
+    if row.part == "system":
+        return "Motor" if is_driven else "System"
+    return PARTS[row.part]
 
 
 def another(row: Quantity) -> str:

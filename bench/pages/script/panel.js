@@ -49,6 +49,14 @@ function aligned(lines, log) {
   return [all, ...columns];
 }
 
+// Width of a vertical axis: its longest number has room, as -1.25×10⁻⁶; most axes are alike.
+function roomBeside(u, texts, number) {
+  const { ticks, gap, font } = u.axes[number];
+  u.ctx.font = font[0];
+  const widths = (texts || []).map((text) => u.ctx.measureText(text || "").width / devicePixelRatio);
+  return Math.max(58, Math.ceil(ticks.size + gap + Math.max(0, ...widths)));
+}
+
 class PanelView {
   // `scales` and `ranges` by "x" and "y"; `acts`: zoomed([x0, x1, y0, y1]), reset(), told(text).
   constructor(place, panel, lines, { width, height, scales, ranges, sync, along, acts }) {
@@ -82,7 +90,7 @@ class PanelView {
         },
         axes: [
           { ...axis("x", panel.across, 56), size: panel.across.names.length ? 46 : 34 },
-          { ...axis("y", panel.up, height < 220 ? 18 : 30), size: 58 },
+          { ...axis("y", panel.up, height < 220 ? 18 : 30), size: roomBeside },
         ],
         series: [{}, ...lines.map((line) => this.drawn(line))],
         cursor: {

@@ -1,14 +1,12 @@
 """`simgap explain` and `simgap score` as they are typed."""
 
-import io
 import json
 import signal
-import time
 
 import pytest
 
 from bench.cli import main
-from bench.commands.progress import Look
+from bench.commands.search_progress import ProgressDisplay
 from bench.registry import simulators
 from sims.extended import load, read
 from tests.bench.gap import schema
@@ -240,12 +238,12 @@ def interrupted(monkeypatch, times):
     """Have Ctrl-C pressed so often as soon as something is shown."""
     left = [times]
 
-    def show(*_):
+    def completed(*_):
         while left[0]:
             left[0] -= 1
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Look, "show", show)
+    monkeypatch.setattr(ProgressDisplay, "completed", completed)
 
 
 def test_ctrl_c_ends_with_what_there_is_and_is_an_interrupt(folder, capsys, tmp_path, monkeypatch):
@@ -267,29 +265,6 @@ def test_ctrl_c_twice_ends_at_once_and_writes_nothing(folder, capsys, tmp_path, 
     assert not out.exists()
     assert "interrupted before there was a result" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-class Terminal(io.StringIO):
-    """What a terminal would show."""
-
-    def isatty(self):
-        return True
-
-
-def test_a_terminal_shows_a_bar_and_a_log_a_line_for_each_part(monkeypatch):
-    for stream, lines in ((Terminal(), 1), (io.StringIO(), 2)):
-        monkeypatch.setattr("sys.stderr", stream)
-        with Look() as look:
-            look.say("fitting")
-            look.show(0.5, "refit of drag.linear")
-            time.sleep(0.25)
-            look.show(0.4, "scores of the library")
-            look.say("measuring")
-        told = stream.getvalue()
-        assert told.count("\n") == (0 if stream.isatty() else lines)
-        assert (" 50%|" in told) == ("scores of the library" in told) == stream.isatty()
-        assert " 40%|" not in told, "a bar does not go back"
-        assert ("left, scores" in told) == stream.isatty()
 
 
 def test_a_thorough_search_changes_nothing_where_nothing_is_left_over(folder, tmp_path):

@@ -1,11 +1,15 @@
 """The page of many logs in a real browser: what it says, and that it leads to each log's own."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
+from bench.figures.logs import held_out, numbers
+from bench.gap.each import frames
 from bench.gap.each.page import Asked, each_page
 from bench.gap.each.rows import Row, table
+from tests.bench.figures.readable import unreadable
 from tests.browser import WIDTHS, Opened
 
 ODD = "a </b><b>$x$"
@@ -120,3 +124,51 @@ def test_nothing_explained_yet_is_a_page_too(tmp_path):
     assert "0 logs, each explained by itself" in html
     assert "<strong>none yet</strong>" in html
     assert "<figure" not in html
+
+
+def test_no_number_beside_a_chart_is_cut_off(browser, tmp_path):
+    small = [Row(f"day{k}", "d", "named", (cause(-1.2345e-6 * (1 + 0.01 * k)),)) for k in range(3)]
+    _, asked = made(tmp_path)
+    folders = {row.log: tmp_path / row.log for row in small}
+    asked = replace(asked, folders=folders, recordings=folders)
+    file = tmp_path / "small.html"
+    file.write_text(each_page(small, asked), encoding="utf-8")
+    # Whatever is drawn in the first column of pixels is cut off there.
+    column = """() => {
+        const canvas = document.querySelector("#found canvas");
+        const data = canvas.getContext("2d").getImageData(0, 0, 1, canvas.height).data;
+        return data.filter((_, i) => i % 4 == 3).reduce((sum, one) => sum + one, 0);
+    }"""
+    with Opened(browser, file) as one:
+        one.page.locator("#found").scroll_into_view_if_needed()
+        one.page.locator("#found canvas").first.wait_for()
+        assert one.page.evaluate(column) == 0
+
+
+LONG = "friction.load_quadratic@left_arm_shoulder_lift_joint"
+OTHERS = ("friction.load_direction@left_arm_shoulder_lift_joint", "joint.backlash@left_arm_elbow")
+
+
+@pytest.mark.parametrize("count", [1, 3, 12])
+def test_the_printed_figures_show_names_in_full(tmp_path, count):
+    rows = [
+        Row(f"recording_of_the_left_arm_on_tuesday_{k}", "d", "ambiguous", (
+            cause(0.1 * (k + 1), LONG, OTHERS), cause(0.2, "friction.coulomb@wrist_1", ())
+        ))
+        for k in range(count)
+    ]  # fmt: skip
+    logs = frames.logs(rows, {row.log: tmp_path / row.log for row in rows})
+    logs["before"], logs["after"] = 12.0, 1.2
+    for drawn in (numbers(logs, frames.numbers(rows)), held_out(logs)):
+        assert unreadable(drawn) == []
+        names = [label.get_text() for label in drawn.axes[0].get_yticklabels()]
+        assert [name.replace("\n", "") for name in names] == list(logs["log"])
+
+
+def test_a_number_at_a_place_is_named_by_it_in_full():
+    joint = "left_arm_shoulder_lift_joint_of_the_upper_body"
+    known = {"value": 1.0, "low": 0.9, "high": 1.1, "unit": "N*m"}
+    found = {"effect": "friction.coulomb@*", "alternatives": [], "coefficients": {}}
+    found["coefficients"][f"coefficient@{joint}"] = known
+    (what,) = frames.numbers([Row("day", "d", "named", (found,))])["what"]
+    assert what == f"friction.coulomb@*: at {joint} [N·m]"

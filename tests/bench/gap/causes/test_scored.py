@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from bench.gap.causes.structure import remains
+from bench.gap.model.progress import SilentListener
+from bench.gap.model.watch import Watch
 from tests.bench.gap.made import recording, searched
 
 
@@ -91,3 +93,26 @@ def test_what_was_scored_longest_ago_makes_room_and_is_scored_again_alike(monkey
     assert search.scored[frozenset(first.names)] is before
     known = {frozenset([*one, "friction.coulomb"]) for one in (first.names, second.names)}
     assert known <= set(search.models)
+
+
+def test_a_survey_of_several_models_reports_each_of_them():
+    class Events(SilentListener):
+        def __init__(self):
+            self.finished = {}
+
+        def stage(self, name, total=None):
+            self.now = name, total
+            self.finished[self.now] = 0
+
+        def advance(self, count=1):
+            self.finished[self.now] += count
+
+    recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
+    candidates = ["friction.coulomb", "spring.linear", "drag.linear"]
+    search, _ = searched(recorded, 0.01, candidates=candidates)
+    names = [("friction.coulomb",), ("spring.linear",)]
+    search.refit([replace(search.base.fit.start(), effects=one) for one in names])
+    heard = Events()
+    search.world.watch = Watch(listener=heard)
+    search.extend([search.models[frozenset(one)] for one in names], 0)
+    assert heard.finished["testing 2 effects beside 2 models", 2] == 2

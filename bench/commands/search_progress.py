@@ -1,0 +1,345 @@
+"""The display of a search's progress on stderr: one live line on a terminal, few lines in a log."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TextIO
+
+TERMINAL_INTERVAL = 0.2
+"""Shortest time between two updates of the live line, in seconds."""
+LOG_INTERVAL = 10.0
+"""Shortest time between two lines where stderr is not a terminal, in seconds."""
+TICK = 0.5
+"""Interval of the timer that keeps the display moving between two events, in seconds."""
+HINT_AFTER = 20.0
+"""Elapsed time after which `HINT` is printed, in seconds."""
+HINT = "add --budget 60 to stop after a minute with the best answer so far"
+LEAST_SHARE = 0.02
+"""Share of the search that must be done before the remaining time is estimated."""
+OVERDUE = 0.5
+"""The estimated remaining time is at least this share of the time since the last event."""
+BAR_WIDTH = 10
+"""Width of the bar, in characters."""
+
+
+class SearchProgress:
+    """The state of a running search: a `ProgressListener` that keeps the latest events.
+
+    Args:
+        clock: returns the time in seconds.
+        budget: seconds after which the search ends; None without such a limit.
+    """
+
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, budget: float | None = None
+    ) -> None:
+        self._clock = clock
+        self._budget = budget
+        self._started = clock()
+        self._name = ""
+        self._total: int | None = None
+        self._done = 0
+        self._best: tuple[str, str] | None = None
+        self._share = 0.0
+        self._is_searching = True
+        # The remaining time as it was estimated when the share last grew, and when that was.
+        self._estimate: float | None = None
+        self._estimated_at = self._started
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Begin a stage; see `ProgressListener`."""
+        self._name, self._total, self._done = name, total, 0
+
+    def advance(self, count: int = 1) -> None:
+        """Finish steps of the stage; see `ProgressListener`."""
+        self._done += count
+
+    def found(self, effects: Sequence[str], share: float) -> None:
+        """Keep the best model so far; see `ProgressListener`."""
+        # 99.96 % is not all of the gap.
+        percent = "over 99" if 0.99 < share < 1.0 else f"{100.0 * share:.0f}"
+        self._best = " + ".join(effects), percent
+
+    def completed(self, share: float) -> None:
+        """Estimate the remaining time from the share done; see `ProgressListener`."""
+        # A model with more effects makes the share smaller, but a bar must not go back.
+        if share <= self._share:
+            return
+        self._share = min(share, 1.0)
+        self._estimated_at = self._clock()
+        if self._share >= LEAST_SHARE:
+            self._estimate = self.elapsed() * (1.0 - self._share) / self._share
+
+    def elapsed(self) -> float:
+        """Return the seconds since the search began."""
+        return self._clock() - self._started
+
+    def remaining(self) -> float | None:
+        """Return the estimated remaining seconds; None where nothing is known or nothing remains.
+
+        The estimate assumes the mean pace so far. Between two events it counts down; where the next
+        event is overdue it grows with the time since the last one.
+        """
+        if self._estimate is None or not self._is_searching:
+            return None
+        since = self._clock() - self._estimated_at
+        return max(self._estimate - since, OVERDUE * since)
+
+    def finish(self, name: str) -> None:
+        """End the search and begin a stage that follows it, as drawing figures."""
+        self._is_searching = False
+        self.stage(name)
+
+    def lines(self, empty: str = "", full: str = "") -> Iterator[str]:
+        """Yield the state as one line, in forms that need fewer and fewer columns.
+
+        Args:
+            empty: a character of the bar that is not done; without it no bar is drawn.
+            full: a character of the bar that is done.
+        """
+        # Rounded down: a full bar means that all is done.
+        done = int(BAR_WIDTH * self._share)
+        percent, bar = f"{100 * self._share:3.0f}% ", ""
+        if not self._is_searching:
+            # The share is one of the search, which may have ended early.
+            percent = ""
+        elif empty:
+            bar = f"|{full * done}{empty * (BAR_WIDTH - done)}| "
+        long = self._joined(self._times(), self._stage(), self._best_so_far())
+        short = self._joined(self._times(), self._stage(), self._best_so_far("best {1} % {0}"))
+        yield f"simgap {percent}{bar}{long}"
+        yield f"{percent}{bar}{short}"
+        yield f"{percent}{short}"
+
+    def report(self) -> str:
+        """Return the state as a line of a log."""
+        times = self._times() if self.elapsed() >= 1.0 else ""
+        return self._joined(self._stage(), self._best_so_far(), times)
+
+    @staticmethod
+    def _joined(*parts: str) -> str:
+        return "; ".join(part for part in parts if part)
+
+    def _best_so_far(self, form: str = "best so far {0} closes {1} % of the gap") -> str:
+        return form.format(*self._best) if self._best is not None else ""
+
+    def _stage(self) -> str:
+        if self._total is None or self._total < 2:
+            return self._name
+        return f"{self._name}, {min(self._done, self._total)} of {self._total}"
+
+    def _times(self) -> str:
+        elapsed = clock_text(self.elapsed())
+        if not self._is_searching:
+            return elapsed
+        if self._budget is not None:
+            left = self._budget - self.elapsed()
+            said = (
+                f"at most {clock_text(left)} left"
+                if left > 0
+                else "budget used up, finishing this step"
+            )
+            return f"{elapsed}, {said}"
+        remaining = self.remaining()
+        return elapsed if remaining is None else f"{elapsed}, about {clock_text(remaining)} left"
+
+
+def clock_text(seconds: float) -> str:
+    """Return a duration as ``0:07`` or ``1:02:03``."""
+    minutes, rest = divmod(round(max(seconds, 0.0)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+class ProgressDisplay(SearchProgress):
+    """Shows a search's progress on stderr while it is entered.
+
+    On a terminal it keeps one live line, which it erases at the end. Elsewhere it prints a line at
+    most every `LOG_INTERVAL` seconds. Events only store values and look at the clock, so that the
+    search is not slowed down. A timer signal redraws between events, not a thread: a process with
+    threads cannot fork workers.
+
+    Args:
+        budget: seconds after which the search ends; None without such a limit.
+        silent: show nothing.
+        hint: whether to print `HINT` in a long search without a budget.
+        stream: where to; stderr if None.
+        clock: returns the time in seconds.
+    """
+
+    def __init__(
+        self,
+        budget: float | None = None,
+        *,
+        silent: bool = False,
+        hint: bool = True,
+        stream: TextIO | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(clock, budget)
+        self._stream = sys.stderr if stream is None else stream
+        self._live = self._stream.isatty()
+        self._silent = silent
+        self._hints = hint and budget is None
+        self._interval = TERMINAL_INTERVAL if self._live else LOG_INTERVAL
+        self._shown_at: float | None = None
+        self._shown = ""
+        # A signal may arrive while a line is written. Its own output waits until that is done.
+        self._busy = False
+        self._waiting: list[str] = []
+        self._has_timer = False
+
+    def __enter__(self) -> ProgressDisplay:
+        if not self._silent and _can_use_timer():
+            signal.signal(signal.SIGALRM, lambda *_: self._update())
+            # System calls of libraries go on after the signal.
+            signal.siginterrupt(signal.SIGALRM, False)
+            signal.setitimer(signal.ITIMER_REAL, TICK, TICK)
+            self._has_timer = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._has_timer:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        # An exception may have come while a line was written.
+        self._busy = False
+        with self._writing():
+            self._erase()
+            self._print_waiting()
+        self._silent = True
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Begin a stage and show it."""
+        super().stage(name, total)
+        self._update()
+
+    def advance(self, count: int = 1) -> None:
+        """Finish steps of the stage and show it."""
+        super().advance(count)
+        self._update()
+
+    def found(self, effects: Sequence[str], share: float) -> None:
+        """Keep the best model so far and show it."""
+        super().found(effects, share)
+        self._update()
+
+    def completed(self, share: float) -> None:
+        """Take in the share done and show it."""
+        super().completed(share)
+        self._update()
+
+    def note(self, text: str) -> None:
+        """Print a line that stays: above the live line on a terminal."""
+        if self._silent:
+            return
+        self._waiting.append(text)
+        if not self._busy:
+            with self._writing():
+                self._draw()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Erase the live line while something else is printed on the terminal."""
+        with self._writing():
+            self._erase()
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._busy = False
+
+    def _update(self) -> None:
+        """Show the state, unless that was done just now."""
+        if self._silent or self._busy or not self._name:
+            return
+        now = self._clock()
+        if self._shown_at is not None and now - self._shown_at < self._interval:
+            return
+        with self._writing():
+            if self._hints and self.elapsed() >= HINT_AFTER and self._is_searching:
+                self._hints = False
+                self._waiting.append(HINT)
+            self._shown_at = now
+            if self._live:
+                self._draw()
+            else:
+                self._print_waiting()
+                self._stream.write(f"simgap: {self.report()} ...\n")
+                self._stream.flush()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        self._busy = True
+        try:
+            yield
+        except (OSError, ValueError):
+            # Nobody reads stderr any more, or it is closed. The search goes on.
+            self._silent = True
+        finally:
+            self._busy = False
+
+    def _draw(self) -> None:
+        """Write what waits, then the live line on a terminal."""
+        if self._waiting:
+            self._erase()
+            self._print_waiting()
+        if not self._live or not self._name:
+            return
+        from tqdm.utils import disp_len, disp_trim
+
+        columns = _columns(self._stream) - 1
+        lines = list(self.lines(*_bar_characters(self._stream)))
+        line = next((one for one in lines if disp_len(one) <= columns), lines[-1])
+        line = disp_trim(line, columns)
+        # A terminal echoes ^C at the end of the line: two characters more are to be overwritten.
+        rest = min(disp_len(self._shown) + 2, columns) - disp_len(line)
+        self._stream.write("\r" + line + " " * max(rest, 0) + "\b" * max(rest, 0))
+        self._stream.flush()
+        self._shown = line
+
+    def _print_waiting(self) -> None:
+        while self._waiting:
+            self._stream.write(f"simgap: {self._waiting.pop(0)}\n")
+            self._stream.flush()
+
+    def _erase(self) -> None:
+        if self._live and self._shown:
+            from tqdm.utils import disp_len
+
+            width = min(disp_len(self._shown) + 2, _columns(self._stream) - 1)
+            self._stream.write("\r" + " " * width + "\r")
+            self._stream.flush()
+            self._shown = ""
+
+
+def _can_use_timer() -> bool:
+    """Return whether this process has a timer signal that nobody else uses."""
+    is_main = threading.current_thread() is threading.main_thread()
+    has_timer = hasattr(signal, "setitimer") and hasattr(signal, "SIGALRM")
+    return is_main and has_timer and signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+
+
+def _columns(stream: Any) -> int:
+    """Return the width of a terminal in columns."""
+    try:
+        columns = os.get_terminal_size(stream.fileno()).columns
+    except (OSError, ValueError, AttributeError):
+        columns = 0
+    return columns or shutil.get_terminal_size().columns
+
+
+def _bar_characters(stream: Any) -> tuple[str, str]:
+    """Return the characters for what is not done and what is done, as far as can be encoded."""
+    try:
+        "█░".encode(getattr(stream, "encoding", None) or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return "-", "#"
+    return "░", "█"

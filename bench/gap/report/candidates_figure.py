@@ -1,0 +1,261 @@
+"""The figure of the candidate causes: how much of the gap each closes by itself, and the evidence
+for it.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.figures.style import BAND, BLUE, INK, SKY, SOFT, ZERO, blank
+from bench.figures.text_layout import break_name, most_lines, text_width
+from bench.gap.report.places import has_places
+from bench.gap.report.ranking import entries, ranked, short_name, standing
+from bench.gap.report.story import Side, Story
+from bench.gap.report.words import clean, number, percent, probability
+from bench.gap.verdict import Candidate
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FOUND, ALIKE, NOT_NEEDED = "found", "found, but cannot be told apart", "not needed"
+"""What `standing` says of a candidate."""
+LINE_LENGTH = 44
+"""A candidate's name of more characters has several lines."""
+LONGEST_LINE = 50
+"""Longest line of the name of a place, in characters."""
+CERTAIN = 1e-3
+"""A p-value up to this is not printed beside its bar: a note gives the largest one."""
+CHANCE = 0.05
+"""A larger p-value is not printed either: its bar is white, and a note says why."""
+LOWEST_SHARE = -0.5
+"""Shares below this are drawn there: how much worse a failed model is has no meaning."""
+POINTER = "▸ "
+"""Stands before the name of a cause, which is bold too, so that it stands out in grey."""
+
+_BARS: Mapping[str, Mapping[str, Any]] = {
+    FOUND: {"facecolor": BLUE},
+    ALIKE: {"facecolor": SKY, "hatch": "///"},
+    NOT_NEEDED: {"facecolor": BAND},
+}
+_DOTS: Mapping[str, Mapping[str, Any]] = {
+    FOUND: {"marker": "o", "markersize": 7, "markerfacecolor": BLUE},
+    ALIKE: {"marker": "D", "markersize": 6, "markerfacecolor": SKY},
+    NOT_NEEDED: {"marker": "o", "markersize": 5, "markerfacecolor": "white"},
+}
+
+# Sizes in inches.
+_EDGE = 0.12
+_SHARES_WIDTH = 2.5
+_SHARE_TEXTS_WIDTH = 1.5
+_SCORES_WIDTH = 2.6
+_SCORE_TEXTS_WIDTH = 0.95
+_TOP = 0.9
+_TOP_WITHOUT_LEGEND = 0.65
+_BOTTOM = 0.95
+_ROW = 0.13
+_LINE = 0.145
+_BAR = 0.16
+_NAME_SIZE = 9
+
+
+def candidates_figure(story: Story) -> Figure:
+    """Draw the candidates, the highest score first.
+
+    Left the share of the held-out gap that each closes by itself, with its 95 % interval, where any
+    was simulated there. Right the evidence for it on the fitted runs.
+    """
+    shown = ranked(story)
+    names = [_name(story, candidate) for candidate in shown]
+    has_shares = any(candidate.heldout_gain is not None for candidate in shown)
+
+    # Bold, as names of causes are, and a little wider than the others.
+    left = _EDGE + 0.12 + text_width(names, _NAME_SIZE, "bold")
+    between = _SHARES_WIDTH + _SHARE_TEXTS_WIDTH if has_shares else 0.0
+    width = max(left + between + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
+    # Rows are as high as the longest name needs, so that bars stand at even distances.
+    row = _ROW + _LINE * most_lines(names)
+    handles, labels = _legend(story)
+    top = _TOP if handles else _TOP_WITHOUT_LEGEND
+    height = top + _BOTTOM + row * len(shown)
+
+    figure, axes = blank(1, 2 if has_shares else 1, (width, height), layout=None, sharey=True)
+    bottom, size = _BOTTOM / height, row * len(shown) / height
+    scores = axes[0, -1]
+    scores.set_position(((left + between) / width, bottom, _SCORES_WIDTH / width, size))
+    _scores_panel(scores, story, shown, thickness=_BAR / row)
+    if has_shares:
+        shares = axes[0, 0]
+        shares.set_position((left / width, bottom, _SHARES_WIDTH / width, size))
+        _shares_panel(shares, story, shown)
+        scores.tick_params(axis="y", left=False, labelleft=False)
+    _label_rows(axes[0, 0], story, shown, names)
+
+    total = len(entries(story))
+    some = f", the best {len(shown)} of {total}" if len(shown) < total else ""
+    title = f"Candidate causes, each by itself{some}"
+    figure.text(_EDGE / width, 1 - 0.2 / height, title, fontsize=11, va="center")
+    figure.legend(
+        handles,
+        labels,
+        loc="center left",
+        bbox_to_anchor=(_EDGE / width, 1 - 0.46 / height),
+        ncols=4,
+        fontsize=8.5,
+        borderaxespad=0.0,
+        handletextpad=0.5,
+        columnspacing=1.4,
+    )
+    note = "\n".join(_notes(story, shown))
+    figure.text(_EDGE / width, 0.1 / height, note, fontsize=8, color=SOFT, va="bottom")
+    return figure
+
+
+def _name(story: Story, candidate: Candidate) -> str:
+    """A candidate's name in as many lines as it needs; its place is never cut."""
+    text = clean(short_name(candidate.effect), 160)
+    if standing(story, candidate.effect) != NOT_NEEDED:
+        text = POINTER + text
+    if len(text) <= LINE_LENGTH:
+        return text
+    # The place has lines of its own.
+    effect, at, place = text.rpartition(" at ")
+    lines = textwrap.wrap(effect if at else text, LINE_LENGTH)
+    return "\n".join([*lines, break_name(f"at {place}", LONGEST_LINE)] if at else lines)
+
+
+def _label_rows(axis: Axes, story: Story, shown: Sequence[Candidate], names: Sequence[str]) -> None:
+    axis.set_yticks(np.arange(len(shown)), names, fontsize=_NAME_SIZE, linespacing=1.15)
+    axis.set_ylim(len(shown) - 0.5, -0.5)
+    axis.tick_params(axis="y", length=0)
+    for label, candidate in zip(axis.get_yticklabels(), shown, strict=True):
+        if standing(story, candidate.effect) != NOT_NEEDED:
+            label.set_fontweight("bold")
+
+
+def _shares_panel(axis: Axes, story: Story, shown: Sequence[Candidate]) -> None:
+    """Draw the share of the held-out gap that each candidate closes, with its 95 % interval."""
+    lowest = 0.0
+    for row, candidate in enumerate(shown):
+        axis.axhline(row, color=BAND, linewidth=0.5, zorder=0)
+        share = candidate.heldout_gain
+        if share is None:
+            continue
+        at = max(share, LOWEST_SHARE)
+        text = percent(share)
+        interval = story.share_intervals.get(candidate.effect)
+        if interval is not None:
+            low, high = (max(end, LOWEST_SHARE) for end in interval)
+            axis.plot([low, high], [row, row], color=INK, linewidth=1.4, zorder=2)
+            lowest = min(lowest, low)
+            text += f" ({' to '.join(percent(end)[:-2] for end in interval)})"
+        lowest = min(lowest, at)
+        look = _DOTS[standing(story, candidate.effect)]
+        axis.plot(at, row, markeredgecolor=INK, linestyle="", zorder=3, **look)
+        axis.annotate(
+            text,
+            (1.0, row),
+            (8, 0),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+        )
+    axis.axvline(0.0, color=ZERO, linewidth=0.6)
+    axis.axvline(1.0, color=ZERO, linewidth=0.6, linestyle=":")
+    axis.set_xlim(lowest - 0.03, 1.05)
+    ticks = [tick for tick in (-0.5, 0.0, 0.25, 0.5, 0.75, 1.0) if tick >= lowest - 0.03]
+    axis.set_xticks(ticks, [f"{100 * tick:.0f}".replace("-", "−") for tick in ticks])
+    axis.set_xlabel("share of the held-out gap closed [%]")
+    axis.set_title("How much it closes (95 %)", fontsize=9.5, loc="left")
+
+
+def _scores_panel(axis: Axes, story: Story, shown: Sequence[Candidate], thickness: float) -> None:
+    """Draw the candidates' scores; ticks are the scores of the same effect at other places."""
+    elsewhere = {entry.best.effect: entry.elsewhere for entry in entries(story)}
+    longest = 1e-9
+    for row, candidate in enumerate(shown):
+        size = max(candidate.score, 0.0)
+        look = dict(_BARS[standing(story, candidate.effect)])
+        if _is_chance(story, candidate):
+            look["facecolor"] = "white"
+        axis.barh(row, size, height=thickness, edgecolor=INK, linewidth=0.6, **look)
+        others = [max(other.score, 0.0) for other in elsewhere.get(candidate.effect, ())]
+        axis.plot(others, [row] * len(others), "|", color=INK, markersize=8, markeredgewidth=1.0)
+        longest = max(longest, size, *others)
+        text = number(candidate.score)
+        if CERTAIN < candidate.p_value <= CHANCE:
+            text += f"  ({_printed(candidate.p_value)})"
+        axis.annotate(
+            text,
+            (max([size, *others]), row),
+            (5, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+            annotation_clip=False,
+        )
+    axis.set_xlim(0.0, longest)
+    axis.locator_params(axis="x", nbins=5)
+    axis.set_xlabel("score: twice the gain in log likelihood")
+    axis.set_title("Evidence on the fitted runs", fontsize=9.5, loc="left")
+
+
+def _is_chance(story: Story, candidate: Candidate) -> bool:
+    """Whether chance gives such a score, and no cause has this effect."""
+    return candidate.p_value > CHANCE and standing(story, candidate.effect) == NOT_NEEDED
+
+
+def _printed(p_value: float) -> str:
+    """``p < 10⁻¹²``."""
+    return probability(p_value).replace(" 1×10", " 10")
+
+
+def _notes(story: Story, shown: Sequence[Candidate]) -> list[str]:
+    """What the figure counts, and the p-values that are not printed beside their bars."""
+    counts = f"Fitted: {_counted(story.fitting)}"
+    if story.held_out is not None:
+        counts += f"; held out: {_counted(story.held_out)}"
+    notes = [f"{counts}."]
+    what = "p: probability of such a score by chance"
+    certain = [c.p_value for c in shown if c.p_value <= CERTAIN]
+    by_chance = [c.p_value for c in shown if _is_chance(story, c)]
+    if certain:
+        which = "for all shown" if len(certain) == len(shown) else "for grey or coloured bars"
+        what += f"; {_printed(max(certain)).replace('=', '≤')} {which}"
+    if by_chance:
+        which = "for all shown" if len(by_chance) == len(shown) else "for white bars"
+        what += f"; {_printed(min(by_chance)).replace('=', '≥')} {which}"
+    notes.append(f"{what}.")
+    missing = sum(candidate.heldout_gain is None for candidate in shown)
+    if 0 < missing < len(shown):
+        notes[1] += " Without a mark: not simulated on held-out runs."
+    return notes
+
+
+def _counted(side: Side) -> str:
+    """``3 runs, 1200 samples of 2 channels``; a sample is one instant of a run."""
+    runs, channels = len(side.times), side.observed.shape[2]
+    samples = int(np.isfinite(side.observed).any(axis=2).sum())
+    one = "1 run" if runs == 1 else f"{runs} runs"
+    of = f" of {channels} channels" if channels > 1 else ""
+    return f"{one}, {samples} samples{of}"
+
+
+def _legend(story: Story) -> tuple[list[Any], list[str]]:
+    """Handles and labels of the legend."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    there = {standing(story, candidate.effect) for candidate in story.verdict.candidates}
+    # Bars of one look need no legend where nothing is found.
+    names = [name for name in _BARS if name in there] if there != {NOT_NEEDED} else []
+    handles: list[Any] = [Patch(edgecolor=INK, linewidth=0.6, **_BARS[name]) for name in names]
+    if any(entry.elsewhere for entry in entries(story)) and has_places(story):
+        handles.append(Line2D([], [], color=INK, marker="|", linestyle="", markersize=8))
+        names = [*names, "the same effect at other places"]
+    return handles, names
