@@ -32,7 +32,6 @@ from bench.gap.model.noise import Noise
 from bench.gap.model.problem import Fit
 from bench.gap.model.world import World
 from sims.base import Array
-from sims.simulated import effect_parameters
 from sims.system import FAMILY
 
 Word = Literal["identifiable", "weak", "not identifiable"]
@@ -182,9 +181,7 @@ class _Identified:
         alike = np.abs(units.T @ units)
         numbers = []
         for row, ((name, place), k) in zip(alike, best.items(), strict=True):
-            parameter = effect_parameters(
-                world.effects[name], world.simulator.system, world.channels
-            )[place]
+            parameter = world.parameters[world.places(name)[place]]
             probe = probes[k]
             half = Z95 / powers[k] if powers[k] > 0 else np.inf
             mixed = [
