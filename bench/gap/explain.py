@@ -250,6 +250,7 @@ class _Explainer:
         self.say("looking for what is missing")
         held_out = HeldOutRuns(self.measuring, self.noise) if self.measuring else None
         finding = name(search, held_out)
+        finding = self.assessor.judged(search, finding)
         self.say("measuring the gain")
         verdict = self.assessor.verdict(search, finding, rng, self.started)
         if self.coarse is not None:

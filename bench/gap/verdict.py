@@ -34,6 +34,15 @@ class Cause:
     coefficients: Mapping[str, Number]
     p_value: float
 
+    @property
+    def open_numbers(self) -> dict[str, Number]:
+        """Its numbers that are not results: at a bound, or without an interval. How a robot is
+        stepped was chosen, and has no interval.
+        """
+        if self.effect.startswith("numerics."):
+            return {}
+        return {name: n for name, n in self.coefficients.items() if not n.is_result}
+
     def document(self) -> Document:
         """As in verdict.json."""
         return {
@@ -221,6 +230,7 @@ def _estimates(numbers: Mapping[str, Number]) -> Document:
     """Numbers as in verdict.json, by name."""
     return {
         name: {"value": n.value, "unit": n.unit, "low": n.low, "high": n.high}
+        | ({"at_bound": n.at_bound} if n.at_bound is not None else {})
         for name, n in numbers.items()
     }
 

@@ -226,6 +226,19 @@ def verdict_of(state: State) -> VerdictName:
     return "ambiguous" if state.alternatives else "named"
 
 
+def verdict_of_numbers(verdict: VerdictName, results: bool) -> VerdictName:
+    """The verdict when the fitted numbers of the causes are known.
+
+    A number at a bound of its range, or without a finite interval, is not a result: its cause is
+    not named.
+
+    Args:
+        verdict: by all other rules.
+        results: whether every number of the causes that stand alone is a result.
+    """
+    return "partial" if verdict == "named" and not results else verdict
+
+
 def verdict_of_cut(causes: int, closed: float, not_asked: Sequence[str]) -> VerdictName:
     """The verdict of a search that was ended early: never more than what was asked supports.
 

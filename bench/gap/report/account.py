@@ -26,6 +26,8 @@ from bench.gap.report.places import (
 from bench.gap.report.ranking import entries
 from bench.gap.report.story import Place, Shown, Side, Story, Tuned
 from bench.gap.report.words import (
+    END,
+    at_bound,
     clean,
     estimate,
     is_wrong,
@@ -57,7 +59,10 @@ MOST_CHANNELS = 6
 """Channels that a sentence names."""
 PERFECT = "with a perfect model the sensor's noise would leave"
 MOVED = 0.05
-"""Share by which a parameter moves that is called out where its interval is not known."""
+"""Relative change of a parameter that is reported as absorption where its interval is not known."""
+LEAST_MOVE = 1e-3
+"""Relative change of a parameter below which it has absorbed nothing, however narrow its interval.
+"""
 
 
 def account(story: Story) -> list[str]:
@@ -127,6 +132,8 @@ def headline(story: Story) -> str:
         return f"Something is missing from the simulation, and {none}."
     if verdict == "ambiguous":
         return f"The simulation {lacks(causes)}: these data cannot tell which."
+    if verdict == "partial" and (open_ones := [c for c in causes if c.open_numbers]):
+        return f"The simulation {lacks(causes)}, but {_undetermined(open_ones)}."
     if verdict == "partial":
         more = "something else that no known cause explains"
         if len(causes) == 1 and (said := sized(causes[0])):
@@ -141,6 +148,41 @@ def headline(story: Story) -> str:
     if too_much(cause):
         return f"The simulation has too much {noun(cause.effect)}."
     return f"The simulation {lacks([replace(cause, alternatives=())])}: {_says(cause)}."
+
+
+def _undetermined(causes: Sequence[Cause]) -> str:
+    """Why causes are not named whose numbers are not results."""
+    numbers = [n for cause in causes for n in cause.open_numbers.values()]
+    at_bounds = [n for n in numbers if n.at_bound is not None]
+    if not at_bounds:
+        which = "its number" if len(numbers) == 1 else "all of its numbers"
+        return f"these data do not determine {which if len(causes) == 1 else 'all numbers'}"
+    first = at_bounds[0]
+    value = with_unit(number(first.value), first.unit)
+    return f"the fit ends at the {END[first.at_bound or 'high']} bound of its range, {value}"
+
+
+def undetermined(story: Story) -> Iterator[str]:
+    """What each number of a cause that is not a result means, and what to do."""
+    for cause in story.verdict.causes:
+        name = clean(cause.effect, 60)
+        for key, fitted in cause.open_numbers.items():
+            what = f"{name}, {clean(key, 60)}"
+            if fitted.at_bound is None:
+                yield (
+                    f"{what}: the data give no finite interval, so the value is not a result. "
+                    "Record a motion in which this effect is larger."
+                )
+                continue
+            beyond = {"low": "below", "high": "above"}[fitted.at_bound]
+            value = with_unit(number(fitted.value), fitted.unit)
+            longer = "; for a time, record longer runs" if fitted.unit == "s" else ""
+            yield (
+                f"{what}: {value} is the {END[fitted.at_bound]} bound of its range, so the value is"
+                f" not a result and has no interval. The data ask for a value {beyond} the bound,"
+                " or another cause acts in a similar way. Check units and constants of the"
+                f" recording{longer}."
+            )
 
 
 def _also(causes: Sequence[Cause]) -> str:
@@ -191,6 +233,7 @@ def following(story: Story) -> Iterator[str]:
         yield looked_for(story)
         yield hiding(story)
     yield gain(story)
+    yield from undetermined(story)
     if verdict == "partial" or (verdict == "named" and len(story.verdict.causes) > 1):
         # The headline says what a single named cause does; here the others have their turn.
         sayings = [
@@ -414,15 +457,27 @@ def moves(story: Story, p: Tuned) -> str:
         nominal = f"its nominal {number(p.before[0])}{unit}"
         return f"{name} is not touched by these data and stays at {nominal}."
     if not story.verdict.causes:
-        return f"{name} = {estimate(*p.before)}{unit}."
-    before, after = f"{estimate(*p.before)}{unit}", f"{estimate(*p.after)}{unit}"
+        return f"{name} = {tuned(p, 0)}."
+    before, after = tuned(p, 0), tuned(p, 1)
     end = ": it had absorbed part of the gap." if absorbed(p) else "."
     return f"{name} {before} before, {after} after ({shift(p)}){end}"
+
+
+def tuned(p: Tuned, when: int) -> str:
+    """A parameter's estimate before (0) or after (1), with its interval or the bound it lies at."""
+    value, bound = (p.before, p.after)[when], p.bounds[when]
+    if bound is not None:
+        return at_bound(value[0], p.unit, bound)
+    return with_unit(estimate(*value), p.unit)
 
 
 def shift(p: Tuned) -> str:
     """The move of a parameter as a signed percentage, or a number where it began at zero."""
     move = p.after[0] - p.before[0]
+    if not move:
+        return "unchanged"
+    if abs(move) < LEAST_MOVE * abs(p.before[0]):
+        return f"changes by less than {percent(LEAST_MOVE)}"
     sign = "+" if move > 0 else ""
     # Of zero there is no share, and "+4000 %" says less than the number.
     if not p.before[0] or abs(move / p.before[0]) > FAR:
@@ -431,14 +486,15 @@ def shift(p: Tuned) -> str:
 
 
 def absorbed(p: Tuned) -> bool:
-    """Whether a parameter moves out of the interval that the base model gives, or that the extended
-    one does.
+    """Whether a parameter changes significantly: by more than its two 95 % intervals allow for, and
+    by `LEAST_MOVE` at least.
     """
-    # Without intervals a move of some size has to do.
+    move = abs(p.after[0] - p.before[0])
+    # Without intervals a change of some size has to do.
     if not np.isfinite([*p.before, *p.after]).all():
-        return abs(p.after[0] - p.before[0]) > MOVED * abs(p.before[0])
-    (before, low, high), (after, low_after, high_after) = p.before, p.after
-    return not (low <= after <= high and low_after <= before <= high_after)
+        return move > MOVED * abs(p.before[0])
+    before, after = ((high - low) / 2.0 for _, low, high in (p.before, p.after))
+    return bool(move > np.hypot(before, after) and move >= LEAST_MOVE * abs(p.before[0]))
 
 
 def experiment(story: Story) -> str:
