@@ -60,7 +60,7 @@ class Assessor:
         """
         world = self.fitting
         numbers = self.numbers(search, finding.model)
-        causes = tuple(self._cause(cause, numbers) for cause in finding.causes)
+        causes = self.causes(search, finding)
         parameters = {world.parameters[i].name: numbers[i] for i in world.base.tolist()}
         # Counted before an experiment is proposed: what that simulates is not part of the answer.
         simulations = world.simulations
@@ -82,6 +82,11 @@ class Assessor:
             time.perf_counter() - started,
             finding.cut,
         )
+
+    def causes(self, search: Search, finding: Finding) -> tuple[Cause, ...]:
+        """The causes of a finding with their numbers."""
+        numbers = self.numbers(search, finding.model)
+        return tuple(self._cause(cause, numbers) for cause in finding.causes)
 
     def numbers(self, search: Search, model: Model) -> dict[int, Number]:
         """Every parameter and coefficient by its place; without an interval where it was not

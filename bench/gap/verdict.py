@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap.causes.rules import CUT, MEANING, VerdictName
+from bench.gap.causes.rules import CUT, FAULTY, MEANING, VerdictName
 from bench.gap.model.watch import Cut
 from bench.gap.propose import Experiment
 from sims.extended import Number
@@ -140,6 +140,57 @@ class Candidate:
         return f"Candidate({self.effect}: score {self.score:.3g}, p {self.p_value:.2g})"
 
 
+@dataclass(frozen=True)
+class RecordingFault:
+    """A wrong unit or a reversed sign of recorded signals that explains nearly all of the misfit.
+
+    Attributes:
+        signals: channels and inputs that are concerned.
+        factor: by which SI values of the first one have to be multiplied.
+        unit: that its numbers are in; None where its sign alone is wrong.
+        says: what is wrong, and the change of the description that corrects it.
+        lines: of each signal, its table in the description and the keys to set.
+        error_before: RMS of the base model's residual on the fitted runs, in units of the noise.
+        error_after: the same with the correction; None where it was not measured.
+        alternatives: other corrections that explain the recording as well, a sentence each.
+    """
+
+    signals: tuple[str, ...]
+    factor: float
+    unit: str | None
+    says: str
+    lines: tuple[str, ...]
+    error_before: float
+    error_after: float | None
+    alternatives: tuple[str, ...] = ()
+
+    def document(self) -> Document:
+        """As in verdict.json."""
+        return {
+            "signals": list(self.signals),
+            "factor": self.factor,
+            "unit": self.unit,
+            "says": self.says,
+            "lines": list(self.lines),
+            "error_before": finite(self.error_before),
+            "error_after": self.error_after,
+            "alternatives": list(self.alternatives),
+        }
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> RecordingFault:
+        """From verdict.json."""
+        lists = ("signals", "lines", "alternatives")
+        before = document["error_before"]
+        return cls(
+            **{
+                **document,
+                **{name: tuple(document[name]) for name in lists},
+                "error_before": np.nan if before is None else before,
+            }
+        )
+
+
 @dataclass(frozen=True, repr=False)
 class Verdict:
     """What explain answers.
@@ -156,6 +207,8 @@ class Verdict:
         simulations: how many were spent.
         seconds: how long it took.
         cut: that the search was ended early, and what was not asked; None where it came to its end.
+        recording_faults: wrong units or signs of the recording, for which no cause was searched;
+            left out where there are none.
     """
 
     verdict: VerdictName
@@ -169,16 +222,20 @@ class Verdict:
     simulations: int
     seconds: float
     cut: Cut | None = None
+    recording_faults: tuple[RecordingFault, ...] = ()
 
     @property
     def says(self) -> str:
         """What the word means, in one sentence."""
+        if self.recording_faults:
+            return FAULTY
         return MEANING[self.verdict] if self.cut is None else CUT[self.verdict]
 
     def document(self) -> Document:
         """The content of verdict.json."""
         # The order of the keys is that of the page that explains them, and of older files.
         proposed = self.next_experiment
+        faults = [fault.document() for fault in self.recording_faults]
         return {
             "verdict": self.verdict,
             "system": self.system,
@@ -191,6 +248,7 @@ class Verdict:
             "simulations": self.simulations,
             "seconds": self.seconds,
             "cut": self.cut.document() if self.cut is not None else None,
+            **({"recording_faults": faults} if faults else {}),
         }
 
     @classmethod
@@ -212,6 +270,7 @@ class Verdict:
             document["simulations"],
             document["seconds"],
             Cut.of(cut) if cut is not None else None,
+            tuple(RecordingFault.of(fault) for fault in document.get("recording_faults", ())),
         )
 
     def __repr__(self) -> str:

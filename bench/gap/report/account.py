@@ -40,7 +40,7 @@ from bench.gap.report.words import (
     sentence,
     with_unit,
 )
-from bench.gap.verdict import Cause, Heldout, Verdict
+from bench.gap.verdict import Cause, Heldout, RecordingFault, Verdict
 from sims.base import Array
 
 WIDTH = 100
@@ -81,6 +81,9 @@ def account(story: Story) -> list[str]:
 def details(story: Story) -> Iterator[str]:
     """Paragraphs below the headline, a sentence or a few each."""
     verdict = story.verdict.verdict
+    if story.verdict.recording_faults:
+        yield effort(story)
+        return
     # What an effect does is said above the details already in these two.
     explained = verdict in ("named", "partial")
     for cause in story.verdict.causes:
@@ -118,6 +121,8 @@ def _says(cause: Cause) -> str:
 def headline(story: Story) -> str:
     """What is wrong with the simulator, in one sentence."""
     verdict, causes = story.verdict.verdict, story.verdict.causes
+    if story.verdict.recording_faults:
+        return sentence(story.verdict.recording_faults[0].says)
     if story.verdict.cut is not None:
         return _headline_of_cut(story.verdict)
     # No cause is said to be lacking where the verdict does not vouch for it.
@@ -226,6 +231,9 @@ def unfixed(story: Story) -> list[str]:
 def following(story: Story) -> Iterator[str]:
     """The sentences that follow the headline at once: the gain, and what the verdict owes."""
     verdict = story.verdict.verdict
+    if story.verdict.recording_faults:
+        yield from _of_faults(story.verdict.recording_faults)
+        return
     if story.verdict.cut is not None:
         yield cut(story)
     # To find nothing says little without what was looked for, and what could not have been seen.
@@ -243,6 +251,19 @@ def following(story: Story) -> Iterator[str]:
         yield sentence("; ".join(sayings))
     if verdict == "ambiguous":
         yield "To tell them apart: " + (experiment(story) or "no experiment is proposed.")
+
+
+def _of_faults(faults: Sequence[RecordingFault]) -> Iterator[str]:
+    """What supports a wrong unit or sign, what else would explain the data, and what to do."""
+    first, *others = faults
+    if first.error_after is not None:
+        yield (
+            "With this correction the error of the tuned simulation on the fitted runs falls from "
+            f"{number(first.error_before)} to {number(first.error_after)} times the noise."
+        )
+    for text in (*first.alternatives, *(fault.says for fault in others)):
+        yield sentence(f"{'or' if text in first.alternatives else 'also'}: {text}")
+    yield "No causes were searched, since each would only imitate this. Correct it and run again."
 
 
 def gain(story: Story) -> str:

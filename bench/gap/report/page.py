@@ -66,6 +66,10 @@ _CUT = {
     "unknown": "unknown: the search was ended early",
 }
 """The same where the search was ended early."""
+_FAULTY = "unknown: a unit or a sign of the recording is wrong"
+"""The same where the recording is at fault."""
+_OPEN = "partial: a cause is found, but its number lies at a bound or has no interval"
+"""The same where numbers of the causes are not results."""
 _CAPTIONS = {
     "robot": (
         "The robot in the run below, where it is furthest from its beginning. Blue marks are "
@@ -146,6 +150,10 @@ def _opening(story: Story) -> Iterator[str]:
     yield "<header>\n" + paragraph(safe(story.title), "recording")
     verdict = story.verdict
     badge = _BADGES[verdict.verdict] if verdict.cut is None else _CUT[verdict.verdict]
+    if verdict.recording_faults:
+        badge = _FAULTY
+    elif verdict.verdict == "partial" and any(cause.open_numbers for cause in verdict.causes):
+        badge = _OPEN
     yield paragraph(f'<span class="badge">{badge}</span>')
     yield f"<h1>{safe(headline(story))}</h1>"
     for text in following(story):
