@@ -63,7 +63,10 @@ def on_time_scale(parameter: Parameter, longest: float, spacing: float) -> Param
     elif parameter.unit == "Hz" and spacing > 0 and 0.5 / spacing < high:
         high = 0.5 / spacing
         low = min(low, high / DECADES)
-    return parameter if (low, high) == parameter.bounds else replace(parameter, bounds=(low, high))
+    if (low, high) == parameter.bounds:
+        return parameter
+    nominal = min(max(parameter.nominal, low), high)
+    return replace(parameter, nominal=nominal, bounds=(low, high), training=None)
 
 
 def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:

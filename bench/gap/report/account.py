@@ -168,26 +168,32 @@ def _undetermined(causes: Sequence[Cause]) -> str:
 
 
 def undetermined(story: Story) -> Iterator[str]:
-    """What each number of a cause that is not a result means, and what to do."""
-    for cause in story.verdict.causes:
-        name = clean(cause.effect, 60)
-        for key, fitted in cause.open_numbers.items():
-            what = f"{name}, {clean(key, 60)}"
-            if fitted.at_bound is None:
-                yield (
-                    f"{what}: the data give no finite interval, so the value is not a result. "
-                    "Record a motion in which this effect is larger."
-                )
-                continue
-            beyond = {"low": "below", "high": "above"}[fitted.at_bound]
-            value = with_unit(number(fitted.value), fitted.unit)
-            longer = "; for a time, record longer runs" if fitted.unit == "s" else ""
-            yield (
-                f"{what}: {value} is the {END[fitted.at_bound]} bound of its range, so the value is"
-                f" not a result and has no interval. The data ask for a value {beyond} the bound,"
-                " or another cause acts in a similar way. Check units and constants of the"
-                f" recording{longer}."
-            )
+    """Which numbers of the causes are not results, what that means, and what to do."""
+    found = [
+        (f"{clean(cause.effect, 60)}, {clean(key, 60)}", fitted)
+        for cause in story.verdict.causes
+        for key, fitted in cause.open_numbers.items()
+    ]
+    at_bounds = [(name, fitted) for name, fitted in found if fitted.at_bound is not None]
+    loose = [name for name, fitted in found if fitted.at_bound is None]
+    if at_bounds:
+        parts = [
+            f"{name}: {with_unit(number(fitted.value), fitted.unit)} is the "
+            f"{END[fitted.at_bound or 'high']} bound of its range"
+            for name, fitted in at_bounds
+        ]
+        longer = any(fitted.unit == "s" for _, fitted in at_bounds)
+        remedy = "; for a time, record longer runs" * longer
+        yield (
+            f"{'; '.join(parts)}. A value at a bound is not a result and has no interval: the data "
+            "ask for a value beyond it, or another cause acts in a similar way. Check units and "
+            f"constants of the recording{remedy}."
+        )
+    if loose:
+        yield (
+            f"{'; '.join(loose)}: the data give no finite interval, so the value is not a result. "
+            "Record a motion in which the effect is larger."
+        )
 
 
 def _also(causes: Sequence[Cause]) -> str:

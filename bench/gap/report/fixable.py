@@ -69,19 +69,38 @@ def fixable(story: Story) -> Iterator[str]:
     there = [s for s in _STANDINGS if any(row.standing == s for row in rows)]
     yield paragraph(safe("; ".join(f"{_SIGNS[s]} {_LEGEND[s]}" for s in there)), "soft")
     placed = [row for row in rows if _place(row)]
-    for kind in dict.fromkeys(kind_of(row.effect) for row in placed):
-        yield _matrix([row for row in placed if kind_of(row.effect) == kind], kind)
+    telling, plain = _told_apart(placed)
+    yield from _matrices(telling)
     if others := [row for row in rows if not _place(row)]:
         yield _families(others)
+    if plain:
+        effects = len({parted(row.effect)[0] for row in plain})
+        head = f"{effects} effects {'more ' * bool(telling)}that could be determined at every place"
+        yield folded(head, "\n".join(_matrices(plain)))
     ordered = sorted(rows, key=lambda row: _STANDINGS.index(row.standing))
     every = table(_HEADS, [_cells(row.number, _LEGEND[row.standing]) for row in ordered])
     yield folded(f"All {len(rows)} causes with their intervals", every)
 
 
+def _told_apart(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]]:
+    """The rows of effects with something to tell, and those of effects that could be determined at
+    every place.
+    """
+    telling = {parted(r.effect)[0] for r in rows if r.standing != "identifiable"}
+    first = [row for row in rows if parted(row.effect)[0] in telling]
+    return first, [row for row in rows if parted(row.effect)[0] not in telling]
+
+
+def _matrices(rows: Sequence[_Row]) -> Iterator[str]:
+    """A matrix for each kind of places."""
+    for kind in dict.fromkeys(kind_of(row.effect) for row in rows):
+        yield _matrix([row for row in rows if kind_of(row.effect) == kind], kind)
+
+
 def counted(story: Story) -> str:
     """How many causes can be determined, and what was found among them."""
     rows = _rows(story)
-    words = ["identifiable" if r.standing == "found" else r.number.word for r in rows]
+    words = [str("identifiable" if r.standing == "found" else r.number.word) for r in rows]
     counts = {s: words.count(s) for s in _STANDINGS[2:]}
     sentence = (
         f"Of {len(rows)} causes, each by itself, this recording can determine "

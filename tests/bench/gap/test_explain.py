@@ -322,7 +322,7 @@ def test_a_parameter_that_ends_at_its_border_is_told(tmp_path):
     (tmp_path / "heavy.toml").write_text(f'system = "slider"\n{units}')
     found = explained(tmp_path / "heavy.csv")
     assert any(
-        "mass ends at the border of its range, 10 kg" in said for said in found.story.remains
+        "mass lies at the upper bound of its range, 10 kg" in said for said in found.story.remains
     )
     assert found.answer.causes[0].coefficients["coefficient"].value == pytest.approx(
         10 / mass - 1, abs=1e-3
