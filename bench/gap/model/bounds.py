@@ -36,7 +36,9 @@ LASTING = 3.0
 DECADES = 100.0
 """Ratio of the highest to the lowest plausible frequency where the sampling sets the highest."""
 AT_BOUND = 1e-6
-"""A fitted number is at a bound if it is nearer to it than this share of its range."""
+"""A fitted number is at a bound if it is nearer to it than this share of its range. A bound of zero
+is met exactly or not at all, since ranges are wide against small coefficients.
+"""
 
 Bound = Literal["low", "high"]
 """Which end of its range a number lies at."""
@@ -87,9 +89,9 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
 def bound_of(value: float, low: float, high: float) -> Bound | None:
     """Which end of its range a fitted number lies at; None if it lies inside."""
     near = AT_BOUND * (high - low)
-    if value <= low + near:
+    if value <= low + near * (low != 0.0):
         return "low"
-    return "high" if value >= high - near else None
+    return "high" if value >= high - near * (high != 0.0) else None
 
 
 def is_instant(coefficient: Parameter) -> bool:

@@ -110,10 +110,19 @@ def test_a_fit_may_move_a_delay_up_to_the_longest_run(seconds):
 
 
 @pytest.mark.parametrize(
-    ("value", "expected"), [(0.0, "low"), (1e-9, "low"), (0.5, None), (1.0, "high"), (1.2, "high")]
+    ("value", "low", "expected"),
+    [
+        (0.0, 0.0, "low"),
+        # A small drag is a drag.
+        (1e-9, 0.0, None),
+        (1e-3 + 1e-9, 1e-3, "low"),
+        (0.5, 0.0, None),
+        (1.0, 0.0, "high"),
+        (1.2, 0.0, "high"),
+    ],
 )
-def test_which_bound_a_number_lies_at(value, expected):
-    assert bound_of(value, 0.0, 1.0) == expected
+def test_which_bound_a_number_lies_at(value, low, expected):
+    assert bound_of(value, low, 1.0) == expected
 
 
 @pytest.mark.parametrize(
