@@ -277,7 +277,7 @@ class _Explainer:
     def _imitated(self, search: Search, finding: Finding) -> tuple[RecordingFault, ...]:
         """Wrong units and signs that causes stand for."""
         found = [
-            recognised(self._units, self.fitting, cause)
+            recognised(self._units, self.fitting, cause, search.base.fit)
             for cause in self.assessor.causes(search, finding)
         ]
         return tuple(fault for fault in found if fault is not None)

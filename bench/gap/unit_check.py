@@ -19,13 +19,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from bench.gap.model.base_fit import HORIZONS, Base, fit_base, misfit_of_starts
+from bench.gap.model.bounds import bound_of
 from bench.gap.model.floor import noise_floor
 from bench.gap.model.noise import Noise
+from bench.gap.model.problem import Fit
 from bench.gap.model.world import World
 from bench.gap.verdict import Cause, RecordingFault
 from sims.base import Array, InputError
@@ -44,6 +46,8 @@ NEAR = 1.04
 """A smaller change, to see whether a factor that is no unit explains the data far better."""
 FAR_BETTER = 1.0 / 3.0
 """Share of the misfit of a hypothesis that such a factor leaves."""
+FOLLOWED = 0.2
+"""Residual, as a share of what a channel moves, that a hypothesis leaves at most."""
 EXPLAINED = 1.5
 """RMS in units of the noise from which on a hypothesis leaves nothing to explain."""
 EQUAL = 1.05
@@ -68,6 +72,8 @@ IGNORED = 0.1
 
 BEGINNING = HORIZONS[0].share
 """The first share of each run, by which hypotheses are screened."""
+_BEYOND = "parameter {} lies beyond the bounds of its range"
+"""What would explain a recording as well whose base fit ends at a bound."""
 _DEGREE = math.pi / 180.0
 _GRAVITY = 9.80665
 UNITS: Mapping[str, Mapping[str, float]] = {
@@ -157,7 +163,7 @@ class Hypothesis:
         pairs = zip(self.signals, self.units, strict=True)
         return {s.name: self.scale * _gain(s, unit) / s.gain for s, unit in pairs}
 
-    def fault(self, file: str, before: float, after: float | None) -> RecordingFault:
+    def fault(self, file: str, before: float | None, after: float | None) -> RecordingFault:
         """What the user is told."""
         factors = self.factors()
         lines = []
@@ -265,27 +271,44 @@ def wrong_units(subject: Subject, world: World, noise: Noise, base: Base) -> Rec
     if not (shares > GROSS).any():
         return None
     before = _rms(residual, seen, noise)
+    known = before if np.isfinite(before) else None
     signals = subject.signals(world.channels)
     asked = list(_hypotheses(signals, _suspects(world, shares)))
     excess = REMAINING * (before - 1.0)
-    fitted = [(one, _fitted(subject, one.factors())) for one in _promising(subject, asked)]
-    good = [(one, after) for one, after in fitted if after - 1.0 <= excess]
-    good = [pair for pair in good if _is_sharp(subject, *pair, int(seen.sum()))]
+    good: list[tuple[Hypothesis, float]] = []
+    others: list[str] = []
+    for one in _promising(subject, asked):
+        after, missed = _fitted(subject, one.factors())
+        if after - 1.0 > excess or missed > FOLLOWED:
+            continue
+        how = _distinction(subject, one, after, int(seen.sum()))
+        if how == "sharp":
+            good.append((one, after))
+        elif how == "absorbed":
+            good.append((one, after))
+            others += [_BEYOND.format(name) for name in _ends(world, base.fit)]
     if not good:
         return None
     # The simplest of those that fit equally well.
     least = min(after for _, after in good)
     alike = sorted((p for p in good if p[1] <= EQUAL * least), key=lambda p: len(p[0].signals))
     (best, after), *rest = alike
-    others = tuple(one.fault(subject.file, before, None).says for one, _ in rest)
-    return replace(best.fault(subject.file, before, after), alternatives=others)
+    others = [*(one.fault(subject.file, None, None).says for one, _ in rest), *others]
+    alternatives = tuple(dict.fromkeys(others))
+    return replace(best.fault(subject.file, known, after), alternatives=alternatives)
 
 
-def recognised(subject: Subject, world: World, cause: Cause) -> RecordingFault | None:
+def recognised(subject: Subject, world: World, cause: Cause, base: Fit) -> RecordingFault | None:
     """The wrong unit or sign that a fitted gain of a sensor or an input stands for; None if it
     stands for none.
 
     A reading that hardly depends on the simulation is not an answer either.
+
+    Args:
+        subject: what is explained.
+        world: its runs for fitting.
+        cause: what was found.
+        base: the base model: a parameter at a bound may be what the gain stands for.
     """
     effect = cause.effect.partition("@")[0]
     if effect not in ("sensor.gain", "input.gain") or len(cause.coefficients) != 1:
@@ -304,14 +327,16 @@ def recognised(subject: Subject, world: World, cause: Cause) -> RecordingFault |
     for one in _of_one((signal,)):
         wanted = one.factors()[signal.name]
         if wanted * factor > 0 and abs(math.log(wanted / factor)) < CLOSE:
-            return one.fault(subject.file, math.nan, None)
+            others = tuple(_BEYOND.format(name) for name in _ends(world, base))
+            return replace(one.fault(subject.file, None, None), alternatives=others)
     if kind == "channels" and abs(gain) < IGNORED:
         says = (
             f"The fit makes {signal.said} nearly independent of the simulation (a sensor gain of "
             f"{coefficient.value:.4g}), which is not an answer: check the unit, the column and the "
             f"sign of {signal.said} in {subject.file}"
         )
-        return RecordingFault((signal.name,), factor, None, says, (), math.nan, None)
+        others = tuple(_BEYOND.format(name) for name in _ends(world, base))
+        return RecordingFault((signal.name,), factor, None, says, (), None, None, others)
     return None
 
 
@@ -329,6 +354,16 @@ def _rescaled(run: Run, factors: Mapping[str, float]) -> Run:
         n: np.stack([v[0], v[1] * factors[n]]) if n in factors else v for n, v in run.before.items()
     }
     return replace(run, channels=scaled(run.channels), inputs=scaled(run.inputs), before=before)
+
+
+def _ends(world: World, fit: Fit) -> list[str]:
+    """Parameters that the base fit leaves at a bound."""
+    found = []
+    for place in fit.free.tolist():
+        parameter = world.parameters[place]
+        if bound_of(float(fit.theta[place]), *parameter.bounds) is not None:
+            found.append(parameter.name)
+    return found
 
 
 def _shares(world: World, residual: Array, noise: Noise) -> Array:
@@ -445,18 +480,23 @@ def _world(subject: Subject, factors: Mapping[str, float]) -> tuple[World, Noise
     return world, Noise(sigma, np.zeros(len(sigma)))
 
 
-def _fitted(subject: Subject, factors: Mapping[str, float]) -> float:
-    """RMS of what the base model leaves of the rescaled recording, in units of its noise."""
+def _fitted(subject: Subject, factors: Mapping[str, float]) -> tuple[float, float]:
+    """What the base model leaves of the rescaled recording: RMS in units of its noise, and the
+    largest share of what a channel moves.
+    """
     world, noise = _world(subject, factors)
     fit = fit_base(world, noise).fit
     seen = np.isfinite(world.observed)
-    rms = _rms(np.where(seen, world.observed - fit.simulated, 0.0), seen, noise)
+    residual = np.where(seen, world.observed - fit.simulated, 0.0)
     world.close()
-    return rms
+    return _rms(residual, seen, noise), float(_shares(world, residual, noise).max())
 
 
-def _is_sharp(subject: Subject, one: Hypothesis, after: float, samples: int) -> bool:
-    """Whether no factor near that of a hypothesis fits as well, the second half of (1).
+def _distinction(
+    subject: Subject, one: Hypothesis, after: float, samples: int
+) -> Literal["sharp", "absorbed", "none"]:
+    """Whether no factor near that of a hypothesis fits as well, the second half of (1); whether
+    parameters absorb the scale of an input, whose unit can be told nevertheless; or neither.
 
     Args:
         subject: what is checked.
@@ -466,19 +506,21 @@ def _is_sharp(subject: Subject, one: Hypothesis, after: float, samples: int) -> 
     """
 
     def left(step: float) -> float:
-        return _fitted(subject, {name: step * k for name, k in one.factors().items()})
+        return _fitted(subject, {name: step * k for name, k in one.factors().items()})[0]
 
-    if all(k < 0 and math.isclose(abs(k), 1.0) for k in one.factors().values()):
-        return True
+    if one.scale == -1.0 and one.units == tuple(s.stated for s in one.signals):
+        return "sharp"
     if after > EXPLAINED:
         near = min(left(1.0 / NEAR), left(NEAR))
         if near - 1.0 < FAR_BETTER * (after - 1.0):
-            return False
+            return "none"
     near = min(left(1.0 / STEP), left(STEP))
     if 2.0 * samples * math.log(near / after) > SHARP:
-        return True
-    is_input = all(signal.kind == "inputs" for signal in one.signals)
-    return is_input and near * EQUAL > after and left(OFF) > WORSE * after
+        return "sharp"
+    # A factor that is no unit of the column is not told by an input that may have any scale.
+    is_unit = one.scale == 1.0 and all(signal.kind == "inputs" for signal in one.signals)
+    absorbed = is_unit and near * EQUAL > after and left(OFF) > WORSE * after
+    return "absorbed" if absorbed else "none"
 
 
 def _listed(names: Sequence[str], most: int = 4) -> str:

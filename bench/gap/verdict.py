@@ -150,8 +150,9 @@ class RecordingFault:
         unit: that its numbers are in; None where its sign alone is wrong.
         says: what is wrong, and the change of the description that corrects it.
         lines: of each signal, its table in the description and the keys to set.
-        error_before: RMS of the base model's residual on the fitted runs, in units of the noise.
-        error_after: the same with the correction; None where it was not measured.
+        error_before: RMS of the base model's residual on the fitted runs, in units of the noise;
+            None where it was not measured.
+        error_after: the same with the correction; None likewise.
         alternatives: other corrections that explain the recording as well, a sentence each.
     """
 
@@ -160,7 +161,7 @@ class RecordingFault:
     unit: str | None
     says: str
     lines: tuple[str, ...]
-    error_before: float
+    error_before: float | None
     error_after: float | None
     alternatives: tuple[str, ...] = ()
 
@@ -172,7 +173,7 @@ class RecordingFault:
             "unit": self.unit,
             "says": self.says,
             "lines": list(self.lines),
-            "error_before": finite(self.error_before),
+            "error_before": self.error_before,
             "error_after": self.error_after,
             "alternatives": list(self.alternatives),
         }
@@ -181,14 +182,7 @@ class RecordingFault:
     def of(cls, document: Mapping[str, Any]) -> RecordingFault:
         """From verdict.json."""
         lists = ("signals", "lines", "alternatives")
-        before = document["error_before"]
-        return cls(
-            **{
-                **document,
-                **{name: tuple(document[name]) for name in lists},
-                "error_before": np.nan if before is None else before,
-            }
-        )
+        return cls(**{**document, **{name: tuple(document[name]) for name in lists}})
 
 
 @dataclass(frozen=True, repr=False)

@@ -263,9 +263,10 @@ def _of_faults(faults: Sequence[RecordingFault]) -> Iterator[str]:
     """What supports a wrong unit or sign, what else would explain the data, and what to do."""
     first, *others = faults
     if first.error_after is not None:
+        before = f"from {number(first.error_before)} " if first.error_before is not None else ""
         yield (
-            "With this correction the error of the tuned simulation on the fitted runs falls from "
-            f"{number(first.error_before)} to {number(first.error_after)} times the noise."
+            "With this correction the error of the tuned simulation on the fitted runs falls "
+            f"{before}to {number(first.error_after)} times the noise."
         )
     for text in (*first.alternatives, *(fault.says for fault in others)):
         yield sentence(f"{'or' if text in first.alternatives else 'also'}: {text}")

@@ -5,6 +5,7 @@ them.
 import json
 import re
 from math import pi
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -214,7 +215,9 @@ def recognised_of(effect, value):
     subject = Subject(simulators.get("pendulum"), recording, "batch")
     world = World(subject.kind, recording, recording.training(), candidates=[effect])
     number = Number(value, "1", value - 1e-3, value + 1e-3)
-    return recognised(subject, world, Cause(effect, (), "says so", {"coefficient": number}, 0.0))
+    nowhere = SimpleNamespace(free=np.array([], dtype=int), theta=np.array([]))
+    cause = Cause(effect, (), "says so", {"coefficient": number}, 0.0)
+    return recognised(subject, world, cause, nowhere)
 
 
 def test_the_gains_of_units_are_those_of_the_unit_library():
