@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap.causes.rules import CUT, FAULTY, MEANING, VerdictName
+from bench.gap.causes.rules import CUT, FAULTY, MEANING, OPEN, VerdictName
 from bench.gap.model.watch import Cut
 from bench.gap.propose import Experiment
 from sims.extended import Number
@@ -223,7 +223,14 @@ class Verdict:
         """What the word means, in one sentence."""
         if self.recording_faults:
             return FAULTY
+        if self.cut is None and self.has_open_numbers:
+            return OPEN
         return MEANING[self.verdict] if self.cut is None else CUT[self.verdict]
+
+    @property
+    def has_open_numbers(self) -> bool:
+        """Whether the verdict is `partial` and a number of a cause is not a result."""
+        return self.verdict == "partial" and any(cause.open_numbers for cause in self.causes)
 
     def document(self) -> Document:
         """The content of verdict.json."""

@@ -66,7 +66,9 @@ CUT: Mapping[VerdictName, str] = {
     "unknown": "the search was ended before it could say what is missing",
 }
 """The same as `MEANING` of a search that was ended early, which has no other verdicts."""
-FAULTY = "the recording states a unit or a sign wrongly; correct it before causes are searched"
+OPEN: str = "a cause is found, but a number of it lies at a bound or has no finite interval"
+"""What `partial` says where a number of a cause is not a result."""
+FAULTY: str = "the recording states a unit or a sign wrongly; correct it before causes are searched"
 """What `unknown` says of a recording with a wrong unit or sign."""
 LAST: Collection[str] = frozenset({"structure", "alternatives"})
 """Questions without which a cause may be real already."""

@@ -152,7 +152,7 @@ def _opening(story: Story) -> Iterator[str]:
     badge = _BADGES[verdict.verdict] if verdict.cut is None else _CUT[verdict.verdict]
     if verdict.recording_faults:
         badge = _FAULTY
-    elif verdict.verdict == "partial" and any(cause.open_numbers for cause in verdict.causes):
+    elif verdict.cut is None and verdict.has_open_numbers:
         badge = _OPEN
     yield paragraph(f'<span class="badge">{badge}</span>')
     yield f"<h1>{safe(headline(story))}</h1>"
