@@ -291,8 +291,12 @@ def wrong_units(subject: Subject, world: World, noise: Noise, base: Base) -> Rec
         return None
     # The simplest of those that fit equally well.
     least = min(after for _, after in good)
-    alike = sorted((p for p in good if p[1] <= EQUAL * least), key=lambda p: len(p[0].signals))
-    (best, after), *rest = alike
+    alike = [pair for pair in good if pair[1] <= EQUAL * least]
+    alike.sort(key=lambda pair: (len(pair[0].signals), pair[0].scale != 1.0))
+    (best, after), *others_alike = alike
+    # Where the sign of a signal does not matter, nothing is wrong with it.
+    same = best.signals, best.units
+    rest = [pair for pair in others_alike if (pair[0].signals, pair[0].units) != same]
     others = [*(one.fault(subject.file, None, None).says for one, _ in rest), *others]
     alternatives = tuple(dict.fromkeys(others))
     return replace(best.fault(subject.file, known, after), alternatives=alternatives)

@@ -104,6 +104,15 @@ def test_what_is_stated_wrongly_is_named_with_the_line_that_corrects_it(
         assert found.error_after < 1.1
 
 
+def test_a_sign_that_does_not_matter_is_not_questioned():
+    wish = {"noise": ["q=0.002"], "observe": ["q"], "initial": ["q=-1:1"]}
+    recording = make(Wish("pendulum", **wish)).recording
+    subject = Subject(simulators.get("pendulum"), recording, "batch")
+    found = fault_of(recording=subject.rescaled({"q": 1 / DEGREE}))
+    assert found.lines == ('[channels.q] unit = "deg"',)
+    assert found.alternatives == ()
+
+
 def test_the_first_line_is_the_correction_and_applying_it_explains_the_recording(tmp_path, capsys):
     path = swing(tmp_path, {"q": "deg"})
     assert main(["explain", str(path), "--out", str(tmp_path / "wrong"), "--jobs", "1"]) == 0
