@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from sims import effects as library
 from sims import files
@@ -55,12 +55,30 @@ _KEYS = (
 
 @dataclass(frozen=True)
 class Number:
-    """A fitted number with its 95 % interval, None where the data do not bound it."""
+    """A fitted number with its 95 % interval, None where the data do not bound it.
+
+    Attributes:
+        value: the estimate.
+        unit: of the estimate and its interval.
+        low, high: the 95 % interval.
+        at_bound: which end of its range the estimate lies at; None where it lies inside. At a bound
+            there is no interval.
+    """
 
     value: float
     unit: str
     low: float | None
     high: float | None
+    at_bound: Literal["low", "high"] | None = None
+
+    @property
+    def is_result(self) -> bool:
+        """Whether the data determine the number: it has an interval, or is zero where nothing less
+        is possible, such as a friction that does not exist.
+        """
+        if self.at_bound is not None:
+            return self.at_bound == "low" and self.value == 0.0
+        return self.low is not None and self.high is not None
 
     def table(self) -> dict[str, Any]:
         """As TOML, which has no null."""
@@ -234,11 +252,11 @@ def _numbers(path: Path, where: str, value: Any) -> dict[str, Number]:
 def _number(path: Path, where: str, value: Any) -> Number:
     given = table(path, where, value, "a table with value and unit")
     fitted = _real(path, f"{where}.value", given.get("value"))
-    bounds = (
+    low, high = (
         _real(path, f"{where}.{end}", given[end]) if end in given else None
         for end in ("low", "high")
     )
-    return Number(fitted, _text(path, "unit", given.get("unit")), *bounds)
+    return Number(fitted, _text(path, "unit", given.get("unit")), low, high)
 
 
 def _text(path: Path, where: str, value: Any) -> str:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bench.gap.causes import rules
 from bench.gap.causes.alternatives import Evidence
 from bench.gap.causes.name import Finding
 from bench.gap.causes.score_test import tail
 from bench.gap.causes.search import Search
 from bench.gap.measure import Gain, gain, intervals
-from bench.gap.model.bounds import is_instant
+from bench.gap.model.bounds import bound_of, coefficient_bounds, is_instant
 from bench.gap.model.floor import Floor
 from bench.gap.model.models import Model, Names
 from bench.gap.model.world import World
@@ -60,7 +61,7 @@ class Assessor:
         """
         world = self.fitting
         numbers = self.numbers(search, finding.model)
-        causes = tuple(self._cause(cause, numbers) for cause in finding.causes)
+        causes = self.causes(search, finding)
         parameters = {world.parameters[i].name: numbers[i] for i in world.base.tolist()}
         # Counted before an experiment is proposed: what that simulates is not part of the answer.
         simulations = world.simulations
@@ -83,11 +84,17 @@ class Assessor:
             finding.cut,
         )
 
+    def causes(self, search: Search, finding: Finding) -> tuple[Cause, ...]:
+        """The causes of a finding with their numbers."""
+        numbers = self.numbers(search, finding.model)
+        return tuple(self._cause(cause, numbers) for cause in finding.causes)
+
     def numbers(self, search: Search, model: Model) -> dict[int, Number]:
         """Every parameter and coefficient by its place; without an interval where it was not
         fitted.
         """
         fitted = intervals(search, model)
+        ranges = self._ranges(model)
         result = {}
         for place, parameter in enumerate(self.fitting.parameters):
             # What the data do not touch stays nominal; effects that are off are zero.
@@ -96,11 +103,28 @@ class Assessor:
             if is_instant(parameter):
                 # Nobody knows when between two samples it was.
                 low, high = low - self.fitting.spacing / 2, high + self.fitting.spacing / 2
-            # JSON has no number for what is not known.
-            bounded = np.isfinite(low) and np.isfinite(high)
-            interval = (low, high) if bounded else (None, None)
-            result[place] = Number(value, parameter.unit, *interval)
+            at_bound = bound_of(value, *ranges[place]) if place in fitted else None
+            # JSON has no number for what is not known; at a bound the curvature says nothing.
+            bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
+            ends = (low, high) if bounded else (None, None)
+            result[place] = Number(value, parameter.unit, ends[0], ends[1], at_bound)
         return result
+
+    def _ranges(self, model: Model) -> dict[int, tuple[float, float]]:
+        """Where the fit of a model could move each number, by its place."""
+        world = self.fitting
+        ranges = {i: world.parameters[i].bounds for i in world.base.tolist()}
+        for name in model.names:
+            ranges |= dict(zip(world.places(name), coefficient_bounds(world, name), strict=True))
+        return ranges
+
+    def judged(self, search: Search, finding: Finding) -> Finding:
+        """The finding with the verdict that its numbers allow."""
+        numbers = self.numbers(search, finding.model)
+        certain = [cause for cause in finding.causes if not cause.alternatives]
+        places = [i for cause in certain for i in self.fitting.places(cause.effect)]
+        results = all(numbers[i].is_result for i in places)
+        return replace(finding, verdict=rules.verdict_of_numbers(finding.verdict, results))
 
     def sigma(self, finding: Finding) -> Array:
         """(C,) the noise floor: stated, or what a model that leaves no structure leaves."""

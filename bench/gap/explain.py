@@ -17,7 +17,7 @@ from bench.gap.assess import Assessor
 from bench.gap.causes.name import Finding, name
 from bench.gap.causes.rules import SWITCH
 from bench.gap.causes.search import Search
-from bench.gap.causes.structure import probes
+from bench.gap.causes.structure import probes, remains
 from bench.gap.design import Design, design
 from bench.gap.explanation import Explanation
 from bench.gap.freeze import frozen
@@ -30,6 +30,8 @@ from bench.gap.model.watch import Watch
 from bench.gap.model.world import World
 from bench.gap.steps import Coarse, with_numerics
 from bench.gap.tell import Teller
+from bench.gap.unit_check import Subject, recognised, wrong_units
+from bench.gap.verdict import RecordingFault
 from bench.problem.seeds import rng_for
 from bench.recordings.joined import load_all
 from bench.recordings.pieces import cut
@@ -187,6 +189,7 @@ class _Explainer:
         self._enter(kind)
         self.coarse: Coarse | None = None
         self.found: tuple[Search, Finding] | None = None
+        self.faults: tuple[RecordingFault, ...] = ()
         self._check()
 
     def _enter(self, kind: type[Simulated]) -> None:
@@ -246,15 +249,41 @@ class _Explainer:
         # One stream for surrogates and bootstrap: the same seed tells the same story.
         rng = self._rng()
         search = self._search(base, rng)
-        held_out = HeldOutRuns(self.measuring, self.noise) if self.measuring else None
-        finding = name(search, held_out)
+        finding = self._finding(search)
         self.watch.stage("measuring the gain")
         verdict = self.assessor.verdict(search, finding, rng, self.started)
+        verdict = replace(verdict, recording_faults=self.faults)
         if self.coarse is not None:
             verdict = with_numerics(verdict, self.coarse)
         self.found = search, finding
         story = Teller(self.assessor, search, base, finding, self.notes).story(verdict)
         return Explanation(verdict, story, self._extended(search, finding))
+
+    def _finding(self, search: Search) -> Finding:
+        """What the simulator lacks; no cause where the recording states a unit or a sign wrongly,
+        which every cause would only imitate.
+        """
+        base = search.base
+        if not self.faults:
+            held_out = HeldOutRuns(self.measuring, self.noise) if self.measuring else None
+            finding = self.assessor.judged(search, name(search, held_out))
+            self.faults = self._imitated(search, finding)
+            if not self.faults:
+                return finding
+        return Finding("unknown", base, base, (), remains(search, base))
+
+    def _imitated(self, search: Search, finding: Finding) -> tuple[RecordingFault, ...]:
+        """Wrong units and signs that causes stand for."""
+        found = [
+            recognised(self._units, self.fitting, cause, search.base.fit)
+            for cause in self.assessor.causes(search, finding)
+        ]
+        return tuple(fault for fault in found if fault is not None)
+
+    @property
+    def _units(self) -> Subject:
+        """What the check of units looks at."""
+        return Subject(self.kind, self.recording, self.engine, self.free)
 
     def close(self) -> None:
         """Let go of what simulates; not earlier, since experiments are proposed by simulating."""
@@ -288,7 +317,10 @@ class _Explainer:
         one.
         """
         base = fit_base(self.fitting, self.noise, self._given())
-        if not self.kind.has_model:
+        if not self.watch.left():
+            fault = wrong_units(self._units, self.fitting, self.noise, base)
+            self.faults = (fault,) if fault is not None else ()
+        if self.faults or not self.kind.has_model:
             return base
         base = self._frozen(self._stepped(base))
         # What is asked about as a cause comes first: it would not be seen afterwards.
@@ -368,6 +400,8 @@ class _Explainer:
 
     def _fails(self) -> InputError:
         """Why nothing could be simulated."""
+        if self.faults:
+            return InputError(f"{self.path}: {self.faults[0].says}")
         if self.watch.left():
             return InputError(
                 f"{self.path}: the search was ended before a fit could follow the recording"

@@ -32,7 +32,6 @@ from bench.gap.model.noise import Noise
 from bench.gap.model.problem import Fit
 from bench.gap.model.world import World
 from sims.base import Array
-from sims.simulated import effect_parameters
 from sims.system import FAMILY
 
 Word = Literal["identifiable", "weak", "not identifiable"]
@@ -182,9 +181,7 @@ class _Identified:
         alike = np.abs(units.T @ units)
         numbers = []
         for row, ((name, place), k) in zip(alike, best.items(), strict=True):
-            parameter = effect_parameters(
-                world.effects[name], world.simulator.system, world.channels
-            )[place]
+            parameter = world.parameters[world.places(name)[place]]
             probe = probes[k]
             half = Z95 / powers[k] if powers[k] > 0 else np.inf
             mixed = [
@@ -228,31 +225,55 @@ def _number(
     return Number(name, free, unit, float(half), low, high, word, others)
 
 
-def told(numbers: Sequence[Number], most: int = 40) -> list[str]:
-    """Lines that say it: free numbers, then causes, those that show least last.
+def told(numbers: Sequence[Number], most: int = 8) -> list[str]:
+    """Lines for the terminal: the free numbers, the causes that show best, and how many more there
+    are.
 
     Args:
-        numbers: of `check`.
-        most: causes to tell one by one; the others are counted.
+        numbers: of `identified`.
+        most: causes that have a line of their own, and names in a list of others.
     """
-    lines = ["what this recording can fix (95 %, white noise assumed; a cause each by itself):"]
-    rows = [number for number in numbers if number.free]
-    causes = [number for number in numbers if not number.free]
-    rows += [number for word in reversed(_WORDS) for number in causes if number.word == word]
-    for number in rows[:most]:
-        half = f"±{number.half:.2g} {number.unit}" if np.isfinite(number.half) else "untouched"
-        if np.isnan(number.half):
-            half = "a limit within reach"
-        other = ", ".join(f"{name} ({corr:.3f})" for name, corr in number.mixed)
-        mixed = f"; mixed up with {other}" if other else ""
-        kind = "free" if number.free else "cause"
-        span = f"{number.low:.3g} to {number.high:.3g}"
-        lines.append(f"  {number.word:16s} {kind:5s} {number.name}: {half} of {span}{mixed}")
-    if len(rows) > most:
-        lines.append(f"  ... and {len(rows) - most} more causes that are identifiable or weak")
-    counts = [f"{sum(n.word == w for n in causes)} {w}" for w in _WORDS]
-    lines.append(f"causes: {', '.join(counts)}")
+    lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
+    lines += [f"  {_line(number)}" for number in numbers if number.free]
+    causes = {word: [n for n in numbers if not n.free and n.word == word] for word in _WORDS}
+    counts = [f"{len(those)} {word}" for word, those in causes.items()]
+    lines.append(f"causes, each by itself, surest first: {', '.join(counts)}")
+    # A limit shows or does not: it has no interval, and comes after those that have one.
+    sure = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
+    lines += [f"  {_line(number)}" for number in sure[:most]]
+    for word, those in (("identifiable too", sure[most:]), *list(causes.items())[1:]):
+        if those:
+            lines.append(f"  {word}: {listed(_effects(those), most)}")
+    if any(len(those) > most for those in causes.values()):
+        lines.append("  every cause with its number: the same command with --json")
     return lines
+
+
+def _line(number: Number) -> str:
+    """A number with its word, its interval, its range and what it is mixed up with."""
+    half = f"±{number.half:.2g} {number.unit}" if np.isfinite(number.half) else "untouched"
+    if np.isnan(number.half):
+        half = "a limit within reach"
+    other = listed([f"{name} ({corr:.3f})" for name, corr in number.mixed], 2)
+    mixed = f"; mixed up with {other}" if other else ""
+    span = f"{number.low:.3g} to {number.high:.3g}"
+    return f"{number.word:16s} {number.name}: {half} of {span}{mixed}"
+
+
+def _effects(numbers: Sequence[Number]) -> list[str]:
+    """Names of causes; those at places once, with the number of their places."""
+    places: dict[str, set[str]] = {}
+    for number in numbers:
+        effect, _, place = number.name.partition(" ")[0].partition("@")
+        places.setdefault(effect, set()).add(place)
+    several = {name: len(at) for name, at in places.items()}
+    return [f"{name} ({n} places)" if n > 1 else name for name, n in several.items()]
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """The first names, and how many more there are."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 _WORDS: tuple[Word, ...] = ("identifiable", "weak", "not identifiable")

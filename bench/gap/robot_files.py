@@ -40,7 +40,7 @@ def robot_files(extended: Extended) -> RobotFiles:
     from sims.robot.markup import without_heading
     from sims.robot.writing import written
 
-    causes = causes_of(extended)
+    causes, left_out = written_causes(causes_of(extended))
     done = written(kind.robot, causes, extended.title)
     try:
         check(kind.robot, causes, done)
@@ -53,7 +53,38 @@ def robot_files(extended: Extended) -> RobotFiles:
         # Gone since it was read: what changes is shown without what was.
         before = ""
     after = done.xml if done.urdf is None else done.urdf
-    return RobotFiles(_named(done), done.said, before, without_heading(after or ""))
+    return RobotFiles(_named(done), (*left_out, *done.said), before, without_heading(after or ""))
+
+
+def written_causes(
+    causes: Mapping[str, Mapping[str, Number]],
+) -> tuple[dict[str, Mapping[str, Number]], tuple[str, ...]]:
+    """The causes that a model file may state, and a line for each that it may not: numbers at a
+    bound of their range, or without an interval, are not results.
+    """
+    kept: dict[str, Mapping[str, Number]] = {}
+    left_out = []
+    for effect, numbers in causes.items():
+        if effect.startswith("numerics."):
+            kept[effect] = numbers
+            continue
+        # Of a family each place stands for itself; coefficients of one place go together.
+        bad = {key.partition("@")[2]: n for key, n in numbers.items() if not n.is_result}
+        own = {key: n for key, n in numbers.items() if key.partition("@")[2] not in bad}
+        if own:
+            kept[effect] = own
+        for place, one in bad.items():
+            # A number that was never fitted is the file's own.
+            if one.at_bound is None and not one.value:
+                continue
+            end = {"low": "lower", "high": "upper", None: ""}[one.at_bound]
+            why = f"lies at the {end} bound of its range" if end else "has no finite interval"
+            name = effect if not place else f"{effect.partition('@')[0]}@{place}"
+            left_out.append(
+                f"{name} is not written to the model file: its value, {one.value:.3g} {one.unit}, "
+                f"{why} and is not a result"
+            )
+    return kept, tuple(left_out)
 
 
 def _named(done: Written) -> dict[str, str]:

@@ -17,6 +17,7 @@ from bench.gap.model.base_fit import Base
 from bench.gap.report import show
 from bench.gap.report.places import of_set
 from bench.gap.report.story import Place, Shown, Side, Story, Tuned
+from bench.gap.report.words import END
 from bench.gap.verdict import Verdict
 from sims.base import Array
 from sims.extended import Number as Estimate
@@ -27,8 +28,6 @@ PNG = b"\x89PNG\r\n\x1a\n"
 """How a file of that kind begins."""
 MOST_PICTURE = 1_000_000
 """Bytes of the picture of a track that a page takes in."""
-BORDER = 1e-6
-"""Share of its range within which a parameter is at the border."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +68,12 @@ class Teller:
             (*show.places(world, before, after, sigma), *held_out_places),
             tuple(show.profiles(world, before, after, sigma)),
             tuple(self._parameters()),
-            tuple(self._remains()),
-            tuple(self._why()),
+            () if verdict.recording_faults else tuple(self._remains()),
+            () if verdict.recording_faults else tuple(self._why()),
             self.finding.vague,
             show.robot_of(world),
             fixable=self._fixable(),
-            apart=self._apart(),
+            apart=Apart() if verdict.recording_faults else self._apart(),
             track=self._track(),
             logs=max(1, len({run.log for run in recording.runs})),
             thorough=self.search.thorough,
@@ -172,6 +171,7 @@ class Teller:
                 _triple(before[i]),
                 _triple(after[i]),
                 touched,
+                (before[i].at_bound, after[i].at_bound),
             )
 
     def _remains(self) -> Iterator[str]:
@@ -196,21 +196,18 @@ class Teller:
         yield from self.notes
 
     def _bordering(self) -> Iterator[str]:
-        """Parameters whose fit would have gone on beyond their range."""
-        world = self.assessor.fitting
-        for i in sorted({*world.base.tolist()} - {*self.base.frozen}):
-            parameter = world.parameters[i]
-            low, high = parameter.bounds
-            near = BORDER * (high - low)
-            for model, when in ((self.finding.base, "the base fit"), (self.finding.model, "")):
-                value = float(model.fit.theta[i])
-                if low + near < value < high - near:
+        """Parameters that a fit leaves at a bound of their range."""
+        for one in self._parameters():
+            values = one.before[0], one.after[0]
+            for when, value, bound in zip(
+                ("in the base fit ", ""), values, one.bounds, strict=True
+            ):
+                if bound is None:
                     continue
-                limit = low if value < 0.5 * (low + high) else high
                 yield (
-                    f"{when and f'in {when} '}{parameter.name} ends at the border of its range,"
-                    f" {limit:g} {parameter.unit}: nothing beyond was tried, and causes may stand"
-                    " in for what lies there"
+                    f"{when}{one.name} lies at the {END[bound]} bound of its range, {value:g}"
+                    f" {one.unit}: larger ranges were not searched, and a cause may compensate for"
+                    " a value beyond the bound. Check the units and constants of the recording"
                 )
                 break
 

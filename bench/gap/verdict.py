@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap.causes.rules import CUT, MEANING, VerdictName
+from bench.gap.causes.rules import CUT, FAULTY, MEANING, OPEN, VerdictName
 from bench.gap.model.watch import Cut
 from bench.gap.propose import Experiment
 from sims.extended import Number
@@ -33,6 +33,15 @@ class Cause:
     says: str
     coefficients: Mapping[str, Number]
     p_value: float
+
+    @property
+    def open_numbers(self) -> dict[str, Number]:
+        """Its numbers that are not results: at a bound, or without an interval. How a robot is
+        stepped was chosen, and has no interval.
+        """
+        if self.effect.startswith("numerics."):
+            return {}
+        return {name: n for name, n in self.coefficients.items() if not n.is_result}
 
     def document(self) -> Document:
         """As in verdict.json."""
@@ -131,6 +140,51 @@ class Candidate:
         return f"Candidate({self.effect}: score {self.score:.3g}, p {self.p_value:.2g})"
 
 
+@dataclass(frozen=True)
+class RecordingFault:
+    """A wrong unit or a reversed sign of recorded signals that explains nearly all of the misfit.
+
+    Attributes:
+        signals: channels and inputs that are concerned.
+        factor: by which SI values of the first one have to be multiplied.
+        unit: that its numbers are in; None where its sign alone is wrong.
+        says: what is wrong, and the change of the description that corrects it.
+        lines: of each signal, its table in the description and the keys to set.
+        error_before: RMS of the base model's residual on the fitted runs, in units of the noise;
+            None where it was not measured.
+        error_after: the same with the correction; None likewise.
+        alternatives: other corrections that explain the recording as well, a sentence each.
+    """
+
+    signals: tuple[str, ...]
+    factor: float
+    unit: str | None
+    says: str
+    lines: tuple[str, ...]
+    error_before: float | None
+    error_after: float | None
+    alternatives: tuple[str, ...] = ()
+
+    def document(self) -> Document:
+        """As in verdict.json."""
+        return {
+            "signals": list(self.signals),
+            "factor": self.factor,
+            "unit": self.unit,
+            "says": self.says,
+            "lines": list(self.lines),
+            "error_before": self.error_before,
+            "error_after": self.error_after,
+            "alternatives": list(self.alternatives),
+        }
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> RecordingFault:
+        """From verdict.json."""
+        lists = ("signals", "lines", "alternatives")
+        return cls(**{**document, **{name: tuple(document[name]) for name in lists}})
+
+
 @dataclass(frozen=True, repr=False)
 class Verdict:
     """What explain answers.
@@ -147,6 +201,8 @@ class Verdict:
         simulations: how many were spent.
         seconds: how long it took.
         cut: that the search was ended early, and what was not asked; None where it came to its end.
+        recording_faults: wrong units or signs of the recording, for which no cause was searched;
+            left out where there are none.
     """
 
     verdict: VerdictName
@@ -160,16 +216,27 @@ class Verdict:
     simulations: int
     seconds: float
     cut: Cut | None = None
+    recording_faults: tuple[RecordingFault, ...] = ()
 
     @property
     def says(self) -> str:
         """What the word means, in one sentence."""
+        if self.recording_faults:
+            return FAULTY
+        if self.cut is None and self.has_open_numbers:
+            return OPEN
         return MEANING[self.verdict] if self.cut is None else CUT[self.verdict]
+
+    @property
+    def has_open_numbers(self) -> bool:
+        """Whether the verdict is `partial` and a number of a cause is not a result."""
+        return self.verdict == "partial" and any(cause.open_numbers for cause in self.causes)
 
     def document(self) -> Document:
         """The content of verdict.json."""
         # The order of the keys is that of the page that explains them, and of older files.
         proposed = self.next_experiment
+        faults = [fault.document() for fault in self.recording_faults]
         return {
             "verdict": self.verdict,
             "system": self.system,
@@ -182,6 +249,7 @@ class Verdict:
             "simulations": self.simulations,
             "seconds": self.seconds,
             "cut": self.cut.document() if self.cut is not None else None,
+            **({"recording_faults": faults} if faults else {}),
         }
 
     @classmethod
@@ -203,6 +271,7 @@ class Verdict:
             document["simulations"],
             document["seconds"],
             Cut.of(cut) if cut is not None else None,
+            tuple(RecordingFault.of(fault) for fault in document.get("recording_faults", ())),
         )
 
     def __repr__(self) -> str:
@@ -221,6 +290,7 @@ def _estimates(numbers: Mapping[str, Number]) -> Document:
     """Numbers as in verdict.json, by name."""
     return {
         name: {"value": n.value, "unit": n.unit, "low": n.low, "high": n.high}
+        | ({"at_bound": n.at_bound} if n.at_bound is not None else {})
         for name, n in numbers.items()
     }
 

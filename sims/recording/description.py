@@ -176,6 +176,29 @@ def description_of(table: Path) -> Path:
     return table.with_suffix(".toml")
 
 
+def stated_columns(path: Path, declared: Declared) -> dict[str, tuple[str, float, float]]:
+    """By channel and input, the unit that a recording's description states, the factor by which the
+    numbers of the column become SI, and the `scale` that is part of it.
+
+    Args:
+        path: the recording's table, `NAME.csv`.
+        declared: its system.
+
+    Raises:
+        InputError: the description is missing or malformed.
+    """
+    description = description_of(path)
+    meta = read_toml(description)
+    columns = {
+        **_columns(description, "channel", meta, declared.channels),
+        **_columns(description, "input", meta, declared.inputs),
+    }
+    return {
+        name: (str(c.table["unit"]), c.scale.gain, float(c.table.get("scale", 1.0)))
+        for name, c in columns.items()
+    }
+
+
 def read_meta(table: Path) -> tuple[Path, dict[str, Any]]:
     """The path and the content of the description of a recording.
 
@@ -314,14 +337,20 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
     where, usual = f"{kind} {name}", f'unit = "{unit}"'
     own = table(path, where, value, f"a table with {usual}")
     # The noise of a signal that is put in is nothing that a simulation could use.
-    allowed = ("unit", "column", "file", "noise" if kind == "channel" else "hold")
+    allowed = ("unit", "scale", "column", "file", "noise" if kind == "channel" else "hold")
     _known(path, f"{kind}s.{name}", own, allowed)
     # No unit is no SI unit: a log in degrees without a word of it would be read as radians.
     stated = text(path, where, own.get("unit"), f"{usual} or one that converts to it")
     try:
-        return _Column(scale(stated, unit), own)
+        converted = scale(stated, unit)
     except InputError as error:
         raise InputError(f"{path}: {where}: {error}") from None
+    if "scale" not in own:
+        return _Column(converted, own)
+    factor = finite(path, f"{kind}s.{name}.scale", own["scale"])
+    if factor == 0:
+        raise fault(path, f"{kind}s.{name}.scale", "a factor that is not zero", own["scale"])
+    return _Column(Scale(factor * converted.gain, converted.offset), own)
 
 
 def _hold(path: Path, name: str, column: _Column) -> bool:

@@ -21,7 +21,7 @@ from bench.gap.causes import rules
 from bench.gap.causes.rules import MEANING
 from bench.gap.model.watch import Cut
 from bench.gap.propose import Experiment as NextExperiment
-from bench.gap.verdict import Candidate, Cause, Heldout, Verdict
+from bench.gap.verdict import Candidate, Cause, Heldout, RecordingFault, Verdict
 from bench.problem.experiment import Experiment
 from bench.schemas import names as schema_names
 from bench.schemas import schema
@@ -222,6 +222,7 @@ KINDS = {
     Candidate: "a candidate",
     NextExperiment: "the next experiment",
     Cut: "the early end",
+    RecordingFault: "a recording fault",
 }
 """Objects in verdict.json, as the page calls them."""
 ESTIMATE = {
@@ -229,6 +230,8 @@ ESTIMATE = {
     "unit": "of the three numbers",
     "low": "of its 95 % interval; null where the data do not bound it",
     "high": "the other end",
+    "at_bound": "which end of its range the number lies at, where there is no interval; left out "
+    "where it lies inside",
 }
 """A number says this in one sentence, which a table needs by its fields."""
 

@@ -17,7 +17,6 @@ from bench.gap.causes.score_test import tail
 from bench.gap.causes.search import Search
 from bench.gap.causes.trial import Trial
 from bench.gap.model.models import Model
-from sims.simulated import effect_parameters
 
 
 @dataclass(frozen=True)
@@ -175,9 +174,9 @@ class Alternatives:
         world = self.search.world
         if not world.linear:
             return model.merit
-        system, lucky = world.simulator.system, 0.0
+        lucky = 0.0
         for name in model.names:
-            parameters = effect_parameters(world.effects[name], system, world.channels)
+            parameters = world.parameters[world.slots[name]]
             if not any(parameter.bounds[0] > 0 for parameter in parameters):
                 lucky += self.search.chance_of(name)
         return model.merit + lucky
@@ -189,8 +188,7 @@ class Alternatives:
         if not having:
             return False
         best = max(having, key=lambda m: m.merit)
-        system = world.simulator.system
-        parameters = effect_parameters(world.effects[effect], system, world.channels)
+        parameters = world.parameters[world.slots[effect]]
         values = best.fit.theta[world.slots[effect]]
         for parameter, value in zip(parameters, values, strict=True):
             low, high = parameter.bounds

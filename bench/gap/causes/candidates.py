@@ -28,7 +28,7 @@ from bench.gap.causes.reaches import (
     reach,
     stopping,
 )
-from bench.gap.model.bounds import CYCLES, coefficient_bounds, is_instant
+from bench.gap.model.bounds import CYCLES, LASTING, coefficient_bounds, is_instant
 from bench.gap.model.differences import followed
 from bench.gap.model.noise import Mask
 from bench.gap.model.problem import Fit, Start
@@ -60,8 +60,6 @@ FREQUENCIES = 96
 """Frequencies tried at most."""
 SPREAD = 1.5
 """How much closer slow frequencies lie than fast ones, as a power."""
-LASTING = 3.0
-"""Of the longest run, times that are tried of what dies away; one is at most twice the other."""
 MODIFIED = (-0.7, -0.25, 0.0, 0.25, 0.7)
 """Shares of its plausible range at which a coefficient that modifies is tried."""
 DEPTHS = (0.005, 0.02, 0.08, 0.2)
@@ -235,7 +233,8 @@ def _grid(world: World, parameter: Parameter, tried: tuple[float, ...], travel: 
         # At the ends there is nothing before or after.
         return np.linspace(first, last, INSTANTS + 2)[1:-1]
     if parameter.unit == "s":
-        # What lasts much longer than the runs is constant in them.
+        # What lasts much longer than the runs is constant in them; one time is at most twice the
+        # time before it.
         high = max(min(high, LASTING * world.longest), 2.0 * low)
         return np.geomspace(low, high, int(np.ceil(np.log2(high / low))) + 1)
     return np.geomspace(low, high, SHAPES)

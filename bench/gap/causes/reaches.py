@@ -13,7 +13,6 @@ from bench.gap.model.bounds import is_instant
 from bench.gap.model.tracks import Track
 from bench.gap.model.world import World
 from sims.base import Array, Parameter
-from sims.simulated import effect_parameters
 from sims.system import Effect
 
 HARDER = (0.3, 1.0, 3.0)
@@ -31,10 +30,8 @@ FINER = 16
 
 
 def parameters_of(world: World, name: str) -> Sequence[Parameter]:
-    """The coefficients of an effect, with their units and plausible ranges."""
-    effect = world.effects[name]
-    system = world.simulator.system
-    return effect_parameters(effect, system, world.channels)
+    """The coefficients of an effect, with their units and their plausible ranges."""
+    return world.parameters[world.slots[name]]
 
 
 def reach(world: World, name: str) -> Array:

@@ -66,6 +66,10 @@ CUT: Mapping[VerdictName, str] = {
     "unknown": "the search was ended before it could say what is missing",
 }
 """The same as `MEANING` of a search that was ended early, which has no other verdicts."""
+OPEN: str = "a cause is found, but a number of it lies at a bound or has no finite interval"
+"""What `partial` says where a number of a cause is not a result."""
+FAULTY: str = "the recording states a unit or a sign wrongly; correct it before causes are searched"
+"""What `unknown` says of a recording with a wrong unit or sign."""
 LAST: Collection[str] = frozenset({"structure", "alternatives"})
 """Questions without which a cause may be real already."""
 
@@ -224,6 +228,19 @@ def verdict_of(state: State) -> VerdictName:
     if incomplete:
         return "partial"
     return "ambiguous" if state.alternatives else "named"
+
+
+def verdict_of_numbers(verdict: VerdictName, results: bool) -> VerdictName:
+    """The verdict when the fitted numbers of the causes are known.
+
+    A number at a bound of its range, or without a finite interval, is not a result: its cause is
+    not named.
+
+    Args:
+        verdict: by all other rules.
+        results: whether every number of the causes that stand alone is a result.
+    """
+    return "partial" if verdict == "named" and not results else verdict
 
 
 def verdict_of_cut(causes: int, closed: float, not_asked: Sequence[str]) -> VerdictName:

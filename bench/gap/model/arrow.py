@@ -81,13 +81,17 @@ class _Arrow:
         # (4), its right side
         right = self.gradient - np.einsum("rqs,rs->q", self.cross, inverse_pull)
 
-        # least squares takes the shortest step where parameters act alike
         shared = np.zeros(len(right))
         moves = ~stuck
         if moves.any():
             free = schur[np.ix_(moves, moves)]
-            solution = np.linalg.lstsq(free, right[moves], rcond=None)
-            shared[moves] = solution[0]
+            # Parameters on one scale: curvatures of an outlet of 1e-6 m^2 and of a lag of seconds
+            # differ by more than double precision holds, and the smaller would be taken for zero.
+            scale = np.sqrt(np.maximum(np.diagonal(self.shared)[moves], LEAST_POWER))
+            scaled = free / np.outer(scale, scale)
+            # least squares takes the shortest step where parameters act alike
+            solution = np.linalg.lstsq(scaled, right[moves] / scale, rcond=None)
+            shared[moves] = solution[0] / scale
 
         own = inverse_pull - np.einsum("rsq,q->rs", inverse_cross, shared)  # (5)
         return shared, own

@@ -143,10 +143,23 @@ def _between(parameter: Parameter, share: float) -> float:
     return float(low + (high - low) * share)
 
 
-def _costs(world: World, noise: Noise, starts: Sequence[Start]) -> Array:
+def misfit_of_starts(world: World, noise: Noise, share: float) -> float:
+    """The lowest sum of squares of the starts of a base fit before they are fitted, over the first
+    share of each run; infinite where none of them can be simulated.
+    """
+    starts = [Start((), theta, world.guess) for theta in _starts(world, None)]
+    return float(_costs(world, noise, starts, share, np.inf).min())
+
+
+def _costs(
+    world: World,
+    noise: Noise,
+    starts: Sequence[Start],
+    share: float = HORIZONS[0].share,
+    lost: float = LOST,
+) -> Array:
     """Sums of squares of each start over the first samples of the runs."""
     count, runs = len(starts), len(world.tracks)
-    share = HORIZONS[0].share
     thetas = [s.theta for s in starts]
     theta = np.repeat(thetas, runs, axis=0)
     states = np.concatenate([s.states for s in starts])
@@ -155,7 +168,7 @@ def _costs(world: World, noise: Noise, starts: Sequence[Start]) -> Array:
     simulated = simulated.reshape(count, runs, *simulated.shape[1:])
 
     # a start that was given up has no samples: it must not seem to fit them
-    left = np.nan_to_num(world.observed - simulated, nan=LOST)
+    left = np.nan_to_num(world.observed - simulated, nan=lost)
     residuals = np.where(world.counted(share), left, 0.0) / noise.sigma
     costs: Array = np.square(residuals).sum(axis=(1, 2, 3))
     return costs

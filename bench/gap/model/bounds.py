@@ -1,11 +1,24 @@
-"""The range in which fits may move the coefficients of effects."""
+"""The range of each coefficient of an effect: where one expects it, and where a fit may move it.
+
+Times and frequencies follow the time scale of the recording: with T the duration of the longest run
+and h the shortest sample interval,
+
+* a delay or a lag is plausible up to a twentieth of T, and a fit may move it up to T: what takes
+  longer than a run is a constant in it;
+* a time constant of something that dies away is at most `LASTING` T;
+* a frequency is at most 1 / (2 h), the Nyquist frequency.
+"""
 
 from __future__ import annotations
 
-from bench.gap.model.world import World
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
 from sims.base import Parameter
-from sims.simulated import effect_parameters
 from sims.system import Effect, Friction
+
+if TYPE_CHECKING:
+    from bench.gap.model.world import World
 
 BEYOND = 20.0
 """A coefficient may be so many times as large as its plausible range has it."""
@@ -18,6 +31,44 @@ CYCLES = 1.0
 """What comes and goes must do so about once in the longest run, else any slow change would be
 called periodic.
 """
+LASTING = 3.0
+"""Longest time constant that is tried of what dies away, in durations of the longest run."""
+DECADES = 100.0
+"""Ratio of the highest to the lowest plausible frequency where the sampling sets the highest."""
+AT_BOUND = 1e-6
+"""A fitted number is at a bound if it is nearer to it than this share of its range. A bound of zero
+is met exactly or not at all, since ranges are wide against small coefficients.
+"""
+
+Bound = Literal["low", "high"]
+"""Which end of its range a number lies at."""
+
+
+def on_time_scale(parameter: Parameter, longest: float, spacing: float) -> Parameter:
+    """The coefficient with a plausible range that suits the time scale of a recording.
+
+    Args:
+        parameter: a coefficient, with the range that its effect states.
+        longest: duration of the longest run, s.
+        spacing: shortest sample interval, s; 0 where it is not known.
+    """
+    low, high = parameter.bounds
+    if is_instant(parameter):
+        return parameter
+    if parameter.unit == "s":
+        if low > 0:
+            high = max(high, LASTING * longest)
+        else:
+            # a delay may have either sign: both ends grow alike
+            times = max(1.0, longest / (BEYOND * high))
+            low, high = times * low, times * high
+    elif parameter.unit == "Hz" and spacing > 0 and 0.5 / spacing < high:
+        high = 0.5 / spacing
+        low = min(low, high / DECADES)
+    if (low, high) == parameter.bounds:
+        return parameter
+    nominal = min(max(parameter.nominal, low), high)
+    return replace(parameter, nominal=nominal, bounds=(low, high), training=None)
 
 
 def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
@@ -28,12 +79,19 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
     stays in its range.
     """
     effect = world.effects[name]
-    coefficients = effect_parameters(effect, world.simulator.system, world.channels)
     most = [c.most for c in effect.coefficients]
     return [
         _bounds(coefficient, effect, world, limit)
-        for coefficient, limit in zip(coefficients, most, strict=False)
+        for coefficient, limit in zip(world.parameters[world.slots[name]], most, strict=False)
     ]
+
+
+def bound_of(value: float, low: float, high: float) -> Bound | None:
+    """Which end of its range a fitted number lies at; None if it lies inside."""
+    near = AT_BOUND * (high - low)
+    if value <= low + near * (low != 0.0):
+        return "low"
+    return "high" if value >= high - near * (high != 0.0) else None
 
 
 def is_instant(coefficient: Parameter) -> bool:
@@ -55,6 +113,9 @@ def _bounds(
     # a shape: how often, how fast, how sharp
     if low > 0:
         return low, high
+    if coefficient.unit == "s":
+        # what takes longer than a run is a constant in it
+        return max(BEYOND * low, -longest), min(BEYOND * high, longest)
     # a part that grows with the square of a force sticks nowhere by itself
     dry = isinstance(effect, Friction) and not coefficient.unit.startswith(PER_FORCE)
     beyond = DRY if dry else BEYOND

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.gap.model.bounds import on_time_scale
 from bench.gap.model.crew import Crew
 from bench.gap.model.lane_cache import LaneCache
 from bench.gap.model.noise import Mask
@@ -149,6 +150,7 @@ class World:
         self.known: Mask = np.array([t.known for t in self.tracks])
         self.guess: Array = np.array([t.guess for t in self.tracks])
         self.longest = self._longest()
+        self.parameters = self._on_time_scale()
         self.clock = self._clock()
         self._travels: dict[str, float] = {}
         self.derivatives: Array | None = None
@@ -263,6 +265,15 @@ class World:
         # the type matters where there is none: places of an empty list would be floats
         return np.array(shifting, dtype=np.intp), np.array(filtering, dtype=np.intp)
 
+    def _on_time_scale(self) -> tuple[Parameter, ...]:
+        """The parameters, with coefficients whose ranges suit the duration and the sampling of the
+        runs.
+        """
+        first, spacing = self.base.size, self.spacing
+        coefficients = self.parameters[first:]
+        scaled = [on_time_scale(p, self.longest, spacing) for p in coefficients]
+        return (*self.parameters[:first], *scaled)
+
     @property
     def channels(self) -> list[str]:
         """Names of the recorded channels, in the order of observations."""
@@ -372,6 +383,7 @@ class World:
         )
         # what is periodic goes on from piece to piece, and what is found in one is found in all
         other.longest = self.longest
+        other.parameters = self.parameters
         other.clock = self.clock
         # found now: of pieces it would be another
         for name in self.channels:

@@ -26,6 +26,8 @@ from bench.gap.report.places import (
 from bench.gap.report.ranking import entries
 from bench.gap.report.story import Place, Shown, Side, Story, Tuned
 from bench.gap.report.words import (
+    END,
+    at_bound,
     clean,
     estimate,
     is_wrong,
@@ -38,7 +40,7 @@ from bench.gap.report.words import (
     sentence,
     with_unit,
 )
-from bench.gap.verdict import Cause, Heldout, Verdict
+from bench.gap.verdict import Cause, Heldout, RecordingFault, Verdict
 from sims.base import Array
 
 WIDTH = 100
@@ -57,7 +59,10 @@ MOST_CHANNELS = 6
 """Channels that a sentence names."""
 PERFECT = "with a perfect model the sensor's noise would leave"
 MOVED = 0.05
-"""Share by which a parameter moves that is called out where its interval is not known."""
+"""Relative change of a parameter that is reported as absorption where its interval is not known."""
+LEAST_MOVE = 1e-3
+"""Relative change of a parameter below which it has absorbed nothing, however narrow its interval.
+"""
 
 
 def account(story: Story) -> list[str]:
@@ -76,6 +81,9 @@ def account(story: Story) -> list[str]:
 def details(story: Story) -> Iterator[str]:
     """Paragraphs below the headline, a sentence or a few each."""
     verdict = story.verdict.verdict
+    if story.verdict.recording_faults:
+        yield effort(story)
+        return
     # What an effect does is said above the details already in these two.
     explained = verdict in ("named", "partial")
     for cause in story.verdict.causes:
@@ -113,6 +121,8 @@ def _says(cause: Cause) -> str:
 def headline(story: Story) -> str:
     """What is wrong with the simulator, in one sentence."""
     verdict, causes = story.verdict.verdict, story.verdict.causes
+    if story.verdict.recording_faults:
+        return sentence(story.verdict.recording_faults[0].says)
     if story.verdict.cut is not None:
         return _headline_of_cut(story.verdict)
     # No cause is said to be lacking where the verdict does not vouch for it.
@@ -127,6 +137,8 @@ def headline(story: Story) -> str:
         return f"Something is missing from the simulation, and {none}."
     if verdict == "ambiguous":
         return f"The simulation {lacks(causes)}: these data cannot tell which."
+    if verdict == "partial" and (open_ones := [c for c in causes if c.open_numbers]):
+        return f"The simulation {lacks(causes)}, but {_undetermined(open_ones)}."
     if verdict == "partial":
         more = "something else that no known cause explains"
         if len(causes) == 1 and (said := sized(causes[0])):
@@ -141,6 +153,47 @@ def headline(story: Story) -> str:
     if too_much(cause):
         return f"The simulation has too much {noun(cause.effect)}."
     return f"The simulation {lacks([replace(cause, alternatives=())])}: {_says(cause)}."
+
+
+def _undetermined(causes: Sequence[Cause]) -> str:
+    """Why causes are not named whose numbers are not results."""
+    numbers = [n for cause in causes for n in cause.open_numbers.values()]
+    at_bounds = [n for n in numbers if n.at_bound is not None]
+    if not at_bounds:
+        which = "its number" if len(numbers) == 1 else "all of its numbers"
+        return f"these data do not determine {which if len(causes) == 1 else 'all numbers'}"
+    first = at_bounds[0]
+    value = with_unit(number(first.value), first.unit)
+    return f"the fit ends at the {END[first.at_bound or 'high']} bound of its range, {value}"
+
+
+def undetermined(story: Story) -> Iterator[str]:
+    """Which numbers of the causes are not results, what that means, and what to do."""
+    found = [
+        (f"{clean(cause.effect, 60)}, {clean(key, 60)}", fitted)
+        for cause in story.verdict.causes
+        for key, fitted in cause.open_numbers.items()
+    ]
+    at_bounds = [(name, fitted) for name, fitted in found if fitted.at_bound is not None]
+    loose = [name for name, fitted in found if fitted.at_bound is None]
+    if at_bounds:
+        parts = [
+            f"{name}: {with_unit(number(fitted.value), fitted.unit)} is the "
+            f"{END[fitted.at_bound or 'high']} bound of its range"
+            for name, fitted in at_bounds
+        ]
+        longer = any(fitted.unit == "s" for _, fitted in at_bounds)
+        remedy = "; for a time, record longer runs" * longer
+        yield (
+            f"{'; '.join(parts)}. A value at a bound is not a result and has no interval: the data "
+            "ask for a value beyond it, or another cause acts in a similar way. Check units and "
+            f"constants of the recording{remedy}."
+        )
+    if loose:
+        yield (
+            f"{'; '.join(loose)}: the data give no finite interval, so the value is not a result. "
+            "Record a motion in which the effect is larger."
+        )
 
 
 def _also(causes: Sequence[Cause]) -> str:
@@ -184,6 +237,9 @@ def unfixed(story: Story) -> list[str]:
 def following(story: Story) -> Iterator[str]:
     """The sentences that follow the headline at once: the gain, and what the verdict owes."""
     verdict = story.verdict.verdict
+    if story.verdict.recording_faults:
+        yield from _of_faults(story.verdict.recording_faults)
+        return
     if story.verdict.cut is not None:
         yield cut(story)
     # To find nothing says little without what was looked for, and what could not have been seen.
@@ -191,6 +247,7 @@ def following(story: Story) -> Iterator[str]:
         yield looked_for(story)
         yield hiding(story)
     yield gain(story)
+    yield from undetermined(story)
     if verdict == "partial" or (verdict == "named" and len(story.verdict.causes) > 1):
         # The headline says what a single named cause does; here the others have their turn.
         sayings = [
@@ -200,6 +257,20 @@ def following(story: Story) -> Iterator[str]:
         yield sentence("; ".join(sayings))
     if verdict == "ambiguous":
         yield "To tell them apart: " + (experiment(story) or "no experiment is proposed.")
+
+
+def _of_faults(faults: Sequence[RecordingFault]) -> Iterator[str]:
+    """What supports a wrong unit or sign, what else would explain the data, and what to do."""
+    first, *others = faults
+    if first.error_after is not None:
+        before = f"from {number(first.error_before)} " if first.error_before is not None else ""
+        yield (
+            "With this correction the error of the tuned simulation on the fitted runs falls "
+            f"{before}to {number(first.error_after)} times the noise."
+        )
+    for text in (*first.alternatives, *(fault.says for fault in others)):
+        yield sentence(f"{'or' if text in first.alternatives else 'also'}: {text}")
+    yield "No causes were searched, since each would only imitate this. Correct it and run again."
 
 
 def gain(story: Story) -> str:
@@ -414,15 +485,27 @@ def moves(story: Story, p: Tuned) -> str:
         nominal = f"its nominal {number(p.before[0])}{unit}"
         return f"{name} is not touched by these data and stays at {nominal}."
     if not story.verdict.causes:
-        return f"{name} = {estimate(*p.before)}{unit}."
-    before, after = f"{estimate(*p.before)}{unit}", f"{estimate(*p.after)}{unit}"
+        return f"{name} = {tuned(p, 0)}."
+    before, after = tuned(p, 0), tuned(p, 1)
     end = ": it had absorbed part of the gap." if absorbed(p) else "."
     return f"{name} {before} before, {after} after ({shift(p)}){end}"
+
+
+def tuned(p: Tuned, when: int) -> str:
+    """A parameter's estimate before (0) or after (1), with its interval or the bound it lies at."""
+    value, bound = (p.before, p.after)[when], p.bounds[when]
+    if bound is not None:
+        return at_bound(value[0], p.unit, bound)
+    return with_unit(estimate(*value), p.unit)
 
 
 def shift(p: Tuned) -> str:
     """The move of a parameter as a signed percentage, or a number where it began at zero."""
     move = p.after[0] - p.before[0]
+    if not move:
+        return "unchanged"
+    if abs(move) < LEAST_MOVE * abs(p.before[0]):
+        return f"changes by less than {percent(LEAST_MOVE)}"
     sign = "+" if move > 0 else ""
     # Of zero there is no share, and "+4000 %" says less than the number.
     if not p.before[0] or abs(move / p.before[0]) > FAR:
@@ -431,14 +514,15 @@ def shift(p: Tuned) -> str:
 
 
 def absorbed(p: Tuned) -> bool:
-    """Whether a parameter moves out of the interval that the base model gives, or that the extended
-    one does.
+    """Whether a parameter changes significantly: by more than its two 95 % intervals allow for, and
+    by `LEAST_MOVE` at least.
     """
-    # Without intervals a move of some size has to do.
+    move = abs(p.after[0] - p.before[0])
+    # Without intervals a change of some size has to do.
     if not np.isfinite([*p.before, *p.after]).all():
-        return abs(p.after[0] - p.before[0]) > MOVED * abs(p.before[0])
-    (before, low, high), (after, low_after, high_after) = p.before, p.after
-    return not (low <= after <= high and low_after <= before <= high_after)
+        return move > MOVED * abs(p.before[0])
+    before, after = ((high - low) / 2.0 for _, low, high in (p.before, p.after))
+    return bool(move > np.hypot(before, after) and move >= LEAST_MOVE * abs(p.before[0]))
 
 
 def experiment(story: Story) -> str:

@@ -13,7 +13,7 @@ from bench.gap.report.account import coefficients, experiment
 from bench.gap.report.agreement import told
 from bench.gap.report.story import Story
 from bench.gap.report.words import clean, noun, sentence
-from bench.pages.elements import folded, listed, paragraph, safe, strong
+from bench.pages.elements import code, folded, listed, paragraph, safe, strong
 
 FEW_LINES = 12
 """Changes of a model file that stand open; more are behind a click."""
@@ -28,11 +28,26 @@ def advice(story: Story, folder: Path | None) -> Iterator[str]:
         story: what is told.
         folder: that the explanation is written to; None for a notebook's.
     """
+    if story.verdict.recording_faults:
+        yield from _corrections(story)
+        return
     yield from _experiment(story)
     yield from _numbers(story)
     yield from changes(story)
     yield from _models(story, folder)
     yield from _further(story)
+
+
+def _corrections(story: Story) -> Iterator[str]:
+    """The lines of the description that correct a wrong unit or sign, and the command to repeat."""
+    file = story.path.with_suffix(".toml").name
+    for fault in story.verdict.recording_faults:
+        yield paragraph(safe(sentence(fault.says), 1000))
+        if fault.lines:
+            yield paragraph(f"In {safe(file, 200)}:")
+            yield listed(code(safe(line, 200)) for line in fault.lines)
+    yield paragraph("Then explain the recording again:")
+    yield command("simgap", "explain", _recording(story))
 
 
 def _experiment(story: Story) -> Iterator[str]:

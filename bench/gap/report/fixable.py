@@ -1,19 +1,59 @@
-"""The report's section on what the recording can fix at all, before any verdict."""
+"""The report's section on what the recording can determine, before any verdict: a sentence, the
+free numbers, and a matrix of the causes; every number behind a click.
+
+What the verdict has found is determined, whatever the score about the base model says of it, and
+members of its sets are marked as such: the section must not contradict the headline.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from bench.gap.identify import Number
 from bench.gap.report.story import Story
-from bench.gap.report.words import joined, number
-from bench.pages.elements import code, paragraph, safe, table
+from bench.gap.report.words import FAMILY, clean, joined, kind_of, name_of, noun, number, parted
+from bench.gap.verdict import Cause
+from bench.pages.elements import code, folded, paragraph, safe, strong, table
 
-MOST = 12
-"""Causes of one kind that are named."""
+MOST = 6
+"""Names in a cell, or in a list, before the others are counted."""
 _HEADS = ("number", "can it be fixed", "95 % interval", "of its range", "mixed up with")
+_STANDINGS = ("found", "set", "identifiable", "weak", "not identifiable")
+"""What can be said of a cause, the surest first."""
+_SIGNS: Mapping[str, str] = {
+    "found": "★",
+    "set": "☆",
+    "identifiable": "●",
+    "weak": "◐",
+    "not identifiable": "○",
+}
+"""Each in a cell of the matrix."""
+_LEGEND: Mapping[str, str] = {
+    "found": "found by the verdict",
+    "set": "explains the data as well as what was found",
+    "identifiable": "could be determined",
+    "weak": "only roughly",
+    "not identifiable": "not to be seen, whether it acts or not",
+}
+_KINDS = {"joint": "joints", "actuator": "actuators", "body": "bodies", "channel": "channels"}
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A cause with what can be said of it.
+
+    Attributes:
+        number: what the recording can say of it.
+        effect: its registered name.
+        standing: of `_STANDINGS`.
+    """
+
+    number: Number
+    effect: str
+    standing: str
 
 
 def fixable(story: Story) -> Iterator[str]:
@@ -21,59 +61,150 @@ def fixable(story: Story) -> Iterator[str]:
     numbers = story.fixable
     if not numbers:
         return
-    yield paragraph(safe(counted(numbers)))
+    rows = _rows(story)
+    yield paragraph(safe(counted(story)))
     free = [one for one in numbers if one.free]
     if free:
-        yield table(_HEADS, [_row(one) for one in free])
-    causes = [one for one in numbers if not one.free]
-    hidden = [one.name for one in causes if one.word == "not identifiable"]
-    if hidden:
-        yield paragraph(f"Not to be seen here, whether it acts or not: {_named(hidden)}.")
-    weak = [one.name for one in causes if one.word == "weak"]
-    if weak:
-        yield paragraph(f"Only roughly: {_named(weak)}.")
-    alike = list(_alike(causes))
-    if alike:
-        told = "; ".join(f"{_named(names)}" for names in alike[:MOST])
-        more = f"; and {len(alike) - MOST} more sets" if len(alike) > MOST else ""
-        yield paragraph(f"Hardly to be told from each other, by their first effects: {told}{more}.")
+        yield table(_HEADS, [_cells(one, one.word) for one in free])
+    there = [s for s in _STANDINGS if any(row.standing == s for row in rows)]
+    yield paragraph(safe("; ".join(f"{_SIGNS[s]} {_LEGEND[s]}" for s in there)), "soft")
+    placed = [row for row in rows if _place(row)]
+    telling, plain = _told_apart(placed)
+    yield from _matrices(telling)
+    if others := [row for row in rows if not _place(row)]:
+        yield _families(others)
+    if plain:
+        effects = len({parted(row.effect)[0] for row in plain})
+        head = f"{effects} effects {'more ' * bool(telling)}that could be determined at every place"
+        yield folded(head, "\n".join(_matrices(plain)))
+    ordered = sorted(rows, key=lambda row: _STANDINGS.index(row.standing))
+    every = table(_HEADS, [_cells(row.number, _LEGEND[row.standing]) for row in ordered])
+    yield folded(f"All {len(rows)} causes with their intervals", every)
 
 
-def counted(numbers: Sequence[Number]) -> str:
-    """One sentence."""
-    causes = [one for one in numbers if not one.free]
-    sure, weak = (sum(one.word == word for one in causes) for word in ("identifiable", "weak"))
-    return (
-        f"Of {len(causes)} causes, each by itself, this recording can fix {sure} well, {weak} "
-        f"roughly and {len(causes) - sure - weak} not at all."
+def _told_apart(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]]:
+    """The rows of effects with something to tell, and those of effects that could be determined at
+    every place.
+    """
+    telling = {parted(r.effect)[0] for r in rows if r.standing != "identifiable"}
+    first = [row for row in rows if parted(row.effect)[0] in telling]
+    return first, [row for row in rows if parted(row.effect)[0] not in telling]
+
+
+def _matrices(rows: Sequence[_Row]) -> Iterator[str]:
+    """A matrix for each kind of places."""
+    for kind in dict.fromkeys(kind_of(row.effect) for row in rows):
+        yield _matrix([row for row in rows if kind_of(row.effect) == kind], kind)
+
+
+def counted(story: Story) -> str:
+    """How many causes can be determined, and what was found among them."""
+    rows = _rows(story)
+    words = [str("identifiable" if r.standing == "found" else r.number.word) for r in rows]
+    counts = {s: words.count(s) for s in _STANDINGS[2:]}
+    sentence = (
+        f"Of {len(rows)} causes, each by itself, this recording can determine "
+        f"{counts['identifiable']} well, {counts['weak']} roughly and "
+        f"{counts['not identifiable']} not at all."
     )
+    found = [f"{noun(c.effect)} ({clean(c.effect, 60)})" for c in _causes(story)]
+    return f"{sentence} Found: {joined(found)}." if found else sentence
 
 
-def _row(one: Number) -> list[str]:
-    half = f"±{number(one.half)} {one.unit}".rstrip() if np.isfinite(one.half) else "–"
+def _causes(story: Story) -> list[Cause]:
+    """Causes that the verdict vouches for."""
+    vouched = story.verdict.verdict in ("named", "ambiguous", "partial")
+    return list(story.verdict.causes) if vouched else []
+
+
+def _rows(story: Story) -> list[_Row]:
+    """The causes in the order of the numbers, with the verdict's own marked."""
+    found: dict[str, str] = {}
+    for cause in _causes(story):
+        for name in (cause.effect, *cause.alternatives):
+            standing = "set" if cause.alternatives else "found"
+            found.setdefault(name, standing)
+            # Of a family, the members with a number of their own.
+            for key in cause.coefficients if name == cause.effect else ():
+                if place := parted(key)[1]:
+                    found.setdefault(f"{parted(name)[0]}@{place}", standing)
+    rows = []
+    for one in story.fixable:
+        if not one.free:
+            effect = one.name.partition(" ")[0]
+            rows.append(_Row(one, effect, found.get(effect, one.word)))
+    return rows
+
+
+def _place(row: _Row) -> str:
+    place = parted(row.effect)[1]
+    return "" if place == FAMILY else place
+
+
+def _best(rows: Sequence[_Row]) -> _Row:
+    return min(rows, key=lambda row: _STANDINGS.index(row.standing))
+
+
+def _matrix(rows: Sequence[_Row], kind: str) -> str:
+    """Effects by places of one kind."""
+    places = list(dict.fromkeys(_place(row) for row in rows))
+    by_effect: dict[str, dict[str, list[_Row]]] = {}
+    for row in rows:
+        by_place = by_effect.setdefault(parted(row.effect)[0], {})
+        by_place.setdefault(_place(row), []).append(row)
+
+    def order(item: tuple[str, dict[str, list[_Row]]]) -> list[int]:
+        return sorted(_STANDINGS.index(_best(own).standing) for own in item[1].values())
+
+    body = []
+    for effect, by_place in sorted(by_effect.items(), key=order):
+        cells = [_sign(by_place[p]) if p in by_place else "" for p in places]
+        body.append([f"{safe(name_of(effect), 60)} {code(safe(effect, 60))}", *cells])
+    heads = [safe(f"{_KINDS.get(kind, 'places')}:"), *(safe(place, 30) for place in places)]
+    return f'<div class="matrix">{table(heads, body)}</div>'
+
+
+def _sign(rows: Sequence[_Row]) -> str:
+    """A cell of the matrix: its sign, and in words what it says."""
+    best = _best(rows)
+    said = f"{best.effect}: {_LEGEND[best.standing]}{_interval(best.number, ', ')}"
+    label = safe(said, 200)
+    sign = f'<span title="{label}" role="img" aria-label="{label}">{_SIGNS[best.standing]}</span>'
+    return strong(sign) if best.standing in ("found", "set") else sign
+
+
+def _families(rows: Sequence[_Row]) -> str:
+    """Causes without a place: families of effects by how well they can be determined."""
+    columns = [s for s in _STANDINGS if any(row.standing == s for row in rows)]
+    families: dict[str, dict[str, list[str]]] = {}
+    for row in rows:
+        own = families.setdefault(row.effect.partition(".")[0], {})
+        own.setdefault(row.standing, []).append(row.effect)
+    body = []
+    for family, own in families.items():
+        cells = []
+        for column in columns:
+            names = list(dict.fromkeys(own.get(column, ())))
+            shown = _names(names)
+            cells.append(strong(shown) if names and column in ("found", "set") else shown)
+        body.append([safe(family, 40), *cells])
+    heads = ["family", *(f"{_SIGNS[s]} {_LEGEND[s]}" for s in columns)]
+    return table(heads, body)
+
+
+def _names(effects: Sequence[str]) -> str:
+    shown = ", ".join(safe(name_of(effect), 60) for effect in effects[:MOST])
+    more = len(effects) - MOST
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
+def _interval(one: Number, before: str = "") -> str:
+    return f"{before}±{number(one.half)} {one.unit}".rstrip() if np.isfinite(one.half) else ""
+
+
+def _cells(one: Number, word: str) -> list[str]:
+    """A row of a table of numbers."""
     span = f"{number(one.low)} to {number(one.high)}"
     mixed = joined([f"{name} ({corr:.2f})" for name, corr in one.mixed]) if one.mixed else "–"
-    return [code(safe(one.name, 60)), one.word, safe(half), safe(span), safe(mixed)]
-
-
-def _named(names: Sequence[str]) -> str:
-    """Names as they are registered, the first ones, and how many more."""
-    each = list(dict.fromkeys(names))
-    said = ", ".join(code(safe(name, 60)) for name in each[:MOST])
-    more = len(each) - MOST
-    return f"{said} and {more} more" if more > 0 else said
-
-
-def _alike(causes: Sequence[Number]) -> Iterator[list[str]]:
-    """Sets of causes that are mixed up, each cause in one set."""
-    names = {one.name for one in causes if one.word != "not identifiable"}
-    by_effect = {one.name.partition(" ")[0]: one for one in causes}
-    told: set[str] = set()
-    for one in causes:
-        own = one.name.partition(" ")[0]
-        if one.name not in names or own in told:
-            continue
-        others = [other for other, _ in one.mixed if other in by_effect and other not in told]
-        if others:
-            told |= {own, *others}
-            yield [own, *others]
+    return [code(safe(one.name, 60)), safe(word), safe(_interval(one)) or "–", safe(span),
+            safe(mixed)]  # fmt: skip

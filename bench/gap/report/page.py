@@ -63,6 +63,10 @@ _CUT = {
     "unknown": "unknown: the search was ended early",
 }
 """The same where the search was ended early."""
+_FAULTY = "unknown: a unit or a sign of the recording is wrong"
+"""The same where the recording is at fault."""
+_OPEN = "partial: a cause is found, but its number lies at a bound or has no interval"
+"""The same where numbers of the causes are not results."""
 _CAPTIONS = {
     "robot": (
         "The robot in the run below, where it is furthest from its beginning. Blue marks are "
@@ -138,7 +142,8 @@ def page(story: Story, drawn: Mapping[str, Printed], folder: Path | None = None)
     made.section("numbers", "What was found, in numbers", *numbers(story))
     made.section("parameters", "The simulator's own parameters", *parameters(story))
     made.section("trust", "Which number to trust", *agreement(story))
-    made.section("remains", "What remains", *remains(story))
+    faulty = bool(story.verdict.recording_faults)
+    made.section("remains", "What remains", *(() if faulty else remains(story)))
     made.section("reading", "How to read this", *reading())
     return made.html()
 
@@ -148,6 +153,10 @@ def _opening(story: Story) -> Iterator[str]:
     yield "<header>\n" + paragraph(safe(story.title), "recording")
     verdict = story.verdict
     badge = _BADGES[verdict.verdict] if verdict.cut is None else _CUT[verdict.verdict]
+    if verdict.recording_faults:
+        badge = _FAULTY
+    elif verdict.cut is None and verdict.has_open_numbers:
+        badge = _OPEN
     yield paragraph(f'<span class="badge">{badge}</span>')
     yield f"<h1>{safe(headline(story))}</h1>"
     for text in following(story):

@@ -9,11 +9,10 @@ from math import isfinite
 
 import numpy as np
 
-from bench.gap.report.account import absorbed, rms, shift
+from bench.gap.report.account import absorbed, rms, shift, tuned
 from bench.gap.report.places import of_set, values_of, without_place
 from bench.gap.report.story import Place, Side, Story, Tuned
 from bench.gap.report.words import (
-    estimate,
     joined,
     noun,
     number,
@@ -149,24 +148,25 @@ def parameters(story: Story) -> Iterator[str]:
         heads.append("before above, after below")
     rows = []
     for p in story.parameters:
-        row = [safe(p.name, 60), _tuned(p, p.before)]
+        row = [safe(p.name, 60), _tuned(p, 0)]
         if extended:
-            row += [_tuned(p, p.after), safe(_move(p)), _intervals(p)]
+            row += [_tuned(p, 1), safe(_move(p)), _intervals(p)]
         rows.append(row)
     yield table(heads, rows)
 
 
-def _tuned(p: Tuned, value: tuple[float, float, float]) -> str:
+def _tuned(p: Tuned, when: int) -> str:
+    """A parameter before (0) or after (1)."""
     # What the data do not touch was not estimated: it is no number of theirs.
     if not p.touched:
-        return safe(with_unit(number(value[0]), p.unit)) + ", nominal: not touched by the data"
-    return safe(with_unit(estimate(*value), p.unit))
+        return safe(with_unit(number(p.before[0]), p.unit)) + ", nominal: not touched by the data"
+    return safe(tuned(p, when))
 
 
 def _move(p: Tuned) -> str:
     if not p.touched:
         return "–"
-    how = "had absorbed part of the gap" if absorbed(p) else "within its interval"
+    how = "had absorbed part of the gap" if absorbed(p) else "not significant"
     return f"{shift(p)}, {how}"
 
 

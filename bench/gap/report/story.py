@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from bench.gap.apart import Apart
 from bench.gap.identify import Number
+from bench.gap.model.bounds import Bound
 from bench.gap.verdict import Verdict
 from sims.base import Array
 
@@ -94,7 +95,7 @@ class Profile:
 @dataclass(frozen=True)
 class Tuned:
     """A parameter before and after the extension, each with its 95 % interval (NaN where the data
-    give none).
+    give none), and which end of its range it lies at, before and after.
     """
 
     name: str
@@ -102,6 +103,7 @@ class Tuned:
     before: tuple[float, float, float]
     after: tuple[float, float, float]
     touched: bool
+    bounds: tuple[Bound | None, Bound | None] = (None, None)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ from sims import effects
 from sims.base import InputError
 from sims.extended import Number
 
+END = {"low": "lower", "high": "upper"}
+"""What an end of a range is called."""
 FAMILY = "*"
 """The place of a family: all of one kind."""
 _AT = {
@@ -148,5 +150,12 @@ def with_unit(text: str, unit: str) -> str:
 
 
 def estimated(fitted: Number) -> str:
-    """A fitted number with its interval and its unit."""
+    """A fitted number with its interval and its unit, or which bound it lies at."""
+    if fitted.at_bound is not None:
+        return at_bound(fitted.value, fitted.unit, fitted.at_bound)
     return with_unit(estimate(fitted.value, fitted.low, fitted.high), fitted.unit)
+
+
+def at_bound(value: float, unit: str, bound: str) -> str:
+    """``4 s (upper bound of its range)``."""
+    return f"{with_unit(number(value), unit)} ({END[bound]} bound of its range)"

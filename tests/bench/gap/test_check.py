@@ -1,5 +1,7 @@
 """The check before the fit: what it calls identifiable is, and what is mixed up is named."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -67,7 +69,7 @@ def test_a_motion_that_does_not_happen_fixes_nothing(tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["inspect", str(path), "--check", "--out", str(out)]) == 1
     said = capsys.readouterr().out
-    assert "not identifiable free  mass" in said
+    assert "  not identifiable mass: " in said
 
 
 def test_what_is_mixed_up_is_named(tmp_path, capsys):
@@ -81,7 +83,7 @@ def test_what_is_mixed_up_is_named(tmp_path, capsys):
     assert main(["inspect", str(path), "--check", "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert "mixed up with" in said
-    assert "  not identifiable cause input.gain" in said
+    assert re.search(r"\n  not identifiable: .*input\.gain", said)
 
 
 def test_free_numbers_are_asked_about_with_the_check_alone(tmp_path, capsys):
@@ -92,8 +94,16 @@ def test_free_numbers_are_asked_about_with_the_check_alone(tmp_path, capsys):
         check(tmp_path / "none.csv")
 
 
-def test_many_causes_are_counted(tmp_path):
+def test_of_many_causes_the_surest_are_listed_and_the_others_counted(tmp_path):
     numbers = check(recorded(tmp_path))
+    causes = [n for n in numbers if not n.free]
     lines = told(numbers, most=3)
-    assert lines[4].startswith("  ... and ")
-    assert lines[-1].startswith("causes: ")
+    sure = [n.name for n in causes if n.word == "identifiable"]
+    assert len(sure) > 6
+    assert f"{len(sure)} identifiable" in lines[2]
+    # Each has an interval, and none is wider than those after it.
+    assert all("identifiable     " in line and "±" in line for line in lines[3:6])
+    assert lines[6].startswith("  identifiable too: ")
+    assert lines[6].endswith(" more")
+    assert lines[-1].endswith("the same command with --json")
+    assert len("\n".join(lines)) < 1500

@@ -82,7 +82,7 @@ def test_it_errs_by_the_noise_where_its_cause_is_true(arm, tmp_path):
 
 def test_freed_numbers_and_numerics_are_written(arm):
     free = robot(EXAMPLE / "arm2.xml", free=["damping@*", "ipos@forearm"])
-    freed = {p.name: Number(0.01, p.unit, None, None) for p in free.parameters}
+    freed = {p.name: Number(0.01, p.unit, 0.009, 0.011) for p in free.parameters}
     free.numerics = Numerics(0.001, "implicitfast")
     causes = causes_of(extended_of(free, freed, FRICTION))
     assert set(causes["mass.offset@forearm"]) == {"x", "y", "z"}

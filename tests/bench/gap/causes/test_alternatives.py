@@ -110,18 +110,13 @@ def test_what_one_of_two_signs_gains_by_chance_is_no_reason_about_a_robot(
 ):
     """What has shapes to choose from pays for them."""
     search = search_of(model(), BEST, model("b", merit=100.0 - 3.0 * SWITCH))
-    system = SimpleNamespace(channels=())
     search.world = SimpleNamespace(
         effects={"a": placed(), "b": placed()},
         linear=True,
-        channels=(),
-        simulator=SimpleNamespace(system=system),
+        parameters=[SimpleNamespace(bounds=(least, 1.0))] * 2,
+        slots={"a": slice(0, 1), "b": slice(1, 2)},
     )
     search.chance_of = {"a": 0.0, "b": 3.0 * SWITCH}.get
-    monkeypatch.setattr(
-        "bench.gap.causes.alternatives.effect_parameters",
-        lambda *_: [SimpleNamespace(bounds=(least, 1.0))],
-    )
     monkeypatch.setattr(Alternatives, "_is_plausible", lambda self, effect: True)
     monkeypatch.setattr(Alternatives, "_p_value", lambda self, rest, effect, gain: 0.0)
     (found,) = Alternatives(search, None, structure=False).evidence(BEST)

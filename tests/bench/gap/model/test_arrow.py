@@ -76,3 +76,17 @@ def test_damping_shortens_the_step_and_what_it_promises(known):
     )
     assert np.abs(smaller.shared).max() < 0.5 * np.abs(whole.shared).max()
     assert smaller.promised < whole.promised
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e9, 1e12])
+def test_a_step_does_not_depend_on_the_units_of_the_parameters(factor):
+    """An outlet in m^2 and a lag in s: curvatures that differ by more than double precision."""
+    residual, jacobian, drift, prior, known = equations([False, False])
+    args = 3, drift, prior, known, 0.0, NONE
+    plain = arrow_step(residual, jacobian, *args)
+    scaled = jacobian.copy()
+    scaled[..., 1] *= factor
+    step = arrow_step(residual, scaled, *args)
+    expected = plain.shared * np.array([1.0, 1.0 / factor, 1.0])
+    np.testing.assert_allclose(step.shared, expected, rtol=1e-5)
+    np.testing.assert_allclose(step.own, plain.own, rtol=1e-5)

@@ -1,0 +1,533 @@
+"""Recognise a wrong unit or a reversed sign of recorded signals before causes are searched.
+
+A column in another unit than its description states is off by a known factor, which no effect of
+the library should explain. Each hypothesis multiplies one signal, or several that share a mistake,
+by such a factor k, or by -1; the base model is fitted again to the rescaled recording. With e the
+RMS of the residual in units of the noise, less one, the hypothesis holds if
+
+    e(k) <= REMAINING e(1),    e(k) < e(k / STEP),    e(k) < e(k STEP)                          (1)
+
+that is, if it removes most of the misfit, and if other factors do not do as well. What it leaves
+may have causes of its own, which move the best factor a little; but if a factor within 4 % of k
+leaves less than a third, it is a gain, of 6.0 say, where turns would be 2 pi. Parameters may absorb
+the scale of an input; there a factor of zero, which switches the input off, must do clearly worse.
+Nothing is tried unless the base model misses some channel by more than `GROSS` of what it moves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from bench.gap.model.base_fit import HORIZONS, Base, fit_base, misfit_of_starts
+from bench.gap.model.bounds import bound_of
+from bench.gap.model.floor import noise_floor
+from bench.gap.model.noise import Noise
+from bench.gap.model.problem import Fit
+from bench.gap.model.world import World
+from bench.gap.verdict import Cause, RecordingFault
+from sims.base import Array, InputError
+from sims.recording.description import stated_columns
+from sims.recording.recording import Recording, Run
+from sims.simulated import Simulated
+
+GROSS = 0.1
+"""Residual of the base model, as a share of the standard deviation of a channel, from which units
+are questioned. A gain error of 5 % stays below it."""
+REMAINING = 0.3
+"""Share of the misfit that a correct unit leaves at most."""
+STEP = 1.25
+"""Factor by which a hypothesis is changed to see whether another factor fits as well."""
+NEAR = 1.04
+"""A smaller change, to see whether a factor that is no unit explains the data far better."""
+FAR_BETTER = 1.0 / 3.0
+"""Share of the misfit of a hypothesis that such a factor leaves."""
+FOLLOWED = 0.2
+"""Residual, as a share of what a channel moves, that a hypothesis leaves at most."""
+EXPLAINED = 1.5
+"""RMS in units of the noise from which on a hypothesis leaves nothing to explain."""
+EQUAL = 1.05
+"""Misfits whose ratio is smaller cannot be told apart."""
+SHARP = 7.0
+"""Twice the log likelihood by which a factor must fit better than others near it."""
+OFF = 1e-6
+"""Factor that switches an input off."""
+WORSE = 3.0
+"""Factor by which the misfit must be larger without an input than with it."""
+TRIED = 2
+"""Hypotheses that are fitted: the best before a fit by the beginning of the runs, and the best by
+all of them."""
+SCREENED = 12
+"""Hypotheses that are simulated over all of the runs, of those that fit their beginning best."""
+WORST = 3
+"""Channels of a robot with the largest misfit whose joints are questioned."""
+CLOSE = 0.02
+"""Relative difference of a fitted gain from a conversion of units that is taken for it."""
+IGNORED = 0.1
+"""Magnitude of a fitted sensor gain below which the reading hardly depends on the simulation."""
+
+BEGINNING = HORIZONS[0].share
+"""The first share of each run, by which hypotheses are screened."""
+_BEYOND = "parameter {} lies beyond the bounds of its range"
+"""What would explain a recording as well whose base fit ends at a bound."""
+_DEGREE = math.pi / 180.0
+_GRAVITY = 9.80665
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "rad": {"rad": 1.0, "deg": _DEGREE, "mrad": 1e-3, "turn": 2.0 * math.pi},
+    "rad/s": {
+        "rad/s": 1.0,
+        "deg/s": _DEGREE,
+        "rpm": math.pi / 30.0,
+        "turn/s": 2.0 * math.pi,
+    },
+    "rad/s^2": {"rad/s^2": 1.0, "deg/s^2": _DEGREE},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "m/s^2": {"m/s^2": 1.0, "g_0": _GRAVITY, "mm/s^2": 1e-3},
+    "N": {"N": 1.0, "kgf": _GRAVITY, "mN": 1e-3, "kN": 1e3},
+    "N*m": {"N*m": 1.0, "kgf*m": _GRAVITY, "N*cm": 1e-2, "mN*m": 1e-3, "kN*m": 1e3},
+    "V": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
+    "A": {"A": 1.0, "mA": 1e-3, "kA": 1e3},
+}
+"""By SI unit, the units that people record in, and their gains."""
+_TOGETHER = (
+    {"rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2"},
+    {"rad": "turn", "rad/s": "turn/s"},
+    {"m": "mm", "m/s": "mm/s", "m/s^2": "mm/s^2"},
+    {"m": "cm", "m/s": "cm/s"},
+)
+"""Units that a whole log is in, by SI unit."""
+_WORDS = {
+    "deg": "degrees",
+    "deg/s": "degrees per second",
+    "rad": "radians",
+    "rad/s": "radians per second",
+    "mrad": "milliradians",
+    "turn": "turns",
+    "turn/s": "turns per second",
+    "rpm": "revolutions per minute",
+    "m": "metres",
+    "mm": "millimetres",
+    "cm": "centimetres",
+    "g_0": "multiples of standard gravity",
+}
+"""Units in words."""
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A recorded channel or input.
+
+    Attributes:
+        name: of the column.
+        kind: ``channels`` or ``inputs``, its table in the description.
+        si: unit that the simulator has.
+        stated: unit that the description states.
+        gain: by which the numbers of the column become SI.
+        scale: the part of it that the description states as a factor of its own.
+    """
+
+    name: str
+    kind: str
+    si: str
+    stated: str
+    gain: float
+    scale: float = 1.0
+
+    @property
+    def said(self) -> str:
+        """``channel q``."""
+        return f"{self.kind.removesuffix('s')} {self.name}"
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Signals whose numbers are in other units than stated, or have the other sign.
+
+    Attributes:
+        signals: which ones.
+        units: that their numbers are in; the stated one where a factor alone is wrong.
+        scale: factor besides that of the units, of all of them.
+    """
+
+    signals: tuple[Signal, ...]
+    units: tuple[str, ...]
+    scale: float = 1.0
+
+    def factors(self) -> dict[str, float]:
+        """By signal, what its SI values have to be multiplied by."""
+        pairs = zip(self.signals, self.units, strict=True)
+        return {s.name: self.scale * _gain(s, unit) / s.gain for s, unit in pairs}
+
+    def fault(self, file: str, before: float | None, after: float | None) -> RecordingFault:
+        """What the user is told."""
+        factors = self.factors()
+        lines = []
+        for signal, unit in zip(self.signals, self.units, strict=True):
+            name = f'"{signal.name}"' if "." in signal.name else signal.name
+            keys = [f'unit = "{unit}"'] * (unit != signal.stated)
+            keys += [f"scale = {self._scale(signal):.9g}"] * (self._scale(signal) != 1.0)
+            lines.append(f"[{signal.kind}.{name}] {', '.join(keys)}")
+        return RecordingFault(
+            tuple(signal.name for signal in self.signals),
+            factors[self.signals[0].name],
+            self.units[0] if self.units[0] != self.signals[0].stated else None,
+            self._says(file, factors),
+            tuple(lines),
+            before,
+            after,
+        )
+
+    def _scale(self, signal: Signal) -> float:
+        """The key `scale` of a signal's table, of which one may be stated already."""
+        return self.scale * signal.scale
+
+    def _says(self, file: str, factors: Mapping[str, float]) -> str:
+        first, unit = self.signals[0], self.units[0]
+        names = _listed([signal.said for signal in self.signals])
+        table = f"[{first.kind}.{first.name}]" if len(self.signals) == 1 else "the tables of each"
+        scale = f"set scale = {self._scale(first):.9g} in {table} of {file}"
+        if unit == first.stated and self.scale == -1.0:
+            return f"The sign of {names} looks reversed: {scale}"
+        if unit == first.stated:
+            return f"The recorded numbers of {names} look converted twice: {scale}"
+        turned = f"; the sign is reversed too: {scale}" if self.scale < 0 else ""
+        words, stated = _WORDS.get(unit, unit), _WORDS.get(first.stated, first.stated)
+        wanted = dict.fromkeys(f'unit = "{one}"' for one in self.units)
+        return (
+            f"The recorded numbers of {names} look like {words}, stated as {stated} "
+            f"(factor {abs(factors[first.name]):.4g}): set {' and '.join(wanted)} in {table} of "
+            f"{file}{turned}"
+        )
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is checked.
+
+    Attributes:
+        kind: the simulator's class.
+        recording: the whole recording, as its description states it.
+        engine: the engine's name.
+        free: constants that are estimated with the parameters.
+    """
+
+    kind: type[Simulated]
+    recording: Recording
+    engine: str | None
+    free: tuple[str, ...] = ()
+
+    @property
+    def file(self) -> str:
+        """Name of the description."""
+        return self.recording.path.with_suffix(".toml").name
+
+    def signals(self, channels: Sequence[str]) -> tuple[Signal, ...]:
+        """The recorded signals, as stated."""
+        try:
+            stated = stated_columns(self.recording.path, self.kind)
+        except InputError:
+            # made in memory, in SI units
+            stated = {}
+        inputs = [c for c in self.kind.inputs if c.name in self.recording.runs[0].inputs]
+        own = [c for c in self.kind.channels if c.name in channels]
+        found = []
+        for kind, declared in (("channels", own), ("inputs", inputs)):
+            for c in declared:
+                found.append(Signal(c.name, kind, c.unit, *stated.get(c.name, (c.unit, 1.0, 1.0))))
+        return tuple(found)
+
+    def rescaled(self, factors: Mapping[str, float]) -> Recording:
+        """The recording with signals multiplied."""
+        recording = self.recording
+        noise = {n: abs(factors.get(n, 1.0)) * s for n, s in recording.noise.items()}
+        runs = tuple(_rescaled(run, factors) for run in recording.runs)
+        return replace(recording, noise=noise, runs=runs)
+
+    def world(self, recording: Recording) -> World:
+        """Its runs for fitting, without any effect."""
+        return World(
+            self.kind, recording, recording.training(), self.engine, (), self.free, candidates=()
+        )
+
+
+def wrong_units(subject: Subject, world: World, noise: Noise, base: Base) -> RecordingFault | None:
+    """The wrong unit or sign that explains nearly all of the misfit of the base model; None where
+    there is none, or nothing is grossly wrong.
+
+    Args:
+        subject: what is explained.
+        world: its runs for fitting.
+        noise: of each channel.
+        base: the fitted base model.
+    """
+    seen = np.isfinite(world.observed)
+    residual = np.where(seen, world.observed - base.fit.simulated, 0.0)
+    shares = _shares(world, residual, noise)
+    if not (shares > GROSS).any():
+        return None
+    before = _rms(residual, seen, noise)
+    known = before if np.isfinite(before) else None
+    signals = subject.signals(world.channels)
+    asked = list(_hypotheses(signals, _suspects(world, shares)))
+    excess = REMAINING * (before - 1.0)
+    good: list[tuple[Hypothesis, float]] = []
+    others: list[str] = []
+    for one in _promising(subject, asked):
+        after, missed = _fitted(subject, one.factors())
+        if after - 1.0 > excess or missed > FOLLOWED:
+            continue
+        how = _distinction(subject, one, after, int(seen.sum()))
+        if how == "sharp":
+            good.append((one, after))
+        elif how == "absorbed":
+            good.append((one, after))
+            others += [_BEYOND.format(name) for name in _ends(world, base.fit)]
+    if not good:
+        return None
+    # The simplest of those that fit equally well.
+    least = min(after for _, after in good)
+    alike = [pair for pair in good if pair[1] <= EQUAL * least]
+    alike.sort(key=lambda pair: (len(pair[0].signals), pair[0].scale != 1.0))
+    (best, after), *others_alike = alike
+    # Where the sign of a signal does not matter, nothing is wrong with it.
+    same = best.signals, best.units
+    rest = [pair for pair in others_alike if (pair[0].signals, pair[0].units) != same]
+    others = [*(one.fault(subject.file, None, None).says for one, _ in rest), *others]
+    alternatives = tuple(dict.fromkeys(others))
+    return replace(best.fault(subject.file, known, after), alternatives=alternatives)
+
+
+def recognised(subject: Subject, world: World, cause: Cause, base: Fit) -> RecordingFault | None:
+    """The wrong unit or sign that a fitted gain of a sensor or an input stands for; None if it
+    stands for none.
+
+    A reading that hardly depends on the simulation is not an answer either.
+
+    Args:
+        subject: what is explained.
+        world: its runs for fitting.
+        cause: what was found.
+        base: the base model: a parameter at a bound may be what the gain stands for.
+    """
+    effect = cause.effect.partition("@")[0]
+    if effect not in ("sensor.gain", "input.gain") or len(cause.coefficients) != 1:
+        return None
+    (coefficient,) = cause.coefficients.values()
+    gain = 1.0 + coefficient.value
+    named = world.effects[cause.effect].signal
+    kind = "channels" if effect == "sensor.gain" else "inputs"
+    own = [s for s in subject.signals(world.channels) if s.kind == kind]
+    usual = world.simulator.system.reading(world.channels) if kind == "channels" else ""
+    signal = next((s for s in own if s.name == (named or usual)), own[0] if own else None)
+    if signal is None or not gain:
+        return None
+    # What is recorded is gain times what there is; what acts is gain times what is commanded.
+    factor = 1.0 / gain if kind == "channels" else gain
+    for one in _of_one((signal,)):
+        wanted = one.factors()[signal.name]
+        if wanted * factor > 0 and abs(math.log(wanted / factor)) < CLOSE:
+            others = tuple(_BEYOND.format(name) for name in _ends(world, base))
+            return replace(one.fault(subject.file, None, None), alternatives=others)
+    if kind == "channels" and abs(gain) < IGNORED:
+        says = (
+            f"The fit makes {signal.said} nearly independent of the simulation (a sensor gain of "
+            f"{coefficient.value:.4g}), which is not an answer: check the unit, the column and the "
+            f"sign of {signal.said} in {subject.file}"
+        )
+        others = tuple(_BEYOND.format(name) for name in _ends(world, base))
+        return RecordingFault((signal.name,), factor, None, says, (), None, None, others)
+    return None
+
+
+def _gain(signal: Signal, unit: str) -> float:
+    if unit == signal.stated:
+        return signal.gain
+    return signal.scale * UNITS[signal.si][unit]
+
+
+def _rescaled(run: Run, factors: Mapping[str, float]) -> Run:
+    def scaled(signals: Mapping[str, Array]) -> dict[str, Array]:
+        return {n: v * factors[n] if n in factors else v for n, v in signals.items()}
+
+    before = {
+        n: np.stack([v[0], v[1] * factors[n]]) if n in factors else v for n, v in run.before.items()
+    }
+    return replace(run, channels=scaled(run.channels), inputs=scaled(run.inputs), before=before)
+
+
+def _ends(world: World, fit: Fit) -> list[str]:
+    """Parameters that the base fit leaves at a bound."""
+    found = []
+    for place in fit.free.tolist():
+        parameter = world.parameters[place]
+        if bound_of(float(fit.theta[place]), *parameter.bounds) is not None:
+            found.append(parameter.name)
+    return found
+
+
+def _shares(world: World, residual: Array, noise: Noise) -> Array:
+    """(C,) RMS of the residual beyond the noise, as a share of what each channel moves; 0 of one
+    that does not move beyond its noise.
+    """
+    shares = []
+    for c, sigma in enumerate(noise.sigma.tolist()):
+        there = np.isfinite(world.observed[..., c])
+        moved = float(np.std(world.observed[..., c][there])) if there.any() else 0.0
+        # A simulation that failed has missed all of it.
+        left = float(np.mean(np.nan_to_num(residual[..., c][there], nan=np.inf) ** 2))
+        beyond = max(left - sigma**2, 0.0) ** 0.5
+        shares.append(beyond / moved if moved > 3.0 * sigma else 0.0)
+    return np.array(shares)
+
+
+def _rms(residual: Array, seen: Any, noise: Noise) -> float:
+    scaled = (residual / noise.sigma)[seen]
+    rms = float(np.sqrt(np.mean(np.square(scaled)))) if scaled.size else 0.0
+    return rms if np.isfinite(rms) else np.inf
+
+
+def _suspects(world: World, shares: Array) -> frozenset[str] | None:
+    """Joints of a robot whose signals are questioned; None of what is no robot: all of them."""
+    if not world.kind.has_model:
+        return None
+    worst = np.argsort(-shares)[:WORST].tolist()
+    joints = {world.channels[c].partition(".")[2] for c in worst}
+    robot: Any = world.kind
+    drives = {a.name for a in robot.robot.actuators if a.joint in joints}
+    return frozenset(joints | drives)
+
+
+def _hypotheses(signals: Sequence[Signal], suspects: frozenset[str] | None) -> Iterator[Hypothesis]:
+    """Every hypothesis: of single signals, of all with one unit, of logs in one system of units,
+    and of joints whose direction is reversed.
+    """
+    for signal in signals:
+        if suspects is None or signal.name.partition(".")[2] in suspects:
+            yield from _of_one((signal,))
+    by_unit: dict[tuple[str, str, str], list[Signal]] = {}
+    for signal in signals:
+        by_unit.setdefault((signal.kind, signal.si, signal.stated), []).append(signal)
+    for alike in by_unit.values():
+        if len(alike) > 1:
+            yield from _of_one(tuple(alike))
+    for units in _TOGETHER:
+        either = [s for s in signals if s.si in units]
+        for wanted in (units, {si: si for si in units}):
+            those = tuple(s for s in either if s.stated != wanted[s.si])
+            if len({s.si for s in those}) > 1:
+                yield Hypothesis(those, tuple(wanted[s.si] for s in those))
+        if len({s.si for s in either}) > 1:
+            si = either[0].si
+            stated = tuple(s.stated for s in either)
+            yield Hypothesis(tuple(either), stated, 1.0 / UNITS[si][units[si]])
+    yield from _reversed(signals, suspects)
+
+
+def _of_one(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
+    """Hypotheses of signals that share a unit."""
+    first = signals[0]
+    own = (first.stated,) * len(signals)
+    yield Hypothesis(signals, own, -1.0)
+    units = UNITS.get(first.si, {})
+    stated = abs(first.gain / first.scale)
+    reached = {1.0}
+    for unit, gain in units.items():
+        if unit != first.stated and not math.isclose(gain, stated, rel_tol=1e-6):
+            yield Hypothesis(signals, (unit,) * len(signals))
+            yield Hypothesis(signals, (unit,) * len(signals), -1.0)
+            reached.add(gain / stated)
+    # what was converted by a program already
+    for factor in [*(1.0 / gain for gain in units.values()), *([1e3, 1e-3] if not units else [])]:
+        if not any(math.isclose(factor, known, rel_tol=CLOSE) for known in reached):
+            yield Hypothesis(signals, own, factor)
+            yield Hypothesis(signals, own, -factor)
+
+
+def _reversed(signals: Sequence[Signal], suspects: frozenset[str] | None) -> Iterator[Hypothesis]:
+    """Joints that turn the other way: the signs of all their channels."""
+    joints: dict[str, list[Signal]] = {}
+    for signal in signals:
+        quantity, _, joint = signal.name.partition(".")
+        if signal.kind == "channels" and quantity in ("q", "qd", "tau"):
+            joints.setdefault(joint, []).append(signal)
+    for joint, own in joints.items():
+        if len(own) > 1 and (suspects is None or joint in suspects):
+            yield Hypothesis(tuple(own), tuple(s.stated for s in own), -1.0)
+
+
+def _promising(subject: Subject, asked: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Those that fit best from the starts of the base fit: by the beginning of the runs, where
+    wrong parameters matter least, and by all of them.
+    """
+
+    def best(those: Sequence[Hypothesis], share: float) -> list[Hypothesis]:
+        scores = []
+        for one in those:
+            world, noise = _world(subject, one.factors())
+            scores.append(misfit_of_starts(world, noise, share))
+            world.close()
+        return [those[i] for i in np.argsort(scores, kind="stable").tolist()]
+
+    first = best(asked, BEGINNING)[:SCREENED]
+    return list(dict.fromkeys([*first[:TRIED], *best(first, 1.0)[:TRIED]]))
+
+
+def _world(subject: Subject, factors: Mapping[str, float]) -> tuple[World, Noise]:
+    recording = subject.rescaled(factors)
+    world = subject.world(recording)
+    sigma = noise_floor(world, recording).sigma
+    return world, Noise(sigma, np.zeros(len(sigma)))
+
+
+def _fitted(subject: Subject, factors: Mapping[str, float]) -> tuple[float, float]:
+    """What the base model leaves of the rescaled recording: RMS in units of its noise, and the
+    largest share of what a channel moves.
+    """
+    world, noise = _world(subject, factors)
+    fit = fit_base(world, noise).fit
+    seen = np.isfinite(world.observed)
+    residual = np.where(seen, world.observed - fit.simulated, 0.0)
+    world.close()
+    return _rms(residual, seen, noise), float(_shares(world, residual, noise).max())
+
+
+def _distinction(
+    subject: Subject, one: Hypothesis, after: float, samples: int
+) -> Literal["sharp", "absorbed", "none"]:
+    """Whether no factor near that of a hypothesis fits as well, the second half of (1); whether
+    parameters absorb the scale of an input, whose unit can be told nevertheless; or neither.
+
+    Args:
+        subject: what is checked.
+        one: the hypothesis.
+        after: what it leaves, RMS in units of the noise.
+        samples: number of samples.
+    """
+
+    def left(step: float) -> float:
+        return _fitted(subject, {name: step * k for name, k in one.factors().items()})[0]
+
+    if one.scale == -1.0 and one.units == tuple(s.stated for s in one.signals):
+        return "sharp"
+    if after > EXPLAINED:
+        near = min(left(1.0 / NEAR), left(NEAR))
+        if near - 1.0 < FAR_BETTER * (after - 1.0):
+            return "none"
+    near = min(left(1.0 / STEP), left(STEP))
+    if 2.0 * samples * math.log(near / after) > SHARP:
+        return "sharp"
+    # A factor that is no unit of the column is not told by an input that may have any scale.
+    is_unit = one.scale == 1.0 and all(signal.kind == "inputs" for signal in one.signals)
+    absorbed = is_unit and near * EQUAL > after and left(OFF) > WORSE * after
+    return "absorbed" if absorbed else "none"
+
+
+def _listed(names: Sequence[str], most: int = 4) -> str:
+    shown = list(names[:most])
+    more = len(names) - most
+    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
