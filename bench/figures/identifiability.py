@@ -17,11 +17,11 @@ from bench.figures.style import (
     SOFT,
     TITLES,
     VERMILION,
-    Styles,
     below,
     blank,
     finish,
     plain,
+    style_of,
 )
 from bench.problem.experiment import Experiment
 from bench.problem.identifiability import STIFF
@@ -169,7 +169,8 @@ def directions_figure(
     ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
     size = (1.8 + 4.0 * len(ranges), 1.2 + 2.3 * len(metrics))
     figure, axes = blank(len(metrics), len(ranges), size, sharey="row", sharex=True)
-    style = Styles(experiment, runs, metrics[0], behind)
+    drawn = [(metric, kind) for metric in metrics for kind in ranges]
+    style = style_of(experiment, statistics, behind, drawn)
     for row, metric in zip(axes, metrics, strict=True):
         for axis, kind in zip(row, ranges, strict=True):
             part = runs[(runs["range"] == kind) & runs[metric].notna()]

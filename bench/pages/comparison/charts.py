@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pandas as pd
 
-from bench.analysis.amortisation import SHARED, seconds_table, totals_table
+from bench.analysis.amortisation import AT_ONCE, NEVER, SHARED, placed_even, seconds_table
 from bench.analysis.medians import bin_names, moments
 from bench.analysis.table import checkpoints
 from bench.figures import errors
 from bench.figures.identifiability import directional
-from bench.figures.runtimes import spread_caption
-from bench.figures.style import TITLES, look
+from bench.figures.runtimes import break_even_sides, spread_caption
+from bench.figures.style import TITLES
 from bench.pages.chart import Axis, Chart, Draw, Panel, Rule, Series, Span
 from bench.pages.comparison.results import Results
 from bench.pages.elements import safe
@@ -21,8 +22,8 @@ from bench.pages.text import number
 
 _DIGITS = 7
 """Of numbers that no file beside the page holds."""
-_THIN, _THINNER = 3, 10
-"""Of the points of a smooth and of a very smooth curve, every so many."""
+_THIN = 3
+"""Step between the points of a smooth curve that the page holds."""
 _MEDIAN = (
     "A line is the median over targets of the recommendation's error (mean over seeds), the band "
     "its 95 % bootstrap interval. Lower and further left is better."
@@ -39,10 +40,12 @@ def error_chart(results: Results, page: Page) -> str:
         keys += [("obs_error", kind) for kind in results.ranges]
     panels = [_against_simulations(results, "errors", *key) for key in keys]
     page.table("errors", _medians(results, keys), _DIGITS)
+    covered = results.statistics.coinciding(keys)
+    same = "".join(f" {safe(tuner)}: {safe(says)}." for tuner, says in covered.items())
     still = results.still("error", "The median error of each tuner against simulations.")
     beside = "error" if "real" in results.ranges else _BESIDE
     return page.chart(
-        Chart("error", "Error against simulations", _MEDIAN, _filled(panels), still, beside)
+        Chart("error", "Error against simulations", _MEDIAN + same, _filled(panels), still, beside)
     )
 
 
@@ -193,34 +196,38 @@ def amortisation_chart(results: Results, page: Page) -> str:
     """From how many targets on a training pays."""
     if "amortisation" not in results.pictures:
         return ""
+    evens = placed_even(results.tables["break_even"])
     parts, panels = [], []
-    evens = results.tables["break_even"]
     for level in _levels(results):
-        table = totals_table(results.statistics.prices[level])
-        parts.append(_thinned(table.assign(threshold=level, what="total"), _THINNER))
-        even = evens[(evens["threshold"] == level) & evens["targets"].between(1, 1e4)]
-        rings = {
-            "range": even["range"],
-            "tuner": "break-even",
-            "targets": even["targets"],
-            "simulations": even["targets"] * even["ert_search"],
-        }
-        parts.append(pd.DataFrame(rings).assign(threshold=level, what="break-even"))
+        searching, learning = break_even_sides(results.statistics.prices[level], results.style)
+        part = evens[(evens["threshold"] == level) & evens["learned"].isin(learning)]
+        parts.append(part.assign(row=part["search"].map(searching.index)))
+        across = Axis("tuner that searches", names=tuple(searching))
+        up = _log("number of targets from which on training pays")
+        rules = (Rule(AT_ONCE, "the search never arrives"), Rule(NEVER, "training never pays"))
         for kind in results.ranges:
-            where = {"range": kind, "threshold": str(level), "what": "total"}
-            lines = _lines(results, table[table["range"] == kind], "simulations", "line", **where)
-            if (even["range"] == kind).any():
-                at = {**where, "what": "break-even"}
-                lines += (Series("break-even", "simulations", look(7), at, draw="points"),)
-            across, up = _log("number of targets"), _log("simulations in total")
-            panel = _panel(results, kind, "totals", "targets", lines, across, up)
-            panels.append(_with(panel, results, level))
-    page.table("totals", pd.concat(parts), _DIGITS)
+            series = tuple(
+                Series(
+                    name,
+                    "targets",
+                    drawn,
+                    {"learned": name, "range": kind, "threshold": str(level)},
+                    "low",
+                    "high",
+                    "points",
+                    0.6 * ((place + 0.5) / len(learning) - 0.5),
+                )
+                for place, (name, drawn) in enumerate(results.looks(part["learned"]))
+            )
+            panel = _panel(results, kind, "even", "row", series, across, up)
+            panels.append(_with(replace(panel, rules=rules), results, level))
+    page.table("even", pd.concat(parts), _DIGITS)
     caption = (
-        "Training and targets times expected simulations, to reach the error for good. At a mark a "
-        "trained tuner passes one that searches; the table has their intervals."
+        "From a mark on, training plus targets times expected simulations of a trained tuner are "
+        "fewer than those of a tuner that searches, to reach the error for good. Bars are 95 % "
+        "bootstrap intervals over targets; lower is better for the training."
     )
-    still = results.still("amortisation", "Simulations in total against the number of targets.")
+    still = results.still("amortisation", "Number of targets from which on each training pays.")
     title = "From how many targets on a training pays"
     return page.chart(Chart("amortisation", title, caption, _filled(panels), still, _BESIDE))
 
@@ -246,7 +253,10 @@ def _against_simulations(
     facets = {**panel.facets, "error": label}
     # Of a recording there is one range, and panels differ in their runs.
     title = f"{label} ({results.count(kind)} starting points)" if kind == "real" else panel.title
-    return Panel(**{**vars(panel), "facets": facets, "rules": rules, "title": title})
+    floor = results.statistics.floor_of(metric)
+    if floor is not None:
+        rules += (Rule(floor, f"below {number(floor, 2)}: count as equal"),)
+    return replace(panel, facets=facets, rules=rules, title=title)
 
 
 def _panel(
@@ -267,7 +277,7 @@ def _panel(
 def _with(panel: Panel, results: Results, level: float) -> Panel:
     """A panel that is one of several levels of the error."""
     reached = f"{number(level)}{_in_widths(results)}"
-    return Panel(**{**vars(panel), "facets": {**panel.facets, "error reached": reached}})
+    return replace(panel, facets={**panel.facets, "error reached": reached})
 
 
 def _lines(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from bench.pages.comparison import charts, parts
-from bench.pages.comparison.conclusion import conclusion, marks, soonest, warnings
+from bench.pages.comparison.conclusion import conclusion, marks, reaching, standing_tables, warnings
 from bench.pages.comparison.results import Results
 from bench.pages.elements import code, listed, paragraph, safe
 from bench.pages.page import Page
@@ -18,6 +18,7 @@ def comparison_page(results: Results) -> str:
     page = Page(f"{name}: comparison of tuners", made)
     page.add(*_opening(results))
     page.add(_concluded(results), charts.error_chart(results, page))
+    page.section("ranking", "Best, worse and not decided", standing_tables(results))
     page.section("all-numbers", "Numbers", parts.table_grid(results, page))
     page.section("pairs", "Pairs", parts.pairs_grid(results, page))
     page.section(
@@ -32,7 +33,7 @@ def comparison_page(results: Results) -> str:
     page.section(
         "reaching",
         "Reaching an error",
-        listed(soonest(results)),
+        listed(reaching(results)),
         charts.runtime_chart(results, page),
         charts.ert_chart(results, page),
         times,
