@@ -19,9 +19,11 @@ from bench.figures import comparison
 from bench.figures.comparison import Labels, labels_of, statistics_of
 from bench.figures.style import TRUSTED, Pictures, keep, taken
 from bench.pages.comparison import headline
+from bench.pages.comparison.conclusion import redraws_text
 from bench.pages.comparison.page import comparison_page
 from bench.pages.comparison.results import Results
 from bench.problem.experiment import Experiment
+from bench.problem.numeric_warnings import numeric_warnings_silenced
 from bench.problem.problem import Problem
 from bench.store.folder import CONFIGURATION, Stored, environment, read
 from bench.store.segments import FOLDER, read_plan
@@ -56,6 +58,7 @@ _SHOWN = (3, 10)
 """Numbers of simulations of which errors along directions are said, beside the whole budget."""
 
 
+@numeric_warnings_silenced()
 def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     """Write tables and figures of the comparison in `folder` from what is stored there, and say
     what came out.
@@ -96,6 +99,8 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
         say(text)
     for text in _marks(stored.experiment):
         say(text)
+    if redrawn := redraws_text(results):
+        say(f"\n{redrawn}")
     failed = stored.statuses[stored.statuses["status"].isin(FAILURES)]
     for text in failure_lines(failed):
         say(text)
@@ -123,8 +128,10 @@ def tables(stored: Stored, statistics: Statistics | None = None) -> dict[str, pd
     statistics = statistics or statistics_of(stored)
     lines = table(stored.runs, stored.statuses, experiment.budget, stored.costs)
     frames = {
-        "table": with_salt(lines, experiment),
-        "ert": ert_table(statistics.curves, statistics.levels, experiment.budget),
+        "table": statistics.sorted(with_salt(lines, experiment)),
+        "ert": statistics.sorted(
+            ert_table(statistics.curves, statistics.levels, experiment.budget)
+        ),
         "ranking": statistics.ranking,
         "pairs": pairs(statistics.curves, statistics.floor),
         "break_even": _break_even(experiment.name, statistics),
@@ -196,6 +203,7 @@ def _headlines(results: Results) -> list[str]:
         lines = [f"\nbest tuners, {where} ({headline.floor_text(statistics, label)})"]
         for one in headline.standings(statistics, kind):
             lines += _standing(one)
+        lines += [headline.failed_runs(statistics, kind)]
         lines += [headline.too_few(statistics, kind) or headline.how_decided(statistics, kind)]
         texts.append("\n".join(line for line in lines if line))
     return texts

@@ -87,6 +87,17 @@ class Statistics:
         ranked = list(last.loc[last["range"] == kind, "tuner"])
         return [*ranked, *(t for t in self.order if t not in ranked)]
 
+    def sorted(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Sort rows that have the columns range and tuner: range by range, the best tuner first."""
+        kinds = [str(kind) for kind in dict.fromkeys(self._all.keys["range"])]
+        order = [(kind, tuner) for kind in kinds for tuner in self.order_in(kind)]
+        places = {key: place for place, key in enumerate(order)}
+        # A tuner that could not be used has no range.
+        keys = [
+            places.get(key, len(places)) for key in zip(frame["range"], frame["tuner"], strict=True)
+        ]
+        return frame.iloc[np.argsort(keys, kind="stable")].reset_index(drop=True)
+
     @cached_property
     def notes(self) -> dict[str, str]:
         """What legends and tables say of tuners some of whose runs failed."""

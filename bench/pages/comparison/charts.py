@@ -40,8 +40,10 @@ def error_chart(results: Results, page: Page) -> str:
         keys += [("obs_error", kind) for kind in results.ranges]
     panels = [_against_simulations(results, "errors", *key) for key in keys]
     page.table("errors", _medians(results, keys), _DIGITS)
-    covered = results.statistics.coinciding(keys)
-    same = "".join(f" {safe(tuner)}: {safe(says)}." for tuner, says in covered.items())
+    notes = [results.statistics.coinciding(keys), results.statistics.notes]
+    same = "".join(
+        f" {safe(tuner)}: {safe(says)}." for part in notes for tuner, says in part.items()
+    )
     still = results.still("error", "The median error of each tuner against simulations.")
     beside = "error" if "real" in results.ranges else _BESIDE
     return page.chart(

@@ -45,7 +45,8 @@ def standing_tables(results: Results) -> str:
         how = headline.how_decided(results.statistics, kind)
         parts.append(f"<h3>{safe(title, 400)}</h3>\n")
         parts.append(elements.table(heads[:width], [row[:width] for row in rows]))
-        parts.append(paragraph(safe(how, 600), "soft") if how else "")
+        failed = headline.failed_runs(results.statistics, kind)
+        parts += [paragraph(safe(text, 1000), "soft") for text in (failed, how) if text]
     return "".join(parts)
 
 
@@ -65,6 +66,8 @@ def _of_range(results: Results, kind: str) -> str:
     said += f"; {', '.join(before)}." if before else "."
     if last.worse:
         said += f" Worse after {last.simulations}: {_named(last.worse)}."
+    if last.failed:
+        said += f" All runs failed: {_named(last.failed)}."
     if last.undecided:
         said += f" Not decided: {_named(last.undecided)}."
     return f"{said} {safe(headline.too_few(results.statistics, kind))}".strip()
@@ -147,9 +150,25 @@ def warnings(results: Results) -> Iterator[str]:
         yield f'{tuners} could not be used here: <a href="#failures">why</a>.'
 
 
+def redraws_text(results: Results) -> str:
+    """How many targets were drawn again, as plain text; empty for none."""
+    redrawn, draws = (
+        results.environment.get(key, 0) for key in ("redrawn_targets", "target_draws")
+    )
+    targets = sum(results.statistics.targets.values())
+    if not redrawn:
+        return ""
+    return (
+        f"{redrawn} of {targets} targets were drawn again because their own simulation diverged "
+        f"({draws} draws in all)."
+    )
+
+
 def marks(results: Results) -> Iterator[str]:
-    """How the runs were made, where that takes something away from them."""
+    """How targets and runs were made, where that limits what they say."""
     if results.experiment.trusted:
         yield "Trusted: the tuners ran inside the harness, where nothing is out of their reach."
     if not results.experiment.salt_sha256:
         yield "The targets have a public salt: everybody can draw them."
+    if redrawn := redraws_text(results):
+        yield redrawn

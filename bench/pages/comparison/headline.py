@@ -72,10 +72,10 @@ def _standing(statistics: Statistics, k: int, part: pd.DataFrame) -> Standing:
     first = named(BEST)
     return Standing(
         k,
-        [statistics.labelled(name) for name in best],
+        [str(name) for name in best],
         _error(statistics, float(first["median"].iloc[0])) if len(first) else "",
-        [_worse(statistics, row) for row in named(WORSE).to_dict("records")],
-        [statistics.labelled(str(name)) for name in named(UNDECIDED)["tuner"]],
+        [_worse(row) for row in named(WORSE).to_dict("records")],
+        [str(name) for name in named(UNDECIDED)["tuner"]],
         [str(name) for name in named(FAILED)["tuner"]],
     )
 
@@ -87,14 +87,13 @@ def _error(statistics: Statistics, median: float) -> str:
     return f"at most {text}" if median <= statistics.floor * (1 + 1e-9) else text
 
 
-def _worse(statistics: Statistics, row: dict[Any, Any]) -> str:
+def _worse(row: dict[Any, Any]) -> str:
     """``cma_es 5.8x (8/10)``."""
     ratio = float(row["error_ratio"])
     factor = f" {number(ratio, _DIGITS)}x" if ratio > 1.0 else ""
     # A failed run has an infinite error.
     factor = factor if np.isfinite(ratio) else " failed"
-    name = statistics.labelled(str(row["tuner"]))
-    return f"{name}{factor} ({row['targets_worse']}/{row['targets']})"
+    return f"{row['tuner']}{factor} ({row['targets_worse']}/{row['targets']})"
 
 
 def floor_text(statistics: Statistics, label: str) -> str:
@@ -136,6 +135,17 @@ def too_few(statistics: Statistics, kind: str) -> str:
         f"{targets} target{'s' * (targets != 1)} cannot decide between {others + 1} tuners: that "
         f"needs at least {needed} (--targets {needed}). The order is that of the medians."
     )
+
+
+def failed_runs(statistics: Statistics, kind: str) -> str:
+    """Tuners some of whose runs failed in a range, with their numbers; empty for none."""
+    part = _in_range(statistics, kind).drop_duplicates("tuner")
+    each = [
+        f"{row['tuner']} {row['failures']} of {row['runs']}"
+        for row in part.to_dict("records")
+        if row["failures"]
+    ]
+    return f"failed runs, which count as infinite errors: {', '.join(each)}" if each else ""
 
 
 def joined(names: Sequence[str]) -> str:
