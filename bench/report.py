@@ -200,7 +200,7 @@ def _headlines(results: Results) -> list[str]:
     for kind in results.ranges:
         things = "starts" if kind == "real" else "targets"
         where = f"{headline.WHERE[kind]}, {results.count(kind)} {things}"
-        lines = [f"\nbest tuners, {where} ({headline.floor_text(statistics, label)})"]
+        lines = [f"\nbest tuners, {where} ({label}; {headline.floor_text(statistics)})"]
         for one in headline.standings(statistics, kind):
             lines += _standing(one)
         lines += [headline.failed_runs(statistics, kind)]

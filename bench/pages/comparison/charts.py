@@ -206,7 +206,10 @@ def amortisation_chart(results: Results, page: Page) -> str:
         parts.append(part.assign(row=part["search"].map(searching.index)))
         across = Axis("tuner that searches", names=tuple(searching))
         up = _log("number of targets from which on training pays")
-        rules = (Rule(AT_ONCE, "the search never arrives"), Rule(NEVER, "training never pays"))
+        rules = (
+            Rule(AT_ONCE, "at once: the search never reaches the error"),
+            Rule(NEVER, "never: not within 10 000 targets"),
+        )
         for kind in results.ranges:
             series = tuple(
                 Series(

@@ -18,8 +18,21 @@ SURE = SIGNIFICANCE
 """Corrected p-value below which one tuner is called better than another."""
 
 
+def best_table(results: Results) -> str:
+    """The best tuners after 1, 3, 10 and all simulations, a column for each range; safe HTML."""
+    columns = [headline.standings(results.statistics, kind) for kind in results.ranges]
+    if not all(columns):
+        return ""
+    rows = [
+        [str(together[0].simulations), *map(_best, together)]
+        for together in zip(*columns, strict=True)
+    ]
+    best = (f"best (median error), {headline.WHERE[kind]}" for kind in results.ranges)
+    return elements.table(["-simulations", *best], rows)
+
+
 def conclusion(results: Results) -> list[str]:
-    """Who is best after 1, 3, 10 and all simulations in each range; safe HTML."""
+    """Which tuners are worse than the best after all simulations in each range; safe HTML."""
     return [_of_range(results, kind) for kind in results.ranges]
 
 
@@ -31,7 +44,7 @@ def standing_tables(results: Results) -> str:
         rows = [
             [
                 str(one.simulations),
-                _named(one.best, strong) + (f" ({safe(one.error)})" if one.best else ""),
+                _best(one),
                 _named(one.worse),
                 _named(one.undecided),
                 _named(one.failed),
@@ -41,7 +54,7 @@ def standing_tables(results: Results) -> str:
         heads = ["-simulations", "best (median error)", "worse", "not decided", "all runs failed"]
         # Most often nothing failed: the column would be empty.
         width = len(heads) if any(row[-1] for row in rows) else len(heads) - 1
-        title = f"{_where(results, kind)}: {headline.floor_text(results.statistics, label)}"
+        title = f"{_where(results, kind)}: {label}; {headline.floor_text(results.statistics)}"
         how = headline.how_decided(results.statistics, kind)
         parts.append(f"<h3>{safe(title, 400)}</h3>\n")
         parts.append(elements.table(heads[:width], [row[:width] for row in rows]))
@@ -50,34 +63,29 @@ def standing_tables(results: Results) -> str:
     return "".join(parts)
 
 
+def _best(one: headline.Standing) -> str:
+    """The best tuners with their median error."""
+    return f"{_named(one.best, strong)} ({safe(one.error)})" if one.best else "every run failed"
+
+
 def _of_range(results: Results, kind: str) -> str:
-    found = headline.standings(results.statistics, kind)
-    where = _where(results, kind)
+    found, where = headline.standings(results.statistics, kind), _where(results, kind)
     if not found:
         return f"{where}: no target has an error that decides."
-    *earlier, last = found
-    if not last.best:
-        return f"{where}: every run of every tuner failed."
-    before = [f"after {one.simulations} {_named(one.best)}" for one in earlier if one.best]
-    said = (
-        f"{where}: best after {last.simulations} simulations: {_named(last.best, strong)} "
-        f"({safe(results.label(results.shown_metric))}, median {safe(last.error)})"
-    )
-    said += f"; {', '.join(before)}." if before else "."
-    if last.worse:
-        said += f" Worse after {last.simulations}: {_named(last.worse)}."
-    if last.failed:
-        said += f" All runs failed: {_named(last.failed)}."
-    if last.undecided:
-        said += f" Not decided: {_named(last.undecided)}."
-    return f"{said} {safe(headline.too_few(results.statistics, kind))}".strip()
+    last = found[-1]
+    parts = {
+        "worse than the best": last.worse,
+        "not decided": last.undecided,
+        "all runs failed": last.failed,
+    }
+    said = "; ".join(f"{what}: {_named(names)}" for what, names in parts.items() if names)
+    return f"{where}, after {last.simulations} simulations: {said or 'no tuner is worse'}."
 
 
 def _where(results: Results, kind: str) -> str:
-    count = results.count(kind)
-    things = "starting point" if kind == "real" else "target"
-    text = headline.WHERE[kind]
-    return f"{text[0].upper()}{text[1:]} ({count} {things}{'s' * (count != 1)})"
+    text, count = headline.WHERE[kind], results.count(kind)
+    things = ("starting point" if kind == "real" else "target") + "s" * (count != 1)
+    return f"{text[0].upper()}{text[1:]} ({count} {things})"
 
 
 def reaching(results: Results) -> list[str]:
@@ -136,7 +144,9 @@ def _named(names: Sequence[str], mark: Callable[[str], str] = str) -> str:
 
 
 def warnings(results: Results) -> Iterator[str]:
-    """What takes something away from the results; safe HTML."""
+    """What limits the results; safe HTML."""
+    few = (headline.too_few(results.statistics, kind) for kind in results.ranges)
+    yield from dict.fromkeys(safe(text) for text in few if text)
     if results.missing:
         yield f"Not finished: {results.missing} planned runs are not made yet."
     statuses = results.stored.statuses

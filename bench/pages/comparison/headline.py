@@ -96,14 +96,9 @@ def _worse(row: dict[Any, Any]) -> str:
     return f"{row['tuner']}{factor} ({row['targets_worse']}/{row['targets']})"
 
 
-def floor_text(statistics: Statistics, label: str) -> str:
-    """Which errors count as equal.
-
-    Args:
-        statistics: of the comparison.
-        label: what the error is called.
-    """
-    return f"{label}; errors below {statistics.floor * statistics.unit:.2g} count as equal"
+def floor_text(statistics: Statistics) -> str:
+    """Which errors count as equal."""
+    return f"errors below {statistics.floor * statistics.unit:.2g} count as equal"
 
 
 def how_decided(statistics: Statistics, kind: str) -> str:
@@ -132,8 +127,8 @@ def too_few(statistics: Statistics, kind: str) -> str:
     if targets >= needed:
         return ""
     return (
-        f"{targets} target{'s' * (targets != 1)} cannot decide between {others + 1} tuners: that "
-        f"needs at least {needed} (--targets {needed}). The order is that of the medians."
+        f"{targets} target{'s' * (targets != 1)} cannot decide between {others + 1} tuners: "
+        f"it takes at least {needed} (--targets {needed})."
     )
 
 
