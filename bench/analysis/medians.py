@@ -77,7 +77,7 @@ def coinciding(drawn: Mapping[str, Sequence[pd.Series[float]]]) -> dict[str, str
     """Find curves that cannot be seen because another one is drawn above them.
 
     A curve coincides with a later one up to k where the two differ by less than `_SAME` in every
-    panel up to k, and have left the start by then: until then all tuners are equal.
+    panel up to k, and have halved the error of the start by then: until then most tuners are alike.
 
     Args:
         drawn: by tuner, in the order in which curves are drawn, its curve in each panel: medians by
@@ -95,7 +95,7 @@ def coinciding(drawn: Mapping[str, Sequence[pd.Series[float]]]) -> dict[str, str
                 continue
             pairs = list(zip(drawn[name], drawn[above], strict=True))
             upto = min(_equal_up_to(mine, other) for mine, other in pairs)
-            moved = any((mine.loc[:upto] < (1 - _SAME) * mine.iloc[0]).any() for mine, _ in pairs)
+            moved = any((mine.loc[:upto] < 0.5 * mine.iloc[0]).any() for mine, _ in pairs)
             if upto > longest and moved:
                 longest = upto
                 whole = all(upto == mine.index[-1] for mine, _ in pairs)
