@@ -198,8 +198,7 @@ def _headlines(results: Results) -> list[str]:
     statistics, texts = results.statistics, []
     label = results.label(results.shown_metric)
     for kind in results.ranges:
-        things = "starts" if kind == "real" else "targets"
-        where = f"{headline.WHERE[kind]}, {results.count(kind)} {things}"
+        where = f"{headline.WHERE[kind]}, {headline.targets_text(statistics, kind)}"
         lines = [f"\nbest tuners, {where} ({label}; {headline.floor_text(statistics)})"]
         for one in headline.standings(statistics, kind):
             lines += _standing(one)

@@ -83,9 +83,8 @@ def _of_range(results: Results, kind: str) -> str:
 
 
 def _where(results: Results, kind: str) -> str:
-    text, count = headline.WHERE[kind], results.count(kind)
-    things = ("starting point" if kind == "real" else "target") + "s" * (count != 1)
-    return f"{text[0].upper()}{text[1:]} ({count} {things})"
+    text = headline.WHERE[kind]
+    return f"{text[0].upper()}{text[1:]} ({headline.targets_text(results.statistics, kind)})"
 
 
 def reaching(results: Results) -> list[str]:

@@ -96,6 +96,15 @@ def _worse(row: dict[Any, Any]) -> str:
     return f"{row['tuner']}{factor} ({row['targets_worse']}/{row['targets']})"
 
 
+def targets_text(statistics: Statistics, kind: str) -> str:
+    """The number of targets of a range: ``10 targets``, or how many of them decide."""
+    count, ranked = statistics.targets[kind], _in_range(statistics, kind)["targets"]
+    deciding = int(ranked.max()) if len(ranked) else 0
+    things = ("starting point" if kind == "real" else "target") + "s" * (count != 1)
+    # Targets whose data identify no direction have no error that decides.
+    return f"{count} {things}" if deciding == count else f"{deciding} of {count} {things} decide"
+
+
 def floor_text(statistics: Statistics) -> str:
     """Which errors count as equal."""
     return f"errors below {statistics.floor * statistics.unit:.2g} count as equal"
@@ -121,11 +130,10 @@ def _others(statistics: Statistics, kind: str) -> int:
 
 def too_few(statistics: Statistics, kind: str) -> str:
     """What is said where so few targets can decide nothing; empty where they can."""
-    part, others = _in_range(statistics, kind), _others(statistics, kind)
-    targets = int(part["targets"].max()) if len(part) else 0
-    needed = targets_needed(others) if others else 0
-    if targets >= needed:
+    ranked, others = _in_range(statistics, kind)["targets"], _others(statistics, kind)
+    if not others or int(ranked.max()) >= (needed := targets_needed(others)):
         return ""
+    targets = int(ranked.max())
     return (
         f"{targets} target{'s' * (targets != 1)} cannot decide between {others + 1} tuners: "
         f"it takes at least {needed} (--targets {needed})."
