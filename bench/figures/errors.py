@@ -63,6 +63,8 @@ def error_figure(
         samples_panel(axis, statistics, panel.metric, panel.kind, style)
         titled(axis, f"{panel.title} ({statistics.targets[panel.kind]} {what})")
         axis.set_ylabel(f"{panel.label}, median")
+    for axis, panel in zip(axes, shown, strict=True):
+        shade_equal(axis, statistics.floor_of(panel.metric))
     finish(figure, axes, style, experiment)
     return figure
 
@@ -142,12 +144,16 @@ def samples_panel(
     for reference in style.behind:
         _grey_lines(axis, reference, kind, metric, budget, style)
     axis.set_yscale("log")
-    _shade_equal(axis, statistics.floor_of(metric))
     simulations_axis(axis, budget)
 
 
-def _shade_equal(axis: Axes, floor: float | None) -> None:
-    """Shade the errors that count as equal, where some are drawn."""
+def shade_equal(axis: Axes, floor: float | None) -> None:
+    """Shade the errors that count as equal, where some are drawn.
+
+    Args:
+        axis: of a figure whose panels are all drawn: its limits are fixed from here on.
+        floor: of `bench.analysis.statistics.Statistics.floor_of`.
+    """
     low, high = axis.get_ylim()
     if floor is None or not low < floor < high:
         return

@@ -10,7 +10,7 @@ import pandas as pd
 
 from bench.analysis.spectra import COLUMNS
 from bench.analysis.statistics import Statistics
-from bench.figures.errors import samples_panel
+from bench.figures.errors import samples_panel, shade_equal
 from bench.figures.style import (
     BLUE,
     CAPTION,
@@ -187,6 +187,9 @@ def directions_figure(
             # Rows share their horizontal axis: it is named under the last.
             if metric != metrics[-1]:
                 axis.set_xlabel("")
+    for row, metric in zip(axes, metrics, strict=True):
+        for axis in row:
+            shade_equal(axis, statistics.floor_of(metric))
     caption = f"{CAPTION} A sloppy direction is one that the target's data do not fix."
     finish(figure, [a for row in axes for a in row], style, experiment, caption)
     return figure

@@ -78,6 +78,19 @@ def test_a_figure_draws_the_numbers_of_the_runs():
         assert lines[tuner].get_ydata()[-1] == pytest.approx(np.median(values), rel=1e-12)
 
 
+def test_errors_that_count_as_equal_are_shaded_and_cut_no_curve():
+    whole = stored(experiment=replace(stored().experiment, negligible_error=0.05))
+    whole = whole._replace(runs=whole.runs.drop(columns=["stiff_error", "sloppy_error"]))
+    drawn = figure(whole, LABELS, "error")
+    for axis in drawn.axes:
+        (said,) = (text.get_text() for text in axis.texts)
+        assert said == "below 0.02: count as equal"  # 0.4 of restitution are one training width
+        low, high = axis.get_ylim()
+        values = np.concatenate([line.get_ydata() for line in axis.lines])
+        assert low <= values.min()
+        assert values.max() <= high
+
+
 def test_statistics_are_computed_once_for_several_figures(monkeypatch):
     whole = stored()
     statistics = statistics_of(whole)
