@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import pandas as pd
 
@@ -40,14 +41,14 @@ def error_chart(results: Results, page: Page) -> str:
         keys += [("obs_error", kind) for kind in results.ranges]
     panels = [_against_simulations(results, "errors", *key) for key in keys]
     page.table("errors", _medians(results, keys), _DIGITS)
-    notes = [results.statistics.coinciding(keys), results.statistics.notes]
-    same = "".join(
-        f" {safe(tuner)}: {safe(says)}." for part in notes for tuner, says in part.items()
-    )
+    same = results.statistics.coinciding(keys)
     still = results.still("error", "The median error of each tuner against simulations.")
     beside = "error" if "real" in results.ranges else _BESIDE
-    return page.chart(
-        Chart("error", "Error against simulations", _MEDIAN + same, _filled(panels), still, beside)
+    return _shown(
+        results,
+        page,
+        Chart("error", "Error against simulations", _MEDIAN, _filled(panels), still, beside),
+        same,
     )
 
 
@@ -68,7 +69,7 @@ def misfit_chart(results: Results, page: Page) -> str:
     )
     still = results.still("misfit", "The median misfit of each tuner against simulations.")
     chart = Chart("misfit", "What tuning leaves", caption, _filled(panels), still, _BESIDE)
-    return page.chart(chart)
+    return _shown(results, page, chart)
 
 
 def directions_chart(results: Results, page: Page) -> str:
@@ -85,7 +86,9 @@ def directions_chart(results: Results, page: Page) -> str:
     )
     still = results.still("directions", "Errors along stiff and sloppy directions, of prediction.")
     title = "Stiff and sloppy directions, and prediction"
-    return page.chart(Chart("directions", title, caption, _filled(panels), still, _BESIDE))
+    return _shown(
+        results, page, Chart("directions", title, caption, _filled(panels), still, _BESIDE)
+    )
 
 
 def distance_chart(results: Results, page: Page) -> str:
@@ -122,7 +125,7 @@ def distance_chart(results: Results, page: Page) -> str:
     )
     still = results.still("distance", "The median error of each tuner by distance of the target.")
     title = "Error against distance from the training range"
-    return page.chart(Chart("distance", title, caption, tuple(panels), still, "after"))
+    return _shown(results, page, Chart("distance", title, caption, tuple(panels), still, "after"))
 
 
 def runtime_chart(results: Results, page: Page) -> str:
@@ -140,8 +143,10 @@ def runtime_chart(results: Results, page: Page) -> str:
         "is what can be solved at all."
     )
     still = results.still("runtime", "The share of thresholds reached by each tuner.")
-    return page.chart(
-        Chart("runtime", "Runtime distributions", caption, tuple(panels), still, _BESIDE)
+    return _shown(
+        results,
+        page,
+        Chart("runtime", "Runtime distributions", caption, tuple(panels), still, _BESIDE),
     )
 
 
@@ -159,7 +164,7 @@ def ert_chart(results: Results, page: Page) -> str:
         "95 % bootstrap interval over targets; a line ends where no run got further."
     )
     title = "Expected running time"
-    return page.chart(Chart("ert", title, caption, _filled(panels), None, _BESIDE))
+    return _shown(results, page, Chart("ert", title, caption, _filled(panels), None, _BESIDE))
 
 
 def cost_chart(results: Results, page: Page) -> str:
@@ -191,7 +196,7 @@ def cost_chart(results: Results, page: Page) -> str:
     )
     still = results.still("cost", "Seconds for one target against seconds of one simulation.")
     title = "Who wins at which cost of a simulation"
-    return page.chart(Chart("cost", title, caption, _filled(panels), still, _BESIDE))
+    return _shown(results, page, Chart("cost", title, caption, _filled(panels), still, _BESIDE))
 
 
 def amortisation_chart(results: Results, page: Page) -> str:
@@ -234,7 +239,26 @@ def amortisation_chart(results: Results, page: Page) -> str:
     )
     still = results.still("amortisation", "Number of targets from which on each training pays.")
     title = "From how many targets on a training pays"
-    return page.chart(Chart("amortisation", title, caption, _filled(panels), still, _BESIDE))
+    return _shown(
+        results, page, Chart("amortisation", title, caption, _filled(panels), still, _BESIDE)
+    )
+
+
+def _shown(
+    results: Results, page: Page, chart: Chart, same: Mapping[str, str] = MappingProxyType({})
+) -> str:
+    """Add a chart to the page; its legend says whose runs failed and which curves coincide.
+
+    Args:
+        results: of the comparison.
+        page: the page.
+        chart: without notes.
+        same: which curve coincides with which, by tuner.
+    """
+    failed = results.statistics.notes
+    names = dict.fromkeys((*failed, *same))
+    notes = {n: "; ".join(part[n] for part in (failed, same) if n in part) for n in names}
+    return page.chart(replace(chart, notes=notes))
 
 
 def _medians(results: Results, keys: Sequence[tuple[str, str]]) -> pd.DataFrame:

@@ -257,6 +257,12 @@ def test_errors_to_be_reached_are_chosen(opened, shown):
     assert opened.page.locator("#cost canvas").first.screenshot() != before
 
 
+def test_the_legend_says_whose_runs_failed(opened):
+    key = opened.page.locator("#error .key[data-name=random]")
+    assert key.inner_text().split("\n")[-1] == "2 of 6 runs failed"
+    assert opened.page.locator("#error .key[data-name=tunenet]").inner_text().strip() == "tunenet"
+
+
 def test_failures_stand_with_their_tracebacks(opened):
     fold = opened.page.locator("#failures details")
     assert fold.count() == 1
