@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -73,8 +74,13 @@ def _of_range(results: Results, kind: str) -> str:
     if not found:
         return f"{where}: no target has an error that decides."
     last = found[-1]
+    # The first one explains the others.
+    first = [
+        re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", one)
+        for one in last.worse[:1]
+    ]
     parts = {
-        "worse than the best": last.worse,
+        "worse than the best": [*first, *last.worse[1:]],
         "not decided": last.undecided,
         "all runs failed": last.failed,
     }

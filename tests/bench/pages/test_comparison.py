@@ -130,7 +130,7 @@ def test_the_headline_says_who_is_worse_by_how_much_and_on_how_many_targets():
     ratio = number(held.tables["ranking"]["error_ratio"].iloc[-1], 2)
     assert said == (
         "Targets in the training range (12 targets), after 12 simulations: "
-        f"worse than the best: random {ratio}x (12/12)."
+        f"worse than the best: random {ratio}x the error (larger on 12 of 12 targets)."
     )
     assert (
         "Wilcoxon&#x27;s signed-rank test against the best, Holm-corrected for 1 comparison."
