@@ -131,7 +131,9 @@ class Together:
     @cached_property
     def ranked(self) -> pd.DataFrame:
         """Ranks among the common tuners: a row a problem, a column a tuner, 1 is best."""
-        each = pd.concat([ranks(part.statistics.curves) for part in self.parts])
+        each = pd.concat(
+            [ranks(part.statistics.curves, part.statistics.floor) for part in self.parts]
+        )
         # Ranks among all tuners have gaps where some are left out.
         return each[list(self.tuners)].rank(axis=1)
 
@@ -152,7 +154,7 @@ class Together:
             curves, levels = part.statistics.curves, part.statistics.levels
             times = ert_table(curves, levels, part.experiment.budget)
             ert.append(marked(times, part.experiment))
-            paired.append(marked(pairs(curves), part.experiment))
+            paired.append(marked(pairs(curves, part.statistics.floor), part.experiment))
         frames = {
             "ert": pd.concat(ert),
             "pairs": pd.concat(paired),
@@ -205,12 +207,7 @@ class Together:
     def _joint_figure(self) -> Figure:
         title = f"{len(self.ranked)} problems"
         experiment = Experiment("all", title, tuners=tuple(Entry(t, t) for t in self.tuners))
-        # A tuner's style and place in the legend go by its mean rank, as if that were an error.
-        rows = [
-            {"tuner": tuner, "run": tuner, "k": 0, "rank": rank}
-            for tuner, rank in self.ranked.mean().items()
-        ]
-        style = Styles(experiment, pd.DataFrame(rows), "rank")
+        style = Styles(experiment, list(self.ranked.mean().sort_values(kind="stable").index))
         return runtimes.joint_runtime_figure(experiment, style, self._shares())
 
     def _shares(self) -> dict[str, Array]:

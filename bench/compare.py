@@ -84,7 +84,8 @@ class Comparison:
         # Before there is a folder: a fault of the user's leaves nothing behind.
         if jobs:
             refuse_unreachable(new.experiment)
-        comparison = cls(new.write(plugins, fingerprint(new.experiment, plugins)))
+        hashes = fingerprint(new.experiment, plugins)
+        comparison = cls(new.write(plugins, hashes, results.redraws))
         comparison.secret = new.secret
         comparison._attach(results)
         return comparison

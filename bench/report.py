@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -17,9 +18,12 @@ from bench.analysis.table import summary, table
 from bench.figures import comparison
 from bench.figures.comparison import Labels, labels_of, statistics_of
 from bench.figures.style import TRUSTED, Pictures, keep, taken
+from bench.pages.comparison import headline
+from bench.pages.comparison.conclusion import redraws_text
 from bench.pages.comparison.page import comparison_page
 from bench.pages.comparison.results import Results
 from bench.problem.experiment import Experiment
+from bench.problem.numeric_warnings import numeric_warnings_silenced
 from bench.problem.problem import Problem
 from bench.sealing.ended import ISOLATED, without_isolation
 from bench.store.folder import CONFIGURATION, Stored, environment, read
@@ -49,10 +53,13 @@ NEEDED = (
 REPORT = "report.html"
 """The page of a comparison, in its folder."""
 WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
+_WIDTH = 120
+"""Characters of a line on the terminal."""
 _SHOWN = (3, 10)
 """Numbers of simulations of which errors along directions are said, beside the whole budget."""
 
 
+@numeric_warnings_silenced()
 def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     """Write tables and figures of the comparison in `folder` from what is stored there, and say
     what came out.
@@ -87,14 +94,18 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     write(folder / REPORT, comparison_page(results))
 
     lines = made["table"]
-    for text in _results(lines, labels):
+    for text in _headlines(results):
+        say(text)
+    for text in _results(lines, labels, statistics):
         say(text)
     for text in _marks(stored.experiment):
         say(text)
+    if redrawn := redraws_text(results):
+        say(f"\n{redrawn}")
     failed = stored.statuses[stored.statuses["status"].isin(FAILURES)]
     for text in failure_lines(failed):
         say(text)
-    say("\n" + _seconds(lines))
+    say("\n" + _seconds(lines, statistics))
     say(f"\ntable   {folder / 'table.csv'}")
     say(f"more    {folder}/{', '.join(f'{name}.csv' for name in made if name != 'table')}")
     for figure in figures:
@@ -105,8 +116,8 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
 
 
 def tables(stored: Stored, statistics: Statistics | None = None) -> dict[str, pd.DataFrame]:
-    """The tables of a comparison by name: table, ert, pairs, break_even, who_wins; none without a
-    run.
+    """Return the tables of a comparison by name: table, ert, ranking, pairs, break_even, who_wins;
+    none without a run.
 
     Args:
         stored: the comparison as `bench.store.folder.read` gives it.
@@ -118,9 +129,12 @@ def tables(stored: Stored, statistics: Statistics | None = None) -> dict[str, pd
     statistics = statistics or statistics_of(stored)
     lines = table(stored.runs, stored.statuses, experiment.budget, stored.costs)
     frames = {
-        "table": with_salt(lines, experiment),
-        "ert": ert_table(statistics.curves, statistics.levels, experiment.budget),
-        "pairs": pairs(statistics.curves),
+        "table": statistics.sorted(with_salt(lines, experiment)),
+        "ert": statistics.sorted(
+            ert_table(statistics.curves, statistics.levels, experiment.budget)
+        ),
+        "ranking": statistics.ranking,
+        "pairs": pairs(statistics.curves, statistics.floor),
         "break_even": _break_even(experiment.name, statistics),
         "who_wins": _who_wins(experiment.name, statistics),
     }
@@ -180,32 +194,67 @@ def _marks(experiment: Experiment) -> list[str]:
     return texts
 
 
-def _results(lines: pd.DataFrame, labels: Labels) -> list[str]:
-    """What came out, a short table or two for each range."""
+def _headlines(results: Results) -> list[str]:
+    """Who is best after 1, 3, 10 and all simulations, a paragraph for each range."""
+    statistics, texts = results.statistics, []
+    label = results.label(results.shown_metric)
+    for kind in results.ranges:
+        where = f"{headline.WHERE[kind]}, {headline.targets_text(statistics, kind)}"
+        lines = [f"\nbest tuners, {where} ({label}; {headline.floor_text(statistics)})"]
+        for one in headline.standings(statistics, kind):
+            lines += _standing(one)
+        lines += [headline.failed_runs(statistics, kind)]
+        lines += [headline.too_few(statistics, kind) or headline.how_decided(statistics, kind)]
+        texts.append("\n".join(line for line in lines if line))
+    return texts
+
+
+def _standing(one: headline.Standing) -> list[str]:
+    """Lines of one number of simulations; what has no tuners is left out."""
+    best = f"{', '.join(one.best)} ({one.error})" if one.best else "none: every run failed"
+    parts = {
+        "best": best,
+        "worse": ", ".join(one.worse),
+        "not decided": ", ".join(one.undecided),
+        "all runs failed": ", ".join(one.failed),
+    }
+    lines = [
+        textwrap.fill(
+            f"{what}: {names}", _WIDTH, initial_indent=" " * 12, subsequent_indent=" " * 14
+        )
+        for what, names in parts.items()
+        if names
+    ]
+    lines[0] = f"  after {one.simulations}".ljust(12) + lines[0].lstrip()
+    return lines
+
+
+def _results(lines: pd.DataFrame, labels: Labels, statistics: Statistics) -> list[str]:
+    """The numbers, a short table or two for each range."""
     texts = []
     for kind in lines["range"][lines["range"] != ""].unique():
-        texts.append("\n" + _text(lines, kind, labels))
-        if more := _directions(lines, kind, labels.channel):
+        texts.append("\n" + _text(lines, kind, labels, statistics))
+        if more := _directions(lines, kind, labels.channel, statistics):
             texts.append("\n" + more)
     return texts
 
 
-def _text(lines: pd.DataFrame, kind: str, labels: Labels) -> str:
+def _text(lines: pd.DataFrame, kind: str, labels: Labels, statistics: Statistics) -> str:
     """One range as a table for the terminal."""
     present = set(lines["metric"])
     if kind == "real":
         held_out = "heldout_error" in present
         metric, what = ("heldout_error", "held-out") if held_out else ("obs_error", "fitted")
-        title = f"mean {what} RMSE of {labels.channel} after N simulations"
+        title = f"median {what} RMSE of {labels.channel} after N simulations"
     else:
         metric = "param_abs_error" if "param_abs_error" in present else "param_error"
         what = labels.parameter or "the parameters [training widths]"
         where = "in the training range" if kind == "in" else "anywhere in the bounds"
-        title = f"mean absolute error of {what} after N simulations, targets {where}"
-    means = summary(lines, metric, kind)
+        title = f"median absolute error of {what} after N simulations, targets {where}"
+    medians = summary(lines, metric, kind, statistics.order_in(kind))
     fits = lines.drop_duplicates("tuner").set_index("tuner")["fit_simulations"]
-    means["trained on"] = [f"{fits[t]:.0f}" if fits[t] else "-" for t in means.index]
-    return f"{title}\n{_laid_out(means)}"
+    medians["trained on"] = [f"{fits[t]:.0f}" if fits[t] else "-" for t in medians.index]
+    return f"{title}\n{_laid_out(medians.rename(index=statistics.labelled))}"
 
 
 def _laid_out(frame: pd.DataFrame) -> str:
@@ -214,7 +263,7 @@ def _laid_out(frame: pd.DataFrame) -> str:
     return bare.to_string(float_format=lambda value: f"{value:.2g}")
 
 
-def _directions(lines: pd.DataFrame, kind: str, channel: str) -> str:
+def _directions(lines: pd.DataFrame, kind: str, channel: str, statistics: Statistics) -> str:
     """Errors along stiff and sloppy directions, and of prediction, of one range; empty where there
     are none.
     """
@@ -227,16 +276,16 @@ def _directions(lines: pd.DataFrame, kind: str, channel: str) -> str:
     part = part[part["simulations"].isin(shown)]
     part = part.assign(column=part["metric"].map(titles) + " " + part["simulations"].astype(str))
     order = [f"{t} {k}" for t in titles.values() for k in sorted(part["simulations"].unique())]
-    means = part.pivot(index="tuner", columns="column", values="mean")
-    means = means[[c for c in order if c in means]].dropna(axis=1, how="all")
-    means = means.sort_values(by=means.columns[-1])
-    title = "mean error along stiff and sloppy directions [training widths]"
+    medians = part.pivot(index="tuner", columns="column", values="median")
+    medians = medians[[c for c in order if c in medians]].dropna(axis=1, how="all")
+    medians = medians.reindex([t for t in statistics.order_in(kind) if t in medians.index])
+    title = "median error along stiff and sloppy directions [training widths]"
     if "heldout_error" in set(part["metric"]):
         title += f" and RMSE of {channel} in unseen scenarios"
-    return f"{title}, after N simulations\n{_laid_out(means)}"
+    return f"{title}, after N simulations\n{_laid_out(medians.rename(index=statistics.labelled))}"
 
 
-def _seconds(lines: pd.DataFrame) -> str:
+def _seconds(lines: pd.DataFrame, statistics: Statistics) -> str:
     """What a tuner took beside what its simulations took, and its training."""
     last = lines[lines["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
     columns = {
@@ -245,6 +294,7 @@ def _seconds(lines: pd.DataFrame) -> str:
         "one training": "fit_seconds",
     }
     seconds = pd.DataFrame({name: last[column] for name, column in columns.items()})
+    seconds = seconds.reindex([t for t in statistics.order if t in seconds.index])
     return f"mean seconds of a run\n{_laid_out(seconds)}"
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from bench.problem.experiment import Experiment
+from bench.problem.numeric_warnings import numeric_warnings_silenced
 from bench.problem.problem import Problem
 from bench.problem.targets import Target
 from bench.report import tables
@@ -77,6 +78,7 @@ class Verified(NamedTuple):
         }
 
 
+@numeric_warnings_silenced()
 def verify(
     folder: Path,
     say: Say,
@@ -242,15 +244,22 @@ def _tables(folder: Path, stored: Stored, say: Say) -> list[Doubt]:
         say("table.csv: none; simgap plot writes it")
         return []
     found = pd.read_csv(path, keep_default_na=True)
-    expected = tables(stored)["table"].reset_index(drop=True)
+    expected = tables(stored)["table"]
     if len(found) != len(expected):
         return [Doubt(path.name, 0, f"expected {len(expected)} rows, found {len(found)}")]
     doubts = []
+    # The order of rows says nothing: it follows the ranking of the version that wrote them.
+    keys = ["experiment", "tuner", "range", "simulations", "metric"]
+    if not set(keys) - set(found):
+        expected = expected.sort_values(keys, kind="stable")
+        found = found.fillna({"range": "", "metric": ""}).sort_values(keys, kind="stable")
+    lines = found.index
     for column in expected:
         if column not in found:
             doubts.append(Doubt(path.name, 0, f"expected a column {column}, found none"))
             continue
-        a, b = expected[column], found[column]
+        a = expected[column].reset_index(drop=True)
+        b = found[column].reset_index(drop=True)
         if pd.api.types.is_numeric_dtype(a) and a.dtype != bool:
             same = np.isclose(a.astype(float), b.astype(float), rtol=_SAME, equal_nan=True)
         else:
@@ -258,6 +267,6 @@ def _tables(folder: Path, stored: Stored, say: Say) -> list[Doubt]:
         if not same.all():
             place = int(np.argmin(same))
             says = f"{column}: expected {a[place]}, found {b[place]}"
-            doubts.append(Doubt(path.name, place + 2, says))
+            doubts.append(Doubt(path.name, int(lines[place]) + 2, says))
     say(f"table.csv: {len(found)} rows made again from runs.parquet")
     return doubts

@@ -36,10 +36,11 @@ EVEN_COLUMNS = [
 ]
 COSTS: Array = np.logspace(-6, 3, 181)
 """Seconds that a simulation may take."""
-MOST_TARGETS = 1e4
-"""That may share a training where simulations in total are put against targets."""
+AT_ONCE, NEVER = 10**-0.5, 10**4.5
+"""Places on a logarithmic axis of a training that pays from the first target on, because the search
+never reaches the error, and of one that does not pay within 10^4 targets.
+"""
 SECONDS_COLUMNS = ["range", "tuner", "simulation_seconds", "seconds"]
-TOTAL_COLUMNS = ["range", "tuner", "targets", "simulations"]
 SHARED = 100
 """Targets that share one training where it is asked who wins at which cost."""
 
@@ -167,17 +168,14 @@ def seconds_table(prices: Mapping[str, Mapping[str, Price]]) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=SECONDS_COLUMNS)
 
 
-def totals_table(prices: Mapping[str, Mapping[str, Price]]) -> pd.DataFrame:
-    """Simulations in total by number of targets, training included, `TOTAL_COLUMNS`. Arguments and
-    what is left out as in `seconds_table`.
+def placed_even(table: pd.DataFrame) -> pd.DataFrame:
+    """Put the numbers of targets of `break_even_table` on a logarithmic axis from `AT_ONCE` to
+    `NEVER`.
     """
-    targets = np.logspace(0, np.log10(MOST_TARGETS), 200)
-    parts = []
-    for kind, by_tuner in prices.items():
-        for tuner, price in by_tuner.items():
-            ert = float(price.effort.ert())
-            total = price.fit_simulations + targets * ert
-            if np.isfinite(ert) and total[0] > 0:
-                columns = (kind, tuner, targets, total)
-                parts.append(pd.DataFrame(dict(zip(TOTAL_COLUMNS, columns, strict=True))))
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=TOTAL_COLUMNS)
+    placed = table.copy()
+    for column in ("targets", "low", "high"):
+        values = table[column].to_numpy(dtype=np.float64)
+        # Fewer than one target is the first; what is beyond the axis stands at its end.
+        within = np.where(values < 1e4, np.maximum(values, 1.0), NEVER)
+        placed[column] = np.where(values == 0, AT_ONCE, within)
+    return placed

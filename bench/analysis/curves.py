@@ -61,11 +61,16 @@ class Curves:
         groups = np.split(np.argsort(codes, kind="stable"), ends[:-1])
         return [str(n) for n in names], groups[: len(names)]
 
-    def final(self) -> Array:
-        """(R,) the metric at the end; infinite for a run that failed: it delivered nothing one
-        could have trusted.
+    def after(self, k: int) -> Array:
+        """(R,) the metric after k simulations; infinite for a run that failed, now or later: what
+        it recommended cannot be trusted.
         """
-        return np.where(self.failed | np.isnan(self.values[:, -1]), np.inf, self.values[:, -1])
+        values = self.values[:, k]
+        return np.where(self.failed | np.isnan(values), np.inf, values)
+
+    def final(self) -> Array:
+        """(R,) the metric after all simulations, see `after`."""
+        return self.after(-1)
 
 
 KEYS = ["run", "experiment", "tuner", "range", "target", "seed"]

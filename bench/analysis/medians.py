@@ -4,7 +4,7 @@ the target's distance from the training range. The figures draw them, and the pa
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -27,12 +27,18 @@ DISTANCE_COLUMNS = [
     "low",
     "high",
 ]
-BINS = 4
-"""Of distances outside the training range; targets within it make one more."""
+_MOST_GROUPS = 4
+"""Maximum number of groups of targets outside the training range."""
+_GROUP = 4
+"""Minimum number of targets outside the training range that make a group, where there are so many:
+fewer have no interval to speak of.
+"""
 _RESAMPLES = 500
 """Of the bootstrap: enough for a band a few pixels wide."""
 _POINTS = 40
 """Numbers of simulations of a curve, on a logarithmic scale."""
+_SAME = 0.02
+"""Relative difference of errors that a logarithmic axis does not show."""
 _MOMENTS = (3, 10)
 """Numbers of simulations at which errors are put against distance, beside the whole budget."""
 
@@ -67,28 +73,71 @@ def median_curves(curves: Curves, metric: str, budget: int) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=MEDIAN_COLUMNS)
 
 
+def coinciding(drawn: Mapping[str, Sequence[pd.Series[float]]]) -> dict[str, str]:
+    """Find curves that cannot be seen because another one is drawn above them.
+
+    A curve coincides with a later one up to k where the two differ by less than `_SAME` in every
+    panel up to k, and have halved the error of the start by then: until then most tuners are alike.
+
+    Args:
+        drawn: by tuner, in the order in which curves are drawn, its curve in each panel: medians by
+            number of simulations.
+
+    Returns:
+        By tuner whose curve is covered: ``same as hybrid up to 2``, or ``same as hybrid``.
+    """
+    notes = {}
+    names = list(drawn)
+    for place, name in enumerate(names):
+        longest = 0
+        for above in names[place + 1 :]:
+            if len(drawn[above]) != len(drawn[name]):
+                continue
+            pairs = list(zip(drawn[name], drawn[above], strict=True))
+            upto = min(_equal_up_to(mine, other) for mine, other in pairs)
+            moved = any((mine.loc[:upto] < 0.5 * mine.iloc[0]).any() for mine, _ in pairs)
+            if upto > longest and moved:
+                longest = upto
+                whole = all(upto == mine.index[-1] for mine, _ in pairs)
+                notes[name] = f"same as {above}" + ("" if whole else f" up to {upto}")
+    return notes
+
+
+def _equal_up_to(mine: pd.Series[float], other: pd.Series[float]) -> int:
+    """The largest number of simulations up to which two curves look the same; 0 for none."""
+    points = mine.index.intersection(other.index)
+    a, b = mine[points].to_numpy(), other[points].to_numpy()
+    same = np.logical_and.accumulate(np.abs(a - b) <= _SAME * np.maximum(a, b))
+    return int(points[same][-1]) if same.any() else 0
+
+
 def by_distance(curves: Curves, distances: pd.Series[float], budget: int) -> pd.DataFrame:
-    """Median error after few, some and all simulations by how far the target lies outside the
-    training range, `DISTANCE_COLUMNS`: bin 0 is inside it, the others are of one width.
+    """Median error after few, some and all simulations by distance from the training range.
+
+    Targets inside the training range are one group (bin 0). Those outside are sorted by distance
+    and divided into at most `_MOST_GROUPS` groups of equal size.
 
     Args:
         curves: of the error, in the range `wide`.
         distances: of each target from the training range, by its name.
         budget: largest number of simulations.
+
+    Returns:
+        A row for each number of simulations, tuner and group, columns `DISTANCE_COLUMNS`; `beyond`
+        and `to` are the smallest and largest distance in the group.
     """
-    bins, edges = _binned(distances)
+    groups = _groups(distances)
     points = moments(budget)
     errors = {t: target_curves(curves.of(tuner=t), points) for t in curves.tuners()}
     lines = []
     for k in points:
         for tuner, by_target in errors.items():
             values = by_target[k].dropna().clip(lower=FLOOR)
-            places = bins[values.index].to_numpy()
-            lines += [
-                (k, tuner, b, *edges[b], int((bins == b).sum()), *_middle(part, tuner, b))
-                for b in range(BINS + 1)
-                if len(part := values.to_numpy()[places == b])
-            ]
+            for b, names in groups.items():
+                part = values.reindex(names).dropna().to_numpy()
+                if len(part):
+                    ends = float(distances[names].min()), float(distances[names].max())
+                    lines.append((k, tuner, b, *ends, len(names), *_middle(part, tuner, b)))
     return pd.DataFrame(lines, columns=DISTANCE_COLUMNS)
 
 
@@ -96,14 +145,13 @@ def _values(frame: pd.DataFrame) -> Array:
     return frame.to_numpy(dtype=np.float64)
 
 
-def _binned(distances: pd.Series[float]) -> tuple[pd.Series[Any], list[tuple[float, float]]]:
-    """The bin of each target, and where each bin begins and ends."""
-    # Bins of one width; targets on the edge of the training range are within it.
-    edges = np.linspace(0.0, float(distances.max()), BINS + 1)
-    outside = 1 + np.searchsorted(edges[1:-1], distances, side="left")
-    bins = pd.Series(np.where(distances > 0, outside, 0), index=distances.index)
-    ends = [(float(edges[b]), float(edges[b + 1])) for b in range(BINS)]
-    return bins, [(0.0, 0.0), *ends]
+def _groups(distances: pd.Series[float]) -> dict[int, list[str]]:
+    """Names of the targets of each group: 0 inside the training range, then by distance."""
+    inside = list(distances.index[distances <= 0])
+    outside = list(distances[distances > 0].sort_values(kind="stable").index)
+    count = min(max(len(outside) // _GROUP, 1), _MOST_GROUPS)
+    parts = [list(part) for part in np.array_split(np.array(outside, dtype=object), count)]
+    return {b: names for b, names in enumerate([inside, *parts]) if names}
 
 
 def _middle(values: Array, tuner: str, place: int) -> tuple[float, float, float]:
@@ -115,10 +163,15 @@ def _middle(values: Array, tuner: str, place: int) -> tuple[float, float, float]
 
 
 def bin_names(table: pd.DataFrame) -> list[str]:
-    """What the bins of `by_distance` are called, with their numbers of targets."""
-    first = table.drop_duplicates("bin").to_dict("records")
-    counts = {int(row["bin"]): row["targets"] for row in first}
-    # Bins outside are of one width; one without a target has no row to say so.
-    width = max((row["to"] / row["bin"] for row in first if row["bin"]), default=0.0)
-    ranges = ["inside", *(f"{b * width:.2f}–{(b + 1) * width:.2f}" for b in range(BINS))]
-    return [f"{name}\nn={counts.get(b, 0)}" for b, name in enumerate(ranges)]
+    """Return what the groups of `by_distance` are called, with their numbers of targets."""
+    first = {int(row["bin"]): row for row in table.drop_duplicates("bin").to_dict("records")}
+    names = []
+    for b in range(max(first, default=0) + 1):
+        row = first.get(b)
+        if row is None:
+            names.append("inside\nn=0")
+            continue
+        ends = [f"{row[end]:.2f}" for end in ("beyond", "to")]
+        name = "–".join(dict.fromkeys(ends)) if b else "inside"
+        names.append(f"{name}\nn={row['targets']}")
+    return names

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -39,29 +40,41 @@ PROBLEMS = 5
 """Problems that mean ranks need at least."""
 
 
-def log_errors(curves: Curves) -> pd.DataFrame:
-    """Logarithms of final errors, a row a target, a column a tuner; the mean over seeds first."""
+def log_errors(curves: Curves, k: int = -1, floor: float = LEAST) -> pd.DataFrame:
+    """Logarithms of errors after k simulations, a row a target, a column a tuner.
+
+    The mean over seeds is taken first. A failure in one seed makes it infinite: the tuner then
+    counts as failed on this target.
+
+    Args:
+        curves: the error of every run.
+        k: number of simulations; -1 for all.
+        floor: errors below this count as equal to it.
+    """
     columns = {}
     for tuner in curves.tuners():
         mine = curves.of(tuner=tuner)
         names, groups = mine.by_target()
-        errors = mean_over_seeds(mine.final(), groups)
-        # A failure in one seed makes the target's mean infinite: it counts as failed.
-        columns[tuner] = pd.Series(logarithms(errors), index=names)
+        errors = mean_over_seeds(mine.after(k), groups)
+        columns[tuner] = pd.Series(logarithms(errors, floor), index=names)
     return pd.DataFrame(columns)
 
 
-def pairs(curves: Curves) -> pd.DataFrame:
-    """Every pair of tuners on the targets of each experiment and range, columns as `PAIR_COLUMNS`.
+def pairs(curves: Curves, floor: float = LEAST) -> pd.DataFrame:
+    """Compare every pair of tuners on the targets of each experiment and range.
 
-    `a_better` is the share of targets on which a ends with the smaller error (ties count half);
-    `effect` the rank-biserial correlation, 1 where a is better on all targets, -1 where b is;
-    `error_ratio` the median of a's error over b's. Holm's correction is over all pairs of an
-    experiment and range.
+    Columns are `PAIR_COLUMNS`. `a_better` is the share of targets on which a ends with the smaller
+    error (ties count half); `effect` the rank-biserial correlation, 1 where a is better on all
+    targets, -1 where b is; `error_ratio` the median of a's error over b's. Holm's correction is
+    over all pairs of an experiment and range.
+
+    Args:
+        curves: the error of every run.
+        floor: errors below this count as equal to it.
     """
     parts = []
     for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
-        logs = log_errors(curves.of(experiment=str(experiment), range=str(kind)))
+        logs = log_errors(curves.of(experiment=str(experiment), range=str(kind)), floor=floor)
         lines = [
             (experiment, kind, a, b, *compared(logs[a].to_numpy(), logs[b].to_numpy()))
             for a, b in itertools.combinations(logs.columns, 2)
@@ -85,18 +98,35 @@ def holm(p: Array) -> Array:
     return corrected
 
 
-def logarithms(errors: Array) -> Array:
-    """(n,) logarithms of errors (n,); of an infinite one, as of a run that failed, what is worse
-    than any error.
+def logarithms(errors: Array, floor: float = LEAST) -> Array:
+    """Return logarithms of errors (n,), of which those below `floor` count as equal to it.
+
+    An infinite error, as of a run that failed, becomes a number that is worse than any error.
     """
-    logs: Array = np.where(np.isinf(errors), _WORST, np.log(np.maximum(errors, LEAST)))
+    logs: Array = np.where(np.isinf(errors), _WORST, np.log(np.maximum(errors, floor)))
     return logs
 
 
-def compared(a: Array, b: Array) -> tuple[int, float, float, float, float]:
-    """Targets, share on which a is better, effect, ratio of errors and p-value (Wilcoxon's
-    signed-rank test), of logarithms of errors a and b (n,) on the same targets.
+class PairedTest(NamedTuple):
+    """How tuner a does against tuner b on the same targets.
+
+    Attributes:
+        targets: number of targets that both have.
+        a_better: share of them on which a has the smaller error; ties count half.
+        effect: matched-pairs rank-biserial correlation, 1 where a is better on all targets.
+        ratio: median over targets of a's error over b's.
+        p_value: of Wilcoxon's signed-rank test, two-sided.
     """
+
+    targets: int
+    a_better: float
+    effect: float
+    ratio: float
+    p_value: float
+
+
+def compared(a: Array, b: Array) -> PairedTest:
+    """Compare the logarithms of errors a and b (n,) on the same targets."""
     from scipy.stats import rankdata, wilcoxon
 
     there = ~(np.isnan(a) | np.isnan(b))
@@ -106,7 +136,7 @@ def compared(a: Array, b: Array) -> tuple[int, float, float, float, float]:
     # Wilcoxon drops ties: they speak for neither.
     unequal = difference[difference != 0]
     if not len(unequal):
-        return len(difference), better, 0.0, 1.0, 1.0
+        return PairedTest(len(difference), better, 0.0, 1.0, 1.0)
     ranks = rankdata(np.abs(unequal))
     # Kerby's simple difference: the share of ranks in favour less the share against.
     effect = float((ranks[unequal < 0].sum() - ranks[unequal > 0].sum()) / ranks.sum())
@@ -116,18 +146,18 @@ def compared(a: Array, b: Array) -> tuple[int, float, float, float, float]:
         p = float(wilcoxon(unequal).pvalue)
     # A failure against none makes a ratio beyond what a number holds.
     ratio = float(np.exp(np.clip(np.median(difference), -700, 700)))
-    return len(difference), better, effect, ratio, p
+    return PairedTest(len(difference), better, effect, ratio, p)
 
 
-def ranks(curves: Curves) -> pd.DataFrame:
-    """Rank of each tuner (columns) on each problem (rows): by the median over targets, failures
-    last, 1 is best.
+def ranks(curves: Curves, floor: float = LEAST) -> pd.DataFrame:
+    """Rank each tuner (columns) on each problem (rows): by the median over targets, failures last,
+    1 is best. Errors below `floor` count as equal to it.
 
     A problem is an experiment and a range; tuners that miss a problem are left out.
     """
     rows = {}
     for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
-        logs = log_errors(curves.of(experiment=str(experiment), range=str(kind)))
+        logs = log_errors(curves.of(experiment=str(experiment), range=str(kind)), floor=floor)
         rows[f"{experiment} {kind}"] = logs.median(axis=0)
     medians = pd.DataFrame(rows).T.dropna(axis="columns")
     # Rounded, so that errors that differ by the last bit share a rank.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -10,8 +10,9 @@ import pandas as pd
 
 from bench.analysis.amortisation import Price, prices
 from bench.analysis.curves import Curves, Rows, primary
-from bench.analysis.medians import by_distance, median_curves
+from bench.analysis.medians import by_distance, coinciding, median_curves
 from bench.analysis.runtimes import share_table, thresholds
+from bench.analysis.tuner_ranking import failure_notes, final_order, rank_tuners
 from bench.problem.experiment import Experiment
 
 PRICED = 3
@@ -34,6 +35,7 @@ class Statistics:
         spread: thresholds of the runtime distribution.
         levels: thresholds of the tables.
         all_runs: those too that lack the metric that decides.
+        floor: errors of the deciding metric below this count as equal to it.
     """
 
     def __init__(
@@ -48,6 +50,10 @@ class Statistics:
         self._rows = self._laid_out(self.runs)
         self.curves = self._rows.curves(self.metric)
         self.spread, self.levels = thresholds(self.curves, in_widths)
+        self.floor = experiment.negligible_error
+        if not in_widths:
+            # On a recording no error is known to be zero: the least one stands for it.
+            self.floor = (1.0 + self.floor) * _least_median(self.curves)
         self.all_runs = runs
         self._curves: dict[str, Curves] = {}
         self._medians: dict[tuple[str, str], pd.DataFrame] = {}
@@ -61,6 +67,78 @@ class Statistics:
         """Targets of each range of which there are runs."""
         counts = self.all_runs.groupby("range", sort=False)["target"].nunique()
         return {str(kind): int(count) for kind, count in counts.items()}
+
+    @cached_property
+    def ranking(self) -> pd.DataFrame:
+        """Tuners ranked in each range; see `bench.analysis.tuner_ranking.rank_tuners`."""
+        return rank_tuners(self.curves, self._budget, self.floor)
+
+    @cached_property
+    def order(self) -> list[str]:
+        """Tuners over all ranges, the best first: the order of legends. Tuners without a run that
+        has the deciding metric come last.
+        """
+        order = final_order(self.curves, self._budget, self.floor)
+        return [*order, *(t for t in self._all.keys["tuner"].unique() if t not in order)]
+
+    def order_in(self, kind: str) -> list[str]:
+        """Tuners of one range after all simulations, the best first."""
+        last = self.ranking[self.ranking["simulations"] == self._budget]
+        ranked = list(last.loc[last["range"] == kind, "tuner"])
+        return [*ranked, *(t for t in self.order if t not in ranked)]
+
+    def sorted(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Sort rows that have the columns range and tuner: range by range, the best tuner first."""
+        kinds = [str(kind) for kind in dict.fromkeys(self._all.keys["range"])]
+        order = [(kind, tuner) for kind in kinds for tuner in self.order_in(kind)]
+        places = {key: place for place, key in enumerate(order)}
+        # A tuner that could not be used has no range.
+        keys = [
+            places.get(key, len(places)) for key in zip(frame["range"], frame["tuner"], strict=True)
+        ]
+        return frame.iloc[np.argsort(keys, kind="stable")].reset_index(drop=True)
+
+    @cached_property
+    def notes(self) -> dict[str, str]:
+        """What legends and tables say of tuners some of whose runs failed."""
+        failed = pd.Series(self._all.failed).groupby(self._all.keys["tuner"], sort=False)
+        return failure_notes({str(t): (int(bad.sum()), len(bad)) for t, bad in failed})
+
+    def coinciding(self, shown: Sequence[tuple[str, str]]) -> dict[str, str]:
+        """Which tuners' curves lie below another's: ``same as hybrid up to 2``, by tuner.
+
+        Args:
+            shown: metric and range of each panel of curves.
+        """
+        drawn: dict[str, list[pd.Series[float]]] = {}
+        for metric, kind in shown:
+            for tuner, line in self.medians(metric, kind).groupby("tuner", sort=False):
+                drawn.setdefault(str(tuner), []).append(line.set_index("simulations")["median"])
+        return coinciding(drawn)
+
+    def floor_of(self, metric: str) -> float | None:
+        """The error below which tuners count as equal, in the unit of a metric; None for metrics
+        that decide nothing.
+        """
+        if metric == self.metric:
+            return self.floor
+        decides = self.metric == "param_error" and metric == "param_abs_error"
+        return self.floor * self.unit if decides else None
+
+    def labelled(self, tuner: str) -> str:
+        """The tuner's name, and how many of its runs failed where some did."""
+        return f"{tuner} [{self.notes[tuner]}]" if tuner in self.notes else tuner
+
+    @cached_property
+    def unit(self) -> float:
+        """What the floor and the medians of the ranking are multiplied by to be errors of the one
+        parameter in its own unit; 1 where there are several, or none whose truth is known.
+        """
+        if self.metric != "param_error" or "param_abs_error" not in self.runs:
+            return 1.0
+        # One is the other times the width of the training range.
+        largest = float(self.runs["param_error"].max())
+        return float(self.runs["param_abs_error"].max()) / largest if largest > 0 else 1.0
 
     def medians(self, metric: str, kind: str) -> pd.DataFrame:
         """Medians of a metric against simulations in a range, of the runs that have it; see
@@ -137,6 +215,12 @@ class Statistics:
             if all(_half(by_tuner) for by_tuner in self.prices[level].values()):
                 return level
         return max(self.prices)
+
+
+def _least_median(curves: Curves) -> float:
+    """The smallest median over runs of any tuner's final error; 0 where every run failed."""
+    medians = [float(np.median(curves.of(tuner=t).final())) for t in curves.tuners()]
+    return min((m for m in medians if np.isfinite(m)), default=0.0)
 
 
 def _half(by_tuner: Mapping[str, Price]) -> bool:

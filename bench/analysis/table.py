@@ -9,7 +9,7 @@ taken for independent evidence.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -118,8 +118,8 @@ def target_curves(curves: Curves, points: list[int]) -> pd.DataFrame:
     return pd.DataFrame(values, index=pd.Index(names, name="target"), columns=points)
 
 
-def summary(table: pd.DataFrame, metric: str, kind: str) -> pd.DataFrame:
-    """Mean error by tuner (rows) and number of simulations (columns), best last column first."""
+def summary(table: pd.DataFrame, metric: str, kind: str, order: Sequence[str]) -> pd.DataFrame:
+    """Median error by tuner (rows, as in `order`) and number of simulations (columns)."""
     part = table[(table["metric"] == metric) & (table["range"] == kind)]
-    means = part.pivot(index="tuner", columns="simulations", values="mean")
-    return means.sort_values(by=means.columns[-1])
+    medians = part.pivot(index="tuner", columns="simulations", values="median")
+    return medians.reindex([tuner for tuner in order if tuner in medians.index])

@@ -409,10 +409,10 @@ class Compared:
 
     @cached_property
     def tables(self) -> dict[str, pd.DataFrame]:
-        """The tables by name: table, ert, pairs, break_even, who_wins; of a bounce shot table and
-        shots (docs/results-films.md), of a study of a missing effect table, ranks and ranking
-        (docs/misspecified.md), of a comparison of diagnosers table, failures, items and the others
-        (docs/diagnosers.md).
+        """The tables by name: table, ert, ranking, pairs, break_even, who_wins; of a bounce shot
+        table and shots (docs/results-films.md), of a study of a missing effect table, ranks and
+        ranking (docs/misspecified.md), of a comparison of diagnosers table, failures, items and
+        the others (docs/diagnosers.md).
         """
         if self.experiment.diagnosis:
             return {name: diagnosis.read_table(self.folder, name) for name in diagnosis.TABLES}
@@ -474,8 +474,8 @@ class Compared:
         return comparison.figure(self._stored, self._labels, name, behind=references)
 
     def summary(self) -> pd.DataFrame:
-        """The last mean error of each tuner, the best first, with how many runs failed; of
-        diagnosers what each raises and names.
+        """Return the last error of each tuner in the order of the ranking, with its verdict and the
+        number of failed runs; for diagnosers what each raises and names.
         """
         table = self.table
         if self.experiment.diagnosis:
@@ -484,8 +484,15 @@ class Compared:
             return table
         last = table[table["simulations"] == table["simulations"].max()]
         first = last[last["metric"] == last["metric"].iloc[0]]
-        columns = ["tuner", "range", "metric", "mean", "low", "high", "runs", "failures"]
-        best: pd.DataFrame = first[columns].sort_values(["range", "mean"])
+        import pandas as pd
+
+        ranking = self.tables["ranking"]
+        last = ranking[ranking["simulations"] == ranking["simulations"].max()]
+        verdicts = last.set_index(["range", "tuner"])["verdict"]
+        places = pd.MultiIndex.from_frame(first[["range", "tuner"]])
+        first = first.assign(verdict=verdicts.reindex(places).to_numpy())
+        columns = ["tuner", "range", "verdict", "metric", "median", "mean", "low", "high"]
+        best: pd.DataFrame = first[[*columns, "runs", "failures"]]
         return best.reset_index(drop=True)
 
     def __repr__(self) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from bench.analysis.statistics import Statistics
 from bench.figures import errors, identifiability, runtimes
-from bench.figures.style import BEHIND, Styles, mark
+from bench.figures.style import BEHIND, mark, style_of
 from bench.problem.experiment import Experiment
 from bench.problem.problem import Problem
 from bench.store.folder import Stored
@@ -145,7 +145,7 @@ def _figure(
 
 
 def _of_effort(experiment: Experiment, name: str, statistics: Statistics) -> Figure:
-    style = Styles(experiment, statistics.runs, statistics.metric)
+    style = style_of(experiment, statistics)
     if name == "runtime":
         return runtimes.runtime_figure(experiment, style, statistics)
     # Tables have every level; a figure has the one at which there is most to see.

@@ -12,11 +12,21 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.analysis.medians import BINS, bin_names, moments
+from bench.analysis.medians import bin_names, moments
 from bench.analysis.rounding import FLOOR
 from bench.analysis.statistics import Statistics
 from bench.analysis.table import checkpoints
-from bench.figures.style import SOFT, TITLES, Styles, behind_id, canvas, finish, titled
+from bench.figures.style import (
+    SHADE,
+    SOFT,
+    TITLES,
+    Styles,
+    behind_id,
+    canvas,
+    finish,
+    style_of,
+    titled,
+)
 from bench.problem.experiment import Experiment
 
 if TYPE_CHECKING:
@@ -46,12 +56,15 @@ def error_figure(
     """
     shown = panels(experiment, statistics, channel, parameter)
     figure, axes = canvas(len(shown))
-    style = Styles(experiment, statistics.all_runs, shown[0].metric, behind)
+    drawn = [(panel.metric, panel.kind) for panel in shown]
+    style = style_of(experiment, statistics, behind, drawn)
     what = "starts" if "real" in experiment.ranges else "targets"
     for axis, panel in zip(axes, shown, strict=True):
         samples_panel(axis, statistics, panel.metric, panel.kind, style)
         titled(axis, f"{panel.title} ({statistics.targets[panel.kind]} {what})")
         axis.set_ylabel(f"{panel.label}, median")
+    for axis, panel in zip(axes, shown, strict=True):
+        shade_equal(axis, statistics.floor_of(panel.metric))
     finish(figure, axes, style, experiment)
     return figure
 
@@ -86,7 +99,8 @@ def misfit_figure(
     """
     kinds = ranges(experiment, statistics.all_runs)
     figure, axes = canvas(len(kinds))
-    style = Styles(experiment, statistics.all_runs, "obs_error", behind)
+    drawn = [("obs_error", kind) for kind in kinds]
+    style = style_of(experiment, statistics, behind, drawn)
     for axis, kind in zip(axes, kinds, strict=True):
         part = statistics.of(kind)
         samples_panel(axis, statistics, "obs_error", kind, style)
@@ -133,6 +147,27 @@ def samples_panel(
     simulations_axis(axis, budget)
 
 
+def shade_equal(axis: Axes, floor: float | None) -> None:
+    """Shade the errors that count as equal, where some are drawn.
+
+    Args:
+        axis: of a figure whose panels are all drawn: its limits are fixed from here on.
+        floor: of `bench.analysis.statistics.Statistics.floor_of`.
+    """
+    low, high = axis.get_ylim()
+    if floor is None or not low < floor < high:
+        return
+    axis.axhspan(low, floor, color=SHADE, linewidth=0, zorder=0)
+    axis.annotate(
+        f"below {floor:.2g}: count as equal",
+        (0, floor),
+        xytext=(4, -10),
+        textcoords="offset points",
+        fontsize=7.5,
+    )
+    axis.set_ylim(low, high)
+
+
 def _grey_lines(
     axis: Axes, reference: Reference, kind: str, metric: str, budget: int, style: Styles
 ) -> None:
@@ -162,11 +197,12 @@ def distance_figure(experiment: Experiment, statistics: Statistics, parameter: s
     table = statistics.distances
     shown = moments(experiment.budget)
     figure, axes = canvas(len(shown))
-    style = Styles(experiment, statistics.all_runs, statistics.parameter_metric)
+    style = style_of(experiment, statistics)
     for axis, k in zip(axes, shown, strict=True):
         for tuner, line in table[table["simulations"] == k].groupby("tuner", sort=False):
             _distance_line(axis, line, str(tuner), style)
-        axis.set_xticks(range(BINS + 1), bin_names(table), fontsize=7)
+        axis.set_xticks(range(len(bin_names(table))), bin_names(table), fontsize=7)
+        axis.set_xlim(-0.5, len(bin_names(table)) - 0.5)
         axis.set_yscale("log")
         titled(axis, f"After {k} simulations")
         axis.set_xlabel(
@@ -180,8 +216,8 @@ def distance_figure(experiment: Experiment, statistics: Statistics, parameter: s
 def _distance_line(axis: Axes, line: pd.DataFrame, tuner: str, style: Styles) -> None:
     middle = line["median"].to_numpy()
     bars = np.array([middle - line["low"], line["high"] - middle])
-    # One target has no interval: its bar has no length. A percentile interval may lie to one side
-    # of the median by rounding; a bar has no such side.
+    # A single target has no interval. A percentile interval may lie to one side of the median by
+    # rounding; a bar has no such side.
     lengths = np.maximum(np.nan_to_num(bars), 0.0)
     places = line["bin"].to_numpy() + style.offset(tuner)
     look = style.of(tuner)

@@ -10,18 +10,18 @@ import pandas as pd
 
 from bench.analysis.spectra import COLUMNS
 from bench.analysis.statistics import Statistics
-from bench.figures.errors import samples_panel
+from bench.figures.errors import samples_panel, shade_equal
 from bench.figures.style import (
     BLUE,
     CAPTION,
     SOFT,
     TITLES,
     VERMILION,
-    Styles,
     below,
     blank,
     finish,
     plain,
+    style_of,
 )
 from bench.problem.experiment import Experiment
 from bench.problem.identifiability import STIFF
@@ -169,7 +169,8 @@ def directions_figure(
     ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
     size = (1.8 + 4.0 * len(ranges), 1.2 + 2.3 * len(metrics))
     figure, axes = blank(len(metrics), len(ranges), size, sharey="row", sharex=True)
-    style = Styles(experiment, runs, metrics[0], behind)
+    drawn = [(metric, kind) for metric in metrics for kind in ranges]
+    style = style_of(experiment, statistics, behind, drawn)
     for row, metric in zip(axes, metrics, strict=True):
         for axis, kind in zip(row, ranges, strict=True):
             part = runs[(runs["range"] == kind) & runs[metric].notna()]
@@ -186,6 +187,9 @@ def directions_figure(
             # Rows share their horizontal axis: it is named under the last.
             if metric != metrics[-1]:
                 axis.set_xlabel("")
+    for row, metric in zip(axes, metrics, strict=True):
+        for axis in row:
+            shade_equal(axis, statistics.floor_of(metric))
     caption = f"{CAPTION} A sloppy direction is one that the target's data do not fix."
     finish(figure, [a for row in axes for a in row], style, experiment, caption)
     return figure

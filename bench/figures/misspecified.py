@@ -163,8 +163,7 @@ def _most_biased(lines: pd.DataFrame) -> str:
 
 def _slope(panel: Axes, one: System, ranks: pd.DataFrame) -> None:
     plain(panel)
-    runs = pd.DataFrame({"tuner": ranks["tuner"], "run": ranks["tuner"], "rank": ranks["plain"]})
-    style = Styles(one.experiment, runs, "rank")
+    style = Styles(one.experiment, list(ranks.sort_values("plain", kind="stable")["tuner"]))
     for tuner, before, after in zip(ranks["tuner"], ranks["plain"], ranks["extended"], strict=True):
         panel.plot([0, 1], [before, after], markersize=5, **style.of(str(tuner)))
     panel.set_xticks([0, 1], ["as it is", "extended"], fontsize=8)

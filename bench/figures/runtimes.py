@@ -4,26 +4,37 @@ mean ranks.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from bench.analysis.amortisation import (
-    MOST_TARGETS,
+    AT_ONCE,
+    NEVER,
     SHARED,
     Price,
-    break_even,
+    break_even_table,
+    placed_even,
     seconds_table,
-    totals_table,
     winners,
 )
-from bench.analysis.runtimes import percentile_interval, resampled
 from bench.analysis.statistics import Statistics
 from bench.analysis.table import checkpoints
 from bench.figures.errors import simulations_axis
-from bench.figures.style import INK, TITLES, Styles, blank, canvas, colour, finish, titled
+from bench.figures.style import (
+    INK,
+    SHADE,
+    TITLES,
+    Styles,
+    blank,
+    canvas,
+    colour,
+    finish,
+    plain,
+    titled,
+)
 from bench.problem.experiment import Experiment
 from sims.base import Array
 
@@ -78,8 +89,7 @@ def spread_caption(spread: Array) -> str:
 def amortisation_figure(
     experiment: Experiment, style: Styles, prices: Prices, level: float
 ) -> Figure:
-    """Simulations in total against the number of targets, training included, with the break-even
-    points.
+    """Number of targets from which on each training pays, against each tuner that searches.
 
     Args:
         experiment: what was compared.
@@ -87,44 +97,62 @@ def amortisation_figure(
         prices: of reaching `level`.
         level: of the deciding metric.
     """
-    figure, axes = canvas(len(prices))
-    table = totals_table(prices)
+    searching, learning = break_even_sides(prices, style)
+    row = max(0.42, 0.14 * len(learning))  # inches
+    size = (2.8 + 3.9 * len(prices), 1.7 + row * max(len(searching), 3))
+    figure, grid = blank(1, len(prices), size, sharey=True)
+    axes = list(grid[0])
     for axis, (kind, by_tuner) in zip(axes, prices.items(), strict=True):
-        for tuner, line in table[table["range"] == kind].groupby("tuner", sort=False):
-            look = style.of(str(tuner))
-            axis.plot(line["targets"], line["simulations"], markevery=25, markersize=4.5, **look)
-        _mark_even(axis, by_tuner)
+        plain(axis)
+        table = placed_even(break_even_table(experiment.name, kind, level, by_tuner))
+        for place, tuner in enumerate(learning):
+            shift = 0.6 * ((place + 0.5) / len(learning) - 0.5)
+            _break_even(axis, table[table["learned"] == tuner], searching, shift, style.of(tuner))
+        for edge, end in ((AT_ONCE * 10**0.25, 0.1), (NEVER / 10**0.25, 1e5)):
+            axis.axvspan(edge, end, color=SHADE, linewidth=0, zorder=0)
         axis.set_xscale("log")
-        axis.set_yscale("log")
-        axis.set_xlabel("number of targets")
-        axis.set_ylabel("simulations in total, training included")
+        axis.set_xlim(0.1, 1e5)
+        ticks = {AT_ONCE: "at\nonce", 1: "1", 10: "10", 100: "100", 1e3: "1000", NEVER: "never"}
+        axis.set_xticks(list(ticks), list(ticks.values()), fontsize=8)
+        axis.minorticks_off()
+        axis.set_xlabel("training pays from this number of targets on")
         titled(axis, TITLES[kind])
+    axes[0].set_yticks(range(len(searching)), searching)
+    axes[0].set_ylabel("instead of")
+    axes[0].set_ylim(len(searching) - 0.5, -0.5)
     caption = (
-        f"To reach an error of {level:.2g} for good: training + targets × expected simulations "
-        "(ERT). Rings: a learned tuner passes a search tuner; bars: 95 % bootstrap interval. "
-        "A tuner without a line never got there, or began there."
+        f"To reach an error of {level:.2g} for good. A mark: from this number of targets on, the "
+        "training and the expected simulations (ERT) of the trained tuner are fewer than those of "
+        "the tuner that searches. At once: the search never reaches the error. Never: not within "
+        "10 000 targets. Bar: 95 % bootstrap interval over targets."
     )
-    finish(figure, axes, style, experiment, caption)
+    finish(figure, axes, style, experiment, caption, "trained tuner")
     return figure
 
 
-def _mark_even(axis: Axes, prices: Mapping[str, Price]) -> None:
-    """A ring at each break-even point, with its 95 % interval as a bar."""
-    # Only against each other: who needs no training has nothing to get back.
-    learning = [p for p in prices.values() if p.fit_simulations]
-    searching = [p for p in prices.values() if not p.fit_simulations]
-    for learned in learning:
-        for search in searching:
-            even = float(break_even(learned, search))
-            if not 1 <= even <= MOST_TARGETS:
-                continue
-            total = even * float(search.effort.ert())
-            picked = resampled(len(learned.effort.successes), "break-even")
-            # Some resamples may never break even: their bar ends where the figure does.
-            spread = percentile_interval(break_even(learned, search, picked))
-            ends = np.clip(spread, 1, MOST_TARGETS)
-            axis.plot(ends, [total, total], color=INK, linewidth=1.0, alpha=0.6, zorder=4)
-            axis.plot(even, total, "o", markersize=9, markerfacecolor="none", color=INK, zorder=5)
+def break_even_sides(prices: Prices, style: Styles) -> tuple[list[str], list[str]]:
+    """Tuners that search, and trained ones that reach the error anywhere; each in the order of the
+    ranking.
+    """
+    found: dict[str, list[Price]] = {}
+    for by_tuner in prices.values():
+        for tuner, price in by_tuner.items():
+            found.setdefault(tuner, []).append(price)
+    order = [tuner for tuner in style.order if tuner in found]
+    learning = [t for t in order if any(price.fit_simulations for price in found[t])]
+    reaching = [t for t in learning if any(np.isfinite(p.effort.ert()) for p in found[t])]
+    return [t for t in order if t not in learning], reaching
+
+
+def _break_even(
+    axis: Axes, table: pd.DataFrame, searching: Sequence[str], shift: float, look: dict[str, Any]
+) -> None:
+    """One trained tuner's mark and interval in the row of each tuner that searches."""
+    rows = np.array([searching.index(str(t)) for t in table["search"]]) + shift
+    middle = table["targets"].to_numpy()
+    ends = np.array([middle - table["low"], table["high"] - middle])
+    mark = {**look, "linestyle": "none", "markersize": 5.0}
+    axis.errorbar(middle, rows, xerr=np.maximum(ends, 0.0), elinewidth=1.0, capsize=2.0, **mark)
 
 
 def cost_figure(experiment: Experiment, style: Styles, prices: Prices, level: float) -> Figure:

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
 
 from bench.analysis.rounding import FLOOR
 from bench.figures.formats import is_pdf_wanted
@@ -24,11 +22,11 @@ from sims.base import InputError
 from sims.files import write_all
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
+    from bench.analysis.statistics import Statistics
     from bench.store.reference import Reference
 
 # Okabe and Ito's eight colours, safe for colour-blind readers: M. Okabe, K. Ito, Color Universal
@@ -182,32 +180,27 @@ def drawn(colour: str, dashes: tuple[float, ...] = (), marker: str = "") -> Look
 
 
 class Styles:
-    """Colour, marker and line of each tuner: fixed by its place in the experiment, listed by its
-    final error.
+    """Colour, marker and line of each tuner, fixed by its place in the experiment.
 
     Args:
         experiment: what was compared.
-        runs: rows of runs.parquet.
-        metric: by whose last value tuners are listed.
+        order: tuners that have runs, as the legend lists them: the best first.
         behind: reference results that curves are drawn in front of; `BEHIND` of them at most.
+        notes: what the legend says below a tuner's name.
     """
 
     def __init__(
         self,
         experiment: Experiment,
-        runs: pd.DataFrame,
-        metric: str,
+        order: Sequence[str],
         behind: Sequence[Reference] = (),
+        notes: Mapping[str, str] | None = None,
     ) -> None:
-        self.experiment, self.behind = experiment, behind
-        present = set(runs["tuner"].unique())
+        self.experiment, self.behind, self.notes = experiment, behind, notes or {}
+        present = set(order)
         # A place counts tuners that did not run too: a colour means the same in every figure.
         self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
-        # Rows stand in order of k, so the last of a run is what it delivered.
-        last = runs.drop_duplicates("run", keep="last").groupby("tuner")[metric].median()
-        self.order: Sequence[str] = sorted(
-            self._places, key=lambda label: float(last.get(label, np.inf))
-        )
+        self.order = [label for label in order if label in self._places]
 
     def of(self, tuner: str) -> dict[str, Any]:
         """Keyword arguments for plotting `tuner`."""
@@ -245,6 +238,26 @@ class Styles:
     def offset(self, tuner: str) -> float:
         """A small shift along a category axis, so that error bars stand beside each other."""
         return (self._places[tuner] - (len(self._places) - 1) / 2) * 0.6 / max(len(self._places), 1)
+
+
+def style_of(
+    experiment: Experiment,
+    statistics: Statistics,
+    behind: Sequence[Reference] = (),
+    shown: Sequence[tuple[str, str]] = (),
+) -> Styles:
+    """Return the looks of a comparison's tuners, in the order of its ranking.
+
+    Args:
+        experiment: what was compared.
+        statistics: of it.
+        behind: reference results that curves are drawn in front of.
+        shown: metric and range of each panel of curves against simulations; the legend says which
+            curves coincide in them.
+    """
+    notes = [statistics.notes, statistics.coinciding(shown)]
+    joined = {t: "\n".join(n[t] for n in notes if t in n) for t in {*notes[0], *notes[1]}}
+    return Styles(experiment, statistics.order, behind, joined)
 
 
 def blank(
@@ -296,14 +309,18 @@ def finish(
     style: Styles,
     experiment: Experiment,
     caption: str = CAPTION,
-    heading: str = "best at the end first",
+    heading: str = "best over all targets first",
 ) -> None:
     """Legend, title and caption."""
     handles: dict[str, Any] = {}
     # A panel may lack a tuner that another has; of those in both, the first panel's is shown.
     for axis in reversed(axes):
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    listed = [(handles[label], label) for label in style.order if label in handles]
+    listed = [
+        (handles[label], "\n".join(filter(None, [label, style.notes.get(label)])))
+        for label in style.order
+        if label in handles
+    ]
     for reference in style.behind:
         listed += _behind_entries(axes, style, reference)
         caption += _behind_caption(reference, style.experiment)

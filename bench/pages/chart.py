@@ -190,6 +190,7 @@ class Chart:
         off: values of toggles that are off at first.
         lights: the facet by which panels light up together with whatever in the page bears the same
             name.
+        notes: what the legend says behind a name.
     """
 
     name: str
@@ -204,6 +205,7 @@ class Chart:
     toggles: tuple[str, ...] = ()
     off: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     lights: str = ""
+    notes: Mapping[str, str] = field(default_factory=dict)
 
     def spec(self) -> dict[str, Any]:
         """What the page's script is told, as JSON holds it."""
@@ -218,4 +220,5 @@ class Chart:
             "toggles": self.toggles,
             "off": self.off,
             "lights": self.lights,
+            "notes": dict(self.notes),
         }

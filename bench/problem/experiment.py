@@ -127,6 +127,11 @@ class Experiment:
         targets: number of targets in each range; for a recording, number of starting points.
         seeds: runs of each stochastic tuner on each target, and trainings of each learned one.
         budget: simulations on one target.
+        negligible_error: error below which tuners count as equal when they are ranked and tested,
+            as a share of the training range (the unit of `param_error`); on a recording, where no
+            truth is known, the same share above the smallest error that any tuner reached. The
+            shipped experiments state a tenth of a percent, or the standard error that their noise
+            leaves where that is larger.
         same_targets_as: another experiment whose targets are met; its own where empty.
         training_budget: simulations that a learned tuner may train with.
         timeout: seconds a run may take.
@@ -189,6 +194,7 @@ class Experiment:
     targets: int = 20
     seeds: int = 1
     budget: int = 100
+    negligible_error: float = 1e-3
     same_targets_as: str = ""
     training_budget: int = 1600
     timeout: float = 3600.0
@@ -275,6 +281,9 @@ class Experiment:
 
     def _check_numbers(self, who: str) -> None:
         """Refuse numbers that are none, or beyond all that can be meant."""
+        if not 0 <= finite(who, "negligible_error", self.negligible_error) < 1:
+            wanted = "a share of the training range, from 0 to below 1"
+            raise fault(who, "negligible_error", wanted, self.negligible_error)
         rate = finite(who, "sampling.rate", self.sampling.rate)
         if not 0 < rate <= FASTEST or self.sampling.samples < 1:
             wanted = f"a rate above 0 Hz and up to {FASTEST:g} Hz, and at least 1 of samples"

@@ -3,13 +3,17 @@
 A target's numbers are drawn from streams of its own (`bench.problem.salt`), in a fixed order: start
 and truth, initial state, inputs, constants, sensor noise. Whatever is drawn in another order is
 another target.
+
+A target whose own simulation diverges says nothing of any tuner. It is drawn again, whole, from
+streams of its own that are named for the number of the draw: the same salt gives the same targets,
+whoever draws them and in whatever order.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -17,10 +21,18 @@ from bench.problem.experiment import Drawn, Experiment
 from bench.problem.recorded import Measured, Side
 from bench.problem.salt import Streams
 from bench.problem.signals import signal
-from sims.base import Array, Channel, Scenario, Simulator, UnitCube
+from sims.base import Array, Channel, InputError, Scenario, Simulator, UnitCube
 
 _CUBE = np.array([[0.0], [1.0]])
 """Corners of the unit cube, in as many dimensions as there are."""
+DIVERGENCE_LIMIT = 1e12
+"""Largest magnitude of a sample, in units of its channel's typical magnitude: beyond it a
+simulation counts as diverged although its numbers are finite.
+"""
+MAX_DRAWS = 200
+"""Maximum number of draws of one target."""
+MAX_FAILED_SHARE = 0.9
+"""Largest share of draws that may diverge: what is left would be no sample of the ranges."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +58,28 @@ class SealedTarget:
 class Target:
     """A sealed target and, in the parent process only, its true parameters (dim,), physical; None
     where unknown.
+
+    Attributes:
+        sealed: what a worker process gets.
+        truth: (dim,) the true parameters.
+        redraws: draws that were discarded because their simulation diverged.
     """
 
     sealed: SealedTarget
     truth: Array | None
+    redraws: int = 0
+
+
+class Redraws(NamedTuple):
+    """How many targets had to be drawn again.
+
+    Attributes:
+        redrawn: targets whose first draw diverged.
+        draws: draws of all targets together.
+    """
+
+    redrawn: int
+    draws: int
 
 
 class Drawing(Protocol):
@@ -78,12 +108,48 @@ class Drawing(Protocol):
 
 
 def draw(problem: Drawing, kind: str, index: int) -> Target:
-    """Target `index` of range `kind`; it depends on the experiment's name, not on tuners, seeds or
-    budgets.
+    """Draw target `index` of range `kind`, again where its simulation diverges.
+
+    It depends on the experiment's name, not on tuners, seeds or budgets.
+
+    Raises:
+        InputError: all of `MAX_DRAWS` draws diverge.
     """
+    for number in range(MAX_DRAWS):
+        target = _draw(problem, kind, index, number)
+        if target is not None:
+            return target
+    raise _diverging(problem.experiment, MAX_DRAWS, MAX_DRAWS)
+
+
+def redraws_of(experiment: Experiment, drawn: Sequence[Target]) -> Redraws:
+    """Count the draws of all targets.
+
+    Raises:
+        InputError: more than `MAX_FAILED_SHARE` of them diverged.
+    """
+    failed = sum(target.redraws for target in drawn)
+    draws = failed + len(drawn)
+    if failed > MAX_FAILED_SHARE * draws:
+        raise _diverging(experiment, failed, draws)
+    return Redraws(sum(target.redraws > 0 for target in drawn), draws)
+
+
+def _diverging(experiment: Experiment, failed: int, draws: int) -> InputError:
+    return InputError(
+        f"experiment {experiment.name}: the simulation of {failed} of {draws} targets drawn "
+        f"diverges (not finite, or beyond {DIVERGENCE_LIMIT:g} times a channel's typical "
+        f"magnitude); expected at most {MAX_FAILED_SHARE:.0%}: narrow the bounds and training "
+        "ranges in [parameters], or choose a smaller time step in [settings]"
+    )
+
+
+def _draw(problem: Drawing, kind: str, index: int, number: int) -> Target | None:
+    """Make one draw; None where the simulation diverges."""
     # No tuner, seed or budget in the stream's name: all tuners meet the same target.
     met = problem.experiment.same_targets_as or problem.experiment.name
-    streams = Streams(problem.salt, met, kind, index)
+    again = ("redraw", number) if number else ()
+    streams = Streams(problem.salt, met, kind, index, *again)
     box = _CUBE if kind == "wide" else problem.cube.training
     start, truth = (
         streams.of(what).uniform(box[0], box[1], size=problem.cube.dim)
@@ -102,8 +168,20 @@ def draw(problem: Drawing, kind: str, index: int) -> Target:
     observed = clean + problem.noise * streams.of("noise").standard_normal(clean.shape)
     fitting = Side(scenarios, observed)
     held_out = _held_out(problem, theta, streams)
+    if any(_diverges(each, problem.channels) for each in (clean, held_out.observed)):
+        return None
     sealed = SealedTarget(name, kind, start, fitting, held_out)
-    return Target(sealed, problem.cube.physical(truth))
+    return Target(sealed, problem.cube.physical(truth), number)
+
+
+def _diverges(observed: Array, channels: Sequence[Channel]) -> bool:
+    """Whether a simulation (T, C) failed: a sample is infinite or beyond `DIVERGENCE_LIMIT`, or a
+    channel has no sample. Single missing samples (NaN), as of a camera, are no failure.
+    """
+    if not len(observed):
+        return False
+    limits = DIVERGENCE_LIMIT * np.array([channel.scale for channel in channels])
+    return bool((np.abs(observed) > limits).any() or np.isnan(observed).all(axis=0).any())
 
 
 def scenario(

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench.problem.experiment import Experiment
+from bench.problem.targets import Redraws
 from bench.runs.housing import seals
 from bench.store.folder import Configuration, create, free_folder
 from bench.store.secret import salted
@@ -27,16 +28,19 @@ class Begun(NamedTuple):
     secret: str | None
     jobs: int
 
-    def write(self, plugins: Sequence[str], hashes: Mapping[str, str]) -> Path:
+    def write(
+        self, plugins: Sequence[str], hashes: Mapping[str, str], redraws: Redraws | None = None
+    ) -> Path:
         """Write its folder, and return it.
 
         Args:
             plugins: plugin files that it needs.
             hashes: of what must not change while it is made.
+            redraws: how many targets were drawn again, for environment.json.
         """
         held = () if self.experiment.trusted else seals()
         configuration = Configuration(self.experiment, list(plugins), dict(hashes))
-        create(self.folder, configuration, self.jobs, self.secret, held)
+        create(self.folder, configuration, self.jobs, self.secret, held, redraws)
         return self.folder
 
 

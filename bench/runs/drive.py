@@ -106,6 +106,11 @@ class _Record:
         self._simulator_seconds: list[tuple[int, float]] = []
         self._best_loss, self._best = np.inf, task.start
 
+    @property
+    def diverged(self) -> bool:
+        """Whether something was simulated and nothing of it has a finite loss."""
+        return self.used > 0 and self._best_loss == np.inf
+
     def recommend(self, recommendation: Array) -> None:
         """Take what the tuner would deliver now, after all that it has seen."""
         self._recommended[-1] = _points(recommendation, self._dim, "recommendations")[0]
@@ -204,6 +209,9 @@ def drive(
         reason = f"stopped after {perf_counter() - started:.1f} s, limit {seconds:g} s"
     elif fault:
         status, reason = "crashed", fault
+    elif status in ("done", "converged") and record.diverged:
+        says = f"none of {record.used} simulations has a finite loss"
+        status, reason = "diverged", f"{says} ({reason or 'budget used'})"
     return record.trace(status, reason)
 
 

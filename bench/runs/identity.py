@@ -42,6 +42,7 @@ NOT_OF_A_RUN = {
     "seeds": "how many there are; each run's id has its own",
     "budget": "each run's id has its own, which the tuner's entry may change",
     "training_budget": "matters to learned tuners alone, and is hashed with their entries",
+    "negligible_error": "ranks tuners when all runs are made",
     "identifiability": "is found beside the runs, which know nothing of it",
     "recording": "where it lies; what it holds is hashed",
     "model": "where it lies; what it holds is hashed",

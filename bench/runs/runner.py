@@ -15,8 +15,9 @@ from typing import Any, Protocol
 
 from bench.problem.experiment import Entry, Experiment
 from bench.problem.identifiability import Spectrum
+from bench.problem.numeric_warnings import numeric_warnings_silenced
 from bench.problem.problem import Problem
-from bench.problem.targets import Target
+from bench.problem.targets import Redraws, Target, redraws_of
 from bench.registry import Registry, SkippedError, effects, simulators, tuners
 from bench.runs.housing import tuned_of
 from bench.runs.identity import Identities
@@ -71,8 +72,9 @@ class Results:
     training cost.
 
     `spectra` says what each target's data identify, by its name, where that can be asked; `tuned`
-    which tuner lives in a process of its own, by label; `hidden` what it must not reach; `notes`
-    what the runs made now tell the authors of their tuners.
+    which tuner lives in a process of its own, by label; `hidden` what it must not reach; `redraws`
+    how many targets were drawn again; `notes` what the runs made now tell the authors of their
+    tuners.
     """
 
     problem: Problem
@@ -83,6 +85,7 @@ class Results:
     skipped: dict[str, str] = field(default_factory=dict)
     tuned: dict[str, Tuned] = field(default_factory=dict)
     hidden: tuple[str, ...] = ()
+    redraws: Redraws | None = None
     interrupted: bool = False
     stopped: str = ""
     notes: Notes = field(init=False)
@@ -189,6 +192,7 @@ def unreachable(kind: str, name: str, part: type) -> InputError:
     )
 
 
+@numeric_warnings_silenced()
 def prepare(experiment: Experiment, salt: str | None = None) -> Results:
     """Check an experiment whole before any work: its simulator, recording, tuners and their
     options; plan its runs.
@@ -210,7 +214,9 @@ def prepare(experiment: Experiment, salt: str | None = None) -> Results:
     entries = [entry for entry in experiment.tuners if entry.label not in results.skipped]
     if not experiment.trusted:
         results.tuned = {entry.label: tuned_of(entry) for entry in entries}
-    results.plan = list(_plan(experiment, entries, results.problem.targets()))
+    drawn = results.problem.targets()
+    results.redraws = redraws_of(experiment, drawn)
+    results.plan = list(_plan(experiment, entries, drawn))
     # Workers open their own; what is left to do here needs no simulator for a while.
     results.problem.close()
     return results
@@ -227,6 +233,7 @@ def _plan(experiment: Experiment, entries: list[Entry], targets: list[Target]) -
                 yield Job(Order(run, entry, seed, target.sealed, budget), target)
 
 
+@numeric_warnings_silenced()
 def run(
     results: Results,
     plugins: Sequence[str] = (),

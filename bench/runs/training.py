@@ -107,6 +107,7 @@ NOT_OF_A_TRAINING = {
     "budget": "of a run",
     "timeout": "of a run",
     "memory": "of a run",
+    "negligible_error": "ranks tuners when all runs are made",
     "identifiability": "is found beside the runs",
     "isolation": "of a run; a training has a process of its own",
     "salt": "targets are met after the training",

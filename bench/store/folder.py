@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench import __version__
 from bench.problem.experiment import Experiment, parse
+from bench.problem.targets import Redraws
 from bench.store.journal import Journal
 from bench.store.made import machine, now, packages
 from bench.store.schema import ENVIRONMENT, OLDER, RUNS, STATUS, Columns
@@ -72,6 +73,7 @@ def create(
     jobs: int,
     secret: str | None = None,
     seals: Sequence[str] = (),
+    redraws: Redraws | None = None,
 ) -> None:
     """Make the folder with experiment.toml and environment.json in it, all at once or not at all.
 
@@ -81,6 +83,7 @@ def create(
         jobs: worker processes that it is meant to be made with.
         secret: the salt that its targets are drawn from; see `bench.store.secret`.
         seals: that hold around its tuners on this machine.
+        redraws: how many targets were drawn again; None for studies without such targets.
 
     Raises:
         InputError: it cannot be made.
@@ -98,6 +101,8 @@ def create(
         "stepping": stepping(),
         "packages": packages(),
     }
+    if redraws is not None:
+        environment |= {"redrawn_targets": redraws.redrawn, "target_draws": redraws.draws}
     try:
         # What there is of a folder is never without what it is for.
         with fresh_folder(folder) as partial:

@@ -292,10 +292,12 @@ ENVIRONMENT: Mapping[str, Any] = {
     "fingerprint": Mapping[str, str],
     "stepping": str,
     "packages": Mapping[str, str],
+    "redrawn_targets": int,
+    "target_draws": int,
 }
 """environment.json: by key what its value is; a file may have others beside them."""
-OLDER = ("fingerprint", "seals", "stepping")
-"""Keys that folders of an older simgap lack."""
+OLDER = ("fingerprint", "seals", "stepping", "redrawn_targets", "target_draws")
+"""Keys that folders of an older simgap lack; the last two are of comparisons of tuners alone."""
 
 
 def spelled(columns: Columns, parameters: Iterable[str], channels: Iterable[str]) -> list[Column]:

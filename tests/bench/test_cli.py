@@ -285,3 +285,46 @@ def test_experiments_need_no_install_location(tmp_path):
     done = simgap("list", "experiments", cwd=tmp_path)
     assert done.returncode == 0
     assert "ball-drop" in done.stdout
+
+
+FAILING = """from methods.base import Tuner
+
+
+class Failing(Tuner):
+    def tune(self, task, rng):
+        yield task.start[None]
+        raise RuntimeError("no more")
+"""
+
+
+@pytest.mark.slow
+def test_the_terminal_says_who_is_best_and_marks_a_tuner_whose_runs_all_failed(
+    tmp_path, capsys, spring
+):
+    experiment, plugin = tmp_path / "spring-test.toml", tmp_path / "failing.py"
+    experiment.write_text(tomli_w.dumps({**SPRING, "noise": {"x": 1e-4}}))
+    plugin.write_text(FAILING)
+    tuners = ["--tuners", "failing,random,least_squares", "--targets", "7", "--seeds", "1"]
+    options = ["--plugin", SPRING_PLUGIN, "--plugin", str(plugin), "--jobs", "0"]
+    code = main(
+        ["compare", str(experiment), *tuners, *options, "--budget", "12", "--allow-failures",
+         "--out", str(tmp_path / "out")]
+    )  # fmt: skip
+    assert code == 0
+    said = capsys.readouterr().out
+    first = said.split("\n\n")[0].strip().splitlines()
+    assert first[0].startswith("best tuners, targets in the training range, 7 targets (")
+    assert "errors below 0.001 count as equal" in first[0]
+    after = {line.split()[1]: line for line in first if line.startswith("  after")}
+    assert list(after) == ["1", "3", "10", "12"]
+    assert after["12"].split("best: ")[1].startswith("least_squares (")
+    assert any(line.strip().startswith("worse: random") for line in first)
+    assert sum("all runs failed: failing" in line for line in first) == 4
+    assert "failed runs, which count as infinite errors: failing 7 of 7" in first
+    assert "Holm-corrected for 1 comparison." in first[-1]
+    tables = [part.splitlines() for part in said.split("\n\n") if part.startswith("median abs")]
+    for lines in tables:
+        names = [line.split("  ")[0] for line in lines[2:]]
+        assert names[0].startswith("least_squares")
+        assert names[-1].startswith("failing [all runs failed]")
+    assert len(tables) == 2

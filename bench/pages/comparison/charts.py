@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
 
 import pandas as pd
 
-from bench.analysis.amortisation import SHARED, seconds_table, totals_table
+from bench.analysis.amortisation import AT_ONCE, NEVER, SHARED, placed_even, seconds_table
 from bench.analysis.medians import bin_names, moments
 from bench.analysis.table import checkpoints
 from bench.figures import errors
 from bench.figures.identifiability import directional
-from bench.figures.runtimes import spread_caption
-from bench.figures.style import TITLES, look
+from bench.figures.runtimes import break_even_sides, spread_caption
+from bench.figures.style import TITLES
 from bench.pages.chart import Axis, Chart, Draw, Panel, Rule, Series, Span
 from bench.pages.comparison.results import Results
 from bench.pages.elements import safe
@@ -21,8 +23,8 @@ from bench.pages.text import number
 
 _DIGITS = 7
 """Of numbers that no file beside the page holds."""
-_THIN, _THINNER = 3, 10
-"""Of the points of a smooth and of a very smooth curve, every so many."""
+_THIN = 3
+"""Step between the points of a smooth curve that the page holds."""
 _MEDIAN = (
     "A line is the median over targets of the recommendation's error (mean over seeds), the band "
     "its 95 % bootstrap interval. Lower and further left is better."
@@ -39,10 +41,14 @@ def error_chart(results: Results, page: Page) -> str:
         keys += [("obs_error", kind) for kind in results.ranges]
     panels = [_against_simulations(results, "errors", *key) for key in keys]
     page.table("errors", _medians(results, keys), _DIGITS)
+    same = results.statistics.coinciding(keys)
     still = results.still("error", "The median error of each tuner against simulations.")
     beside = "error" if "real" in results.ranges else _BESIDE
-    return page.chart(
-        Chart("error", "Error against simulations", _MEDIAN, _filled(panels), still, beside)
+    return _shown(
+        results,
+        page,
+        Chart("error", "Error against simulations", _MEDIAN, _filled(panels), still, beside),
+        same,
     )
 
 
@@ -63,7 +69,7 @@ def misfit_chart(results: Results, page: Page) -> str:
     )
     still = results.still("misfit", "The median misfit of each tuner against simulations.")
     chart = Chart("misfit", "What tuning leaves", caption, _filled(panels), still, _BESIDE)
-    return page.chart(chart)
+    return _shown(results, page, chart)
 
 
 def directions_chart(results: Results, page: Page) -> str:
@@ -80,7 +86,9 @@ def directions_chart(results: Results, page: Page) -> str:
     )
     still = results.still("directions", "Errors along stiff and sloppy directions, of prediction.")
     title = "Stiff and sloppy directions, and prediction"
-    return page.chart(Chart("directions", title, caption, _filled(panels), still, _BESIDE))
+    return _shown(
+        results, page, Chart("directions", title, caption, _filled(panels), still, _BESIDE)
+    )
 
 
 def distance_chart(results: Results, page: Page) -> str:
@@ -117,7 +125,7 @@ def distance_chart(results: Results, page: Page) -> str:
     )
     still = results.still("distance", "The median error of each tuner by distance of the target.")
     title = "Error against distance from the training range"
-    return page.chart(Chart("distance", title, caption, tuple(panels), still, "after"))
+    return _shown(results, page, Chart("distance", title, caption, tuple(panels), still, "after"))
 
 
 def runtime_chart(results: Results, page: Page) -> str:
@@ -135,8 +143,10 @@ def runtime_chart(results: Results, page: Page) -> str:
         "is what can be solved at all."
     )
     still = results.still("runtime", "The share of thresholds reached by each tuner.")
-    return page.chart(
-        Chart("runtime", "Runtime distributions", caption, tuple(panels), still, _BESIDE)
+    return _shown(
+        results,
+        page,
+        Chart("runtime", "Runtime distributions", caption, tuple(panels), still, _BESIDE),
     )
 
 
@@ -154,7 +164,7 @@ def ert_chart(results: Results, page: Page) -> str:
         "95 % bootstrap interval over targets; a line ends where no run got further."
     )
     title = "Expected running time"
-    return page.chart(Chart("ert", title, caption, _filled(panels), None, _BESIDE))
+    return _shown(results, page, Chart("ert", title, caption, _filled(panels), None, _BESIDE))
 
 
 def cost_chart(results: Results, page: Page) -> str:
@@ -186,43 +196,69 @@ def cost_chart(results: Results, page: Page) -> str:
     )
     still = results.still("cost", "Seconds for one target against seconds of one simulation.")
     title = "Who wins at which cost of a simulation"
-    return page.chart(Chart("cost", title, caption, _filled(panels), still, _BESIDE))
+    return _shown(results, page, Chart("cost", title, caption, _filled(panels), still, _BESIDE))
 
 
 def amortisation_chart(results: Results, page: Page) -> str:
     """From how many targets on a training pays."""
     if "amortisation" not in results.pictures:
         return ""
+    evens = placed_even(results.tables["break_even"])
     parts, panels = [], []
-    evens = results.tables["break_even"]
     for level in _levels(results):
-        table = totals_table(results.statistics.prices[level])
-        parts.append(_thinned(table.assign(threshold=level, what="total"), _THINNER))
-        even = evens[(evens["threshold"] == level) & evens["targets"].between(1, 1e4)]
-        rings = {
-            "range": even["range"],
-            "tuner": "break-even",
-            "targets": even["targets"],
-            "simulations": even["targets"] * even["ert_search"],
-        }
-        parts.append(pd.DataFrame(rings).assign(threshold=level, what="break-even"))
+        searching, learning = break_even_sides(results.statistics.prices[level], results.style)
+        part = evens[(evens["threshold"] == level) & evens["learned"].isin(learning)]
+        parts.append(part.assign(row=part["search"].map(searching.index)))
+        across = Axis("tuner that searches", names=tuple(searching))
+        up = _log("number of targets from which on training pays")
+        rules = (
+            Rule(AT_ONCE, "at once: the search never reaches the error"),
+            Rule(NEVER, "never: not within 10 000 targets"),
+        )
         for kind in results.ranges:
-            where = {"range": kind, "threshold": str(level), "what": "total"}
-            lines = _lines(results, table[table["range"] == kind], "simulations", "line", **where)
-            if (even["range"] == kind).any():
-                at = {**where, "what": "break-even"}
-                lines += (Series("break-even", "simulations", look(7), at, draw="points"),)
-            across, up = _log("number of targets"), _log("simulations in total")
-            panel = _panel(results, kind, "totals", "targets", lines, across, up)
-            panels.append(_with(panel, results, level))
-    page.table("totals", pd.concat(parts), _DIGITS)
+            series = tuple(
+                Series(
+                    name,
+                    "targets",
+                    drawn,
+                    {"learned": name, "range": kind, "threshold": str(level)},
+                    "low",
+                    "high",
+                    "points",
+                    0.6 * ((place + 0.5) / len(learning) - 0.5),
+                )
+                for place, (name, drawn) in enumerate(results.looks(part["learned"]))
+            )
+            panel = _panel(results, kind, "even", "row", series, across, up)
+            panels.append(_with(replace(panel, rules=rules), results, level))
+    page.table("even", pd.concat(parts), _DIGITS)
     caption = (
-        "Training and targets times expected simulations, to reach the error for good. At a mark a "
-        "trained tuner passes one that searches; the table has their intervals."
+        "From a mark on, training plus targets times expected simulations of a trained tuner are "
+        "fewer than those of a tuner that searches, to reach the error for good. Bars are 95 % "
+        "bootstrap intervals over targets; lower is better for the training."
     )
-    still = results.still("amortisation", "Simulations in total against the number of targets.")
+    still = results.still("amortisation", "Number of targets from which on each training pays.")
     title = "From how many targets on a training pays"
-    return page.chart(Chart("amortisation", title, caption, _filled(panels), still, _BESIDE))
+    return _shown(
+        results, page, Chart("amortisation", title, caption, _filled(panels), still, _BESIDE)
+    )
+
+
+def _shown(
+    results: Results, page: Page, chart: Chart, same: Mapping[str, str] = MappingProxyType({})
+) -> str:
+    """Add a chart to the page; its legend says whose runs failed and which curves coincide.
+
+    Args:
+        results: of the comparison.
+        page: the page.
+        chart: without notes.
+        same: which curve coincides with which, by tuner.
+    """
+    failed = results.statistics.notes
+    names = dict.fromkeys((*failed, *same))
+    notes = {n: "; ".join(part[n] for part in (failed, same) if n in part) for n in names}
+    return page.chart(replace(chart, notes=notes))
 
 
 def _medians(results: Results, keys: Sequence[tuple[str, str]]) -> pd.DataFrame:
@@ -246,7 +282,10 @@ def _against_simulations(
     facets = {**panel.facets, "error": label}
     # Of a recording there is one range, and panels differ in their runs.
     title = f"{label} ({results.count(kind)} starting points)" if kind == "real" else panel.title
-    return Panel(**{**vars(panel), "facets": facets, "rules": rules, "title": title})
+    floor = results.statistics.floor_of(metric)
+    if floor is not None:
+        rules += (Rule(floor, f"below {number(floor, 2)}: count as equal"),)
+    return replace(panel, facets=facets, rules=rules, title=title)
 
 
 def _panel(
@@ -267,7 +306,7 @@ def _panel(
 def _with(panel: Panel, results: Results, level: float) -> Panel:
     """A panel that is one of several levels of the error."""
     reached = f"{number(level)}{_in_widths(results)}"
-    return Panel(**{**vars(panel), "facets": {**panel.facets, "error reached": reached}})
+    return replace(panel, facets={**panel.facets, "error reached": reached})
 
 
 def _lines(

@@ -1,161 +1,157 @@
-"""Who wins where, in a sentence or two that the statistics support."""
+"""Headline of a comparison's page, and what limits its results."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from bench.analysis.paired import log_errors
-from bench.analysis.rounding import FLOOR
-from bench.pages.comparison.results import RANGES, Results
-from bench.pages.elements import safe, strong
+from bench.analysis.tuner_ranking import BEST, EQUAL, SIGNIFICANCE
+from bench.pages import elements
+from bench.pages.comparison import headline
+from bench.pages.comparison.results import Results
+from bench.pages.elements import paragraph, safe, strong
 from bench.pages.text import number, percent
 
-SURE = 0.05
-"""Holm-corrected p-value below which one tuner is called better than another."""
-_FEW = 4
-"""Names that a sentence holds."""
+SURE = SIGNIFICANCE
+"""Corrected p-value below which one tuner is called better than another."""
+
+
+def best_table(results: Results) -> str:
+    """The best tuners after 1, 3, 10 and all simulations, a column for each range; safe HTML."""
+    columns = [headline.standings(results.statistics, kind) for kind in results.ranges]
+    if not all(columns):
+        return ""
+    rows = [
+        [str(together[0].simulations), *map(_best, together)]
+        for together in zip(*columns, strict=True)
+    ]
+    best = (f"best (median error), {headline.WHERE[kind]}" for kind in results.ranges)
+    return elements.table(["-simulations", *best], rows)
 
 
 def conclusion(results: Results) -> list[str]:
-    """Who ends best in each range; safe HTML."""
+    """Which tuners are worse than the best after all simulations in each range; safe HTML."""
     return [_of_range(results, kind) for kind in results.ranges]
 
 
-def soonest(results: Results) -> list[str]:
-    """Who reaches an error soonest in each range; safe HTML."""
-    said = ((_where(results, kind), _soonest(results, kind)) for kind in results.ranges)
-    return [f"{where}: {text}" for where, text in said if text]
+def standing_tables(results: Results) -> str:
+    """For each range a table of the tuners that are best, worse and not decided; safe HTML."""
+    label = results.label(results.shown_metric)
+    parts = []
+    for kind in results.ranges:
+        rows = [
+            [
+                str(one.simulations),
+                _best(one),
+                _named(one.worse),
+                _named(one.undecided),
+                _named(one.failed),
+            ]
+            for one in headline.standings(results.statistics, kind)
+        ]
+        heads = ["-simulations", "best (median error)", "worse", "not decided", "all runs failed"]
+        # Most often nothing failed: the column would be empty.
+        width = len(heads) if any(row[-1] for row in rows) else len(heads) - 1
+        title = f"{_where(results, kind)}: {label}; {headline.floor_text(results.statistics)}"
+        how = headline.how_decided(results.statistics, kind)
+        parts.append(f"<h3>{safe(title, 400)}</h3>\n")
+        parts.append(elements.table(heads[:width], [row[:width] for row in rows]))
+        failed = headline.failed_runs(results.statistics, kind)
+        parts += [paragraph(safe(text, 1000), "soft") for text in (failed, how) if text]
+    return "".join(parts)
+
+
+def _best(one: headline.Standing) -> str:
+    """The best tuners with their median error."""
+    return f"{_named(one.best, strong)} ({safe(one.error)})" if one.best else "every run failed"
 
 
 def _of_range(results: Results, kind: str) -> str:
-    medians = log_errors(results.statistics.curves.of(range=kind)).median().sort_values()
-    if medians.empty:
-        return f"{_where(results, kind)}: no target has an error that decides."
-    winner = str(medians.index[0])
-    failed = results.statistics.curves.of(range=kind, tuner=winner).failed
-    if failed.all():
-        return f"{_where(results, kind)}: every run of every tuner failed."
-    said = f"{_where(results, kind)}: {_least(results, kind, winner)}"
-    return f"{said} {_against(results, kind, winner)}".strip()
+    found, where = headline.standings(results.statistics, kind), _where(results, kind)
+    if not found:
+        return f"{where}: no target has an error that decides."
+    last = found[-1]
+    # The first one explains the others.
+    first = [
+        re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", one)
+        for one in last.worse[:1]
+    ]
+    parts = {
+        "worse than the best": [*first, *last.worse[1:]],
+        "not decided": last.undecided,
+        "all runs failed": last.failed,
+    }
+    said = "; ".join(f"{what}: {_named(names)}" for what, names in parts.items() if names)
+    return f"{where}, after {last.simulations} simulations: {said or 'no tuner is worse'}."
 
 
 def _where(results: Results, kind: str) -> str:
-    count = results.count(kind)
-    things = "starting point" if kind == "real" else "target"
-    text = f"Targets {RANGES[kind]}" if kind != "real" else "The recording"
-    return f"{text} ({count} {things}{'s' * (count != 1)})"
+    text = headline.WHERE[kind]
+    return f"{text[0].upper()}{text[1:]} ({headline.targets_text(results.statistics, kind)})"
 
 
-def _least(results: Results, kind: str, winner: str) -> str:
-    """Who ends with the smallest error, and what that is."""
-    metric = results.statistics.metric
-    if metric == "param_error":
-        metric = results.statistics.parameter_metric
-    line = results.statistics.medians(metric, kind)
-    line = line[line["tuner"] == winner]
-    if line.empty:
-        return f"{strong(safe(winner))} ends with the smallest median error."
-    last = line.iloc[-1]
-    interval = ""
-    if np.isfinite(last["low"]) and last["high"] > FLOOR:
-        interval = f" (95 % {_at(last['low'])} to {_at(last['high'])})"
-    after = int(last["simulations"])
-    return (
-        f"{strong(safe(winner))} ends with the smallest error after {after} simulations: "
-        f"{safe(results.label(metric))}, median {_at(last['median'])}{interval}."
-    )
+def reaching(results: Results) -> list[str]:
+    """How soon the best tuners of each range reach an error for good; safe HTML."""
+    said = ((_where(results, kind), _reaching(results, kind)) for kind in results.ranges)
+    return [f"{where}: {text}" for where, text in said if text]
 
 
-def _at(error: float) -> str:
-    """An error of a curve, which ends where rounding in the observation begins."""
-    return number(error) if error > FLOOR else f"at most {number(FLOOR)}"
-
-
-def _against(results: Results, kind: str, winner: str) -> str:
-    """Against how many of the others the paired test holds."""
-    pairs = results.tables["pairs"]
-    mine = pairs[(pairs["range"] == kind) & ((pairs["a"] == winner) | (pairs["b"] == winner))]
-    if mine.empty:
-        return ""
-    favour = np.where(mine["a"] == winner, mine["effect"], -mine["effect"])
-    others = np.where(mine["a"] == winner, mine["b"], mine["a"])
-    sure = (mine["p_holm"] < SURE).to_numpy() & (favour > 0)
-    test = "(paired test, p &lt; 0.05)"
-    if not sure.any():
-        return f"No other can be told apart from it {test}{_too_few(results, kind)}."
-    text = f"It is better than {sure.sum()} of {len(mine)} others {test}"
-    left = [str(name) for name in others[~sure]]
-    return f"{text}; not told apart: {_named(left)}." if left else f"{text}."
-
-
-def _too_few(results: Results, kind: str) -> str:
-    """Why a test of few targets cannot find anything."""
-    # The smallest p of Wilcoxon's signed-rank test on n pairs, before any correction.
-    least = 2.0 ** (1 - results.count(kind))
-    pairs = results.tables["pairs"]
-    tests = int((pairs["range"] == kind).sum())
-    if least * tests < SURE:
-        return ""
-    return f": {results.count(kind)} targets are too few for {tests} pairs"
-
-
-def _soonest(results: Results, kind: str) -> str:
-    """Who needs the fewest simulations to a level that half of the tuners reach."""
-    level = results.statistics.level
-    table = results.tables["ert"]
+def _reaching(results: Results, kind: str) -> str:
+    statistics, table = results.statistics, results.tables["ert"]
+    ranking = statistics.ranking[statistics.ranking["range"] == kind]
+    last = ranking[ranking["simulations"] == ranking["simulations"].max()]
+    best = list(last.loc[last["verdict"].isin((BEST, EQUAL)), "tuner"])
     part = table[
-        (table["range"] == kind) & (table["threshold"] == level) & (table["successes"] > 0)
+        (table["range"] == kind)
+        & (table["threshold"] == statistics.level)
+        & (table["successes"] > 0)
+        & table["tuner"].isin(best)
     ]
     if part.empty:
         return ""
-    part = part.sort_values("ert", kind="stable")
-    first = part.iloc[0]
-    rivals = part.iloc[1:][part.iloc[1:]["low"] <= first["high"]]
-    names = [str(first["tuner"]), *map(str, rivals["tuner"])]
-    reached = f"{int(first['successes'])} of {int(first['runs'])} runs"
-    text = (
-        f"an error of {number(level)}{_unit(results)} is reached for good soonest by "
-        f"{_named(names[:1], strong)}: {number(first['ert'])} simulations expected "
-        f"({_ends(first)}; {reached}){_training(results, first)}"
+    lines = sorted(part.to_dict("records"), key=lambda row: statistics.order.index(row["tuner"]))
+    each = [
+        f"{safe(row['tuner'], 40)} {number(row['ert'])} ({_ends(row)}; {int(row['successes'])} of "
+        f"{int(row['runs'])} runs{_training(results, row)})"
+        for row in lines
+    ]
+    return (
+        "expected simulations of the best tuners until the error stays at or below "
+        f"{number(statistics.level)}{_unit(results)}: {', '.join(each)}."
     )
-    if len(names) > 1:
-        text += f"; the intervals of {_named(names[1:])} overlap with its own"
-    return f"{text}."
 
 
 def _unit(results: Results) -> str:
-    """What the error that decides is measured in."""
+    """The unit of the error that decides."""
     metric = results.statistics.metric
     if metric in ("param_error", "stiff_error"):
         return " training widths"
     return f" in {safe(results.label(metric))}"
 
 
-def _ends(line: pd.Series[Any]) -> str:
+def _ends(line: Mapping[Any, Any]) -> str:
     high = number(line["high"]) if np.isfinite(line["high"]) else "∞"
     return f"95 % {number(line['low'])} to {high}"
 
 
-def _training(results: Results, line: pd.Series[Any]) -> str:
+def _training(results: Results, line: Mapping[Any, Any]) -> str:
     simulations, _ = results.stored.costs.get(str(line["tuner"]), (0.0, 0.0))
-    return f", after a training of {number(simulations, 6)}" if simulations else ""
+    return f"; training {number(simulations, 6)}" if simulations else ""
 
 
-def _named(names: Sequence[str], how: object = None) -> str:
-    """A few names, and how many more there are."""
-    shown = [strong(safe(n, 40)) if how is strong else safe(n, 40) for n in names[:_FEW]]
-    more = len(names) - len(shown)
-    if more:
-        return f"{', '.join(shown)} and {more} more"
-    return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
+def _named(names: Sequence[str], mark: Callable[[str], str] = str) -> str:
+    """Names as safe HTML, each marked."""
+    shown = [mark(safe(name, 100)) for name in names]
+    return headline.joined(shown) if shown else ""
 
 
 def warnings(results: Results) -> Iterator[str]:
-    """What takes something away from the results; safe HTML."""
+    """What limits the results; safe HTML."""
+    few = (headline.too_few(results.statistics, kind) for kind in results.ranges)
+    yield from dict.fromkeys(safe(text) for text in few if text)
     if results.missing:
         yield f"Not finished: {results.missing} planned runs are not made yet."
     statuses = results.stored.statuses
@@ -169,9 +165,25 @@ def warnings(results: Results) -> Iterator[str]:
         yield f'{tuners} could not be used here: <a href="#failures">why</a>.'
 
 
+def redraws_text(results: Results) -> str:
+    """How many targets were drawn again, as plain text; empty for none."""
+    redrawn, draws = (
+        results.environment.get(key, 0) for key in ("redrawn_targets", "target_draws")
+    )
+    targets = sum(results.statistics.targets.values())
+    if not redrawn:
+        return ""
+    return (
+        f"{redrawn} of {targets} targets were drawn again because their own simulation diverged "
+        f"({draws} draws in all)."
+    )
+
+
 def marks(results: Results) -> Iterator[str]:
-    """How the runs were made, where that takes something away from them."""
+    """How targets and runs were made, where that limits what they say."""
     if results.experiment.trusted:
         yield "Trusted: the tuners ran inside the harness, where nothing is out of their reach."
     if not results.experiment.salt_sha256:
         yield "The targets have a public salt: everybody can draw them."
+    if redrawn := redraws_text(results):
+        yield redrawn

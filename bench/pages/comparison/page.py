@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from bench.pages.comparison import charts, parts
-from bench.pages.comparison.conclusion import conclusion, marks, soonest, warnings
+from bench.pages.comparison import charts, headline, parts
+from bench.pages.comparison.conclusion import (
+    best_table,
+    conclusion,
+    marks,
+    reaching,
+    standing_tables,
+    warnings,
+)
 from bench.pages.comparison.results import Results
 from bench.pages.elements import code, listed, paragraph, safe
 from bench.pages.page import Page
@@ -18,6 +25,7 @@ def comparison_page(results: Results) -> str:
     page = Page(f"{name}: comparison of tuners", made)
     page.add(*_opening(results))
     page.add(_concluded(results), charts.error_chart(results, page))
+    page.section("ranking", "Best, worse and not decided", standing_tables(results))
     page.section("all-numbers", "Numbers", parts.table_grid(results, page))
     page.section("pairs", "Pairs", parts.pairs_grid(results, page))
     page.section(
@@ -32,7 +40,7 @@ def comparison_page(results: Results) -> str:
     page.section(
         "reaching",
         "Reaching an error",
-        listed(soonest(results)),
+        listed(reaching(results)),
         charts.runtime_chart(results, page),
         charts.ert_chart(results, page),
         times,
@@ -64,10 +72,12 @@ def _opening(results: Results) -> Iterator[str]:
         f"{code(safe(experiment.name, 100))}: {tuners} tuner{'s' * (tuners != 1)}, "
         f"{runs} runs of up to {experiment.budget} simulations."
     )
-    yield paragraph(f"{counts} {safe(experiment.says)}", "soft") + "\n</header>"
+    equal = headline.floor_text(results.statistics)
+    yield paragraph(f"{counts} {safe(experiment.says)} {safe(equal.capitalize())}.", "soft")
+    yield "</header>"
 
 
 def _concluded(results: Results) -> str:
-    said = f'<div class="conclusion">{listed(conclusion(results))}</div>'
-    warned = "".join(paragraph(text, "warning") for text in warnings(results))
+    said = f'<div class="conclusion">{best_table(results)}{listed(conclusion(results))}</div>'
+    warned = paragraph(" ".join(warnings(results)), "warning") if any(warnings(results)) else ""
     return said + warned + paragraph(" ".join(marks(results)), "soft")

@@ -23,7 +23,7 @@ _LONG = 6000
 
 
 def table_grid(results: Results, page: Page) -> str:
-    """table.csv, at first the error that decides at the end of the budget."""
+    """table.csv, at first the error that decides at the end of the budget, the best tuner first."""
     table = results.tables["table"]
     page.table("table", table)
     metric = results.statistics.metric
@@ -49,7 +49,7 @@ def table_grid(results: Results, page: Page) -> str:
     )
     filters = ("range", "metric", "simulations")
     title = "Every number: table.csv"
-    return page.grid(Grid("numbers", title, "table", columns, filters, only, "mean", "tuner"))
+    return page.grid(Grid("numbers", title, "table", columns, filters, only, switch="tuner"))
 
 
 def ert_grid(results: Results, page: Page) -> str:
@@ -70,7 +70,7 @@ def ert_grid(results: Results, page: Page) -> str:
     if len(results.ranges) > 1:
         only["range"] = results.ranges[0]
     title = "Expected running times: ert.csv"
-    return page.grid(Grid("times", title, "ert", columns, filters, only, "ert", "tuner"))
+    return page.grid(Grid("times", title, "ert", columns, filters, only, switch="tuner"))
 
 
 def pairs_grid(results: Results, page: Page) -> str:
@@ -175,6 +175,7 @@ def seconds(results: Results) -> str:
     """What the comparison took: a table of means by tuner."""
     table = results.tables["table"]
     last = table[table["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
+    last = last.reindex([t for t in results.statistics.order if t in last.index])
     rows = [
         [
             safe(name, 60),

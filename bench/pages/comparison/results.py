@@ -12,17 +12,10 @@ import pandas as pd
 from bench.analysis.statistics import Statistics
 from bench.figures.comparison import FILES, Labels
 from bench.figures.errors import parameter_label
-from bench.figures.style import Look, Pictures, Styles
+from bench.figures.style import Look, Pictures, Styles, style_of
 from bench.pages.chart import Static
 from bench.problem.experiment import Experiment
 from bench.store.folder import Stored
-
-RANGES = {
-    "in": "in the training range",
-    "wide": "anywhere in the bounds",
-    "real": "of the recording",
-}
-"""Ranges of targets in the middle of a sentence."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +57,7 @@ class Results:
     @cached_property
     def style(self) -> Styles:
         """Looks of the tuners, and their order by the error that decides."""
-        return Styles(self.experiment, self.statistics.runs, self.statistics.metric)
+        return style_of(self.experiment, self.statistics)
 
     def looks(self, present: pd.Series[Any]) -> list[tuple[str, Look]]:
         """The tuners of a column, best first, each with its look."""
@@ -74,6 +67,12 @@ class Results:
     def count(self, kind: str) -> int:
         """Targets of a range; of a recording, starting points."""
         return self.statistics.targets[kind]
+
+    @property
+    def shown_metric(self) -> str:
+        """The error that decides; of one parameter in its own unit."""
+        metric = self.statistics.metric
+        return self.statistics.parameter_metric if metric == "param_error" else metric
 
     def label(self, metric: str) -> str:
         """What an error is called on an axis."""

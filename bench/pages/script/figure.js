@@ -166,7 +166,8 @@ class FigureView {
     const made = names.map((name) => {
       const { look, draw } = series.get(name);
       const act = (event) => (event.shiftKey || event.detail === 2 ? alone(name) : toggle(name));
-      return element("button", { type: "button", class: "key", "aria-pressed": String(!off.has(name)), "data-name": name, on: { click: act } }, swatch(look, draw), ` ${name}`);
+      return element("button", { type: "button", class: "key", "aria-pressed": String(!off.has(name)), "data-name": name, on: { click: act } }, swatch(look, draw), ` ${name}`,
+        this.spec.notes[name] ? element("span", { class: "soft" }, this.spec.notes[name]) : null);
     });
     if (names.length > 2) {
       made.push(element("button", { type: "button", class: "every", on: { click: () => state.switchOff([...off].filter((name) => !names.includes(name))) } }, "all"));

@@ -117,8 +117,9 @@ def test_bootstrap_repeats():
     np.testing.assert_array_equal(interval(values, means, "a"), interval(values, means, "a"))
 
 
-def test_summary_puts_the_best_at_the_end_first():
+def test_a_summary_has_medians_in_the_order_that_is_asked_for():
     runs = pd.concat([runs_of({(0, 0): [1, 0.5]}), runs_of({(0, 0): [1, 0.1]}, tuner="b")])
-    means = summary(table(runs, statuses_of(runs), 1), "param_abs_error", "in")
-    assert list(means.index) == ["b", "a"]
-    assert means.loc["a", 1] == 0.5
+    lines = table(runs, statuses_of(runs), 1)
+    medians = summary(lines, "param_abs_error", "in", ["b", "skipped", "a"])
+    assert list(medians.index) == ["b", "a"]
+    assert medians.loc["a", 1] == 0.5

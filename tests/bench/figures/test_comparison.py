@@ -57,7 +57,7 @@ def test_what_a_comparison_lacks_is_not_drawn(missing, changes):
         ("distance", 3, "After 12 simulations"),
         ("runtime", 2, "share of (run, threshold) pairs reached for good"),
         ("cost", 2, "seconds for one target"),
-        ("amortisation", 2, "simulations in total, training included"),
+        ("amortisation", 2, "instead of"),
         ("spectra", 2, "what the data can know"),
         ("directions", 6, "of prediction,\nRMSE of z [m]"),
     ],
@@ -78,6 +78,19 @@ def test_a_figure_draws_the_numbers_of_the_runs():
         assert lines[tuner].get_ydata()[-1] == pytest.approx(np.median(values), rel=1e-12)
 
 
+def test_errors_that_count_as_equal_are_shaded_and_cut_no_curve():
+    whole = stored(experiment=replace(stored().experiment, negligible_error=0.05))
+    whole = whole._replace(runs=whole.runs.drop(columns=["stiff_error", "sloppy_error"]))
+    drawn = figure(whole, LABELS, "error")
+    for axis in drawn.axes:
+        (said,) = (text.get_text() for text in axis.texts)
+        assert said == "below 0.02: count as equal"  # 0.4 of restitution are one training width
+        low, high = axis.get_ylim()
+        values = np.concatenate([line.get_ydata() for line in axis.lines])
+        assert low <= values.min()
+        assert values.max() <= high
+
+
 def test_statistics_are_computed_once_for_several_figures(monkeypatch):
     whole = stored()
     statistics = statistics_of(whole)
@@ -93,8 +106,9 @@ def test_statistics_are_computed_once_for_several_figures(monkeypatch):
 def test_tables_can_be_had_without_a_file():
     whole = stored()
     made = tables(whole)
-    assert list(made) == ["table", "ert", "pairs", "break_even", "who_wins"]
-    expected = table(whole.runs, whole.statuses, 12, whole.costs)
+    assert list(made) == ["table", "ert", "ranking", "pairs", "break_even", "who_wins"]
+    expected = statistics_of(whole).sorted(table(whole.runs, whole.statuses, 12, whole.costs))
+    assert list(dict.fromkeys(expected["tuner"])) == ["tunenet", "random"]
     pd.testing.assert_frame_equal(made["table"].drop(columns=["salt", "trusted"]), expected)
     assert set(made["ert"]["tuner"]) == {"random", "tunenet"}
     assert set(made["pairs"]["range"]) == {"in", "wide"}
@@ -109,8 +123,20 @@ def test_who_begins_at_the_target_needs_nothing_and_has_no_place_on_a_logarithmi
     errors = ["param_error", "param_abs_error", "stiff_error", "sloppy_error"]
     first.loc[first["tuner"] == "random", errors] = 0.01
     there = stored(runs=first)
-    for name in ("amortisation", "cost"):
-        drawn = figure(there, LABELS, name)
-        lines = {line.get_label() for axis in drawn.axes for line in axis.get_lines()}
-        assert "random" not in lines
-        assert "tunenet" in lines
+    drawn = figure(there, LABELS, "cost")
+    lines = {line.get_label() for axis in drawn.axes for line in axis.get_lines()}
+    assert "random" not in lines
+    assert "tunenet" in lines
+
+
+def test_break_even_is_drawn_at_the_numbers_of_its_table():
+    whole = stored()
+    drawn = figure(whole, LABELS, "amortisation")
+    evens = tables(whole)["break_even"]
+    level = statistics_of(whole).level
+    for axis, kind in zip(drawn.axes, ("in", "wide"), strict=True):
+        part = evens[(evens["range"] == kind) & (evens["threshold"] == level)]
+        (line,) = (one for one in axis.containers if one.get_label() == "tunenet")
+        expected = np.where(part["targets"] == 0, 10**-0.5, part["targets"])
+        assert line.lines[0].get_xdata().tolist() == pytest.approx(expected.tolist())
+    assert [tick.get_text() for tick in drawn.axes[0].get_yticklabels()] == ["random"]

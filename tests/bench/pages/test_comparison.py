@@ -4,7 +4,6 @@ and holds whatever texts come.
 
 import csv
 import io
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,14 @@ import pytest
 from bench.analysis.amortisation import seconds_table
 from bench.figures import comparison
 from bench.figures.style import taken
-from bench.pages.comparison.conclusion import conclusion, soonest, warnings
+from bench.pages.comparison.conclusion import (
+    best_table,
+    conclusion,
+    marks,
+    reaching,
+    standing_tables,
+    warnings,
+)
 from bench.pages.comparison.page import comparison_page
 from bench.pages.comparison.parts import again
 from bench.pages.comparison.results import Results
@@ -111,45 +117,87 @@ def test_the_first_screen_says_who_wins_and_shows_it(opened):
     assert opened.text("h1") == TITLE
     bottom = "document.querySelector('#error canvas').getBoundingClientRect().bottom"
     assert opened.page.evaluate(bottom) < 1000
-    assert "tunenet ends with the smallest error after 12 simulations" in opened.text(".conclusion")
-    assert "2 of 12 runs failed (17 %): why." in opened.text("p.warning")
+    rows = opened.page.locator(".conclusion tbody tr").all_inner_texts()
+    assert [row.split()[:2] for row in rows] == [[k, "tunenet"] for k in ("1", "3", "10", "12")]
+    few, failed = opened.text("p.warning").split(". ", 1)
+    assert few == "3 targets cannot decide between 2 tuners: it takes at least 6 (--targets 6)"
+    assert failed == "2 of 12 runs failed (17 %): why."
 
 
-def test_a_winner_is_called_better_only_where_the_test_says_so():
-    (sure,) = conclusion(results(many(12)))
-    assert "Targets in the training range (12 targets): <strong>tunenet</strong> ends" in sure
-    assert sure.endswith("It is better than 1 of 1 others (paired test, p &lt; 0.05).")
-    (few,) = conclusion(results(many(4)))
-    assert "No other can be told apart from it (paired test, p &lt; 0.05): 4 targets" in few
+def test_the_headline_says_who_is_worse_by_how_much_and_on_how_many_targets():
+    held = results(many(12))
+    (said,) = conclusion(held)
+    ratio = number(held.tables["ranking"]["error_ratio"].iloc[-1], 2)
+    assert said == (
+        "Targets in the training range (12 targets), after 12 simulations: "
+        f"worse than the best: random {ratio}x the error (larger on 12 of 12 targets)."
+    )
+    assert (
+        "Wilcoxon&#x27;s signed-rank test against the best, Holm-corrected for 1 comparison."
+        in (standing_tables(held))
+    )
+
+
+def test_too_few_targets_are_said_in_one_sentence_and_the_best_is_named_all_the_same():
+    held = results(many(4))
+    (said,), (few,) = conclusion(held), warnings(held)
+    assert said.endswith("after 12 simulations: not decided: random.")
+    assert few.startswith("4 targets cannot decide between 2 tuners")
+    assert "it takes at least 6 (--targets 6)." in few
+    assert best_table(held).count("<strong>tunenet</strong>") == 4
+
+
+def test_equal_tuners_are_best_together():
     same = many(12)
     values = same.runs[same.runs["tuner"] == "random"]["stiff_error"].to_numpy()
     same.runs.loc[same.runs["tuner"] == "tunenet", "stiff_error"] = values
-    (equal,) = conclusion(results(same))
-    assert "No other can be told apart from it" in equal
-    assert "too few" not in equal
+    held = results(same)
+    assert best_table(held).count("<strong>random</strong> and <strong>tunenet</strong>") == 4
+    (equal,) = conclusion(held)
+    assert equal.endswith("after 12 simulations: no tuner is worse.")
 
 
-def test_the_median_that_is_said_is_that_of_the_table():
+def test_the_median_of_the_headline_is_that_of_the_table():
     whole = results(many(12))
-    (said,) = conclusion(whole)
     table = whole.tables["table"]
     line = table[(table["metric"] == "stiff_error") & (table["tuner"] == "tunenet")]
     median = line[line["simulations"] == BUDGET]["median"].item()
-    assert f"median {number(median)} (95 % " in said
+    assert f"<strong>tunenet</strong> ({median:.2g})" in best_table(whole)
     exact = many(12)
     exact.runs.loc[exact.runs["tuner"] == "tunenet", "stiff_error"] = 1e-13
-    (least,) = conclusion(results(exact))
-    assert "median at most 1×10⁻⁹." in least
-    (soon,) = soonest(whole)
+    assert "<strong>tunenet</strong> (at most 0.001)" in best_table(results(exact))
+    (soon,) = reaching(whole)
     ert = whole.tables["ert"]
     ert = ert[(ert["threshold"] == whole.statistics.level) & (ert["tuner"] == "tunenet")]
-    assert f"<strong>tunenet</strong>: {number(ert['ert'].item())} simulations expected" in soon
-    assert "after a training of 800" in soon
+    assert f": tunenet {number(ert['ert'].item())} (95" in soon
+    assert "training 800)" in soon
+
+
+def test_a_tuner_whose_runs_all_crashed_is_last_and_marked_everywhere():
+    whole = many(12)
+    crashed = whole.statuses["tuner"] == "tunenet"  # has the smallest errors
+    whole.statuses.loc[crashed, "status"] = "crashed"
+    held = results(whole)
+    assert held.statistics.order == ["random", "tunenet"]
+    assert "tunenet" not in best_table(held)
+    assert "all runs failed: tunenet." in conclusion(held)[0]
+    assert list(dict.fromkeys(held.tables["table"]["tuner"])) == ["random", "tunenet"]
+    drawn = comparison.figure(whole, LABELS, "error")
+    labels = [text.get_text() for text in drawn.legends[0].get_texts()]
+    assert labels == ["random", "tunenet\nall runs failed"]
+
+
+def test_targets_that_were_drawn_again_are_said():
+    held = replace(results(), environment={"redrawn_targets": 2, "target_draws": 11})
+    said = (
+        "2 of 6 targets were drawn again because their own simulation diverged (11 draws in all)."
+    )
+    assert said in list(marks(held))
 
 
 def test_what_is_missing_or_failed_is_said():
-    assert list(warnings(results())) == []
-    (unfinished,) = warnings(results(missing=3))
+    assert list(warnings(results(many(6)))) == []
+    (unfinished,) = warnings(results(many(6), missing=3))
     assert unfinished == "Not finished: 3 planned runs are not made yet."
 
 
@@ -209,6 +257,12 @@ def test_errors_to_be_reached_are_chosen(opened, shown):
     assert opened.page.locator("#cost canvas").first.screenshot() != before
 
 
+def test_the_legend_says_whose_runs_failed(opened):
+    key = opened.page.locator("#error .key[data-name=random]")
+    assert key.inner_text().split("\n")[-1] == "2 of 6 runs failed"
+    assert opened.page.locator("#error .key[data-name=tunenet]").inner_text().strip() == "tunenet"
+
+
 def test_failures_stand_with_their_tracebacks(opened):
     fold = opened.page.locator("#failures details")
     assert fold.count() == 1
@@ -244,6 +298,7 @@ def test_a_comparison_of_one_tuner_without_a_run_that_reached_anything_has_a_pag
     kept = whole.statuses[whole.statuses["tuner"] == "random"]
     held = results(whole._replace(runs=alone, statuses=kept, costs={}, spectra=None))
     html = comparison_page(held)
-    assert soonest(held) == []
-    assert re.search("<strong>random</strong> ends with the smallest error", html)
+    assert reaching(held) == []
+    assert best_table(held) in html
+    assert "<strong>random</strong> (5)" in best_table(held)
     assert 'id="against"' not in html

@@ -1,0 +1,156 @@
+"""Who is best after 1, 3, 10 and all simulations, in words for the terminal and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from bench.analysis.statistics import Statistics
+from bench.analysis.tuner_ranking import (
+    BEST,
+    EQUAL,
+    FAILED,
+    SIGNIFICANCE,
+    UNDECIDED,
+    WORSE,
+    targets_needed,
+)
+from bench.pages.text import number
+
+_DIGITS = 2
+"""Significant digits of factors."""
+WHERE = {
+    "in": "targets in the training range",
+    "wide": "targets anywhere in the bounds",
+    "real": "the recording",
+}
+"""Ranges of targets."""
+
+
+class Standing(NamedTuple):
+    """The tuners of one range after some number of simulations.
+
+    Attributes:
+        simulations: number of simulations.
+        best: tuners that share the smallest error.
+        error: the median error of the best, in words.
+        worse: those that the test calls worse, each with factor and number of targets.
+        undecided: those with a larger median error of which the test decides nothing.
+        failed: those all of whose runs failed.
+    """
+
+    simulations: int
+    best: list[str]
+    error: str
+    worse: list[str]
+    undecided: list[str]
+    failed: list[str]
+
+
+def standings(statistics: Statistics, kind: str) -> list[Standing]:
+    """The standing after 1, 3, 10 and all simulations in one range."""
+    ranking = _in_range(statistics, kind)
+    return [
+        _standing(statistics, k, ranking[ranking["simulations"] == k])
+        for k in sorted(set(ranking["simulations"].astype(int)))
+    ]
+
+
+def _in_range(statistics: Statistics, kind: str) -> pd.DataFrame:
+    return statistics.ranking[statistics.ranking["range"] == kind]
+
+
+def _standing(statistics: Statistics, k: int, part: pd.DataFrame) -> Standing:
+    def named(*verdicts: str) -> pd.DataFrame:
+        return part[part["verdict"].isin(verdicts)]
+
+    # Equal tuners stand in the order of legends, so that a page has one order.
+    best = sorted(named(BEST, EQUAL)["tuner"], key=statistics.order.index)
+    first = named(BEST)
+    return Standing(
+        k,
+        [str(name) for name in best],
+        _error(statistics, float(first["median"].iloc[0])) if len(first) else "",
+        [_worse(row) for row in named(WORSE).to_dict("records")],
+        [str(name) for name in named(UNDECIDED)["tuner"]],
+        [str(name) for name in named(FAILED)["tuner"]],
+    )
+
+
+def _error(statistics: Statistics, median: float) -> str:
+    if not np.isfinite(median):
+        return "it failed on half of the targets"
+    text = f"{median * statistics.unit:.2g}"
+    return f"at most {text}" if median <= statistics.floor * (1 + 1e-9) else text
+
+
+def _worse(row: dict[Any, Any]) -> str:
+    """``cma_es 5.8x (8/10)``."""
+    ratio = float(row["error_ratio"])
+    factor = f" {number(ratio, _DIGITS)}x" if ratio > 1.0 else ""
+    # A failed run has an infinite error.
+    factor = factor if np.isfinite(ratio) else " failed"
+    return f"{row['tuner']}{factor} ({row['targets_worse']}/{row['targets']})"
+
+
+def targets_text(statistics: Statistics, kind: str) -> str:
+    """The number of targets of a range: ``10 targets``, or how many of them decide."""
+    count, ranked = statistics.targets[kind], _in_range(statistics, kind)["targets"]
+    deciding = int(ranked.max()) if len(ranked) else 0
+    things = ("starting point" if kind == "real" else "target") + "s" * (count != 1)
+    # Targets whose data identify no direction have no error that decides.
+    return f"{count} {things}" if deciding == count else f"{deciding} of {count} {things} decide"
+
+
+def floor_text(statistics: Statistics) -> str:
+    """Which errors count as equal."""
+    return f"errors below {statistics.floor * statistics.unit:.2g} count as equal"
+
+
+def how_decided(statistics: Statistics, kind: str) -> str:
+    """How the ranking is tested and how to read it."""
+    others = _others(statistics, kind)
+    if not others:
+        return ""
+    return (
+        f"5.8x (8/10): median error 5.8 times the best one's, larger on 8 of 10 targets. Worse: "
+        f"p < {SIGNIFICANCE:g} in Wilcoxon's signed-rank test against the best, Holm-corrected for "
+        f"{others} comparison{'s' * (others > 1)}."
+    )
+
+
+def _others(statistics: Statistics, kind: str) -> int:
+    """Number of tuners that the best one is tested against."""
+    part = _in_range(statistics, kind)
+    return max(part.loc[part["verdict"] != FAILED, "tuner"].nunique() - 1, 0)
+
+
+def too_few(statistics: Statistics, kind: str) -> str:
+    """What is said where so few targets can decide nothing; empty where they can."""
+    ranked, others = _in_range(statistics, kind)["targets"], _others(statistics, kind)
+    if not others or int(ranked.max()) >= (needed := targets_needed(others)):
+        return ""
+    targets = int(ranked.max())
+    return (
+        f"{targets} target{'s' * (targets != 1)} cannot decide between {others + 1} tuners: "
+        f"it takes at least {needed} (--targets {needed})."
+    )
+
+
+def failed_runs(statistics: Statistics, kind: str) -> str:
+    """Tuners some of whose runs failed in a range, with their numbers; empty for none."""
+    part = _in_range(statistics, kind).drop_duplicates("tuner")
+    each = [
+        f"{row['tuner']} {row['failures']} of {row['runs']}"
+        for row in part.to_dict("records")
+        if row["failures"]
+    ]
+    return f"failed runs, which count as infinite errors: {', '.join(each)}" if each else ""
+
+
+def joined(names: Sequence[str]) -> str:
+    """``a, b and c``."""
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
