@@ -7,11 +7,14 @@ import pytest
 
 PLUGINS = Path(__file__).parent / "plugins"
 
-_BESIDE = Path(__file__).parents[2] / "shared" / "data"
-"""Where the real recordings lie on machines that have them."""
+_SHARED = Path(__file__).parents[2] / "shared"
+_BESIDE = _SHARED / "data"
+"""Folder of the real recordings on machines that have them."""
 
-if _BESIDE.is_dir():  # for child processes too; who has set it knows better
-    os.environ.setdefault("SIMGAP_DATA", str(_BESIDE))
+# For child processes too. Values that the user has set stand.
+for _name, _folder in (("SIMGAP_DATA", _BESIDE), ("SIMGAP_ROBOTS", _SHARED / "robots")):
+    if _folder.is_dir():
+        os.environ.setdefault(_name, str(_folder))
 
 # One test's threads of linear algebra wait for another's, and spend its time waiting.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -40,8 +43,9 @@ def spring():
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path_factory, monkeypatch):
-    """Trained weights of tests never meet the user's."""
+    """Keep the trained weights and data sets of tests apart from the user's."""
     monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path_factory.getbasetemp() / "data"))
 
 
 @pytest.fixture(scope="session")

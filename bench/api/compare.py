@@ -67,7 +67,7 @@ _ROWS = 200
 """Rows of a table that a notebook shows."""
 
 
-AnExperiment: TypeAlias = Annotated[
+ExperimentSource: TypeAlias = Annotated[
     str | Path | Experiment,
     Expected("the name of an experiment, the path of its TOML file or an Experiment"),
 ]
@@ -85,7 +85,7 @@ RecordingFile: TypeAlias = Annotated[
 
 @check_arguments
 def compare(
-    experiment: AnExperiment | None = None,
+    experiment: ExperimentSource | None = None,
     *,
     model: str | Path | None = None,
     recording: RecordingFile | None = None,
@@ -108,38 +108,45 @@ def compare(
     force: bool = False,
     pdf: bool = False,
 ) -> Compared:
-    """Run an experiment: tuners x targets x seeds; returns its tables and figures.
+    """Run an experiment: every tuner on every target with every seed.
 
     Args:
-        experiment: its name, the path of its TOML file, or itself; none where a robot is tuned:
-        model: its model file, MJCF or URDF.
-        recording: a recording of it; without one it is tuned to simulations of its own.
+        experiment: the name of an experiment, the path of its TOML file, or an `Experiment`; None
+            for a robot, which `model` and `free` describe.
+        model: model file of a robot, MJCF or URDF.
+        recording: path of a recording of that robot; without one, targets are simulated.
         free: numbers of the model file to tune, as ``damping@*`` or ``mass@forearm``.
-        tuners: only these: labels, registered names, and classes, which are registered.
-        targets: in each range.
-        seeds: of each tuner that uses chance.
-        budget: simulations on one target.
-        training_budget: simulations that a learned tuner may learn from.
-        timeout: seconds that a run may take, then it is ended.
-        memory: MiB that a run may take; 0 is no limit.
-        jobs: worker processes; 0 runs everything in this process, where prints show and
-            breakpoints hold, and which a class that is defined in a notebook's cell needs; its
-            tuners are trusted.
-        trust: run the tuners inside the harness, where nothing is out of their reach: quicker, and
-            what comes out is marked so.
-        isolation: "run" gives every run of a tuner a fresh process, "tuner" all with the same seed
-            one; the experiment's where None.
-        salt: what targets are drawn from, secret until the end; "public" for the published ones, a
-            fresh one where None.
-        out: folder to write, a new one; below results/ where None.
-        plugins: Python files with more tuners, simulators and effects.
-        cluster: address of a Dask scheduler to run on instead.
-        progress: told of every step.
-        force: begin although it needs more than this machine has.
+        tuners: labels, registered names or classes of the tuners to run; all of the experiment's
+            where None. A class is registered.
+        targets: number of targets in each range.
+        seeds: number of seeds for each tuner that uses random numbers.
+        budget: number of simulations on one target.
+        training_budget: number of simulations that a learned tuner may train on.
+        timeout: time limit of a run in seconds.
+        memory: memory limit of a run in MiB; 0 is no limit.
+        jobs: number of worker processes. 0 runs everything in this process: output of ``print``
+            appears, breakpoints work, and classes of a script or notebook can be used; tuners are
+            trusted then.
+        trust: run tuners inside the harness, where they could read the true parameters. This is
+            faster, and the results are marked.
+        isolation: ``run`` starts a fresh process for every run of a tuner, ``tuner`` one for all
+            runs with the same seed; the experiment's own where None.
+        salt: text from which targets are drawn. It is secret until the end; ``public`` draws the
+            published targets; a fresh one where None.
+        out: folder to write, new or empty; a new one below results/ where None.
+        plugins: Python files with further tuners, simulators and effects.
+        cluster: address of a Dask scheduler to run on.
+        progress: called with a title and a number of steps; gives the function that is called after
+            each step.
+        force: start even if it needs more than this machine has.
         pdf: write every figure as PDF too, in addition to PNG.
 
+    Returns:
+        Tables and figures of the results.
+
     Raises:
-        InputError: a fault in what was asked for, in one line; nothing has been run then.
+        InputError: an argument, the experiment or a plugin cannot be used; nothing has been run
+            then.
     """
     if experiment is None and not (model or recording or free):
         raise InputError(
@@ -172,7 +179,7 @@ def compare(
 
 @check_arguments
 def sweep(
-    experiment: AnExperiment,
+    experiment: ExperimentSource,
     *,
     jobs: Natural = 2,
     trust: bool = False,

@@ -63,41 +63,45 @@ def explain(
     progress: Callable[[float, str], None] | None = None,
     listener: ProgressListener | None = None,
 ) -> Explanation:
-    """Show what the simulation of a recording gets wrong, name the cause, extend the simulator.
+    """Find what the simulator of a recorded system lacks, and extend the simulator by it.
 
     Args:
         recording: the path of ``NAME.csv``, a recording that was read or simulated, or a pandas
-            DataFrame (`read_recording` says what its columns are); several of one system are
-            explained together, and each also by itself.
-        system: take it for this system, whatever the description says; a DataFrame needs it, or:
-        model: take it for this robot, whatever the description says: an MJCF or URDF.
-        units: of the columns of a DataFrame.
-        constants: known numbers of the system, with a DataFrame.
+            DataFrame with the columns that `read_recording` describes. Several recordings of one
+            system are explained together, and each also by itself.
+        system: name of the system, in place of the one that the description states. A DataFrame
+            needs this or `model`.
+        model: model file of a robot, MJCF or URDF, in place of what the description states.
+        units: units of a DataFrame's columns by name; those in ``df.attrs["units"]`` without.
+        constants: known numbers of the system in SI units, with a DataFrame.
         description: anything else about a DataFrame, with the keys of ``NAME.toml``.
-        engine: pybullet, mujoco or batch; a simulator that steps itself has its own.
-        free: constants to estimate with the parameters; of a robot numbers of its file, as
-            ``damping@*`` or ``mass@forearm``.
-        tuner: a registered tuner that finds where the fit of the base parameters begins.
-        seed: of the surrogates and the bootstrap.
-        force: explain what needs more than this machine has, or has stamps that cannot be seconds.
-        budget: seconds of the clock after which the search ends with what it has then; the
-            answer's ``cut`` says what was not asked any more. None: it comes to its end.
-        jobs: processes that work at once, where that pays; None: one for each core. The answer does
-            not depend on it.
-        whole: look at all of a long recording of a robot; else at pieces from all over it.
-        pieces: seconds of the pieces that every run is cut into, each with an initial state of its
-            own: for motion that drifts or is unstable.
-        thorough: search on where causes are found and something is left over: further causes are
-            taken that held-out runs bear out. Takes about twice as long there.
-        say: told what the user should know of the recording and of the base model.
-        stop: asked between two steps of the search; True ends it as a budget does.
-        progress: told the share that is done, as far as can be known, and what is looked at.
+        engine: ``pybullet``, ``mujoco`` or ``batch``; not used for a simulator that steps itself.
+        free: constants to estimate together with the parameters; for a robot, numbers of its model
+            file, as ``damping@*`` or ``mass@forearm``.
+        tuner: name of a tuner that finds the starting point of the base fit; a grid where None.
+        seed: seed of the surrogate data and the bootstrap.
+        force: explain a recording that needs more than this machine has, or whose stamps cannot be
+            seconds.
+        budget: time limit of the search in seconds. The search then ends with what it has found,
+            and ``cut`` of the answer says what was not tested. No limit where None.
+        jobs: number of processes; one for each core where None. The answer does not depend on it.
+        whole: use all samples of a long recording of a robot; otherwise pieces from all over it.
+        pieces: length in seconds of the pieces that runs are cut into. Each piece has an initial
+            state of its own, for motion that drifts or is unstable.
+        thorough: where causes are found and a residual remains, search for further causes that
+            held-out runs confirm. This takes about twice as long.
+        say: called with notes on the recording and the base model.
+        stop: called between two steps; the search ends, as at its time limit, when it returns True.
+        progress: called with the share that is done (an estimate) and the current step.
         listener: receives the events of the search: its stages with their steps, and the best
             model so far.
 
+    Returns:
+        The verdict, its causes, the extended simulator and the figures.
+
     Raises:
-        InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
-            or the budget is no number above 0, or ended before anything could be simulated.
+        InputError: an argument is wrong; the recording cannot be read, is too short or is of a
+            simulator that takes no effects; or the search ended before the first simulation.
     """
     about = FrameDescription(system, model, units or {}, constants or {}, description or {})
     sources = sources_of(recording, about)
