@@ -13,9 +13,10 @@ from bench.gap.causes.name import Finding
 from bench.gap.causes.score_test import tail
 from bench.gap.causes.search import Search
 from bench.gap.measure import Gain, gain, intervals
-from bench.gap.model.bounds import bound_of, coefficient_bounds, is_instant
+from bench.gap.model.bounds import bound_of, coefficient_bounds
 from bench.gap.model.floor import Floor
 from bench.gap.model.models import Model, Names
+from bench.gap.model.time_scale import is_instant
 from bench.gap.model.world import World
 from bench.gap.propose import Experiment, next_experiment
 from bench.gap.verdict import Candidate, Cause, Heldout, Verdict, finite

@@ -28,10 +28,11 @@ from bench.gap.causes.reaches import (
     reach,
     stopping,
 )
-from bench.gap.model.bounds import CYCLES, LASTING, coefficient_bounds, is_instant
+from bench.gap.model.bounds import CYCLES, coefficient_bounds
 from bench.gap.model.differences import followed
 from bench.gap.model.noise import Mask
 from bench.gap.model.problem import Fit, Start
+from bench.gap.model.time_scale import LASTING, is_instant
 from bench.gap.model.world import World
 from sims.base import Array, Parameter
 from sims.system import FAMILY

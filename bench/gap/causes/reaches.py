@@ -9,7 +9,7 @@ from itertools import product
 
 import numpy as np
 
-from bench.gap.model.bounds import is_instant
+from bench.gap.model.time_scale import is_instant
 from bench.gap.model.tracks import Track
 from bench.gap.model.world import World
 from sims.base import Array, Parameter

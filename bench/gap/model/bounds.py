@@ -1,24 +1,16 @@
 """The range of each coefficient of an effect: where one expects it, and where a fit may move it.
 
-Times and frequencies follow the time scale of the recording: with T the duration of the longest run
-and h the shortest sample interval,
-
-* a delay or a lag is plausible up to a twentieth of T, and a fit may move it up to T: what takes
-  longer than a run is a constant in it;
-* a time constant of something that dies away is at most `LASTING` T;
-* a frequency is at most 1 / (2 h), the Nyquist frequency.
+Times and frequencies follow the time scale of the recording (`bench.gap.model.time_scale`).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+from bench.gap.model.time_scale import is_instant
+from bench.gap.model.world import World
 from sims.base import Parameter
 from sims.system import Effect, Friction
-
-if TYPE_CHECKING:
-    from bench.gap.model.world import World
 
 BEYOND = 20.0
 """A coefficient may be so many times as large as its plausible range has it."""
@@ -31,10 +23,6 @@ CYCLES = 1.0
 """What comes and goes must do so about once in the longest run, else any slow change would be
 called periodic.
 """
-LASTING = 3.0
-"""Longest time constant that is tried of what dies away, in durations of the longest run."""
-DECADES = 100.0
-"""Ratio of the highest to the lowest plausible frequency where the sampling sets the highest."""
 AT_BOUND = 1e-6
 """A fitted number is at a bound if it is nearer to it than this share of its range. A bound of zero
 is met exactly or not at all, since ranges are wide against small coefficients.
@@ -42,33 +30,6 @@ is met exactly or not at all, since ranges are wide against small coefficients.
 
 Bound = Literal["low", "high"]
 """Which end of its range a number lies at."""
-
-
-def on_time_scale(parameter: Parameter, longest: float, spacing: float) -> Parameter:
-    """The coefficient with a plausible range that suits the time scale of a recording.
-
-    Args:
-        parameter: a coefficient, with the range that its effect states.
-        longest: duration of the longest run, s.
-        spacing: shortest sample interval, s; 0 where it is not known.
-    """
-    low, high = parameter.bounds
-    if is_instant(parameter):
-        return parameter
-    if parameter.unit == "s":
-        if low > 0:
-            high = max(high, LASTING * longest)
-        else:
-            # a delay may have either sign: both ends grow alike
-            times = max(1.0, longest / (BEYOND * high))
-            low, high = times * low, times * high
-    elif parameter.unit == "Hz" and spacing > 0 and 0.5 / spacing < high:
-        high = 0.5 / spacing
-        low = min(low, high / DECADES)
-    if (low, high) == parameter.bounds:
-        return parameter
-    nominal = min(max(parameter.nominal, low), high)
-    return replace(parameter, nominal=nominal, bounds=(low, high), training=None)
 
 
 def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
@@ -92,11 +53,6 @@ def bound_of(value: float, low: float, high: float) -> Bound | None:
     if value <= low + near * (low != 0.0):
         return "low"
     return "high" if value >= high - near * (high != 0.0) else None
-
-
-def is_instant(coefficient: Parameter) -> bool:
-    """Whether it is an instant on the clock of a recording's stamps."""
-    return coefficient.name.endswith(".instant")
 
 
 def _bounds(

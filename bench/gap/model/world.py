@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.gap.model.bounds import on_time_scale
 from bench.gap.model.crew import Crew
 from bench.gap.model.lane_cache import LaneCache
 from bench.gap.model.noise import Mask
+from bench.gap.model.time_scale import on_time_scale
 from bench.gap.model.tracks import Track, first_of, tracked
 from bench.gap.model.watch import Watch
 from sims import effects as library

@@ -12,7 +12,8 @@ from scipy.integrate import solve_ivp
 from bench.cli import main
 from bench.gap.causes.rules import verdict_of_numbers
 from bench.gap.explain import explain
-from bench.gap.model.bounds import bound_of, coefficient_bounds, on_time_scale
+from bench.gap.model.bounds import bound_of, coefficient_bounds
+from bench.gap.model.time_scale import on_time_scale
 from bench.gap.report.account import absorbed, account, headline, moves, shift
 from bench.gap.report.story import Tuned
 from bench.gap.robot_files import written_causes
