@@ -179,6 +179,7 @@ def test_seals_of_this_machine_and_of_a_folder_are_said(sound, capsys):
     assert "revealed" in said
 
 
+@pytest.mark.slow
 def test_trusted_runs_are_marked_in_every_table_and_figure(tmp_path, capsys, monkeypatch):
     (tmp_path / "e.toml").write_text(
         tomli_w.dumps({**SPRING, "targets": 2, "seeds": 1, "budget": 3, "tuners": ["random"]})

@@ -59,6 +59,7 @@ def statuses(met):
     return arena.stored(met).statuses.set_index("tuner")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(KINDS))
 def test_its_run_ends_in_the_status_that_it_deserves(statuses, held, name):
     if NEEDED.get(name, "process") not in held:

@@ -91,6 +91,7 @@ def trusted(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHEATERS)
 def test_a_cheater_is_no_better_than_random_search(met, name):
     assert arena.gains(met, name) > arena.CHANCE

@@ -20,6 +20,7 @@ def subject(registry, name):
         pytest.skip(f"{name}: {reason}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("check", TUNER_CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", tuners.names())
 def test_tuner(name, check):

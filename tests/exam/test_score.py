@@ -138,6 +138,7 @@ def test_a_crash_is_a_row():
     json.dumps(row)
 
 
+@pytest.mark.slow
 def test_an_exam_goes_on_where_it_was(tmp_path, capsys):
     given = ["--quick", "--only", "clean", "--jobs", "1", "--out", str(tmp_path)]
     explain = ["--explain", "tests.exam.stubs:sees_nothing"]

@@ -12,6 +12,7 @@ def fitted():
     return tuner
 
 
+@pytest.mark.slow
 def test_estimates_from_the_target_alone_and_simulates_once(fitted):
     off = []
     for seed in range(20):
@@ -59,6 +60,7 @@ def test_published_trains_on_targets_alone():
     assert run(tuner, toy, 0)[0].status == "converged"
 
 
+@pytest.mark.slow
 def test_two_parameters():
     toy = Toy(2, runs=2)
     tuner = Regressor(scenarios=80, points=60, epochs=100)

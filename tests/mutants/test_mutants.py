@@ -44,6 +44,7 @@ def tree(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_killed_survived_and_broken_are_told_apart_and_the_file_is_put_back(tree):
     ends = [
         tried(ADD, tree),

@@ -22,6 +22,7 @@ def item():
     return items.draw("single", "arm2-servo", "friction.coulomb", 0)
 
 
+@pytest.mark.slow
 def test_an_item_follows_from_its_name(item):
     assert items.Item.of(item.json()) == item
     first = items.draw("clean", "arm2-servo", "any", 0)
@@ -108,6 +109,7 @@ def test_a_slipping_encoder_jumps_and_stays(item):
     assert jump[-1] == pytest.approx(total)
 
 
+@pytest.mark.slow
 def test_what_is_alike_in_a_servo_is_found_so_and_a_sensor_of_force_splits_it(item):
     """A force that is constant is a command that is off: kp times as much."""
     whole = items.setting_of(item.name)

@@ -54,6 +54,7 @@ def test_a_wheel_that_lacks_a_file_or_has_one_too_many_is_found(wheel, tmp_path,
     assert faults(other) == [says]
 
 
+@pytest.mark.slow
 def test_it_is_installed_and_used_away_from_the_checkout(wheel, tmp_path):
     python = environment(tmp_path / "env")
     (packages,) = (tmp_path / "env" / "lib").glob("python3*/site-packages")

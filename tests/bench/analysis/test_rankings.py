@@ -47,6 +47,7 @@ def test_a_turned_order_is_told_from_chance():
     assert turned.halves == pytest.approx(1.0), "the first condition agrees with itself"
 
 
+@pytest.mark.slow
 def test_an_order_of_chance_alone_is_not_told_from_no_change():
     rng = np.random.default_rng(3)
     p_values = [

@@ -44,6 +44,7 @@ def untimed(table):
     return table.drop(columns=[name for name in table if "seconds" in name])
 
 
+@pytest.mark.slow
 def test_python_and_the_command_make_the_same(experiment, tmp_path):
     command = ["compare", str(experiment), "--plugin", str(PLUGINS / "spring.py"), "--jobs", "1"]
     assert main([*command, "--out", str(tmp_path / "command")]) == 0
@@ -68,6 +69,7 @@ def test_python_and_the_command_make_the_same(experiment, tmp_path):
         assert pictures == ({".png", ".pdf"} if jobs else {".png"})
 
 
+@pytest.mark.slow
 def test_a_class_is_compared_its_figures_and_summary_are_at_hand(experiment, tmp_path):
     backend = matplotlib.get_backend()
     run = simgap.compare(experiment, tuners=["random", Halving], jobs=0, out=tmp_path / "out")
@@ -91,6 +93,7 @@ def test_a_class_is_compared_its_figures_and_summary_are_at_hand(experiment, tmp
     assert len(shown) < 5000
 
 
+@pytest.mark.slow
 def test_a_fault_in_a_class_shows_its_own_line_and_the_others_go_on(experiment, tmp_path, capfd):
     run = simgap.compare(experiment, tuners=["random", Careless], jobs=0, out=tmp_path / "out")
     reasons = run.statuses.set_index("tuner").loc["careless", "reason"]
@@ -128,6 +131,7 @@ def test_a_bounce_shot_has_tables_too(tmp_path):
     assert "<table" in run._repr_html_()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_sweep_is_several_comparisons_on_the_same_targets(experiment, tmp_path, capsys):
     experiment.write_text(tomli_w.dumps({**SETTINGS, "sweep": {"budget": [3, 5]}}))

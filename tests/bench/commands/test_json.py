@@ -304,6 +304,7 @@ def test_every_command_has_a_case_and_a_schema():
     assert there <= set(names())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_what_a_command_prints_is_of_the_form_that_its_schema_publishes(name, request, capsys):
     def ask(*arguments, code=0):
@@ -390,6 +391,7 @@ class Loud(Tuner):
 """
 
 
+@pytest.mark.slow
 def test_what_a_tuner_prints_does_not_come_to_stand_in_the_document(place):
     (place / "loud.py").write_text(LOUD)
     command = ["compare", place / "spring-small.toml", *PLUGIN, "--plugin", place / "loud.py"]

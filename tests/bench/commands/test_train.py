@@ -58,6 +58,7 @@ def ahead(experiment, *more):
     )
 
 
+@pytest.mark.slow
 def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
     assert ahead(experiment, "--out", tmp_path / "out") == 0
     files = sorted(cache.iterdir())
@@ -186,6 +187,7 @@ def not_a_number(path):
 BREAKS = [truncated, emptied, flipped, pickled, foreign, another, reshaped, not_a_number]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoil", BREAKS, ids=lambda spoil: spoil.__name__)
 def test_broken_weights_are_refused_with_one_line(experiment, cache, capsys, spoil):
     assert ahead(experiment) == 0

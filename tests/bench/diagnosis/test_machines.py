@@ -88,6 +88,7 @@ ASKED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("system", "name"), ASKED)
 def test_each_effect_does_what_the_library_says(system, name, arm):
     c = SOMEWHERE[name.partition("@")[0]]

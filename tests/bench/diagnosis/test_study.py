@@ -77,6 +77,7 @@ def made(tmp_path_factory):
     return code, out
 
 
+@pytest.mark.slow
 def test_a_short_one_from_outside_is_in_the_table(made):
     _, out = made
     own = [row for row in items(out) if row["diagnoser"] == "fifteen"]
@@ -165,6 +166,7 @@ def test_who_cannot_be_asked_counts_nowhere(tmp_path, capsys):
     assert "declines cannot be asked 2 of the questions: it knows no sliders." in page
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_it_goes_on_where_it_was(made, tmp_path, capsys):
     path = written(tmp_path, "fifteen")
@@ -189,6 +191,7 @@ def test_it_goes_on_where_it_was(made, tmp_path, capsys):
     assert str(out / "report.html") in said["files"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_secret_is_kept_until_the_end_and_draws_other_questions(tmp_path):
     path = written(tmp_path, "fifteen")

@@ -77,6 +77,7 @@ def notebook(monkeypatch):
     pyplot.switch_backend(before)
 
 
+@pytest.mark.slow
 def test_drawing_leaves_backend_settings_and_open_figures_alone(notebook, tmp_path):
     before = notebook()
     assert before[2] == [7]

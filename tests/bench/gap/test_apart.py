@@ -91,6 +91,7 @@ def test_a_mass_that_grows_from_day_to_day(tmp_path):
     assert abs(mass.value - 2.03) > 3 * mass.error
 
 
+@pytest.mark.slow
 def test_the_groups_disagree_by_chance_as_often_as_they_say(tmp_path):
     chances = []
     for seed in range(12):
@@ -192,6 +193,7 @@ def warm(folder, drags, temperatures):
     return path
 
 
+@pytest.mark.slow
 def test_what_a_number_moves_with_says_what_is_missing(tmp_path):
     """Friction that falls as it warms, on days in no order."""
     heat = np.array([3, 0, 7, 5, 1, 8, 2, 6, 4])

@@ -70,6 +70,7 @@ def names_of(explanation):
     return {cause.effect, *cause.alternatives}
 
 
+@pytest.mark.slow
 def test_the_proposed_run_splits_the_set(tmp_path):
     before = write(tmp_path, "before", slow(), lag=0.04)
     proposed = simgap.design(before)

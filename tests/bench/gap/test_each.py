@@ -48,6 +48,7 @@ def explain(logs, out, *more):
     return main(["explain", *map(str, logs), "--each", "--out", str(out), *more])
 
 
+@pytest.mark.slow
 def test_every_log_has_its_folder_and_its_row(logs, tmp_path, capsys):
     out = tmp_path / "out"
     assert explain(logs, out, "--jobs", "2") == 0
@@ -77,6 +78,7 @@ def test_every_log_has_its_folder_and_its_row(logs, tmp_path, capsys):
     assert named[2][1] == hashlib.sha256(logs[1].read_bytes()).hexdigest()
 
 
+@pytest.mark.slow
 def test_a_log_that_cannot_be_explained_costs_no_other_and_what_is_there_stays(logs, tmp_path):
     out, bad = tmp_path / "out", tmp_path / "bad.csv"
     bad.write_text("nothing\n")

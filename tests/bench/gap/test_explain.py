@@ -218,6 +218,7 @@ def test_what_takes_no_effects_is_refused(tmp_path, spring):
         explain(tmp_path / "spring.csv")
 
 
+@pytest.mark.slow
 def test_a_plugins_simulator_without_forces_is_explained(tmp_path):
     pytest.importorskip("mujoco")
     load_plugins([EXAMPLES / "bob.py"])

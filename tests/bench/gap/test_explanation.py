@@ -138,6 +138,7 @@ def test_without_being_asked_it_writes_no_pdf(named, tmp_path):
     assert b"application/pdf" not in paths[-1].read_bytes()
 
 
+@pytest.mark.slow
 def test_all_is_written_or_nothing(named, tmp_path, monkeypatch):
     def full(path, content):
         if "report" in path.name:

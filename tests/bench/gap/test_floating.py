@@ -170,6 +170,7 @@ def test_a_log_of_what_floats_is_tuned_to(tmp_path):
     assert last["heldout_error_q.boom"].to_numpy() < 2e-3
 
 
+@pytest.mark.slow
 def test_what_floats_is_tuned_to_simulations_of_itself(tmp_path):
     (tmp_path / "satellite.xml").write_text(MODEL)
     last = compared(tmp_path, "--model", str(tmp_path / "satellite.xml"))

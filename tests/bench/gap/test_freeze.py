@@ -49,6 +49,7 @@ def test_what_is_free_in_the_description_is_fitted(log):
     assert number.low < DAMPING - 0.1 < number.high
 
 
+@pytest.mark.slow
 def test_a_number_that_is_mixed_up_is_frozen_and_said(log):
     said = []
     found = explain(log("damping@*", "mass@*", "inertia.armature@*"), say=said.append)

@@ -14,6 +14,7 @@ from sims.base import InputError
 from tests.bench.gap.made import recording
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forked on Linux alone")
 def test_the_answer_is_the_same_to_the_last_bit_with_one_two_and_eight(monkeypatch):
     # Small pieces of a small search, all of them given to workers, whatever threads there are.

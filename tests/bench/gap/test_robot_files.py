@@ -66,6 +66,7 @@ def test_the_report_shows_the_lines_to_change(arm, tmp_path, monkeypatch):
     assert "What to change" not in nothing._repr_html_()
 
 
+@pytest.mark.slow
 def test_it_errs_by_the_noise_where_its_cause_is_true(arm, tmp_path):
     shown = story()
     explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))

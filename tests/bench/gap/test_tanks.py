@@ -50,6 +50,7 @@ def test_the_simulator_follows_the_solver_to_a_third_of_the_noise(made, rim):
     assert (exact[:, 0].max() == rim) == (rim == made.RIM)
 
 
+@pytest.mark.slow
 def test_the_rim_is_named_with_its_height(made):
     answer = explain(RECORDING).answer
     (cause,) = answer.causes

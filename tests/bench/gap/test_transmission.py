@@ -63,6 +63,7 @@ def log(folder):
     return folder / "log.csv"
 
 
+@pytest.mark.slow
 def test_a_spring_is_found_behind_a_drive_that_weighs_more_than_it_gives(tmp_path):
     explained = explain(log(tmp_path))
     assert explained.answer.verdict == "named"

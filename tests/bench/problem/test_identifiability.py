@@ -193,6 +193,7 @@ def test_errors_along_directions_and_of_prediction_are_recorded(folder):
     assert problem.identifiable
 
 
+@pytest.mark.slow
 def test_folder_has_the_spectra_and_the_table_the_metrics(folder):
     folder, results = folder
     said = []

@@ -23,6 +23,7 @@ def started(tmp_path):
         yield running
 
 
+@pytest.mark.slow
 def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_nothing(
     started, tmp_path
 ):
@@ -52,6 +53,7 @@ def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_no
     same(folder, tmp_path / "local")
 
 
+@pytest.mark.slow
 def test_runs_are_isolated_there_too_and_a_lost_scheduler_leaves_a_folder_to_resume(
     started, tmp_path
 ):
@@ -105,6 +107,7 @@ shot = { balls = ["golf"] }
 """
 
 
+@pytest.mark.slow
 def test_bounce_shot_on_a_cluster_is_the_one_of_two_local_workers(started, tmp_path):
     """Recordings and weights travel there; workers find none of them on this machine's paths."""
     (tmp_path / "shot.toml").write_text(SHOT)
@@ -120,6 +123,7 @@ def test_bounce_shot_on_a_cluster_is_the_one_of_two_local_workers(started, tmp_p
     assert set(tables[0]["status"]) <= {"done", "converged"}
 
 
+@pytest.mark.slow
 def test_nobody_there_is_one_line(tmp_path, capsys):
     experiment = write(tmp_path / "e.toml")
     common = [

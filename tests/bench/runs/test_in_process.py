@@ -71,6 +71,7 @@ def here(experiment):
     return results
 
 
+@pytest.mark.slow
 def test_table_is_the_same_without_workers_and_with_one_or_two(tmp_path, monkeypatch):
     experiment = spring_experiment(tuners=EVERYONE, targets=2, training_budget=60)
     tables = []

@@ -58,6 +58,7 @@ def two_workers():
     return compared(spring_experiment(tuners=EVERYTHING), jobs=2)
 
 
+@pytest.mark.slow
 def test_table_does_not_depend_on_the_number_of_workers(two_workers, tmp_path):
     experiment = spring_experiment(tuners=EVERYTHING)
     first, second = (tables(experiment, tmp_path / str(jobs), jobs) for jobs in (1, 2))
@@ -70,6 +71,7 @@ def test_table_does_not_depend_on_the_number_of_workers(two_workers, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_other_tuners_in_the_comparison_change_nothing(two_workers):
     alone = frame(compared(spring_experiment(tuners={"cma_es": {}}), jobs=2)).drop(columns=MEASURED)
     among = (

@@ -156,6 +156,7 @@ def test_effect_of_a_plugin_file_is_part_of_what_names_it(tmp_path):
     assert keys[0] != keys[1]
 
 
+@pytest.mark.slow
 def test_any_file_of_the_rooms_that_make_runs_changes_keys_and_ids(tmp_path, monkeypatch):
     from bench.runs import sources
 

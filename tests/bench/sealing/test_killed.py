@@ -89,6 +89,7 @@ class Killing:
                 self.killed += 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", SEALED)
 def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
     experiment, path = slow

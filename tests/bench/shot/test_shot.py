@@ -148,6 +148,7 @@ def test_recorded_drop_reads_as_any_recording_of_a_ball(experiment, tmp_path):
     assert np.polyfit(t, fall, 2)[0] == pytest.approx(-9.81 / 2, rel=0.06)
 
 
+@pytest.mark.slow
 @vision
 def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_camera_stood(
     tmp_path, monkeypatch
@@ -193,6 +194,7 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
     assert found["golf"] - found["squash"] > 0.2  # 0.86 and 0.54 by the tables
 
 
+@pytest.mark.slow
 @vision
 def test_a_drop_that_cannot_be_tracked_is_a_row_and_not_the_end(experiment, tmp_path, capsys):
     """A film of 16 pixels' height shows a golf ball on a fifth of a pixel."""
@@ -277,6 +279,7 @@ def test_world_that_cannot_be_had_is_skipped_with_its_reason(
     assert "skipped: the world needs mujoco" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_command_from_recorded_drop_to_table_and_again_from_what_is_kept(tmp_path, capsys):
     assert "bounce-shot" in names()
     text = f"""{SMALL}

@@ -95,6 +95,7 @@ def test_each_run_has_its_own_and_a_short_one_none():
     )
 
 
+@pytest.mark.slow
 def test_a_network_that_is_told_the_inputs_beats_one_that_is_not(told, blind):
     knows, guesses = errors(told, Driven()), errors(blind, Driven())
     assert knows[1] < 0.02 < guesses[1] / 2
@@ -102,6 +103,7 @@ def test_a_network_that_is_told_the_inputs_beats_one_that_is_not(told, blind):
     assert knows[10] < 1e-6
 
 
+@pytest.mark.slow
 def test_so_does_the_regressor():
     knows, guesses = (
         errors(trained(Regressor, told), Driven(), budget=1)[1] for told in (True, False)

@@ -91,6 +91,7 @@ def test_simgap_begins_where_the_recording_says_and_moves_alike(machine, tmp_pat
     assert np.abs(seen - seen[0]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_a_wrong_mass_below_a_ball_joint_is_found_by_the_command(tmp_path):
     """A question of the sheet, of which four runs are enough."""
     name, truth = "single/hung-motor/mass.scale/0", 0.0787
@@ -106,6 +107,7 @@ def test_a_wrong_mass_below_a_ball_joint_is_found_by_the_command(tmp_path):
     assert verdict["heldout"]["gap_closed"] > 0.9
 
 
+@pytest.mark.slow
 def test_a_held_out_run_that_is_chaotic_is_no_gap(tmp_path):
     """It grows 1,400 times what the guess of its beginning is off by: derivatives there lead a fit
     astray, which leaves twice the noise.

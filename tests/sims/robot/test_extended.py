@@ -226,6 +226,7 @@ def recorded(folder, simulator, theta, name="log"):
     return table
 
 
+@pytest.mark.slow
 def test_its_score_on_its_own_motion_is_nothing(path, tmp_path):
     made = load(path, simulators.get)
     simulator = made()

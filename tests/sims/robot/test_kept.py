@@ -66,6 +66,7 @@ def robots():
     return len(RobotSystem.__subclasses__())
 
 
+@pytest.mark.slow
 def test_what_was_explained_is_gone():
     before = robots()
     # Long enough that places were searched and causes refitted.

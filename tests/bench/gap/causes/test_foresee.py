@@ -32,6 +32,7 @@ def search(log):
     return searched(log, SIGMA)[0]
 
 
+@pytest.mark.slow
 def test_what_few_samples_show_is_fitted_to_all_of_them(search, log, monkeypatch):
     found = settle(search, sought(search))
     assert found.names == ("friction.coulomb",)
