@@ -61,8 +61,6 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "legend.frameon": False,
     "text.usetex": False,
-    # Fitting letters to the grid of pixels takes a tenth of a figure's time, and spaces them worse.
-    "text.hinting": "none",
     # Names come from files: a dollar sign in one is a dollar sign.
     "text.parse_math": False,
 }

@@ -76,9 +76,9 @@ def test_shown_in_a_notebook_it_is_the_report_in_a_frame(named):
     page = unescape(re.search('srcdoc="([^"]*)"', html)[1])
     assert page.startswith("<!DOCTYPE html>")
     assert "90 % of the gap closed" in page
-    pictures = re.findall('src="data:image/svg.xml;base64,([^"]+)"', page)
+    pictures = re.findall('src="data:image/png;base64,([^"]+)"', page)
     assert len(pictures) == 3
-    assert all(b64decode(picture).startswith(b"<?xml") for picture in pictures)
+    assert all(b64decode(picture).startswith(b"\x89PNG") for picture in pictures)
 
 
 def test_its_report_is_that_of_the_folder_but_for_the_files_beside_it(named, tmp_path):
