@@ -7,9 +7,10 @@ the other, so that the same display serves any search.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 
+@runtime_checkable
 class ProgressListener(Protocol):
     """Receives the events of one search, in the order in which they happen.
 
