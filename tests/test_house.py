@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("bench", "methods", "sims")
 ROOMS = {
     "across", "analysis", "api", "behind", "bundle", "checks", "cli", "commands", "compare",
-    "diagnoser", "diagnosers", "diagnosis",
+    "datasets", "diagnoser", "diagnosers", "diagnosis",
     "differ", "experiments", "figures", "gap", "misspecified", "pages", "problem",
     "recordings", "registry", "report", "runs", "schemas", "sealing", "shot", "sizes", "store",
     "study",

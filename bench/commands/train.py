@@ -67,7 +67,8 @@ def _train(options: argparse.Namespace, say: Say) -> Answer:
     )
     seeds = options.seeds or seeds_of(experiment, entry)
     check_training(experiment, entry, seeds, options.force)
-    say(f"experiment: {experiment.name}")
+    if options.experiment is None:
+        say(f"experiment: {experiment.name}")
     trained, files = [], []
     with Bars("epoch") as bars:
         losses = Losses(experiment, bars.start)

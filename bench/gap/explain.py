@@ -26,7 +26,7 @@ from bench.gap.model.base_fit import Base, fit_base, without_step
 from bench.gap.model.crew import Crew
 from bench.gap.model.floor import Floor, noise_floor
 from bench.gap.model.noise import Noise
-from bench.gap.model.watch import Watch
+from bench.gap.model.watch import STAGES, Watch
 from bench.gap.model.world import World
 from bench.gap.steps import Coarse, with_numerics
 from bench.gap.tell import Teller
@@ -243,6 +243,7 @@ class _Explainer:
     # Small products: with a thread for each core they take five times as long where others compute.
     @one_thread()
     def run(self) -> Explanation:
+        self.watch.stage(STAGES["base_fit"])
         base = self._base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._fails()

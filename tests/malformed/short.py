@@ -55,7 +55,7 @@ SHORT = {
     "bench.across.Together.frames": _cut,
     "bench.store.made.distributions": _nothing,
     "bench.gap.explain._Explainer.run": _cut,
-    "bench.checks.command._isolated": _cut,
+    "bench.checks.command._lines": _cut,
     "bench.recordings.film.write_video": _cut,
     "bench.figures.recording.draw": _nothing,
     "bench.figures.track.drawn": lambda *_: (b"", b""),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from bench.runs.drive import drive
 from methods.base import Array, Ask, Evaluation, Tuner
 from methods.bayes import Bayes
 from methods.cma_es import CMAES
@@ -122,7 +123,8 @@ def test_nothing_but_failed_simulations_is_survived(tuner: Tuner) -> None:
     task, evaluate = problem(
         lambda theta: np.full((30, 2), np.nan), TRUTH[:2], START[:2], 30, decays(TRUTH[:2])
     )
-    trace = run(tuner, task, evaluate)
+    trace = drive(tuner, task, evaluate, np.random.default_rng(0))
+    assert trace.status == "diverged", trace.reason
     assert (trace.recommendations == START[:2]).all()
 
 

@@ -126,5 +126,6 @@ def test_everything_fails_and_it_still_uses_its_budget(two):
         lambda p: (toy.observe(p, None), np.full(len(p), np.inf)),
         np.random.default_rng(0),
     )
-    assert trace.status == "done"
+    assert trace.status == "diverged"
+    assert trace.reason.startswith("none of 9 simulations has a finite loss")
     assert len(trace.losses) == 9

@@ -114,7 +114,6 @@ class Watch:
         self._done, self._now = 0.0, WEIGHTS["base_fit"]
         self._ahead = _after("base_fit")
         self._looks = -1
-        self._listener.stage(STAGES["base_fit"])
 
     def stage(self, name: str, total: int | None = None) -> None:
         """Report the stage that begins, and its number of steps where that is known."""
