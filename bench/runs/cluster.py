@@ -77,7 +77,8 @@ class ClusterPool:
         self.address = address
         try:
             self._client = Client(address, timeout=10.0, set_as_default=False)
-        except (OSError, ValueError, TypeError, ImportError) as error:
+        # Dask asserts that the event loop of an earlier, failed client is still running.
+        except (OSError, ValueError, TypeError, ImportError, AssertionError) as error:
             raise InputError(
                 f"{address}: no Dask scheduler answers there ({first_line(error)})"
             ) from None

@@ -160,11 +160,13 @@ def test_a_log_of_something_else_is_one_line(name, tmp_path):
 
 
 @pytest.mark.slow
-def test_commands_in_degrees_are_a_gain_of_the_command(tmp_path):
+def test_commands_in_degrees_are_answered_with_the_unit(tmp_path):
     explained = explain(table_of(tmp_path, scaled(57.3, 1, 1, 1)))
-    (cause,) = explained.causes
-    assert cause.effect == "input.gain@m_shoulder"
-    assert cause.coefficients["coefficient"].value == pytest.approx(1 / 57.3 - 1, abs=1e-3)
+    assert explained.causes == ()
+    (fault,) = explained.answer.recording_faults
+    assert fault.signals == ("u.m_shoulder",)
+    assert fault.factor == pytest.approx(np.pi / 180, rel=1e-9)
+    assert fault.unit == "deg"
 
 
 @pytest.mark.slow
