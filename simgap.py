@@ -4,7 +4,7 @@ The one name for users and for authors of plugins, in a script, a notebook and a
 
     import simgap
 
-    run = simgap.compare("ball-drop", tuners=["cma_es", "least_squares"], targets=5)
+    run = simgap.compare("ball-drop", tuners=["cma_es", "least_squares"], targets=10)
     found = simgap.explain("swing.csv")
     simgap.simulate("pendulum", effects={"drag.linear": 2e-4}, noise=0.002).write("swing.csv")
 
