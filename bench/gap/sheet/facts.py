@@ -18,6 +18,9 @@ from sims.recording.recording import Recording
 FORMAT = 1
 """Of sheet.toml."""
 
+NAMES_IN_TERMINAL = 5
+"""Maximum number of effects that the terminal names as not shown by the data."""
+
 
 @dataclass(frozen=True)
 class Facts:
@@ -109,5 +112,8 @@ class Facts:
         shown = [row for row in self.rows if row.number is not None]
         lines += [f"  {clean(r.name, 60)} = {estimated(r.number)}" for r in shown if r.number]
         rest = [row.name for row in self.rows if row.number is None]
-        lines.append(f"not shown by these data: {clean(joined(rest), 2000) or 'nothing'}")
+        few, more = rest[:NAMES_IN_TERMINAL], len(rest) - NAMES_IN_TERMINAL
+        if more > 0:
+            few = [*few, f"{more} more (the sheet says how small each could be)"]
+        lines.append(f"not shown by these data: {clean(joined(few), 2000) or 'nothing'}")
         return lines

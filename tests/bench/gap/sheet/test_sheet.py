@@ -70,6 +70,15 @@ def test_what_is_not_there_is_not_shown_within_what_these_data_resolve(sheet: Da
     assert len(leaning) <= 0.2 * len(absent)
 
 
+def test_the_terminal_names_few_of_the_effects_that_are_not_shown(sheet: DataSheet) -> None:
+    hidden = [row.name for row in sheet.rows if row.number is None]
+    (line,) = [line for line in sheet.lines() if line.startswith("not shown")]
+    assert len(hidden) > 5
+    named, _, more = line.partition(": ")[2].partition(" and ")
+    assert named.split(", ") == hidden[:5]
+    assert more.startswith(f"{len(hidden) - 5} more")
+
+
 def test_what_the_data_resolve_is_what_least_squares_says(sheet: DataSheet) -> None:
     """An offset of the sensor, in a motion that gravity bends little: its interval is no narrower
     than that of a mean, and not much wider than that of the pose that gravity tells.
