@@ -91,4 +91,9 @@ def coupled(robot: Robot, coefficients: Mapping[str, float]) -> Robot:
             if robot.actuators[actuator.id].joint == name:
                 actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON
                 actuator.target = tendon.name
+                if actuator.inheritrange > 0:
+                    # The tendon has no range to inherit: the joint's is written down.
+                    actuator.inheritrange = 0.0
+                    actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
+                    actuator.ctrlrange = robot.compiled.actuator_ctrlrange[actuator.id]
     return replace(robot, spec=spec, coupled=tuple(coefficients))

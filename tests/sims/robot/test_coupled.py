@@ -86,6 +86,17 @@ def test_a_coupled_servo_follows_the_sum_that_its_shaft_turns(integrator, close)
     assert np.abs(alone[:, 1] - seen[:, 1]).max() > 3e-3
 
 
+def test_a_coupled_servo_keeps_the_command_range_that_it_inherits_from_its_joint():
+    """A tendon has no range to inherit: MuJoCo refuses to compile the actuator as it stands."""
+    inherits = SERVO.replace("/>", ' inheritrange="0.5"/>')
+    text = TABLE.format(actuator=inherits, integrator="RK4")
+    text = text.replace('name="across"', 'name="across" range="-0.2 0.2"')
+    limited = robot_simulator(Robot(Path("t.xml"), "mjcf", mujoco.MjSpec.from_string(text)))
+    clipped = moved(limited, ["joint.coupling@across"], [C], held(0.15), BOTH)
+    expected = moved(table(SERVO), ["joint.coupling@across"], [C], held(0.1), BOTH)
+    np.testing.assert_allclose(clipped, expected, atol=1e-9)
+
+
 def test_what_drives_say_between_samples_is_theirs_at_both_joints():
     """A command on its way up: each torque is that of the command of the instant."""
     times = np.arange(50) / 100.0
