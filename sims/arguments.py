@@ -248,7 +248,7 @@ def _dict(place: str, value: Any, hint: Any) -> Any:
 
 
 def _tuple(place: str, value: Any, hint: Any) -> Any:
-    """A tuple of so many entries."""
+    """Convert a value to a tuple with the number of entries that the annotation has."""
     inner = get_args(hint)
     if not isinstance(value, list | tuple | np.ndarray) or len(value) != len(inner):
         return _NOTHING

@@ -33,7 +33,7 @@ def require_file(path: Path, wanted: str = "") -> None:
         wanted: what was expected, for the message; may be empty.
 
     Raises:
-        InputError: there is none; the message names files of similar names in that folder.
+        InputError: the file does not exist; the message names similar files in its folder.
     """
     expected = f"; expected {wanted}" if wanted else ""
     try:

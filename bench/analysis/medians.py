@@ -30,8 +30,8 @@ DISTANCE_COLUMNS = [
 _MOST_GROUPS = 4
 """Maximum number of groups of targets outside the training range."""
 _GROUP = 4
-"""Minimum number of targets outside the training range that make a group, where there are so many:
-fewer have no interval to speak of.
+"""Minimum number of targets in a group outside the training range, if there are that many targets:
+the interval of a smaller group says little.
 """
 _RESAMPLES = 500
 """Of the bootstrap: enough for a band a few pixels wide."""

@@ -67,7 +67,7 @@ def ranked_after(budget: int) -> list[int]:
 
 
 def targets_needed(others: int) -> int:
-    """Number of targets from which the best tuner can be told apart from each of `others` tuners.
+    """Return the number of targets that can decide between the best tuner and `others` tuners.
 
     The smallest two-sided p-value of Wilcoxon's signed-rank test on n pairs is 2 / 2^n; Holm's
     first step multiplies it by the number of comparisons.

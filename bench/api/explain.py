@@ -121,7 +121,7 @@ def sources_of(
         about: what the user states of data frames among them.
 
     Raises:
-        InputError: there is none, a data frame is malformed, or `about` states something of what is
+        InputError: no recording is given, a data frame is malformed, or `about` describes what is
             no data frame.
     """
     about = about or FrameDescription()

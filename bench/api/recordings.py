@@ -122,8 +122,9 @@ def read_recording(
 
     Args:
         path: the table, or a DataFrame.
-        system: take it for this system, whatever the description says; a DataFrame needs it, or:
-        model: take it for this robot, whatever the description says: an MJCF or URDF.
+        system: name of the system, in place of the one that the description states. A DataFrame
+            needs this or `model`.
+        model: model file of a robot, MJCF or URDF, in place of what the description states.
         units: of a DataFrame's columns by name; those in ``df.attrs["units"]`` without.
         constants: known numbers of the system in SI units, with a DataFrame.
         description: anything else about a DataFrame, with the keys of ``NAME.toml``.

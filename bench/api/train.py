@@ -116,7 +116,7 @@ def default_experiment(simulator: str) -> str:
     the simulator. Studies of a missing effect, which compare simulators too, do not count.
 
     Raises:
-        InputError: there are several and no default, or there is none.
+        InputError: no experiment trains this simulator, or several do and none is the default.
     """
     if simulator in DEFAULT_EXPERIMENTS:
         return DEFAULT_EXPERIMENTS[simulator]

@@ -138,7 +138,7 @@ def get(name: str) -> DataSet:
     """The data set of a name.
 
     Raises:
-        InputError: there is none; the message has the names that there are.
+        InputError: no data set has this name; the message lists the known names.
     """
     if name not in _catalogue():
         raise unknown("data set", name, names())

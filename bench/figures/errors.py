@@ -106,13 +106,7 @@ def misfit_figure(
         samples_panel(axis, statistics, "obs_error", kind, style)
         floor = least_misfit(part)
         axis.axhline(floor, color=SOFT, linewidth=0.8, linestyle=(0, (2, 2)))
-        axis.annotate(
-            f"least that any tuner reached: {floor:.2g} (median)",
-            (0, floor),
-            xytext=(4, -10),
-            textcoords="offset points",
-            fontsize=7.5,
-        )
+        _label_below(axis, floor, f"least that any tuner reached: {floor:.2g} (median)")
         titled(axis, f"{TITLES[kind]} ({statistics.targets[kind]} targets)")
         axis.set_ylabel(f"RMSE of {channel}, median")
     finish(figure, axes, style, experiment)
@@ -147,6 +141,11 @@ def samples_panel(
     simulations_axis(axis, budget)
 
 
+def _label_below(axis: Axes, level: float, text: str) -> None:
+    """Write a text below a horizontal level, at the left end of the axis."""
+    axis.annotate(text, (0, level), xytext=(4, -10), textcoords="offset points", fontsize=7.5)
+
+
 def shade_equal(axis: Axes, floor: float | None) -> None:
     """Shade the errors that count as equal, where some are drawn.
 
@@ -158,13 +157,7 @@ def shade_equal(axis: Axes, floor: float | None) -> None:
     if floor is None or not low < floor < high:
         return
     axis.axhspan(low, floor, color=SHADE, linewidth=0, zorder=0)
-    axis.annotate(
-        f"below {floor:.2g}: count as equal",
-        (0, floor),
-        xytext=(4, -10),
-        textcoords="offset points",
-        fontsize=7.5,
-    )
+    _label_below(axis, floor, f"below {floor:.2g}: count as equal")
     axis.set_ylim(low, high)
 
 

@@ -23,6 +23,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from bench.gap.identify import listed
 from bench.gap.model.base_fit import HORIZONS, Base, fit_base, misfit_of_starts
 from bench.gap.model.bounds import bound_of
 from bench.gap.model.floor import noise_floor
@@ -51,7 +52,7 @@ FOLLOWED = 0.2
 EXPLAINED = 1.5
 """RMS in units of the noise from which on a hypothesis leaves nothing to explain."""
 EQUAL = 1.05
-"""Misfits whose ratio is smaller cannot be told apart."""
+"""Ratio of two misfits below which they count as equal."""
 SHARP = 7.0
 """Twice the log likelihood by which a factor must fit better than others near it."""
 OFF = 1e-6
@@ -72,6 +73,8 @@ IGNORED = 0.1
 
 BEGINNING = HORIZONS[0].share
 """The first share of each run, by which hypotheses are screened."""
+_NAMED = 4
+"""Maximum number of signals that a sentence names."""
 _BEYOND = "parameter {} lies beyond the bounds of its range"
 """What would explain a recording as well whose base fit ends at a bound."""
 _DEGREE = math.pi / 180.0
@@ -151,7 +154,7 @@ class Hypothesis:
     Attributes:
         signals: which ones.
         units: that their numbers are in; the stated one where a factor alone is wrong.
-        scale: factor besides that of the units, of all of them.
+        scale: factor of all signals, in addition to that of the units.
     """
 
     signals: tuple[Signal, ...]
@@ -164,7 +167,7 @@ class Hypothesis:
         return {s.name: self.scale * _gain(s, unit) / s.gain for s, unit in pairs}
 
     def fault(self, file: str, before: float | None, after: float | None) -> RecordingFault:
-        """What the user is told."""
+        """Describe the hypothesis as a fault of the recording, with the lines to change."""
         factors = self.factors()
         lines = []
         for signal, unit in zip(self.signals, self.units, strict=True):
@@ -188,7 +191,7 @@ class Hypothesis:
 
     def _says(self, file: str, factors: Mapping[str, float]) -> str:
         first, unit = self.signals[0], self.units[0]
-        names = _listed([signal.said for signal in self.signals])
+        names = listed([signal.said for signal in self.signals], _NAMED)
         table = f"[{first.kind}.{first.name}]" if len(self.signals) == 1 else "the tables of each"
         scale = f"set scale = {self._scale(first):.9g} in {table} of {file}"
         if unit == first.stated and self.scale == -1.0:
@@ -525,9 +528,3 @@ def _distinction(
     is_unit = one.scale == 1.0 and all(signal.kind == "inputs" for signal in one.signals)
     absorbed = is_unit and near * EQUAL > after and left(OFF) > WORSE * after
     return "absorbed" if absorbed else "none"
-
-
-def _listed(names: Sequence[str], most: int = 4) -> str:
-    shown = list(names[:most])
-    more = len(names) - most
-    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import floor, isfinite, log10
 
 RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
@@ -23,6 +24,13 @@ def clean(text: object, most: int = 400) -> str:
     """
     plain = "".join(_harmless(c) for c in str(text)).strip()
     return plain if len(plain) <= most else plain[: most - 1] + "…"
+
+
+def joined(parts: Sequence[str], last: str = "and") -> str:
+    """Join names as ``a``, ``a and b`` or ``a, b and c``."""
+    if len(parts) < 2:
+        return "".join(parts)
+    return f"{', '.join(parts[:-1])} {last} {parts[-1]}"
 
 
 def _harmless(character: str) -> str:

@@ -4,9 +4,9 @@ A target's numbers are drawn from streams of its own (`bench.problem.salt`), in 
 and truth, initial state, inputs, constants, sensor noise. Whatever is drawn in another order is
 another target.
 
-A target whose own simulation diverges says nothing of any tuner. It is drawn again, whole, from
-streams of its own that are named for the number of the draw: the same salt gives the same targets,
-whoever draws them and in whatever order.
+A target whose own simulation diverges cannot be used to compare tuners. The whole target is drawn
+again from random streams that are named after the number of the draw. So the same salt gives the
+same targets, in any process and in any order.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ simulation counts as diverged although its numbers are finite.
 MAX_DRAWS = 200
 """Maximum number of draws of one target."""
 MAX_FAILED_SHARE = 0.9
-"""Largest share of draws that may diverge: what is left would be no sample of the ranges."""
+"""Largest share of draws that may diverge: the rest would not be a sample of the ranges."""
 
 
 @dataclass(frozen=True)

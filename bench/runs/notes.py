@@ -1,4 +1,4 @@
-"""What the author of a tuner should know about its isolated runs, beside how they ended."""
+"""Notes for the author of a tuner about its isolated runs, in addition to their statuses."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The events by which a search reports its progress.
 
-Whatever searches reports to a `ProgressListener`; whatever displays progress is one. Neither knows
+A search reports events to a `ProgressListener`; a display of progress is one. Neither depends on
 the other, so that the same display serves any search.
 """
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from bench.pages.text import RAISED
 from bench.pages.text import clean as clean
 from bench.pages.text import estimate as estimate
+from bench.pages.text import joined as joined
 from bench.pages.text import number as number
 from bench.pages.text import percent as percent
 from bench.pages.text import probability as probability
@@ -110,14 +111,6 @@ def at(kind: str, places: Sequence[str], last: str = "or", wrong: bool = False) 
 def name_of(effect: str) -> str:
     """An effect's noun without its article, for lists."""
     return re.sub(r"^an? ", "", noun(effect))
-
-
-def joined(parts: Sequence[str], last: str = "and") -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
-    if len(parts) < 2:
-        return "".join(parts)
-    front = ", ".join(parts[:-1])
-    return f"{front} {last} {parts[-1]}"
 
 
 def sentence(text: object) -> str:

@@ -13,7 +13,7 @@ from bench.pages import elements
 from bench.pages.comparison import headline
 from bench.pages.comparison.results import Results
 from bench.pages.elements import paragraph, safe, strong
-from bench.pages.text import number, percent
+from bench.pages.text import joined, number, percent
 
 SURE = SIGNIFICANCE
 """Corrected p-value below which one tuner is called better than another."""
@@ -145,7 +145,7 @@ def _training(results: Results, line: Mapping[Any, Any]) -> str:
 def _named(names: Sequence[str], mark: Callable[[str], str] = str) -> str:
     """Names as safe HTML, each marked."""
     shown = [mark(safe(name, 100)) for name in names]
-    return headline.joined(shown) if shown else ""
+    return joined(shown)
 
 
 def warnings(results: Results) -> Iterator[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,8 +148,3 @@ def failed_runs(statistics: Statistics, kind: str) -> str:
         if row["failures"]
     ]
     return f"failed runs, which count as infinite errors: {', '.join(each)}" if each else ""
-
-
-def joined(names: Sequence[str]) -> str:
-    """``a, b and c``."""
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
